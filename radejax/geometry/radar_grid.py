@@ -1,0 +1,269 @@
+"""The sensor's axes and the mapping between bins and metres.
+
+Every conversion between bins of the radar tensor and positions in the ego frame goes
+through `RadarGrid`; no other module knows a bin size.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+AzimuthMapping = Literal["true", "stretched"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RadarGrid:
+    """Bin centers of a 4D radar tensor: four uniform, increasing axes.
+
+    Azimuth is positive to the right of boresight, `azimuth = -atan2(y, x)`, as in
+    K-Radar. Doppler is the aliased radial velocity. Grids compare and hash by value,
+    so they can be static arguments of jitted functions.
+
+    Attributes:
+        range_m: `[R]` metres.
+        azimuth_rad: `[A]` radians.
+        elevation_rad: `[E]` radians.
+        doppler_mps: `[D]` metres per second.
+        fov_range_m: Objects farther than this are outside the field of view.
+        fov_azimuth_rad: Objects beyond plus or minus this azimuth are outside.
+
+    Raises:
+        ValueError: An axis has fewer than 2 bins, or is not uniform and increasing.
+
+    References:
+        Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
+    """
+
+    range_m: np.ndarray
+    azimuth_rad: np.ndarray
+    elevation_rad: np.ndarray
+    doppler_mps: np.ndarray
+    fov_range_m: float
+    fov_azimuth_rad: float
+
+    def __post_init__(self) -> None:
+        for name in ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps"):
+            axis = np.array(getattr(self, name), np.float64)
+            if axis.ndim != 1 or axis.size < 2:
+                raise ValueError(
+                    f"{name} must be a vector of at least 2 bins, got shape {axis.shape}"
+                )
+            step = (axis[-1] - axis[0]) / (axis.size - 1)
+            deviation = np.abs(axis - (axis[0] + step * np.arange(axis.size))).max()
+            if not step > 0 or deviation > 1e-3 * step:
+                raise ValueError(f"{name} must be uniform and increasing, got {axis}")
+            axis.setflags(write=False)
+            object.__setattr__(self, name, axis)
+
+    # Construction --------------------------------------------------------------------
+
+    @classmethod
+    def kradar(cls) -> RadarGrid:
+        """The real sensor: 64 Doppler, 256 range, 37 elevation, 107 azimuth bins."""
+        return cls(
+            range_m=0.462890625 * np.arange(256),
+            azimuth_rad=np.deg2rad(np.arange(-53.0, 54.0)),
+            elevation_rad=np.deg2rad(np.arange(-18.0, 19.0)),
+            doppler_mps=np.linspace(-1.932591, 1.872198, 64),
+            fov_range_m=118.0,
+            fov_azimuth_rad=np.deg2rad(53.0),
+        )
+
+    @classmethod
+    def reduced(
+        cls,
+        *,
+        num_doppler: int,
+        num_range: int,
+        num_elevation: int,
+        num_azimuth: int,
+        max_range_m: float = 118.0,
+        max_azimuth_deg: float = 53.0,
+        max_elevation_deg: float = 18.0,
+        max_doppler_mps: float = 1.932591,
+    ) -> RadarGrid:
+        """A coarser sensor with axes like K-Radar's, for tests and quick starts.
+
+        Range starts at 0; azimuth and elevation are symmetric; Doppler covers
+        `[-max, max)` as the output of an FFT does.
+        """
+        azimuth = np.deg2rad(max_azimuth_deg)
+        elevation = np.deg2rad(max_elevation_deg)
+        return cls(
+            range_m=np.linspace(0.0, max_range_m, num_range),
+            azimuth_rad=np.linspace(-azimuth, azimuth, num_azimuth),
+            elevation_rad=np.linspace(-elevation, elevation, num_elevation),
+            doppler_mps=np.linspace(
+                -max_doppler_mps, max_doppler_mps, num_doppler, endpoint=False
+            ),
+            fov_range_m=float(max_range_m),
+            fov_azimuth_rad=float(azimuth),
+        )
+
+    @classmethod
+    def from_dict(cls, fields: Mapping[str, Any]) -> RadarGrid:
+        """Inverse of `to_dict`."""
+        return cls(**{f.name: fields[f.name] for f in dataclasses.fields(cls)})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain lists and floats, exact through JSON."""
+        return {
+            f.name: getattr(self, f.name).tolist()
+            if isinstance(getattr(self, f.name), np.ndarray)
+            else float(getattr(self, f.name))
+            for f in dataclasses.fields(self)
+        }
+
+    def padded(
+        self, multiple: int = 8, azimuth_mapping: AzimuthMapping = "true"
+    ) -> RadarGrid:
+        """Grid of maps whose range and azimuth are zero-padded to a multiple.
+
+        Args:
+            multiple: Bins are appended at the far and right end up to a multiple.
+            azimuth_mapping: "true" continues the axes; bins keep their place.
+                "stretched" reproduces the released RADE-Net: the padded azimuth bins
+                span the unpadded field of view, and the last range bin lies at the
+                nominal maximum range. Only for official checkpoints, which were
+                trained so: targets drift up to 5 columns from the data.
+        """
+        num_range = -(-self.num_range // multiple) * multiple
+        num_azimuth = -(-self.num_azimuth // multiple) * multiple
+        if azimuth_mapping == "true":
+            range_m = self.range_m[0] + self.range_step_m * np.arange(num_range)
+            azimuth = self.azimuth_rad[0] + self.azimuth_step_rad * np.arange(
+                num_azimuth
+            )
+        elif azimuth_mapping == "stretched":
+            range_m = np.linspace(self.range_m[0], self.fov_range_m, num_range)
+            azimuth = np.linspace(
+                self.azimuth_rad[0], self.azimuth_rad[-1], num_azimuth
+            )
+        else:
+            raise ValueError(
+                f"azimuth_mapping must be 'true' or 'stretched', got {azimuth_mapping!r}"
+            )
+        return dataclasses.replace(self, range_m=range_m, azimuth_rad=azimuth)
+
+    # Sizes ---------------------------------------------------------------------------
+
+    @property
+    def num_range(self) -> int:
+        return self.range_m.size
+
+    @property
+    def num_azimuth(self) -> int:
+        return self.azimuth_rad.size
+
+    @property
+    def num_elevation(self) -> int:
+        return self.elevation_rad.size
+
+    @property
+    def num_doppler(self) -> int:
+        return self.doppler_mps.size
+
+    @property
+    def shape_drea(self) -> tuple[int, int, int, int]:
+        """Shape of a tesseract: Doppler, range, elevation, azimuth."""
+        return self.num_doppler, self.num_range, self.num_elevation, self.num_azimuth
+
+    @property
+    def projection_shape(self) -> tuple[int, int, int]:
+        """Shape of a projection: range, azimuth, Doppler + elevation channels."""
+        return self.num_range, self.num_azimuth, self.num_doppler + self.num_elevation
+
+    @property
+    def range_step_m(self) -> float:
+        return float((self.range_m[-1] - self.range_m[0]) / (self.num_range - 1))
+
+    @property
+    def azimuth_step_rad(self) -> float:
+        span = self.azimuth_rad[-1] - self.azimuth_rad[0]
+        return float(span / (self.num_azimuth - 1))
+
+    # Bins and metres -----------------------------------------------------------------
+
+    def cell_to_ego(self, range_cell: Any, azimuth_cell: Any) -> Any:
+        """Positions of range-azimuth cells on the ground plane of the ego frame.
+
+        Cell (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da, hence at
+        x = r cos(a), y = -r sin(a).
+
+        Args:
+            range_cell: Position along range in bins, `[...]`; may be fractional.
+            azimuth_cell: Position along azimuth in bins, `[...]`.
+
+        Returns:
+            `[..., 2]` x (forward) and y (left) in metres; NumPy float64 for NumPy
+            or Python input, else a JAX array.
+        """
+        xp = _array_module(range_cell, azimuth_cell)
+        range_m = self.range_m[0] + range_cell * self.range_step_m
+        azimuth = self.azimuth_rad[0] + azimuth_cell * self.azimuth_step_rad
+        return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
+
+    def ego_to_cell(self, x_m: Any, y_m: Any) -> Any:
+        """Fractional bins of ground positions: inverse of `cell_to_ego`.
+
+        Returns:
+            `[..., 2]` range and azimuth in bins; not clipped to the grid.
+        """
+        xp = _array_module(x_m, y_m)
+        range_cell = (xp.hypot(x_m, y_m) - self.range_m[0]) / self.range_step_m
+        azimuth = -xp.arctan2(y_m, x_m)
+        azimuth_cell = (azimuth - self.azimuth_rad[0]) / self.azimuth_step_rad
+        return xp.stack([range_cell, azimuth_cell], -1)
+
+    def nearest_cell(self, x_m: Any, y_m: Any) -> Any:
+        """Integer bins nearest to ground positions, clipped to the grid.
+
+        Halves round to even, as in the released ground-truth encoding.
+
+        Returns:
+            `[..., 2]` int32 range and azimuth indices.
+        """
+        xp = _array_module(x_m, y_m)
+        cell = xp.round(self.ego_to_cell(x_m, y_m)).astype(xp.int32)
+        return xp.clip(cell, 0, np.array([self.num_range - 1, self.num_azimuth - 1]))
+
+    def cell_centers_ego(self) -> np.ndarray:
+        """`[R, A, 2]` float64 x and y of every range-azimuth bin center, metres."""
+        return self.cell_to_ego(
+            np.arange(self.num_range)[:, None], np.arange(self.num_azimuth)[None, :]
+        )
+
+    def in_field_of_view(self, x_m: Any, y_m: Any) -> Any:
+        """True where the sensor looks: in front, within maximum azimuth and range."""
+        xp = _array_module(x_m, y_m)
+        azimuth = xp.arctan2(y_m, x_m)
+        return (
+            (xp.abs(azimuth) <= self.fov_azimuth_rad)
+            & (x_m >= 0)
+            & (xp.hypot(x_m, y_m) <= self.fov_range_m)
+        )
+
+    # Value semantics -----------------------------------------------------------------
+
+    def _key(self) -> tuple:
+        return tuple(
+            v.tobytes() if isinstance(v, np.ndarray) else v
+            for v in (getattr(self, f.name) for f in dataclasses.fields(self))
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RadarGrid) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+
+def _array_module(*values: Any) -> Any:
+    """NumPy where every value is NumPy's or Python's, else jax.numpy."""
+    on_host = all(isinstance(v, np.ndarray | np.generic | float | int) for v in values)
+    return np if on_host else jnp
