@@ -1,0 +1,38 @@
+"""Detectors as Flax modules; `build` makes one from its config."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+
+from radejax.errors import UserError
+
+_MODULES = {
+    "radenet": "radejax.models.radenet",
+    "dinorade": "radejax.models.dinorade",
+}
+
+
+def build(config: Mapping[str, Any]) -> nn.Module:
+    """The model that `config.model` describes.
+
+    Args:
+        config: A mapping with `name`, "radenet" or "dinorade", and exactly the
+            fields of that model.
+
+    Returns:
+        A Flax module, without parameters.
+
+    Raises:
+        UserError: The name is unknown, a field is missing, unknown or impossible.
+    """
+    if "name" not in config or config["name"] not in _MODULES:
+        name = repr(config["name"]) if "name" in config else "missing"
+        raise UserError(
+            f"config.model.name is {name}; available models: {sorted(_MODULES)}"
+        )
+    # Imported on demand: a radar-only run does not load the camera's modules.
+    return importlib.import_module(_MODULES[config["name"]]).from_config(config)

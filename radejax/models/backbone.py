@@ -1,0 +1,127 @@
+"""U-shaped encoder and decoder over the range-azimuth plane.
+
+References:
+    RADE-Net, section III-C and figure 3.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from radejax.models.cbam import CBAM, CBAMKind
+from radejax.models.layers import (
+    Conv,
+    ConvGNSiLU,
+    DoubleConvResidual,
+    Upsample,
+    max_pool,
+)
+
+
+class InputStem(nn.Module):
+    """Encodes Doppler and elevation channels apart before they are mixed.
+
+    1x1 convolutions to `features` and `features / 2` channels, then a 3x3
+    convolution; all with normalisation and SiLU and without bias.
+
+    Attributes:
+        features: Output channels.
+        doppler_bins: The first so many channels are Doppler, the rest elevation.
+        num_groups: Groups of the normalisations.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int
+    doppler_bins: int
+    num_groups: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        def block(features: int, size: int, name: str) -> ConvGNSiLU:
+            return ConvGNSiLU(
+                features,
+                self.num_groups,
+                size,
+                use_bias=False,
+                dtype=self.dtype,
+                name=name,
+            )
+
+        doppler = block(self.features, 1, "doppler")(x[..., : self.doppler_bins])
+        elevation = block(self.features // 2, 1, "elevation")(
+            x[..., self.doppler_bins :]
+        )
+        mixed = jnp.concatenate([doppler, elevation], -1)
+        return block(self.features, 3, "mix")(mixed)
+
+
+class Backbone(nn.Module):
+    """Projection `[B, R, A, D+E]` -> features `[B, R, A, decoder_width]`.
+
+    Encoder level i halves the map after `widths[i]` channels; the decoder doubles it
+    and joins the attended skip of the same level. R and A must be multiples of
+    2 ** len(widths).
+
+    Attributes:
+        doppler_bins: Doppler channels of the input; only the stem tells them apart.
+        widths: Channels of the encoder levels, finest first.
+        decoder_width: Channels of the last decoder stage.
+        num_groups: Groups of the normalisations.
+        cbam: Attention on the skips, or None.
+        input_stem: `InputStem` instead of one 3x3 convolution.
+        dtype: Dtype of the computation and the output.
+        remat: Recompute blocks in the backward pass instead of storing them.
+    """
+
+    doppler_bins: int
+    widths: tuple[int, ...] = (128, 256, 512)
+    decoder_width: int = 128
+    num_groups: int = 32
+    cbam: CBAMKind | None = "official"
+    input_stem: bool = False
+    dtype: Any = jnp.float32
+    remat: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        wrap = nn.remat if self.remat else lambda module: module
+        double_conv, attention = wrap(DoubleConvResidual), wrap(CBAM)
+
+        def block(features: int, name: str) -> nn.Module:
+            return double_conv(features, self.num_groups, dtype=self.dtype, name=name)
+
+        x = self._start(x)
+        skips = []
+        for i, width in enumerate(self.widths, 1):
+            x = block(width, f"encoder_{i}")(x)
+            skips.append(x)
+            x = max_pool(x)
+        for i in (1, 2):
+            x = block(self.widths[-1], f"bottleneck_{i}")(x)
+        decoder_widths = (*self.widths[-2::-1], self.decoder_width)
+        for i, width in enumerate(decoder_widths, 1):
+            skip = skips.pop()
+            x = Upsample(x.shape[-1], dtype=self.dtype, name=f"upsample_{i}")(x)
+            if self.cbam is not None:
+                skip = attention(
+                    self.cbam, self.num_groups, dtype=self.dtype, name=f"cbam_{i}"
+                )(skip)
+            x = block(width, f"decoder_{i}")(jnp.concatenate([x, skip], -1))
+        return x
+
+    def _start(self, x: jax.Array) -> jax.Array:
+        width = self.widths[0]
+        if self.input_stem:
+            return InputStem(
+                width,
+                self.doppler_bins,
+                self.num_groups,
+                dtype=self.dtype,
+                name="stem",
+            )(x)
+        return Conv(width, dtype=self.dtype, name="start")(x)

@@ -1,0 +1,82 @@
+"""Decoupled heads: a class heatmap and eight box parameters per bin.
+
+References:
+    RADE-Net, section III-E. "Sigmoid after each convolution" there is a slip: the
+    released code has GroupNorm and SiLU between convolutions and one sigmoid at the
+    end of the heatmap head, which lives in losses and decoding here.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from radejax.models.layers import Conv, ConvGNSiLU
+from radejax.structures import DetectionMaps
+
+HeadKind = Literal["expanded", "default"]
+
+NUM_BOX_PARAMS = 8
+
+
+class Head(nn.Module):
+    """`ConvGNSiLU` blocks, then a 1x1 convolution in float32.
+
+    "expanded": three blocks of the input's width. "default": one block of half the
+    input's width and at most 64 channels.
+
+    Attributes:
+        features: Output channels.
+        kind: "expanded" or "default".
+        num_groups: Groups of the normalisations.
+        dtype: Dtype of the computation up to the last convolution.
+        remat: Recompute blocks in the backward pass instead of storing them.
+    """
+
+    features: int
+    kind: HeadKind = "expanded"
+    num_groups: int = 32
+    dtype: Any = jnp.float32
+    remat: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        width = x.shape[-1]
+        widths = (width,) * 3 if self.kind == "expanded" else (min(64, width // 2),)
+        block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
+        for i, width in enumerate(widths, 1):
+            x = block(width, self.num_groups, dtype=self.dtype, name=f"conv_{i}")(x)
+        return Conv(self.features, 1, name="out")(x)
+
+
+class Heads(nn.Module):
+    """Features `[B, R, A, C]` -> `DetectionMaps`, float32.
+
+    Attributes:
+        num_classes: Channels of the heatmap.
+        kind: "expanded" or "default", see `Head`.
+        num_groups: Groups of the normalisations.
+        dtype: Dtype of the computation up to the last convolution.
+        remat: Recompute blocks in the backward pass instead of storing them.
+    """
+
+    num_classes: int
+    kind: HeadKind = "expanded"
+    num_groups: int = 32
+    dtype: Any = jnp.float32
+    remat: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> DetectionMaps:
+        def head(features: int, name: str) -> Head:
+            return Head(
+                features, self.kind, self.num_groups, self.dtype, self.remat, name=name
+            )
+
+        return DetectionMaps(
+            heatmap_logits=head(self.num_classes, "heatmap")(x),
+            box_params=head(NUM_BOX_PARAMS, "box")(x),
+        )

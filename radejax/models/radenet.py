@@ -1,0 +1,201 @@
+"""RADE-Net: from radar projections to heatmap and box parameters.
+
+References:
+    Leitgeb et al., RADE-Net; architecture as in the released code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from radejax.errors import UserError
+from radejax.models.backbone import Backbone
+from radejax.models.cbam import CBAMKind
+from radejax.models.heads import HeadKind, Heads
+from radejax.models.neck import Neck, NeckKind
+from radejax.structures import DetectionMaps
+
+DTYPES = ("float32", "bfloat16")
+
+
+class RadeNet(nn.Module):
+    """Radar-only detector: backbone, neck and two heads.
+
+    Maps are zero-padded at the far and right end to a multiple of `pad_multiple`;
+    the output keeps the padding unless `crop_output`.
+
+    Attributes:
+        num_classes: Channels of the heatmap.
+        doppler_bins: First channels of the projection.
+        elevation_bins: Remaining channels of the projection.
+        widths: Channels of the encoder levels, finest first.
+        decoder_width: Channels of the last decoder stage, neck and heads.
+        num_groups: Groups of every normalisation; must divide every width.
+        cbam: "official", "paper" or None; see `radejax.models.cbam.CBAM`.
+        input_stem: Encode Doppler and elevation apart first.
+        neck: "dilated" or "plain".
+        heads: "expanded" or "default".
+        pad_multiple: Multiple of 2 ** len(widths).
+        crop_output: Cut the maps back to the projection's bins.
+        dtype: "float32" or "bfloat16", of the computation; outputs are float32.
+        remat: Recompute blocks in the backward pass: less memory, more time.
+    """
+
+    num_classes: int
+    doppler_bins: int = 64
+    elevation_bins: int = 37
+    widths: tuple[int, ...] = (128, 256, 512)
+    decoder_width: int = 128
+    num_groups: int = 32
+    cbam: CBAMKind | None = "official"
+    input_stem: bool = False
+    neck: NeckKind = "dilated"
+    heads: HeadKind = "expanded"
+    pad_multiple: int = 8
+    crop_output: bool = False
+    dtype: str = "float32"
+    remat: bool = False
+
+    @nn.compact
+    def __call__(self, projection: jax.Array, train: bool = False) -> DetectionMaps:
+        """Predicts from projections.
+
+        Args:
+            projection: `[B, R, A, D+E]` as `radejax.data.projection.project` makes
+                them, Doppler channels first; any float dtype.
+            train: Has no effect; for the signature that all models share.
+
+        Returns:
+            Maps on the padded bins, or on the projection's if `crop_output`.
+        """
+        del train
+        channels = self.doppler_bins + self.elevation_bins
+        if projection.ndim != 4 or projection.shape[-1] != channels:
+            raise ValueError(
+                f"projection must be [B, R, A, {channels}] with {self.doppler_bins} "
+                f"Doppler and {self.elevation_bins} elevation channels, got "
+                f"{projection.shape}"
+            )
+        dtype = jnp.dtype(self.dtype)
+        x = pad_to_multiple(projection.astype(dtype), self.pad_multiple)
+        x = Backbone(
+            self.doppler_bins,
+            self.widths,
+            self.decoder_width,
+            self.num_groups,
+            self.cbam,
+            self.input_stem,
+            dtype=dtype,
+            remat=self.remat,
+            name="backbone",
+        )(x)
+        x = Neck(self.neck, self.num_groups, dtype, self.remat, name="neck")(x)
+        maps = Heads(
+            self.num_classes,
+            self.heads,
+            self.num_groups,
+            dtype,
+            self.remat,
+            name="heads",
+        )(x)
+        if self.crop_output:
+            r, a = projection.shape[1:3]
+            maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
+        return maps
+
+
+def pad_to_multiple(x: jax.Array, multiple: int) -> jax.Array:
+    """Zero-pads range and azimuth of `[B, R, A, C]` at their ends to a multiple."""
+    pad_range, pad_azimuth = (-x.shape[1] % multiple, -x.shape[2] % multiple)
+    return jnp.pad(x, ((0, 0), (0, pad_range), (0, pad_azimuth), (0, 0)))
+
+
+FIELDS = (
+    "num_classes",
+    "doppler_bins",
+    "elevation_bins",
+    "widths",
+    "decoder_width",
+    "num_groups",
+    "cbam",
+    "input_stem",
+    "neck",
+    "heads",
+    "pad_multiple",
+    "crop_output",
+    "dtype",
+    "remat",
+)
+"""Fields of a model config beside `name`."""
+
+_CHOICES = {
+    "cbam": ("official", "paper", "off", None),
+    "neck": ("dilated", "plain"),
+    "heads": ("expanded", "default"),
+    "dtype": DTYPES,
+}
+
+
+def from_config(config: Mapping[str, Any]) -> RadeNet:
+    """RADE-Net as a config describes it.
+
+    Args:
+        config: Exactly the keys `name` and `FIELDS`. `cbam` may be "off" for None.
+
+    Raises:
+        UserError: A key is missing or unknown, or a value is not possible.
+    """
+    fields = {key: config[key] for key in config if key != "name"}
+    check_keys(fields, FIELDS, "model")
+    for key, choices in _CHOICES.items():
+        if fields[key] not in choices:
+            raise UserError(
+                f"config.model.{key} is {fields[key]!r}, expected one of {choices}"
+            )
+    fields["widths"] = tuple(fields["widths"])
+    if fields["cbam"] == "off":
+        fields["cbam"] = None
+    model = RadeNet(**fields)
+    _check_sizes(model)
+    return model
+
+
+def check_keys(
+    fields: Mapping[str, Any], expected: tuple[str, ...], section: str
+) -> None:
+    """Raises `UserError` naming keys of a config section that are too many or few."""
+    unknown = sorted(set(fields) - set(expected))
+    missing = sorted(set(expected) - set(fields))
+    problems = [f"unknown {unknown}"] * bool(unknown)
+    problems += [f"missing {missing}"] * bool(missing)
+    if problems:
+        raise UserError(
+            f"config.{section} has {' and '.join(problems)}; its keys are "
+            f"{sorted(expected)}"
+        )
+
+
+def _check_sizes(model: RadeNet) -> None:
+    stride = 2 ** len(model.widths)
+    if model.pad_multiple < 1 or model.pad_multiple % stride:
+        raise UserError(
+            f"config.model.pad_multiple is {model.pad_multiple}; {len(model.widths)} "
+            f"levels need a multiple of {stride}"
+        )
+    widths = {f"widths[{i}]": width for i, width in enumerate(model.widths)}
+    widths["decoder_width"] = model.decoder_width
+    if model.heads == "default":
+        widths["decoder_width / 2 (default heads)"] = min(64, model.decoder_width // 2)
+    if model.input_stem:
+        widths["widths[0] / 2 (input stem)"] = model.widths[0] // 2
+    for name, width in widths.items():
+        if width < 1 or width % model.num_groups:
+            raise UserError(
+                f"config.model: {name} = {width} is not a multiple of "
+                f"num_groups = {model.num_groups}"
+            )
