@@ -7,11 +7,18 @@ ego frame: x forward, y left, z up, metres; yaw counter-clockwise from x, radian
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
+import numpy as np
 from flax import struct
 
 CLASSES = ("Sedan", "Bus or Truck", "Pedestrian", "Motorcycle", "Bicycle")
 """K-Radar's five detection classes in the order of every class axis."""
+
+BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
+"""Names of the numbers of a box, metres and radians."""
 
 
 @struct.dataclass
@@ -67,3 +74,42 @@ class Detections:
     classes: jax.Array
     is_valid: jax.Array
     num_cut: jax.Array
+
+    def to_columns(self, classes: Sequence[str] = CLASSES) -> dict[str, np.ndarray]:
+        """The valid rows of all frames as plain columns, as evaluation takes them.
+
+        Returns:
+            "frame" `[N]` position in the batch, "box" `[N, 7]`, "cls" `[N]` names,
+            "score" `[N]`; by frame, then by descending score.
+        """
+        frame, row = np.nonzero(np.asarray(self.is_valid))
+        indices = np.asarray(self.classes)[frame, row]
+        return {
+            "frame": frame,
+            "box": np.asarray(self.boxes, np.float64)[frame, row],
+            "cls": np.asarray(classes, object)[indices].astype(str),
+            "score": np.asarray(self.scores, np.float64)[frame, row],
+        }
+
+    def to_list(self, classes: Sequence[str] = CLASSES) -> list[list[dict[str, Any]]]:
+        """One list a frame of dictionaries: cls, score and the seven box numbers."""
+        columns = self.to_columns(classes)
+        frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
+        for frame, box, cls, score in zip(
+            columns["frame"],
+            columns["box"].tolist(),
+            columns["cls"].tolist(),
+            columns["score"].tolist(),
+            strict=True,
+        ):
+            values = dict(zip(BOX_FIELDS, box, strict=True))
+            frames[frame].append({"cls": cls, "score": score, **values})
+        return frames
+
+    def to_pandas(self, classes: Sequence[str] = CLASSES) -> Any:
+        """One row a detection, as a `pandas.DataFrame` (extra "notebook")."""
+        import pandas
+
+        columns = self.to_columns(classes)
+        boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
+        return pandas.DataFrame({**columns, **boxes})

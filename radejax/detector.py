@@ -1,0 +1,294 @@
+"""`Detector`: tensors in, boxes out, in one jitted call."""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from radejax.data import projection as projection_lib
+from radejax.data.pipeline import to_float
+from radejax.detection.decode import decode
+from radejax.errors import UserError
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.structures import CLASSES, Detections
+from radejax.training.step import map_grid
+
+EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
+
+
+class Detector:
+    """A trained model with everything between a radar tensor and boxes.
+
+    One object may be shared by threads. Batches are padded to a few fixed sizes, so
+    that any number of frames compiles at most `len(batch_sizes)` programs per input
+    kind; thresholds and region can change without compiling again.
+
+    Args:
+        model: From `radejax.models.build`.
+        variables: Its parameters and other collections.
+        grid: Of the sensor.
+        classes: Names in the order of the heatmap's channels.
+        decode_options: Static keyword arguments of `radejax.detection.decode.decode`:
+            max_detections, threshold_inclusive, per_class_nms, z0_m.
+        azimuth_mapping: "true", or "stretched" for official checkpoints.
+        score_threshold: Default of calls.
+        nms_iou: Default of calls.
+        roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, or None.
+        batch_sizes: Sizes that are compiled.
+        device: Where to run; JAX's default device if None.
+
+    Examples:
+        >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
+        >>> detector(projection).to_list()  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        variables: Mapping[str, Any],
+        grid: RadarGrid,
+        *,
+        classes: Sequence[str] = CLASSES,
+        decode_options: Mapping[str, Any] | None = None,
+        azimuth_mapping: str = "true",
+        score_threshold: float = 0.3,
+        nms_iou: float = 0.3,
+        roi: Sequence[float] | None = None,
+        batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
+        device: jax.Device | None = None,
+    ) -> None:
+        self.model = model
+        self.grid = grid
+        self.classes = tuple(classes)
+        self.score_threshold = score_threshold
+        self.nms_iou = nms_iou
+        self.roi = roi
+        self._device = device if device is not None else jax.devices()[0]
+        self.variables = jax.device_put(variables, self._device)
+        self._batch_sizes = tuple(sorted(batch_sizes))
+        options = {"max_detections": 100, **(decode_options or {})}
+        self._run = jax.jit(
+            functools.partial(
+                _detect,
+                model,
+                map_grid(grid, model, azimuth_mapping),
+                options,
+            ),
+            static_argnames="is_tesseract",
+        )
+
+    # Construction --------------------------------------------------------------------
+
+    @classmethod
+    def from_workdir(
+        cls, path: str | pathlib.Path, step: int | None = None, **overrides: Any
+    ) -> Detector:
+        """Detector of a training run.
+
+        Args:
+            path: Work folder of `train.py`.
+            step: Of the checkpoint; the newest if None.
+            **overrides: Arguments of `Detector`.
+
+        Raises:
+            FileNotFoundError: No run or no such checkpoint there.
+        """
+        from radejax.experiment import load_run  # above this floor: a convenience
+
+        run = load_run(path, step)
+        return cls.from_config(run.config, run.variables, run.grid, **overrides)
+
+    @classmethod
+    def from_config(
+        cls,
+        config: Any,
+        variables: Mapping[str, Any],
+        grid: RadarGrid,
+        **overrides: Any,
+    ) -> Detector:
+        """Detector with the model, thresholds and mapping that a config states."""
+        from radejax import models
+
+        decode_options = dict(config.decode)
+        arguments = {
+            "classes": tuple(config.classes),
+            "azimuth_mapping": config.data.azimuth_mapping,
+            "score_threshold": decode_options.pop("score_threshold"),
+            "nms_iou": decode_options.pop("nms_iou"),
+            "decode_options": decode_options,
+        }
+        return cls(
+            models.build(config.model), variables, grid, **(arguments | overrides)
+        )
+
+    @classmethod
+    def from_torch(
+        cls,
+        path_or_state_dict: str | pathlib.Path | Mapping[str, Any],
+        *,
+        grid: RadarGrid | None = None,
+        model_overrides: Mapping[str, Any] | None = None,
+        **overrides: Any,
+    ) -> Detector:
+        """Detector of an official RADE-Net checkpoint.
+
+        Args:
+            path_or_state_dict: `.pth` file, or mapping of names to arrays.
+            grid: K-Radar's if None.
+            model_overrides: For what names and shapes cannot tell.
+            **overrides: Arguments of `Detector`.
+        """
+        from radejax.interop import radenet_torch
+
+        model, variables = radenet_torch.load(
+            path_or_state_dict, **(model_overrides or {})
+        )
+        arguments = {"azimuth_mapping": "stretched"} | overrides
+        return cls(model, variables, grid or RadarGrid.kradar(), **arguments)
+
+    # Use -----------------------------------------------------------------------------
+
+    def __call__(
+        self,
+        frames: Any,
+        image: Any = None,
+        camera: Any = None,
+        *,
+        score_threshold: float | None = None,
+        nms_iou: float | None = None,
+        roi: Sequence[float] | None = None,
+    ) -> Detections:
+        """Finds the objects in one frame or many.
+
+        Args:
+            frames: Projections `[B, R, A, D+E]` or `[R, A, D+E]` as
+                `radejax.data.projection.project` makes them; tesseracts
+                `[B, D, R, E, A]` or `[D, R, E, A]` in linear power, projected on the
+                device; or the path of a tesseract or projection file, or several.
+            image: `[B, H, W, 3]` left front images for radar-camera models.
+            camera: Their calibration, as the model takes it.
+            score_threshold: Instead of the detector's own.
+            nms_iou: Likewise.
+            roi: Likewise; `(x0, x1, y0, y1, z0, z1)` in metres.
+
+        Returns:
+            Detections with a leading batch axis, also for a single frame.
+
+        Raises:
+            UserError: The shape fits neither; says what was expected.
+        """
+        frames, is_tesseract = self._batch(frames)
+        num_frames = frames.shape[0]
+        if num_frames == 0:
+            raise UserError("no frames: the batch is empty")
+        roi = roi if roi is not None else self.roi
+        settings = (
+            np.float32(
+                self.score_threshold if score_threshold is None else score_threshold
+            ),
+            np.float32(self.nms_iou if nms_iou is None else nms_iou),
+            np.asarray(EVERYWHERE if roi is None else roi, np.float32),
+        )
+        largest = self._batch_sizes[-1]
+        parts = []
+        for start in range(0, num_frames, largest):
+            chunk = jax.tree.map(
+                lambda x, s=start: x[s : s + largest], (frames, image, camera)
+            )
+            count = chunk[0].shape[0]
+            size = next(s for s in self._batch_sizes if s >= count)
+            chunk = jax.tree.map(lambda x, s=size: _pad_batch(x, s), chunk)
+            chunk = jax.device_put(chunk, self._device)
+            found = self._run(
+                self.variables, *chunk, *settings, is_tesseract=is_tesseract
+            )
+            parts.append(jax.tree.map(lambda x, n=count: x[:n], found))
+        if len(parts) == 1:
+            return parts[0]
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+    def warmup(self, batch_size: int = 1, *, tesseract: bool = False) -> Detector:
+        """Compiles for a batch size, so that the first real call is fast."""
+        shape = self.grid.shape_drea if tesseract else self.grid.projection_shape
+        jax.block_until_ready(self(np.zeros((batch_size, *shape), np.float32)))
+        return self
+
+    def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
+        """Detections of one item after the other, each started before the last ends.
+
+        Reading and projecting the next item overlap with the device's work on this.
+
+        Args:
+            frames: Items as `__call__` takes them.
+            **settings: Keyword arguments of `__call__`.
+        """
+        pending = None
+        for item in frames:
+            started = self(item, **settings)
+            if pending is not None:
+                yield pending
+            pending = started
+        if pending is not None:
+            yield pending
+
+    # Inside --------------------------------------------------------------------------
+
+    def _batch(self, frames: Any) -> tuple[Any, bool]:
+        if isinstance(frames, str | pathlib.Path):
+            frames = [frames]
+        if isinstance(frames, Sequence) and all(
+            isinstance(f, str | pathlib.Path) for f in frames
+        ):
+            frames = np.stack([projection_lib.load(f, self.grid) for f in frames])
+        shape = tuple(np.shape(frames))
+        projection, tesseract = self.grid.projection_shape, self.grid.shape_drea
+        for expected, is_tesseract in ((projection, False), (tesseract, True)):
+            if shape[-len(expected) :] == expected and len(shape) - len(expected) < 2:
+                return frames if len(shape) > len(expected) else frames[
+                    None
+                ], is_tesseract
+        raise UserError(
+            f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
+            f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
+            f"[B, {', '.join(map(str, tesseract))}]"
+        )
+
+
+def _detect(
+    model: nn.Module,
+    grid: RadarGrid,
+    options: Mapping[str, Any],
+    variables: Any,
+    frames: jax.Array,
+    image: Any,
+    camera: Any,
+    score_threshold: jax.Array,
+    nms_iou: jax.Array,
+    roi: jax.Array,
+    *,
+    is_tesseract: bool,
+) -> Detections:
+    """From a batch of tensors to detections; pure, to be jitted."""
+    if is_tesseract:
+        frames = projection_lib.project_jax(frames)
+    inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
+    maps = model.apply(variables, *inputs, train=False)
+    return decode(
+        maps, grid, score_threshold=score_threshold, nms_iou=nms_iou, roi=roi, **options
+    )
+
+
+def _pad_batch(x: Any, size: int) -> Any:
+    """Repeats the last frame up to a batch size."""
+    missing = size - x.shape[0]
+    if missing == 0:
+        return x
+    xp = np if isinstance(x, np.ndarray) else jnp
+    return xp.concatenate([x, xp.repeat(x[-1:], missing, 0)])

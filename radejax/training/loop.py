@@ -1,0 +1,272 @@
+"""The training loop: from a data iterator to checkpoints, for any number of devices."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from absl import logging
+
+from radejax.errors import DataError
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.training import sharding
+from radejax.training.checkpoints import Checkpoints, abstract_state
+from radejax.training.state import (
+    TrainState,
+    create_state,
+    make_optimizer,
+    make_schedule,
+)
+from radejax.training.step import make_train_step, model_inputs
+from radejax.training.watch import Watch
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainResult:
+    """How a training ended.
+
+    Attributes:
+        state: Placed on the mesh.
+        step: Steps taken in all, over every start of the run.
+        finished: False where a SIGTERM ended it early; the state is saved.
+    """
+
+    state: TrainState
+    step: int
+    finished: bool
+
+
+Evaluate = Callable[[TrainState, int], Mapping[str, float]]
+
+
+def train(
+    model: nn.Module,
+    variables: Mapping[str, Any] | None,
+    loader: Any,
+    grid: RadarGrid,
+    workdir: str | pathlib.Path,
+    *,
+    config: Any,
+    info: Mapping[str, Any],
+    steps_per_epoch: int,
+    mesh: jax.sharding.Mesh | None = None,
+    evaluate: Evaluate | None = None,
+) -> TrainResult:
+    """Trains until the configured epochs are done, from where an earlier start ended.
+
+    Args:
+        model: Called as `model.apply(variables, *inputs, train=True)`.
+        variables: To start from, an imported checkpoint's for example; None draws
+            them from `config.seed`.
+        loader: Checkpointable grain iterator of `Batch`; endless.
+        grid: Grid of the model's maps.
+        workdir: Checkpoints and logs go here.
+        config: The whole configuration; `seed`, `loss` and `train` are read.
+        info: Plain values that each checkpoint carries.
+        steps_per_epoch: Batches of one pass over the data.
+        mesh: Devices to use; all by default.
+        evaluate: Called every `train.evaluate_every_epochs` epochs; what it returns is
+            logged and kept with the checkpoint.
+
+    Raises:
+        DataError: More than `train.max_skipped_steps` steps in a row without a finite
+            loss and gradient; names the frames of the last such batch.
+        UserError: A configuration that does not fit the devices; a full disk.
+    """
+    workdir = pathlib.Path(workdir)
+    mesh = sharding.make_mesh() if mesh is None else mesh
+    options = config.train
+    num_steps = steps_per_epoch * options.num_epochs
+    sharding.check_batch_size(options.batch_size, mesh, "train.batch_size")
+    optimizer = make_optimizer(
+        make_schedule(
+            learning_rate=options.learning_rate,
+            final_learning_rate=options.final_learning_rate,
+            num_steps=num_steps,
+            warmup_steps=options.warmup_steps,
+        ),
+        weight_decay=options.weight_decay,
+        gradient_clip_norm=options.gradient_clip_norm,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
+    init = _make_init(model, variables, optimizer, config)
+    inputs = _first_inputs(loader)
+    abstract = jax.eval_shape(init, inputs)
+    placement = sharding.state_sharding(abstract, mesh, options.parameter_sharding)
+    step_fn = jax.jit(
+        make_train_step(
+            model,
+            optimizer,
+            grid,
+            loss=dict(config.loss),
+            num_accumulate=options.num_accumulate,
+            ema_decay=options.ema_decay,
+        ),
+        donate_argnums=0,
+        out_shardings=(placement, sharding.replicated(mesh)),
+    )
+    rng = jax.device_put(jax.random.key(config.seed + 1), sharding.replicated(mesh))
+    checkpoints = Checkpoints(
+        workdir / "checkpoints", max_to_keep=options.checkpoints_to_keep
+    )
+    with checkpoints:
+        restored = checkpoints.restore(abstract_state(abstract, placement), loader)
+        if restored is None:
+            state, start = jax.jit(init, out_shardings=placement)(inputs), 0
+        else:
+            state, start = restored
+            logging.info("continuing from step %d of %d", start, num_steps)
+        run = _Run(step_fn, loader, mesh, rng, checkpoints, info, options, evaluate)
+        with Watch(
+            workdir,
+            start_step=start,
+            num_steps=num_steps,
+            frames_per_step=options.batch_size,
+            is_main=jax.process_index() == 0,
+        ) as watch:
+            return run(state, start, num_steps, steps_per_epoch, watch)
+
+
+@dataclasses.dataclass
+class _Run:
+    """The loop itself, with what stays the same from step to step."""
+
+    step_fn: Callable
+    loader: Any
+    mesh: jax.sharding.Mesh
+    rng: jax.Array
+    checkpoints: Checkpoints
+    info: Mapping[str, Any]
+    options: Any
+    evaluate: Evaluate | None
+
+    def __call__(
+        self,
+        state: TrainState,
+        start: int,
+        num_steps: int,
+        steps_per_epoch: int,
+        watch: Watch,
+    ) -> TrainResult:
+        options, saved = self.options, start
+        with _StopOnSignal() as stop:
+            step = start
+            while step < num_steps and not stop.is_set():
+                waiting = time.perf_counter()
+                batch = sharding.put_batch(next(self.loader), self.mesh)
+                watch.add_data_wait(time.perf_counter() - waiting)
+                state, metrics = self.step_fn(state, batch, self.rng)
+                step += 1
+                watch.tick(step)
+                if step % options.log_every_steps == 0 or step == num_steps:
+                    watch.log(step, metrics, epoch=step / steps_per_epoch)
+                    _check_skipped(state, options.max_skipped_steps)
+                scores = self._evaluate(state, step, num_steps, steps_per_epoch, watch)
+                due = step % options.checkpoint_every_steps == 0 or step == num_steps
+                if due or scores:
+                    self._save(step, state, scores)
+                    saved = step
+            if saved < step:
+                self._save(step, state, None)
+            self.checkpoints.wait()
+        return TrainResult(state=state, step=step, finished=step >= num_steps)
+
+    def _evaluate(
+        self,
+        state: TrainState,
+        step: int,
+        num_steps: int,
+        steps_per_epoch: int,
+        watch: Watch,
+    ) -> Mapping[str, float] | None:
+        every = self.options.evaluate_every_epochs * steps_per_epoch
+        if self.evaluate is None or not every or step % every or step == num_steps:
+            return None
+        scores = self.evaluate(state, step)
+        watch.write(step, scores)
+        return scores
+
+    def _save(
+        self, step: int, state: TrainState, metrics: Mapping[str, float] | None
+    ) -> None:
+        _check_skipped(state, self.options.max_skipped_steps)
+        self.checkpoints.save(step, state, self.loader, info=self.info, metrics=metrics)
+
+
+def _make_init(
+    model: nn.Module,
+    variables: Mapping[str, Any] | None,
+    optimizer: Any,
+    config: Any,
+) -> Callable[[Any], TrainState]:
+    def init(inputs: Any) -> TrainState:
+        start = variables
+        if start is None:
+            keys = jax.random.split(jax.random.key(config.seed))
+            rngs = {"params": keys[0], "dropout": keys[1]}
+            start = model.init(rngs, *inputs, train=False)
+        return create_state(
+            start,
+            optimizer,
+            batch_size=config.train.batch_size,
+            use_ema=config.train.ema_decay is not None,
+        )
+
+    return init
+
+
+def _first_inputs(loader: Any) -> Any:
+    """Inputs of the right shape to initialise with, without moving the iterator on."""
+    position = loader.get_state()
+    batch = next(loader)
+    loader.set_state(position)
+    one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), batch)
+    return model_inputs(one)
+
+
+def _check_skipped(state: TrainState, limit: int) -> None:
+    in_row = int(state.num_skipped_in_row)
+    if in_row > limit:
+        frames = np.asarray(state.skipped_frames).tolist()
+        raise DataError(
+            f"loss or gradient was not finite in {in_row} steps in a row (limit "
+            f"train.max_skipped_steps={limit}); frames of the last batch: {frames}"
+        )
+
+
+class _StopOnSignal:
+    """Set once SIGTERM or SIGINT arrives; the step under way is finished first."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self._previous: dict[int, Any] = {}
+
+    def is_set(self) -> bool:
+        return self._event.is_set()
+
+    def __enter__(self) -> _StopOnSignal:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, _: Any) -> None:
+        if self._event.is_set():
+            raise KeyboardInterrupt(f"second {signal.Signals(number).name}")
+        logging.warning(
+            "%s: saving a checkpoint, then stopping", signal.Signals(number).name
+        )
+        self._event.set()

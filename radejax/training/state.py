@@ -1,0 +1,139 @@
+"""Train state and optimizer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from radejax.errors import UserError
+
+
+@struct.dataclass
+class TrainState:
+    """Everything a training step reads and writes.
+
+    Attributes:
+        step: Number of steps taken, skipped ones included; int32.
+        params: Trainable and frozen parameters, float32.
+        model_state: Other variable collections, such as running batch statistics.
+        opt_state: The optimizer's.
+        ema_params: Moving average of `params`, or None.
+        num_skipped: Steps skipped in all because loss or gradient was not finite.
+        num_skipped_in_row: The same, since the last step that was taken.
+        skipped_frames: `[B]` int32 frames of the last skipped batch; -1 at first.
+    """
+
+    step: jax.Array
+    params: Any
+    model_state: Any
+    opt_state: Any
+    ema_params: Any
+    num_skipped: jax.Array
+    num_skipped_in_row: jax.Array
+    skipped_frames: jax.Array
+
+    @property
+    def eval_variables(self) -> dict[str, Any]:
+        """Variables to run the model with: averaged parameters where there are any."""
+        params = self.params if self.ema_params is None else self.ema_params
+        return {"params": params, **self.model_state}
+
+
+def make_schedule(
+    *,
+    learning_rate: float,
+    final_learning_rate: float,
+    num_steps: int,
+    warmup_steps: int,
+) -> optax.Schedule:
+    """Linear warm-up from zero, then a cosine from the peak down to the floor.
+
+    RADE-Net section IV-B: cosine per step from 1e-3 to 1e-4, no warm-up.
+
+    Raises:
+        UserError: The warm-up is longer than the training.
+    """
+    if not 0 <= warmup_steps < num_steps:
+        raise UserError(
+            f"train.warmup_steps={warmup_steps} must be less than the {num_steps} steps "
+            "of the training"
+        )
+    cosine = optax.cosine_decay_schedule(
+        learning_rate, num_steps - warmup_steps, final_learning_rate / learning_rate
+    )
+    if warmup_steps == 0:
+        return cosine
+    warmup = optax.linear_schedule(0.0, learning_rate, warmup_steps)
+    return optax.join_schedules([warmup, cosine], [warmup_steps])
+
+
+def make_optimizer(
+    schedule: optax.Schedule,
+    *,
+    weight_decay: float,
+    gradient_clip_norm: float | None = None,
+    is_frozen: Callable[[str], bool] | None = None,
+) -> optax.GradientTransformation:
+    """AdamW with torch's defaults, decaying every parameter as the papers' runs do.
+
+    Args:
+        schedule: Learning rate by step.
+        weight_decay: Decoupled weight decay.
+        gradient_clip_norm: Global norm to clip to, or None.
+        is_frozen: Told a parameter's path such as "backbone/stem/kernel", True where
+            it stays as it is: it gets no update and no optimizer state.
+    """
+    parts = [optax.adamw(schedule, weight_decay=weight_decay)]
+    if gradient_clip_norm is not None:
+        parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
+    optimizer = optax.chain(*parts)
+    if is_frozen is None:
+        return optimizer
+
+    def labels(params: Any) -> Any:
+        return jax.tree_util.tree_map_with_path(
+            lambda path, _: "frozen" if is_frozen(parameter_name(path)) else "trained",
+            params,
+        )
+
+    return optax.partition(
+        {"trained": optimizer, "frozen": optax.set_to_zero()}, labels
+    )
+
+
+def parameter_name(path: tuple[Any, ...]) -> str:
+    """Path of a parameter in its tree as "outer/inner/kernel"."""
+    return "/".join(str(getattr(key, "key", key)) for key in path)
+
+
+def create_state(
+    variables: Mapping[str, Any],
+    optimizer: optax.GradientTransformation,
+    *,
+    batch_size: int,
+    use_ema: bool,
+) -> TrainState:
+    """State before the first step.
+
+    Args:
+        variables: Of the model: "params" and any other collections.
+        optimizer: From `make_optimizer`.
+        batch_size: Global; the shape of `skipped_frames`.
+        use_ema: Keep a moving average of the parameters.
+    """
+    params = variables["params"]
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        params=params,
+        model_state={k: v for k, v in variables.items() if k != "params"},
+        opt_state=optimizer.init(params),
+        ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
+        num_skipped=jnp.zeros((), jnp.int32),
+        num_skipped_in_row=jnp.zeros((), jnp.int32),
+        skipped_frames=jnp.full((batch_size,), -1, jnp.int32),
+    )

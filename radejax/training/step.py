@@ -1,0 +1,145 @@
+"""One training step and one prediction step, as pure functions to be jitted."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+
+from radejax.data.pipeline import to_float
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.losses.detection import detection_loss
+from radejax.structures import Batch
+from radejax.training.state import TrainState
+
+Metrics = dict[str, jax.Array]
+
+
+def model_inputs(batch: Batch) -> tuple[Any, ...]:
+    """Positional inputs of the model: the projection, and the camera's if there is one."""
+    projection = to_float(batch.projection)
+    if batch.image is None:
+        return (projection,)
+    return projection, batch.image, batch.camera
+
+
+def make_train_step(
+    model: nn.Module,
+    optimizer: optax.GradientTransformation,
+    grid: RadarGrid,
+    *,
+    loss: Mapping[str, Any],
+    num_accumulate: int = 1,
+    ema_decay: float | None = None,
+) -> Callable[[TrainState, Batch, jax.Array], tuple[TrainState, Metrics]]:
+    """Builds the function of one optimizer step.
+
+    A step whose loss or gradient is not finite leaves parameters and optimizer as they
+    were and is counted in the state.
+
+    Args:
+        model: Radar or radar-camera detector.
+        optimizer: From `make_optimizer`.
+        grid: Grid of the model's maps.
+        loss: Keyword arguments of `detection_loss`.
+        num_accumulate: The batch is cut into this many parts whose gradients are
+            averaged, for batches that do not fit at once.
+        ema_decay: Decay of the parameters' moving average, or None.
+
+    Returns:
+        `step(state, batch, rng) -> (state, metrics)`; `rng` is the run's own key, made
+        different for every step from the state's counter.
+    """
+
+    def loss_of_part(
+        params: Any, model_state: Any, part: Batch, rng: jax.Array
+    ) -> tuple[jax.Array, tuple[Any, Metrics]]:
+        maps, updates = model.apply(
+            {"params": params, **model_state},
+            *model_inputs(part),
+            train=True,
+            rngs={"dropout": rng},
+            mutable=list(model_state),
+        )
+        total, parts = detection_loss(maps, part, grid, **loss)
+        return total, (updates, {"loss": total, **parts})
+
+    gradient = jax.value_and_grad(loss_of_part, has_aux=True)
+
+    def accumulate(state: TrainState, batch: Batch, rng: jax.Array) -> Any:
+        if num_accumulate == 1:
+            (_, aux), grads = gradient(state.params, state.model_state, batch, rng)
+            return grads, *aux
+
+        def body(carry: Any, part_and_rng: Any) -> Any:
+            model_state, total = carry
+            part, part_rng = part_and_rng
+            (_, (model_state, parts)), grads = gradient(
+                state.params, model_state, part, part_rng
+            )
+            return (model_state, jax.tree.map(jnp.add, total, grads)), parts
+
+        split = jax.tree.map(
+            lambda x: x.reshape(num_accumulate, -1, *x.shape[1:]), batch
+        )
+        start = state.model_state, jax.tree.map(jnp.zeros_like, state.params)
+        rngs = jax.random.split(rng, num_accumulate)
+        (model_state, grads), parts = jax.lax.scan(body, start, (split, rngs))
+        grads = jax.tree.map(lambda g: g / num_accumulate, grads)
+        return grads, model_state, jax.tree.map(lambda p: p.mean(0), parts)
+
+    def step(
+        state: TrainState, batch: Batch, rng: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        rng = jax.random.fold_in(rng, state.step)
+        grads, model_state, metrics = accumulate(state, batch, rng)
+        grad_norm = optax.global_norm(grads)
+        is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(metrics["loss"])
+
+        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
+        ema_params = state.ema_params
+        if ema_decay is not None:
+            ema_params = optax.incremental_update(params, ema_params, 1.0 - ema_decay)
+        taken = params, model_state, opt_state, ema_params
+        kept = state.params, state.model_state, state.opt_state, state.ema_params
+        params, model_state, opt_state, ema_params = jax.tree.map(
+            lambda new, old: jnp.where(is_finite, new, old), taken, kept
+        )
+        is_skipped = (~is_finite).astype(jnp.int32)
+        state = TrainState(
+            step=state.step + 1,
+            params=params,
+            model_state=model_state,
+            opt_state=opt_state,
+            ema_params=ema_params,
+            num_skipped=state.num_skipped + is_skipped,
+            num_skipped_in_row=(state.num_skipped_in_row + 1) * is_skipped,
+            skipped_frames=jnp.where(is_finite, state.skipped_frames, batch.frame),
+        )
+        return state, {**metrics, "grad_norm": grad_norm, "skipped": state.num_skipped}
+
+    return step
+
+
+def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: str) -> RadarGrid:
+    """Grid of the maps that a model makes from projections on `grid`.
+
+    Args:
+        grid: Of the sensor.
+        model: Pads to `model.pad_multiple` and, if `model.crop_output`, crops again.
+        azimuth_mapping: See `RadarGrid.padded`.
+    """
+    padded = grid.padded(model.pad_multiple, azimuth_mapping)
+    if not model.crop_output:
+        return padded
+    return dataclasses.replace(
+        padded,
+        range_m=padded.range_m[: grid.num_range],
+        azimuth_rad=padded.azimuth_rad[: grid.num_azimuth],
+    )
