@@ -88,7 +88,7 @@ def write_calibration(
     path: str | os.PathLike, frame_difference: int, dx_m: float, dy_m: float
 ) -> None:
     """Writes `info_calib/calib_radar_lidar.txt`: metres to add to LiDAR positions."""
-    text = f"frame difference,x,y\n{int(frame_difference)},{dx_m!r},{dy_m!r}\n"
+    text = f"frame difference,x,y\n{int(frame_difference)},{float(dx_m)!r},{float(dy_m)!r}\n"
     with atomic_write(path) as file:
         file.write(text.encode("ascii"))
 
