@@ -1,0 +1,248 @@
+"""What all pictures share: figures without global state, colours, boxes, saving.
+
+Figures are plain `matplotlib.figure.Figure` objects: nothing here touches pyplot, its
+backend or its list of open figures, so drawing works without a display, in threads
+and in notebooks alike.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
+
+from radejax.errors import UserError
+from radejax.files import atomic_path
+from radejax.structures import CLASSES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# The brightest fifth is left out: white boxes must stand out on the strongest echoes.
+COLOR_MAP = LinearSegmentedColormap.from_list(
+    "radar", matplotlib.colormaps["viridis"](np.linspace(0.0, 0.82, 256))
+)
+GROUND_TRUTH_COLOR = "white"
+PREDICTION_COLOR = "#ff4d40"
+PREDICTION_TEXT_COLOR = "#ff7d70"  # thin strokes need more light than lines
+ROI_COLOR = "black"
+# Okabe and Ito's palette: told apart under every common colour blindness.
+CLASS_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#CC79A7")
+SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+class Objects(NamedTuple):
+    """Boxes of one frame, ready to draw.
+
+    Attributes:
+        boxes: `[N, 7]` x, y, z, l, w, h, yaw in the ego frame.
+        names: N class names.
+        scores: `[N]` or None for ground truth.
+    """
+
+    boxes: np.ndarray
+    names: tuple[str, ...]
+    scores: np.ndarray | None = None
+
+
+def as_objects(
+    value: Any, class_names: Sequence[str] = CLASSES, *, what: str = "objects"
+) -> Objects:
+    """Boxes, classes and scores of one frame from whatever holds them.
+
+    Args:
+        value: None; `Objects`; `(boxes, classes)`; `(boxes, scores, classes)`; a
+            mapping or an object (a frame, one frame of `Detections`) with `boxes`,
+            `classes` and perhaps `scores` and `is_valid`; or the evaluation's columns
+            `box`, `cls`, `score`. Classes are names or indices into `class_names`.
+        class_names: Names of the class indices.
+        what: Named in errors.
+
+    Raises:
+        UserError: Shapes do not fit together, or a class index has no name.
+    """
+    if value is None:
+        return Objects(np.zeros((0, 7)), ())
+    if isinstance(value, Objects):
+        boxes, classes, scores, is_valid = value.boxes, value.names, value.scores, None
+    elif isinstance(value, tuple | list):
+        if len(value) not in (2, 3):
+            raise UserError(
+                f"{what} must be (boxes, classes) or (boxes, scores, classes), "
+                f"got {len(value)} parts"
+            )
+        boxes, classes, is_valid = value[0], value[-1], None
+        scores = value[1] if len(value) == 3 else None
+    else:
+        boxes = _field(value, ("boxes", "box"), what)
+        classes = _field(value, ("classes", "cls"), what)
+        scores = _field(value, ("scores", "score"), None)
+        is_valid = _field(value, ("is_valid",), None)
+    return _checked(boxes, classes, scores, is_valid, class_names, what)
+
+
+def _field(value: Any, names: tuple[str, ...], required_for: str | None) -> Any:
+    """First of the names that a mapping or object has."""
+    for name in names:
+        if isinstance(value, Mapping):
+            if name in value:
+                return value[name]
+        elif getattr(value, name, None) is not None:
+            return getattr(value, name)
+    if required_for is None:
+        return None
+    raise UserError(f"{required_for} ({type(value).__name__}) has no {names[0]!r}")
+
+
+def _checked(
+    boxes: Any,
+    classes: Any,
+    scores: Any,
+    is_valid: Any,
+    class_names: Sequence[str],
+    what: str,
+) -> Objects:
+    """Valid rows as `Objects`, after a look at every shape."""
+    boxes = np.asarray(boxes, np.float64)
+    if boxes.size == 0:
+        return Objects(np.zeros((0, 7)), (), None if scores is None else np.zeros(0))
+    if boxes.ndim != 2 or boxes.shape[1] != 7:
+        raise UserError(
+            f"{what}: boxes must be [N, 7] (x, y, z, l, w, h, yaw) of one frame, "
+            f"got shape {boxes.shape}"
+        )
+    columns = {"classes": classes, "scores": scores, "is_valid": is_valid}
+    for name, column in columns.items():
+        if column is not None and len(column) != len(boxes):
+            raise UserError(f"{what}: {len(boxes)} boxes but {len(column)} {name}")
+    keep = np.ones(len(boxes), bool) if is_valid is None else np.asarray(is_valid, bool)
+    names = tuple(
+        _class_name(c, class_names, what)
+        for c, kept in zip(classes, keep, strict=True)
+        if kept
+    )
+    return Objects(
+        boxes[keep], names, None if scores is None else np.asarray(scores)[keep]
+    )
+
+
+def _class_name(value: Any, class_names: Sequence[str], what: str) -> str:
+    """Name of a class given by name or index."""
+    if isinstance(value, str):
+        return str(value)
+    if not 0 <= int(value) < len(class_names):
+        raise UserError(
+            f"{what}: class index {int(value)} has no name among {tuple(class_names)}"
+        )
+    return class_names[int(value)]
+
+
+def label_texts(objects: Objects) -> list[str]:
+    """Class names, with the score where there is one."""
+    if objects.scores is None:
+        return list(objects.names)
+    return [
+        f"{name} {score:.2f}"
+        for name, score in zip(objects.names, objects.scores, strict=True)
+    ]
+
+
+def footprints(boxes: np.ndarray, points_per_edge: int = 1) -> np.ndarray:
+    """Outlines of boxes on the ground, starting at the front left corner.
+
+    Args:
+        boxes: `[N, 7]`.
+        points_per_edge: Points on each edge; more than 1 where edges bend, as in a
+            polar view.
+
+    Returns:
+        `[N, 4 * points_per_edge + 1, 2]` x and y, closed, counter-clockwise.
+    """
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) / 2.0
+    t = np.arange(points_per_edge)[:, None] / points_per_edge
+    edges = corners[:-1, None] * (1 - t) + corners[1:, None] * t  # [4, P, 2]
+    unit = np.concatenate([edges.reshape(-1, 2), corners[-1:]])
+    return _place(unit, boxes)
+
+
+def heading_marks(boxes: np.ndarray) -> np.ndarray:
+    """`[N, 2, 2]` segments that stick out of the middle of each front edge.
+
+    Outwards, so that the echo inside the box stays visible.
+    """
+    return _place(np.array([[0.5, 0.0], [0.85, 0.0]]), boxes)
+
+
+def _place(unit: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Points `[P, 2]` in units of length and width, at every box: `[N, P, 2]`."""
+    along, across = np.moveaxis(unit[None] * boxes[:, None, 3:5], -1, 0)  # [N, P]
+    cos, sin = np.cos(boxes[:, 6:7]), np.sin(boxes[:, 6:7])
+    x = boxes[:, 0:1] + along * cos - across * sin
+    y = boxes[:, 1:2] + along * sin + across * cos
+    return np.stack([x, y], -1)
+
+
+def add_colorbar(mesh: Any, ax: Axes, label: str) -> None:
+    """A colour bar as high as the axes, also where equal aspect shrinks them."""
+    cax = ax.inset_axes((1.02, 0.0, 0.035, 1.0))
+    ax.figure.colorbar(mesh, cax=cax, label=label)
+
+
+def halo(width: float, color: str = "black") -> list:
+    """Path effects: an outline that keeps lines and text legible on any map."""
+    return [Stroke(linewidth=width, foreground=color), Normal()]
+
+
+def new_figure(
+    width_in: float, height_in: float, *, dpi: float = 110, layout: str | None = None
+) -> Figure:
+    """An empty figure outside pyplot's list of open figures."""
+    return Figure(figsize=(width_in, height_in), dpi=dpi, layout=layout)
+
+
+def color_limits_of(values: np.ndarray) -> tuple[float, float]:
+    """Ends of a colour bar: noise floor (20 %) to the strongest echoes (99.9 %).
+
+    Non-finite values are ignored; a constant map gets a range of one unit.
+    """
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(finite, [20.0, 99.9])
+    return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)
+
+
+def save_figure(figure: Figure, path: str | os.PathLike, **kwargs: Any) -> pathlib.Path:
+    """Writes a figure completely or not at all.
+
+    The file appears under its name by a rename, so a reader never sees half of it.
+
+    Args:
+        figure: What to write.
+        path: Target; the suffix sets the format. Folders are made.
+        **kwargs: For `Figure.savefig`, such as `dpi`.
+
+    Returns:
+        The path written.
+
+    Raises:
+        UserError: matplotlib cannot write the suffix.
+    """
+    path = pathlib.Path(path)
+    suffix = path.suffix.lstrip(".").lower()
+    supported = figure.canvas.get_supported_filetypes()
+    if suffix not in supported:
+        raise UserError(
+            f"cannot write a picture as {path.name!r}; suffixes: {sorted(supported)}"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=suffix, **kwargs)
+    return path
