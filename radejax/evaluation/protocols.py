@@ -1,0 +1,291 @@
+"""The protocols in use: what each does to boxes, frames, matches and the curve.
+
+Everything here is exact for weighted frames: a weight of 0 leaves a frame out, 2 counts
+it twice. Conditions (weathers) and bootstrap resamples are then the same computation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from radejax.errors import UserError
+
+SkipEmpty = Literal["class", "frame"] | None
+EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """How a number is made.
+
+    Attributes:
+        name: Name in results and reports.
+        geometry: Boxes compared: "plain" as given; "rounded" with ground truth rounded to
+            2 decimals; "exchanged" rounded and with l and w exchanged (K-Radar's export);
+            "exchanged_top" also with z taken as the top of the box.
+        matching: "kradar" two passes in ground-truth order; "best" each prediction may
+            only take its own best object; "free" by score, the best free object.
+        curve: How precisions become one number.
+        skip_empty: Frames left out by default: "class" those without an object of the
+            class, "frame" those without an object of any class, None none.
+        summary: One line for reports.
+    """
+
+    name: str
+    geometry: Literal["plain", "rounded", "exchanged", "exchanged_top"]
+    matching: Literal["kradar", "best", "free"]
+    curve: Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "exact"]
+    skip_empty: SkipEmpty
+    summary: str
+
+
+RECOMMENDED = "exact"
+"""The protocol of our own choice; docs/evaluation.md says why."""
+
+PROTOCOLS = {
+    protocol.name: protocol
+    for protocol in (
+        Protocol(
+            "kradar_r40",
+            "exchanged",
+            "kradar",
+            "r40",
+            "frame",
+            "K-Radar's revised evaluation as the field runs it (l and w exchanged)",
+        ),
+        Protocol(
+            "kradar_r40_yaw",
+            "rounded",
+            "kradar",
+            "r40",
+            "frame",
+            "K-Radar's revised evaluation with the yaw right",
+        ),
+        Protocol(
+            "kradar_r11",
+            "exchanged_top",
+            "kradar",
+            "r11",
+            "frame",
+            "K-Radar's older evaluation: 11 of 41 samples, z as the top of a box",
+        ),
+        Protocol(
+            "voc11",
+            "plain",
+            "best",
+            "voc11",
+            "class",
+            "RADE-Net's evaluator, 11 recall levels",
+        ),
+        Protocol(
+            "recall41",
+            "plain",
+            "best",
+            "recall41",
+            "class",
+            "RADE-Net's evaluator, 41 recall levels",
+        ),
+        Protocol(
+            "coco101",
+            "plain",
+            "best",
+            "coco101",
+            "class",
+            "RADE-Net's evaluator, 101 recall levels (RADE-Net, DinoRADE)",
+        ),
+        Protocol(
+            "auc",
+            "plain",
+            "best",
+            "auc",
+            "class",
+            "RADE-Net's evaluator, area under the raw curve",
+        ),
+        Protocol(
+            RECOMMENDED,
+            "plain",
+            "free",
+            "exact",
+            None,
+            "exact area under the interpolated curve, every frame counts (recommended)",
+        ),
+    )
+}
+
+
+def get_protocol(name: str) -> Protocol:
+    """The protocol of that name.
+
+    Raises:
+        UserError: No such protocol; the message lists them.
+    """
+    if name not in PROTOCOLS:
+        raise UserError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
+    return PROTOCOLS[name]
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """What one AP was computed from.
+
+    Attributes:
+        ap: Average precision, 0 to 100; NaN where no object exists, except that
+            K-Radar's protocols give 0 then.
+        num_gt: Objects counted.
+        num_det: Predictions counted.
+        precision: `[K]` precision at each sample (K-Radar: made monotone; others: raw).
+        recall: `[K]` recall at each sample.
+        score: `[K]` score threshold of each sample.
+    """
+
+    ap: float
+    num_gt: int
+    num_det: int
+    precision: np.ndarray
+    recall: np.ndarray
+    score: np.ndarray
+
+
+def score_thresholds(
+    sampled: np.ndarray, weight: np.ndarray, num_gt: int
+) -> np.ndarray:
+    """K-Radar's at most 41 score thresholds at recall steps of 1/40.
+
+    Walking down the matched scores with c = 0, the i-th score is skipped while
+    (i+2)/n - c < c - (i+1)/n and it is not the last; else it is kept and c grows by 1/40.
+    The differences are monotone in i also after rounding, so the first score not skipped
+    for a given c is found by counting, and the k-th kept one is the larger of that and
+    the one after the (k-1)-th.
+
+    Args:
+        sampled: `[S]` scores of the matched predictions, falling.
+        weight: `[S]` how often each counts.
+        num_gt: Number of ground truths n.
+
+    Returns:
+        `[K]` thresholds, falling, K <= 41. Empty without matches.
+
+    References:
+        K-Radar, utils/kitti_eval/eval_revised.py: get_thresholds.
+    """
+    ends = np.cumsum(weight)
+    total = int(ends[-1]) if ends.size else 0
+    if total == 0 or num_gt == 0:
+        return np.zeros(0)
+    current = np.concatenate(
+        [[0.0], np.cumsum(np.full(40, 1.0 / 40.0))]
+    )  # step by step
+    # The crossing lies at i = c n - 3/2; a window decides it with the original rounding.
+    low = np.maximum(np.ceil(current * num_gt - 1.5).astype(np.int64) - 4, 0)
+    index = low[:, None] + np.arange(9)
+    left, right = (index + 1) / num_gt, (index + 2) / num_gt
+    skipped = (right - current[:, None]) < (current[:, None] - left)
+    crossing = np.minimum(low + skipped.sum(axis=1), total - 1)
+    steps = np.arange(crossing.size)
+    kept = steps + np.maximum.accumulate(crossing - steps)
+    kept = kept[kept < total]
+    # The last score is always kept, and nothing after it.
+    return sampled[np.searchsorted(ends, kept, side="right")]
+
+
+def kradar_curve(
+    *,
+    matched_score: np.ndarray,
+    matched_weight: np.ndarray,
+    event_score: np.ndarray,
+    event_delta: np.ndarray,
+    det_score: np.ndarray,
+    det_weight: np.ndarray,
+    num_gt: int,
+    samples: Literal["r40", "r11"],
+) -> Curve:
+    """AP in K-Radar's protocol from the steps of `matching.match_kradar`.
+
+    Args:
+        matched_score: `[S]` scores matched in the first pass, falling.
+        matched_weight: `[S]` weights of their frames.
+        event_score: `[E]` scores at which true positives appear, falling.
+        event_delta: `[E]` how many, times the weight of the frame.
+        det_score: `[M]` scores of all predictions, falling.
+        det_weight: `[M]` weights of their frames.
+        num_gt: Number of ground truths.
+        samples: All 41 precision samples, or every fourth (11).
+    """
+    thresholds = score_thresholds(matched_score, matched_weight, num_gt)
+    found = _sum_at_least(event_score, event_delta, thresholds)
+    made = _sum_at_least(det_score, det_weight, thresholds)
+    precision = np.zeros(41)
+    precision[: thresholds.size] = found / np.maximum(made, 1)
+    precision = np.maximum.accumulate(precision[::-1])[::-1]
+    step = 1 if samples == "r40" else 4
+    taken = precision[::step]
+    return Curve(
+        ap=float(taken.sum() / taken.size * 100),
+        num_gt=int(num_gt),
+        num_det=int(det_weight.sum()),
+        precision=precision[: thresholds.size],
+        recall=found / max(num_gt, 1),
+        score=thresholds,
+    )
+
+
+def _sum_at_least(score: np.ndarray, value: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Sum of `value` over entries with score >= at; scores fall."""
+    total = np.concatenate([[0], np.cumsum(value)])
+    return total[np.searchsorted(-score, -at, side="right")]
+
+
+def pooled_curve(
+    *,
+    score: np.ndarray,
+    is_tp: np.ndarray,
+    weight: np.ndarray,
+    num_gt: int,
+    curve: str,
+) -> Curve:
+    """AP from all predictions sorted by falling score.
+
+    Args:
+        score: `[M]` scores, falling.
+        is_tp: `[M]` bool, True for true positives.
+        weight: `[M]` weights of their frames.
+        num_gt: Number of ground truths.
+        curve: "voc11", "recall41", "coco101", "auc" (RADE-Net) or "exact".
+    """
+    counts = weight > 0  # a frame left out must not leave a point at recall 0 either
+    score, is_tp, weight = score[counts], is_tp[counts], weight[counts]
+    num_det = int(weight.sum())
+    found = np.cumsum(is_tp * weight)
+    made = np.cumsum(weight)
+    if curve == "exact":
+        # Equal scores are one threshold, whatever order they are listed in.
+        last = np.ones(score.size, bool)
+        last[:-1] = score[1:] != score[:-1]
+        found, made, score = found[last], made[last], score[last]
+        precision, recall = found / made, found / max(num_gt, 1)
+    else:
+        precision, recall = found / (made + EPSILON), found / (num_gt + EPSILON)
+    if num_gt == 0:
+        ap = float("nan")
+    elif num_det == 0:
+        ap = 0.0
+    else:
+        ap = 100 * _pooled_ap(precision, recall, curve)
+    return Curve(ap, int(num_gt), num_det, precision, recall, score)
+
+
+def _pooled_ap(precision: np.ndarray, recall: np.ndarray, curve: str) -> float:
+    """One number in [0, 1] for a curve of rising recall."""
+    if curve == "exact":
+        height = np.maximum.accumulate(precision[::-1])[::-1]
+        return float((np.diff(recall, prepend=0.0) * height).sum())
+    precision = np.concatenate([[1.0], precision])
+    recall = np.concatenate([[0.0], recall])
+    if curve == "auc":
+        return float(np.trapezoid(precision, recall))
+    levels = np.linspace(0.0, 1.0, {"voc11": 11, "recall41": 41, "coco101": 101}[curve])
+    height = np.concatenate([np.maximum.accumulate(precision[::-1])[::-1], [0.0]])
+    return float(height[np.searchsorted(recall, levels, side="left")].mean())
