@@ -9,6 +9,7 @@ largest number of boxes in a group, not the number of boxes.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 from scipy import sparse
@@ -49,7 +50,7 @@ def greedy(
     bounds = np.searchsorted(rank, np.arange(rank[-1] + 2))
     taken = np.zeros(num_targets, bool)
     chosen = []
-    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+    for low, high in itertools.pairwise(bounds):
         pairs = order[low:high]
         position = np.where(taken[target[pairs]], pairs.size, np.arange(pairs.size))
         best = np.minimum.reduceat(position, np.flatnonzero(first[low:high]))
@@ -166,7 +167,7 @@ def _steps(
     true_positives = np.zeros(level_pred.size, np.int64)
     chunk = np.cumsum(count) // VIRTUAL_PAIRS_PER_CHUNK
     bounds = np.flatnonzero(np.diff(chunk, prepend=-1, append=chunk[-1] + 1))
-    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+    for low, high in itertools.pairwise(bounds):
         part = count[low:high]
         level = np.repeat(np.arange(high - low), part)
         pair = np.arange(level.size) - np.repeat(np.cumsum(part) - part, part)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 PAIRS_PER_CHUNK = 2_000_000
@@ -32,7 +34,7 @@ def candidate_pairs(
     )
     bounds = np.unique(np.concatenate([[0], cuts, [count.size]]))
     parts_a, parts_b = [], []
-    for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+    for low, high in itertools.pairwise(bounds):
         part = count[low:high]
         a = np.repeat(np.arange(low, high), part)
         b = np.arange(a.size) - np.repeat(np.cumsum(part) - part, part)
