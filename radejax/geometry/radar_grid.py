@@ -10,8 +10,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
+
+from radejax.geometry.boxes import array_module
 
 AzimuthMapping = Literal["true", "stretched"]
 
@@ -203,7 +204,7 @@ class RadarGrid:
             `[..., 2]` x (forward) and y (left) in metres; NumPy float64 for NumPy
             or Python input, else a JAX array.
         """
-        xp = _array_module(range_cell, azimuth_cell)
+        xp = array_module(range_cell, azimuth_cell)
         range_m = self.range_m[0] + range_cell * self.range_step_m
         azimuth = self.azimuth_rad[0] + azimuth_cell * self.azimuth_step_rad
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
@@ -214,10 +215,18 @@ class RadarGrid:
         Returns:
             `[..., 2]` range and azimuth in bins; not clipped to the grid.
         """
-        xp = _array_module(x_m, y_m)
-        range_cell = (xp.hypot(x_m, y_m) - self.range_m[0]) / self.range_step_m
-        azimuth = -xp.arctan2(y_m, x_m)
-        azimuth_cell = (azimuth - self.azimuth_rad[0]) / self.azimuth_step_rad
+        xp = array_module(x_m, y_m)
+        # The order of operations decides which way exact half bins round. This one
+        # gives the released code's bins, and straight ahead the exact middle even in
+        # float32: azimuth is counted from the middle of the axis, not from its edge.
+        last_range, last_azimuth = self.num_range - 1, self.num_azimuth - 1
+        range_span = float(self.range_m[-1] - self.range_m[0])
+        azimuth_span = float(self.azimuth_rad[-1] - self.azimuth_rad[0])
+        azimuth_mid = float(self.azimuth_rad[-1] + self.azimuth_rad[0]) / 2
+        range_m = xp.sqrt(x_m * x_m + y_m * y_m) - float(self.range_m[0])
+        azimuth = -xp.arctan2(y_m, x_m) - azimuth_mid
+        range_cell = range_m * last_range / range_span
+        azimuth_cell = azimuth * last_azimuth / azimuth_span + last_azimuth / 2
         return xp.stack([range_cell, azimuth_cell], -1)
 
     def nearest_cell(self, x_m: Any, y_m: Any) -> Any:
@@ -228,9 +237,11 @@ class RadarGrid:
         Returns:
             `[..., 2]` int32 range and azimuth indices.
         """
-        xp = _array_module(x_m, y_m)
-        cell = xp.round(self.ego_to_cell(x_m, y_m)).astype(xp.int32)
-        return xp.clip(cell, 0, np.array([self.num_range - 1, self.num_azimuth - 1]))
+        xp = array_module(x_m, y_m)
+        cell = xp.round(self.ego_to_cell(x_m, y_m))
+        range_idx = xp.clip(cell[..., 0], 0, self.num_range - 1)
+        azimuth_idx = xp.clip(cell[..., 1], 0, self.num_azimuth - 1)
+        return xp.stack([range_idx, azimuth_idx], -1).astype(xp.int32)
 
     def cell_centers_ego(self) -> np.ndarray:
         """`[R, A, 2]` float64 x and y of every range-azimuth bin center, metres."""
@@ -240,7 +251,7 @@ class RadarGrid:
 
     def in_field_of_view(self, x_m: Any, y_m: Any) -> Any:
         """True where the sensor looks: in front, within maximum azimuth and range."""
-        xp = _array_module(x_m, y_m)
+        xp = array_module(x_m, y_m)
         azimuth = xp.arctan2(y_m, x_m)
         return (
             (xp.abs(azimuth) <= self.fov_azimuth_rad)
@@ -261,9 +272,3 @@ class RadarGrid:
 
     def __hash__(self) -> int:
         return hash(self._key())
-
-
-def _array_module(*values: Any) -> Any:
-    """NumPy where every value is NumPy's or Python's, else jax.numpy."""
-    on_host = all(isinstance(v, np.ndarray | np.generic | float | int) for v in values)
-    return np if on_host else jnp

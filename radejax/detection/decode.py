@@ -1,0 +1,282 @@
+"""From a detector's maps to boxes: peaks, box parameters, rotated NMS.
+
+Everything is one pure function of fixed shapes: K rows per frame, a mask of those in
+use, and a count of the peaks that found no row.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from radejax.detection.nms import rotated_nms
+from radejax.geometry.boxes import boxes7_from_8
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.structures import DetectionMaps, Detections
+
+NARROW_ROI = np.array([0.0, -6.4, -2.0, 72.0, 6.4, 6.0])
+"""K-Radar's benchmark region: x, y, z minima, then maxima, in metres."""
+WIDE_ROI = np.array([0.0, -16.0, -2.0, 72.0, 16.0, 7.6])
+"""K-Radar's wide region: x, y, z minima, then maxima, in metres."""
+
+
+@struct.dataclass
+class Peaks:
+    """The strongest heatmap peaks of a batch, by descending score, before NMS.
+
+    Attributes:
+        cell: `[B, P, 2]` int32 range and azimuth bins.
+        boxes: `[B, P, 8]` boxes decoded there, yaw vector as regressed.
+        scores: `[B, P]`; 0 where not `is_valid`.
+        classes: `[B, P]` int32.
+        is_valid: `[B, P]` bool.
+        num_found: `[B]` int32 peaks above the threshold (and in the region), in all.
+    """
+
+    cell: jax.Array
+    boxes: jax.Array
+    scores: jax.Array
+    classes: jax.Array
+    is_valid: jax.Array
+    num_found: jax.Array
+
+
+def decode(
+    maps: DetectionMaps,
+    grid: RadarGrid,
+    *,
+    max_detections: int,
+    score_threshold: float | jax.Array,
+    nms_iou: float | jax.Array = 0.3,
+    pre_nms: int | None = None,
+    roi: np.ndarray | jax.Array | None = None,
+    per_class_nms: bool = False,
+    threshold_inclusive: bool = False,
+    z0_m: float | jax.Array = 0.0,
+) -> Detections:
+    """Boxes of a batch of detection maps.
+
+    As released: a peak is a bin that is not exceeded in its 3 x 3 neighbourhood of its
+    own class map and scores above the threshold; a bin gives at most one box, of its
+    best class (the first of equals); boxes outside the region are dropped; greedy
+    bird's-eye-view NMS. The length of the regressed yaw vector scales a box in NMS, as
+    released, but not in the result.
+
+    Args:
+        maps: Heatmap logits and box parameters, any float dtype; scores are computed
+            in float32.
+        grid: The grid of the maps.
+        max_detections: K, rows of the result.
+        score_threshold: Peaks must score above it.
+        nms_iou: Of two boxes overlapping this much or more the weaker is dropped.
+        pre_nms: Peaks that enter NMS at most, the strongest; default 2 K.
+        roi: `[6]` x, y, z minima and maxima in metres, bounds included, or None.
+        per_class_nms: Only boxes of the same class suppress each other.
+        threshold_inclusive: Peaks that score exactly the threshold count (the paper's
+            reading; the released code's is exclusive).
+        z0_m: Height added to the regressed z: the paper's sensor height.
+
+    Returns:
+        Detections by descending score; equal scores in order of range, then azimuth.
+        `num_cut` counts peaks beyond `pre_nms` and boxes after NMS beyond K.
+
+    Raises:
+        ValueError: Shapes of maps and grid differ, or a size is not positive.
+
+    Examples:
+        >>> grid = RadarGrid.reduced(
+        ...     num_doppler=4, num_range=16, num_elevation=4, num_azimuth=8)
+        >>> logits = jnp.full((1, 16, 8, 2), -9.0).at[0, 5, 3, 1].set(2.0)
+        >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
+        >>> found = decode(maps, grid, max_detections=4, score_threshold=0.3)
+        >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
+        ([[1, -1, -1, -1]], 0.8808)
+    """
+    if max_detections < 1:
+        raise ValueError(f"max_detections must be at least 1, got {max_detections}")
+    peaks = find_peaks(
+        maps,
+        grid,
+        max_peaks=2 * max_detections if pre_nms is None else pre_nms,
+        score_threshold=score_threshold,
+        roi=roi,
+        threshold_inclusive=threshold_inclusive,
+        z0_m=z0_m,
+    )
+    keep = suppress(peaks, nms_iou, per_class=per_class_nms)
+    return _compact(peaks, keep, max_detections)
+
+
+def suppress(
+    peaks: Peaks, nms_iou: float | jax.Array, *, per_class: bool = False
+) -> jax.Array:
+    """`[B, P]` bool: which peaks survive rotated NMS, across classes or per class."""
+
+    def one_frame(boxes: jax.Array, is_valid: jax.Array, classes: jax.Array):
+        return rotated_nms(
+            boxes, is_valid, nms_iou, classes=classes if per_class else None
+        )
+
+    return jax.vmap(one_frame)(peaks.boxes, peaks.is_valid, peaks.classes)
+
+
+def find_peaks(
+    maps: DetectionMaps,
+    grid: RadarGrid,
+    *,
+    max_peaks: int,
+    score_threshold: float | jax.Array,
+    roi: np.ndarray | jax.Array | None = None,
+    threshold_inclusive: bool = False,
+    z0_m: float | jax.Array = 0.0,
+) -> Peaks:
+    """The strongest local maxima of the heatmaps with their boxes, before NMS.
+
+    Args and errors are those of `decode`; `max_peaks` is P, cut to the number of bins.
+    """
+    _check_shapes(maps, grid)
+    if max_peaks < 1:
+        raise ValueError(f"at least 1 peak must enter NMS, got {max_peaks}")
+    num_range, num_azimuth = maps.heatmap_logits.shape[1:3]
+    scores = jax.nn.sigmoid(maps.heatmap_logits.astype(jnp.float32))
+    above = (
+        scores >= score_threshold if threshold_inclusive else scores > score_threshold
+    )
+    is_peak = above & (scores >= _max_3x3(scores))
+    scores = jnp.where(is_peak, scores, 0.0)
+    best = jnp.max(scores, axis=-1)  # [B, R, A]
+    if roi is not None:
+        best = jnp.where(_in_roi(maps.box_params, grid, roi, z0_m), best, 0.0)
+    best = best.reshape(best.shape[0], -1)  # [B, R * A]
+    top, cell = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
+    is_valid = top > 0
+    at = jax.vmap(lambda values, cell: values[cell])
+    classes = jnp.argmax(at(_flat_cells(scores), cell), -1)  # the first of equals
+    params = at(_flat_cells(maps.box_params), cell).astype(jnp.float32)
+    cell = jnp.stack([cell // num_azimuth, cell % num_azimuth], -1)
+    return Peaks(
+        cell=cell,
+        boxes=boxes_at(params, cell, grid, z0_m),
+        scores=top,
+        classes=classes.astype(jnp.int32),
+        is_valid=is_valid,
+        num_found=jnp.sum(best > 0, axis=-1, dtype=jnp.int32),
+    )
+
+
+def boxes_at(
+    params: jax.Array,
+    cell: jax.Array,
+    grid: RadarGrid,
+    z0_m: float | jax.Array = 0.0,
+) -> jax.Array:
+    """Boxes described by the parameters of given bins.
+
+    Args:
+        params: `[..., 8]` raw dx, dy, dz, l, w, h, sin, cos.
+        cell: `[..., 2]` integer range and azimuth bins.
+        grid: The grid of the maps.
+        z0_m: Height added to dz.
+
+    Returns:
+        `[..., 8]` float32 x, y, z, l, w, h and the raw sin, cos.
+    """
+    params = params.astype(jnp.float32)
+    range_m = jnp.asarray(grid.range_m, jnp.float32)[cell[..., 0]]
+    cos = jnp.asarray(np.cos(grid.azimuth_rad), jnp.float32)[cell[..., 1]]
+    sin = jnp.asarray(np.sin(grid.azimuth_rad), jnp.float32)[cell[..., 1]]
+    center = jnp.stack([range_m * cos, -range_m * sin, jnp.zeros_like(sin) + z0_m], -1)
+    return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
+
+
+def _max_3x3(values: jax.Array) -> jax.Array:
+    """Maximum over each bin and its neighbours in range and azimuth: `[B, R, A, C]`."""
+    for axis in (1, 2):
+        size = values.shape[axis]
+        pad = [(0, 0)] * values.ndim
+        pad[axis] = (1, 1)
+        padded = jnp.pad(values, pad, constant_values=-jnp.inf)
+        shifts = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in (0, 2)]
+        values = jnp.maximum(values, jnp.maximum(*shifts))
+    return values
+
+
+def _in_roi(
+    params: jax.Array,
+    grid: RadarGrid,
+    roi: np.ndarray | jax.Array,
+    z0_m: float | jax.Array,
+) -> jax.Array:
+    """`[B, R, A]` bool: the box of a bin has its center in the region."""
+    roi = jnp.asarray(roi, jnp.float32)
+    if roi.shape != (6,):
+        raise ValueError(
+            f"roi must be [6]: x, y, z minima, then maxima; got {roi.shape}"
+        )
+    center = params[..., :3].astype(jnp.float32)
+    ground = jnp.asarray(grid.cell_centers_ego(), jnp.float32)[None]  # [1, R, A, 2]
+    inside = jnp.ones(params.shape[:3], bool)
+    offsets = (ground[..., 0], ground[..., 1], z0_m)
+    for axis, offset in enumerate(offsets):
+        position = center[..., axis] + offset
+        inside &= (position >= roi[axis]) & (position <= roi[axis + 3])
+    return inside
+
+
+def _compact(peaks: Peaks, keep: jax.Array, max_detections: int) -> Detections:
+    """The kept peaks moved to the front, in order, as K rows."""
+    order = jnp.argsort(~keep, axis=-1, stable=True)[:, :max_detections]
+    at = jax.vmap(lambda values, order: values[order])
+    is_valid = at(keep, order)
+    num_kept = jnp.sum(keep, axis=-1, dtype=jnp.int32)
+    num_entered = jnp.sum(peaks.is_valid, axis=-1, dtype=jnp.int32)
+    detections = Detections(
+        boxes=jnp.where(
+            is_valid[..., None], boxes7_from_8(at(peaks.boxes, order)), 0.0
+        ),
+        scores=jnp.where(is_valid, at(peaks.scores, order), 0.0),
+        classes=jnp.where(is_valid, at(peaks.classes, order), -1),
+        is_valid=is_valid,
+        num_cut=peaks.num_found
+        - num_entered
+        + jnp.maximum(num_kept - max_detections, 0),
+    )
+    missing = max_detections - order.shape[1]
+    return _pad_rows(detections, missing) if missing > 0 else detections
+
+
+def _pad_rows(detections: Detections, count: int) -> Detections:
+    """`count` empty rows appended, for K larger than the map has bins."""
+
+    def pad(values: jax.Array, fill: float) -> jax.Array:
+        widths = [(0, 0), (0, count)] + [(0, 0)] * (values.ndim - 2)
+        return jnp.pad(values, widths, constant_values=fill)
+
+    return detections.replace(
+        boxes=pad(detections.boxes, 0),
+        scores=pad(detections.scores, 0),
+        classes=pad(detections.classes, -1),
+        is_valid=pad(detections.is_valid, False),
+    )
+
+
+def _flat_cells(values: jax.Array) -> jax.Array:
+    """`[B, R, A, C]` -> `[B, R * A, C]`."""
+    return values.reshape(values.shape[0], -1, values.shape[-1])
+
+
+def _check_shapes(maps: DetectionMaps, grid: RadarGrid) -> None:
+    logits, params = maps.heatmap_logits.shape, maps.box_params.shape
+    expected = (grid.num_range, grid.num_azimuth)
+    if len(logits) != 4 or params != (*logits[:3], 8):
+        raise ValueError(
+            f"maps must be [B, R, A, C] and [B, R, A, 8], got {logits} and {params}"
+        )
+    if logits[1:3] != expected:
+        raise ValueError(
+            f"maps have {logits[1]} x {logits[2]} range x azimuth bins, the grid "
+            f"{expected[0]} x {expected[1]}: pass the grid of the maps "
+            "(grid.padded(...) where the model pads and does not crop)"
+        )

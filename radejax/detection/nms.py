@@ -1,0 +1,76 @@
+"""Rotated non-maximum suppression of a fixed number of boxes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from radejax.geometry.rotated_iou import bev_iou
+
+
+def rotated_nms(
+    boxes: jax.Array,
+    is_valid: jax.Array,
+    iou_threshold: float | jax.Array,
+    *,
+    classes: jax.Array | None = None,
+) -> jax.Array:
+    """Which boxes survive greedy bird's-eye-view non-maximum suppression.
+
+    In order of the rows, a box is kept unless it overlaps a box kept before:
+
+        for j in range(K):
+            keep[j] = valid[j] and not any(keep[i] and iou[i, j] >= t for i < j)
+
+    Args:
+        boxes: `[K, 7]` or `[K, 8]`, by descending score; the yaw vector of `[K, 8]`
+            scales the box, as in the released code (see `bev_iou`).
+        is_valid: `[K]` bool; False rows are neither kept nor suppress others.
+        iou_threshold: Boxes overlapping this much or more are suppressed.
+        classes: `[K]` class indices; given, only boxes of one class suppress each
+            other.
+
+    Returns:
+        `[K]` bool, True where a box is kept.
+
+    Examples:
+        >>> boxes = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
+        >>> rotated_nms(boxes, jnp.array([True, True]), 0.3).tolist()
+        [True, False]
+    """
+    overlaps = bev_iou(boxes, boxes) >= iou_threshold
+    if classes is not None:
+        overlaps &= classes[:, None] == classes[None, :]
+    return greedy_suppression(overlaps, is_valid)
+
+
+def greedy_suppression(overlaps: jax.Array, is_valid: jax.Array) -> jax.Array:
+    """The greedy choice for a given overlap relation, rows by descending score.
+
+    Instead of K steps one after the other, all rows are decided together from the
+    previous guess until nothing changes. Row j depends on rows before it only, so
+    after n rounds the first n rows are final, the fixed point is unique, and it is the
+    greedy answer. Rounds needed: the longest chain of boxes each suppressed by or
+    freed by the one before, a handful, never more than K.
+
+    Args:
+        overlaps: `[K, K]` bool, True where a pair may not both be kept.
+        is_valid: `[K]` bool.
+
+    Returns:
+        `[K]` bool, True where a row is kept.
+    """
+    before = jnp.triu(overlaps, 1)  # [i, j]: i would suppress j
+
+    def decide(keep: jax.Array) -> jax.Array:
+        return is_valid & ~jnp.any(before & keep[:, None], axis=0)
+
+    def changed(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return jnp.any(state[0] != state[1])
+
+    keep, _ = jax.lax.while_loop(
+        changed,
+        lambda state: (decide(state[0]), state[0]),
+        (decide(is_valid), is_valid),
+    )
+    return keep

@@ -1,0 +1,151 @@
+"""Conversions and simple geometry of upright 3D boxes.
+
+A box is `[..., 7]`: x, y, z of its center, full length (along its heading), width and
+height, yaw; or `[..., 8]` with sin yaw and cos yaw in place of yaw, as networks regress
+it. Functions follow the type of their input: NumPy in, NumPy out; else JAX.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+# Signs of the half extents at the corners, counter-clockwise from front left.
+_SIGN_LENGTH = (1.0, -1.0, -1.0, 1.0)
+_SIGN_WIDTH = (1.0, 1.0, -1.0, -1.0)
+
+
+def array_module(*values: Any) -> Any:
+    """NumPy where every value is NumPy's or Python's, else jax.numpy."""
+    on_host = all(
+        isinstance(v, np.ndarray | np.generic | float | int | list | tuple)
+        for v in values
+    )
+    return np if on_host else jnp
+
+
+def boxes8_from_7(boxes: Any) -> Any:
+    """Boxes with sin and cos of yaw: `[..., 7]` -> `[..., 8]`.
+
+    Args:
+        boxes: `[..., 7]` x, y, z, l, w, h, yaw; metres and radians.
+
+    Returns:
+        `[..., 8]` x, y, z, l, w, h, sin yaw, cos yaw.
+
+    Raises:
+        ValueError: The last axis is not 7 long.
+
+    Examples:
+        >>> boxes8_from_7(np.array([1.0, 2, 3, 4, 2, 1, 0])).tolist()
+        [1.0, 2.0, 3.0, 4.0, 2.0, 1.0, 0.0, 1.0]
+    """
+    xp = array_module(boxes)
+    boxes = _checked(xp.asarray(boxes), 7)
+    yaw = boxes[..., 6:7]
+    return xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
+
+
+def boxes7_from_8(boxes: Any) -> Any:
+    """Boxes with the yaw angle: inverse of `boxes8_from_7`.
+
+    The length of the (sin, cos) vector does not matter; sin = cos = 0 gives yaw 0.
+
+    Args:
+        boxes: `[..., 8]` x, y, z, l, w, h, sin yaw, cos yaw.
+
+    Returns:
+        `[..., 7]` x, y, z, l, w, h, yaw in (-pi, pi].
+
+    Raises:
+        ValueError: The last axis is not 8 long.
+    """
+    xp = array_module(boxes)
+    boxes = _checked(xp.asarray(boxes), 8)
+    yaw = xp.arctan2(boxes[..., 6:7], boxes[..., 7:8])
+    return xp.concatenate([boxes[..., :6], yaw], -1)
+
+
+def bev_corners(boxes: Any) -> Any:
+    """Corners of the boxes' footprints, counter-clockwise from front left.
+
+    ```
+        x (heading)
+        ^      0 ---- 3
+        |      |      |      y points left
+        +-->   1 ---- 2
+    ```
+
+    Args:
+        boxes: `[..., 7]`, or `[..., 8]` whose yaw vector is normalised first.
+
+    Returns:
+        `[..., 4, 2]` x and y in metres.
+    """
+    xp = array_module(boxes)
+    boxes = xp.asarray(boxes)
+    if boxes.shape[-1] == 8:
+        boxes = boxes7_from_8(boxes)
+    boxes = _checked(boxes, 7)
+    sin, cos = xp.sin(boxes[..., 6, None]), xp.cos(boxes[..., 6, None])
+    ahead = boxes[..., 3, None] / 2 * _row(xp, _SIGN_LENGTH, boxes)  # [..., 4]
+    left = boxes[..., 4, None] / 2 * _row(xp, _SIGN_WIDTH, boxes)
+    x = boxes[..., 0, None] + cos * ahead - sin * left
+    y = boxes[..., 1, None] + sin * ahead + cos * left
+    return xp.stack([x, y], -1)
+
+
+def corners(boxes: Any) -> Any:
+    """Corners of boxes: the footprint's four at the bottom, then at the top.
+
+    Args:
+        boxes: `[..., 7]` or `[..., 8]`, as for `bev_corners`.
+
+    Returns:
+        `[..., 8, 3]` x, y, z in metres.
+    """
+    xp = array_module(boxes)
+    boxes = xp.asarray(boxes)
+    ground = bev_corners(boxes)  # [..., 4, 2]
+    z, half = boxes[..., 2, None, None], boxes[..., 5, None, None] / 2
+    level = xp.zeros_like(ground[..., :1])
+    bottom = xp.concatenate([ground, level + z - half], -1)
+    top = xp.concatenate([ground, level + z + half], -1)
+    return xp.concatenate([bottom, top], -2)
+
+
+def transform_boxes(boxes: Any, translation_m: Any, yaw_rad: float = 0.0) -> Any:
+    """Boxes in a frame turned and shifted on the ground: rotate, then translate.
+
+    Args:
+        boxes: `[..., 7]` boxes in the source frame.
+        translation_m: `[3]` position of the source frame's origin in the target frame.
+        yaw_rad: Heading of the source frame's x axis in the target frame.
+
+    Returns:
+        `[..., 7]` boxes in the target frame; yaw is not wrapped.
+
+    Raises:
+        ValueError: The last axis is not 7 long.
+    """
+    xp = array_module(boxes, translation_m)
+    boxes = _checked(xp.asarray(boxes), 7)
+    sin, cos = np.sin(yaw_rad), np.cos(yaw_rad)
+    x = boxes[..., 0] * cos - boxes[..., 1] * sin + translation_m[0]
+    y = boxes[..., 0] * sin + boxes[..., 1] * cos + translation_m[1]
+    z = boxes[..., 2] + translation_m[2]
+    center = xp.stack([x, y, z], -1)
+    return xp.concatenate([center, boxes[..., 3:6], boxes[..., 6:] + yaw_rad], -1)
+
+
+def _row(xp: Any, values: tuple[float, ...], like: Any) -> Any:
+    """`values` along a new last axis, of the rank and dtype of `like`."""
+    return xp.asarray(values, like.dtype).reshape((1,) * (like.ndim - 1) + (-1,))
+
+
+def _checked(boxes: Any, width: int) -> Any:
+    if boxes.ndim < 1 or boxes.shape[-1] != width:
+        raise ValueError(f"boxes must be [..., {width}], got shape {boxes.shape}")
+    return boxes

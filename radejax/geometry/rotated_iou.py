@@ -1,0 +1,225 @@
+"""Overlap of rotated boxes, exact and branch-free, for JAX and NumPy.
+
+Area by Green's theorem: half the integral of x dy - y dx along the boundary of the
+intersection. That boundary consists of the parts of each box's edges inside the other
+box, so
+
+    area = 1/2 sum over the edges of both boxes of
+           (length of the edge inside the other box) x (distance of its line from O).
+
+No polygon is built and nothing is sorted; 16 edge pairs are a fixed sum of array
+expressions. What makes it exact for coincident edges is that both boxes use the same
+crossing point of a pair of edge lines: along (nearly) coincident lines that point may
+be anywhere, but what one edge loses the other gains. O is the center of the first
+box, which keeps coordinates small and float32 errors below 1e-6 of the area.
+
+The same lines of code run on `jax.numpy` (float32, jit) and on NumPy (float64, for
+evaluation, which need not load JAX).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_FAR = 1e6  # metres; stands for infinity along a line, finite so that 0 * _FAR is 0
+
+
+def bev_iou(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Bird's-eye-view IoU of every box of `a` with every box of `b`.
+
+    Args:
+        a: `[..., N, 7]` boxes x, y, z, l, w, h, yaw; or `[..., N, 8]` with sin and
+            cos of yaw, whose length, when not 1, scales the box (as the released NMS
+            and metrics do).
+        b: `[..., M, 7]` or `[..., M, 8]`.
+
+    Returns:
+        `[..., N, M]` float32 in [0, 1]. Boxes of zero or negative size overlap
+        nothing.
+
+    Raises:
+        ValueError: The last axis is neither 7 nor 8 long.
+
+    Examples:
+        >>> car = jnp.array([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
+        >>> moved = car.at[0, 0].set(2.0)
+        >>> round(float(bev_iou(car, moved)[0, 0]), 4)
+        0.3333
+    """
+    return bev_iou_pairs(a[..., :, None, :], b[..., None, :, :])
+
+
+def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Volume IoU of every box of `a` with every box of `b`; arguments of `bev_iou`.
+
+    Returns:
+        `[..., N, M]` float32 in [0, 1].
+    """
+    return iou_3d_pairs(a[..., :, None, :], b[..., None, :, :])
+
+
+def bev_iou_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Bird's-eye-view IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`."""
+    a, b = _footprint(jnp, _as_float32(a)), _footprint(jnp, _as_float32(b))
+    return _ratio(jnp, _intersection(jnp, a, b), a[2] * a[3], b[2] * b[3])
+
+
+def iou_3d_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Volume IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`."""
+    a, b = _as_float32(a), _as_float32(b)
+    return _iou_3d(jnp, a, b)
+
+
+def bev_intersection_np(
+    a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16
+) -> np.ndarray:
+    """Footprint overlap of corresponding boxes in float64, without JAX.
+
+    Args:
+        a: `[P, 7]` boxes, or `[P, 8]` (see `bev_iou`).
+        b: `[P, 7]` or `[P, 8]`.
+        chunk_size: Pairs worked on at a time; bounds memory to about 100 MB.
+
+    Returns:
+        `[P]` intersection areas in square metres.
+
+    Raises:
+        ValueError: Shapes differ or are not `[P, 7]` or `[P, 8]`.
+    """
+    return _by_chunks(
+        lambda a, b: _intersection(np, _footprint(np, a), _footprint(np, b)),
+        a,
+        b,
+        chunk_size,
+    )
+
+
+def bev_iou_np(
+    a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16
+) -> np.ndarray:
+    """Bird's-eye-view IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`."""
+
+    def iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        a, b = _footprint(np, a), _footprint(np, b)
+        return _ratio(np, _intersection(np, a, b), a[2] * a[3], b[2] * b[3])
+
+    return _by_chunks(iou, a, b, chunk_size)
+
+
+def iou_3d_np(a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16) -> np.ndarray:
+    """Volume IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`."""
+    return _by_chunks(lambda a, b: _iou_3d(np, a, b), a, b, chunk_size)
+
+
+def _by_chunks(function: Any, a: Any, b: Any, chunk_size: int) -> np.ndarray:
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if a.ndim != 2 or b.ndim != 2 or a.shape[0] != b.shape[0]:
+        raise ValueError(
+            f"expected two arrays of P boxes [P, 7], got {a.shape} and {b.shape}"
+        )
+    starts = range(0, max(len(a), 1), chunk_size)
+    parts = [function(a[i : i + chunk_size], b[i : i + chunk_size]) for i in starts]
+    return np.concatenate(parts)
+
+
+def _as_float32(boxes: Any) -> jax.Array:
+    """At least float32: float64 passes through where JAX has it enabled."""
+    boxes = jnp.asarray(boxes)
+    return boxes.astype(jnp.promote_types(boxes.dtype, jnp.float32))
+
+
+def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
+    """Center x, y, length, width (not negative), sin and cos of heading: `[...]`."""
+    width = boxes.shape[-1] if boxes.ndim else 0
+    if width not in (7, 8):
+        raise ValueError(f"boxes must be [..., 7] or [..., 8], got {boxes.shape}")
+    x, y, length, breadth = (boxes[..., i] for i in (0, 1, 3, 4))
+    if width == 7:
+        return (
+            x,
+            y,
+            xp.maximum(length, 0),
+            xp.maximum(breadth, 0),
+            xp.sin(boxes[..., 6]),
+            xp.cos(boxes[..., 6]),
+        )
+    scale = xp.sqrt(boxes[..., 6] ** 2 + boxes[..., 7] ** 2)
+    divisor = xp.where(scale > 0, scale, 1)
+    sin = boxes[..., 6] / divisor
+    cos = xp.where(scale > 0, boxes[..., 7] / divisor, 1)
+    return x, y, xp.maximum(length * scale, 0), xp.maximum(breadth * scale, 0), sin, cos
+
+
+def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
+    """Area common to two footprints, elementwise with broadcasting."""
+    ax, ay, a_length, a_width, a_sin, a_cos = a
+    bx, by, b_length, b_width, b_sin, b_cos = b
+    # Center and heading of b in the frame of a.
+    dx, dy = bx - ax, by - ay
+    x = a_cos * dx + a_sin * dy
+    y = a_cos * dy - a_sin * dx
+    sin = a_cos * b_sin - a_sin * b_cos
+    cos = a_cos * b_cos + a_sin * b_sin
+    # Edges as (direction, outward distance from the box's own center, half length);
+    # the box lies to the left of each edge. Directions by quarter turns.
+    zero, one = xp.zeros_like(sin), xp.ones_like(sin)
+    a_direction = [(one, zero), (zero, one), (-one, zero), (zero, -one)]
+    b_direction = [(cos, sin), (-sin, cos), (-cos, -sin), (sin, -cos)]
+    a_half = [(a_width / 2, a_length / 2), (a_length / 2, a_width / 2)] * 2
+    b_half = [(b_width / 2, b_length / 2), (b_length / 2, b_width / 2)] * 2
+
+    a_low, a_high = [-h for _, h in a_half], [h for _, h in a_half]
+    b_low, b_high = [-h for _, h in b_half], [h for _, h in b_half]
+    for i, (ux, uy) in enumerate(a_direction):
+        for j, (vx, vy) in enumerate(b_direction):
+            # From the middle of edge i of a to the middle of edge j of b.
+            gap_x = x + b_half[j][0] * vy - a_half[i][0] * uy
+            gap_y = y - b_half[j][0] * vx + a_half[i][0] * ux
+            turn = ux * vy - uy * vx
+            offset = gap_x * vy - gap_y * vx
+            is_left = turn > 0
+            # Parallel lines cross infinitely far away, on the side that says whether
+            # edge i lies inside. On the very same line all of edge i counts: of two
+            # equal edges then one is counted, of two opposite ones both, which cancel.
+            divisor = xp.where(turn == 0, 1, turn)
+            far = xp.where(offset >= 0, _FAR, -_FAR)
+            # turn == 0 is treated as not left: edge i is inside beyond the crossing.
+            at_a = xp.where(turn == 0, -far, xp.clip(offset / divisor, -_FAR, _FAR))
+            at_b = at_a * (ux * vx + uy * vy) - (gap_x * vx + gap_y * vy)
+            a_high[i] = xp.where(is_left, xp.minimum(a_high[i], at_a), a_high[i])
+            a_low[i] = xp.where(is_left, a_low[i], xp.maximum(a_low[i], at_a))
+            b_low[j] = xp.where(is_left, xp.maximum(b_low[j], at_b), b_low[j])
+            b_high[j] = xp.where(is_left, b_high[j], xp.minimum(b_high[j], at_b))
+
+    twice_area = zero
+    for i in range(4):
+        inside = xp.maximum(a_high[i] - a_low[i], 0)
+        twice_area = twice_area + inside * a_half[i][0]
+    for j, (vx, vy) in enumerate(b_direction):
+        inside = xp.maximum(b_high[j] - b_low[j], 0)
+        twice_area = twice_area + inside * (b_half[j][0] + x * vy - y * vx)
+    smaller = xp.minimum(a_length * a_width, b_length * b_width)
+    return xp.clip(twice_area / 2, 0, smaller)
+
+
+def _iou_3d(xp: Any, a: Any, b: Any) -> Any:
+    """Volume IoU: overlap on the ground times overlap in height."""
+    ground_a, ground_b = _footprint(xp, a), _footprint(xp, b)
+    height_a, height_b = xp.maximum(a[..., 5], 0), xp.maximum(b[..., 5], 0)
+    gap = xp.abs(a[..., 2] - b[..., 2])
+    # Written about the center distance, so that boxes of one height give it exactly.
+    shared = xp.minimum((height_a + height_b) / 2 - gap, xp.minimum(height_a, height_b))
+    volume = _intersection(xp, ground_a, ground_b) * xp.maximum(shared, 0)
+    volume_a = ground_a[2] * ground_a[3] * height_a
+    volume_b = ground_b[2] * ground_b[3] * height_b
+    return _ratio(xp, volume, volume_a, volume_b)
+
+
+def _ratio(xp: Any, shared: Any, size_a: Any, size_b: Any) -> Any:
+    """Intersection over union; 0 where both boxes are empty."""
+    union = size_a + size_b - shared
+    return shared / xp.where(union > 0, union, 1)
