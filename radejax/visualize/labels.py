@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from radejax.visualize.canvas import halo
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+Side = Literal["left", "right", "above"]
 
 # Sizes of DejaVu Sans, in units of the font size: near enough to reserve room.
 _CHARACTER_WIDTH = 0.60
@@ -20,7 +23,7 @@ def place_labels(
     obstacles: np.ndarray,
     anchors: np.ndarray,
     sizes: np.ndarray,
-    prefer_left: np.ndarray,
+    prefer: Sequence[Side],
     frame: np.ndarray,
     *,
     gap: float,
@@ -28,38 +31,54 @@ def place_labels(
     """Lower left corners of labels beside their boxes, clear of what is there already.
 
     Greedy: labels are placed in the given order, each at the nearest of a fan of
-    places (left or right of its box, shifted up or down by half lines) where it
+    places (left or right of its box, or above it, shifted by half lines) where it
     overlaps the least.
 
     Args:
         obstacles: `[M, 4]` rectangles x0, y0, x1, y1 to keep clear.
         anchors: `[N, 4]` rectangle of the box that each label belongs to.
         sizes: `[N, 2]` width and height of each label.
-        prefer_left: `[N]` bool, True where the label should stand left of its box.
+        prefer: N sides where the labels should stand.
         frame: `[4]` rectangle that labels should not leave.
         gap: Distance between box and label.
 
     Returns:
-        `[N, 2]` corners, in the unit of the input (pixels).
+        `[N, 2]` corners, in the unit of the input (pixels, y up).
     """
     taken = [np.asarray(r, float) for r in obstacles]
     corners = np.zeros((len(anchors), 2))
-    for i, (box, (width, height)) in enumerate(zip(anchors, sizes, strict=True)):
-        shifts = 0.5 * height * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 6, -6, 8, -8])
-        left, right = box[0] - gap - width, box[2] + gap
-        sides = (left, right) if prefer_left[i] else (right, left)
-        x0 = np.tile(sides, len(shifts))
-        y0 = np.repeat((box[1] + box[3]) / 2 - height / 2 + shifts, 2)
-        places = np.stack([x0, y0, x0 + width, y0 + height], -1)
-        area = width * height
+    for i, (box, size) in enumerate(zip(anchors, sizes, strict=True)):
+        lower_left = _candidates(box, size, prefer[i], gap)
+        places = np.concatenate([lower_left, lower_left + size], -1)
+        area = size.prod()
         outside = area - _overlap(places, np.asarray(frame, float)[None]).sum(-1)
         covered = _overlap(places, np.array(taken).reshape(-1, 4)).sum(-1)
         # A small price on distance decides among places that are equally clear.
-        cost = (2 * outside + covered) / area + 0.02 * np.arange(len(places))
+        cost = (2 * outside + covered) / area + 0.004 * np.arange(len(places))
         best = int(np.argmin(cost))
         corners[i] = places[best, :2]
         taken.append(places[best])
     return corners
+
+
+def _candidates(
+    box: np.ndarray, size: np.ndarray, prefer: Side, gap: float
+) -> np.ndarray:
+    """`[P, 2]` lower left corners around a box, the most wanted first."""
+    width, height = size
+    if prefer == "above":
+        shifts = 0.5 * height * np.arange(20)
+        middle = (box[0] + box[2] - width) / 2
+        columns = (middle, box[0], box[2] - width)
+        x = np.tile(columns, len(shifts))
+        y = np.repeat(box[3] + gap + shifts, 3)
+        inside = [[middle, box[3] - gap - height], [middle, box[1] + gap]]
+        return np.concatenate([np.stack([x, y], -1), inside])
+    shifts = 0.5 * height * np.array([0, 1, -1, 2, -2, 3, -3, 4, -4, 6, -6, 8, -8])
+    left, right = box[0] - gap - width, box[2] + gap
+    x = np.tile((left, right) if prefer == "left" else (right, left), len(shifts))
+    y = np.repeat((box[1] + box[3]) / 2 - height / 2 + shifts, 2)
+    return np.stack([x, y], -1)
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -71,24 +90,27 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def draw_labels(
     ax: Axes,
-    outlines: list[np.ndarray],
-    texts: list[str],
-    colors: list[str],
-    prefer_left: list[bool],
+    outlines: Sequence[np.ndarray],
+    texts: Sequence[str],
+    colors: Sequence[str],
+    prefer: Sequence[Side],
     *,
     font_size: float = 7.5,
+    keep_boxes_clear: bool = True,
 ) -> None:
     """Writes a text beside each outline; a thin line leads to a text that moved away.
 
-    Axes limits and aspect must be final: room is reserved in pixels.
+    Axes limits and aspect must be final: room is reserved in pixels. Outlines whose
+    center is out of sight get no text.
 
     Args:
         ax: Where to draw.
         outlines: N arrays `[P, 2]` of points in data coordinates.
         texts: N texts.
         colors: N colours.
-        prefer_left: Which texts should stand left of their outline.
+        prefer: N sides where the texts should stand.
         font_size: Points.
+        keep_boxes_clear: Texts avoid all outlines, not only other texts.
     """
     frame = ax.get_window_extent().extents
     rectangles = np.zeros((len(outlines), 4))
@@ -96,60 +118,68 @@ def draw_labels(
         pixels = ax.transData.transform(outline)
         rectangles[i] = [*pixels.min(0), *pixels.max(0)]
     centers = (rectangles[:, :2] + rectangles[:, 2:]) / 2
-    shown = np.flatnonzero(
-        ((centers >= frame[:2]) & (centers <= frame[2:])).all(-1)
-        if len(outlines)
-        else []
+    shown = np.flatnonzero(((centers >= frame[:2]) & (centers <= frame[2:])).all(-1))
+    if not shown.size:
+        return
+    low, high = frame[:2], frame[2:]
+    anchors = np.concatenate(
+        [
+            np.clip(rectangles[shown, :2], low, high),
+            np.clip(rectangles[shown, 2:], low, high),
+        ],
+        -1,
     )
     pixel_per_point = ax.figure.dpi / 72
     line = font_size * pixel_per_point
     sizes = np.array(
         [[_CHARACTER_WIDTH * line * len(texts[i]), _LINE_HEIGHT * line] for i in shown]
-    ).reshape(-1, 2)
+    )
     corners = place_labels(
-        rectangles[shown],
-        rectangles[shown],
+        anchors if keep_boxes_clear else np.zeros((0, 4)),
+        anchors,
         sizes,
-        np.array(prefer_left, bool)[shown],
+        [prefer[i] for i in shown],
         frame,
         gap=3 * pixel_per_point,
     )
-    for i, corner, size in zip(shown, corners, sizes, strict=True):
-        _draw_label(
-            ax, texts[i], colors[i], rectangles[i], corner, size, font_size=font_size
-        )
+    for i, anchor, corner, size in zip(shown, anchors, corners, sizes, strict=True):
+        _draw_label(ax, texts[i], colors[i], anchor, corner, size, font_size=font_size)
 
 
 def _draw_label(
     ax: Axes,
     text: str,
     color: str,
-    rectangle: np.ndarray,
+    anchor: np.ndarray,
     corner: np.ndarray,
     size: np.ndarray,
     *,
     font_size: float,
 ) -> None:
-    """One text, right-aligned on the left of its box, with its leader if it moved."""
-    pixel_per_point = ax.figure.dpi / 72
-    is_left = corner[0] < rectangle[0]
-    edge = np.array(
-        [rectangle[0] if is_left else rectangle[2], rectangle[[1, 3]].mean()]
-    )
-    target = corner + size * (1.0 if is_left else 0.0, 0.5)
-    has_moved = abs(target[1] - edge[1]) > 0.75 * size[1]
+    """One text, aligned with the nearest point of its box, with a leader if it moved."""
+    center = corner + size / 2
+    edge = np.clip(center, anchor[:2], anchor[2:])
+    if corner[0] >= anchor[2]:
+        align, target = "left", corner + size * (0.0, 0.5)
+    elif corner[0] + size[0] <= anchor[0]:
+        align, target = "right", corner + size * (1.0, 0.5)
+    else:
+        align, target = "center", center
+    # The point of the text that is nearest to the box.
+    near = np.clip(edge, corner, corner + size)
+    has_moved = np.hypot(*(near - edge)) > 0.75 * size[1]
     leader = {"arrowstyle": "-", "color": color, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
     ax.annotate(
         text,
         xy=ax.transData.inverted().transform(edge),
-        xytext=(target - edge) / pixel_per_point,
+        xytext=(target - edge) * 72 / ax.figure.dpi,
         textcoords="offset points",
-        ha="right" if is_left else "left",
+        ha=align,
         va="center",
         color=color,
         fontsize=font_size,
         path_effects=halo(1.6),
         arrowprops=leader if has_moved else None,
-        annotation_clip=True,
+        annotation_clip=False,
         zorder=6,
     )

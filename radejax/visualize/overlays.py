@@ -64,7 +64,7 @@ def draw_objects(
 ) -> None:
     """Boxes with heading marks, then their labels: ground truth left, found right."""
     ax.apply_aspect()
-    outlines, texts, colors, prefer_left = [], [], [], []
+    outlines, texts, colors, prefer = [], [], [], []
     thickness = _thickness(ax, [o for o in (truth, found) if o is not None], to_axes)
     for objects, color, text_color, width, is_truth in (
         (truth, GROUND_TRUTH_COLOR, GROUND_TRUTH_COLOR, 1.9, True),
@@ -89,9 +89,9 @@ def draw_objects(
         outlines += list(np.concatenate([edges, marks], 1))
         texts += label_texts(objects)
         colors += [text_color] * len(edges)
-        prefer_left += [is_truth] * len(edges)
+        prefer += ["left" if is_truth else "right"] * len(edges)
     if show_labels and outlines:
-        draw_labels(ax, outlines, texts, colors, prefer_left)
+        draw_labels(ax, outlines, texts, colors, prefer)
 
 
 def _thickness(ax: Axes, sets: list[Objects], to_axes: Callable) -> float:

@@ -1,0 +1,173 @@
+"""Boxes on the camera image.
+
+Boxes come in the ego frame, in which models are trained and scored; the calibration
+takes them to pixels. Whoever has boxes as the label files hold them (LiDAR frame) adds
+the sensor offset first: the usual reason for boxes drawn beside their cars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.collections import LineCollection, PolyCollection
+
+from radejax.errors import UserError
+from radejax.geometry.camera import CameraCalibration, ImageKind
+from radejax.structures import CLASSES
+from radejax.visualize.canvas import (
+    GROUND_TRUTH_COLOR,
+    PREDICTION_COLOR,
+    PREDICTION_TEXT_COLOR,
+    Objects,
+    label_texts,
+    new_figure,
+)
+from radejax.visualize.labels import draw_labels
+from radejax.visualize.overlays import both_sets
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Corners in units of length, width and height, and the edges between them.
+_CORNERS = np.array(
+    [
+        [x, y, z]
+        for z in (-0.5, 0.5)
+        for x, y in ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
+    ]
+)
+_FRONT = (0, 1, 5, 4)
+_NEAR_M = 0.5
+
+
+def draw_camera(
+    image: Any,
+    calibration: CameraCalibration,
+    *,
+    ground_truth: Any = None,
+    predictions: Any = None,
+    class_names: Sequence[str] = CLASSES,
+    image_kind: ImageKind = "raw",
+    ax: Axes | None = None,
+    show_labels: bool = True,
+    title: str | None = None,
+) -> Axes:
+    """Draws 3D boxes on an image: edges, and the front face tinted.
+
+    Args:
+        image: `[H, W, 3]` uint8, or float in [0, 1]; of the calibration's size.
+        calibration: The camera, with its ego-from-LiDAR offset.
+        ground_truth: Boxes with classes in the ego frame; see `canvas.as_objects`.
+        predictions: Boxes with scores and classes in the ego frame.
+        class_names: Names of class indices.
+        image_kind: "raw" as recorded, or how the image was undistorted.
+        ax: Where to draw; a new figure by default.
+        show_labels: Write class and score at the boxes.
+        title: Title of the axes.
+
+    Returns:
+        The axes, in pixels of the image.
+
+    Raises:
+        UserError: Image and calibration differ in size, or boxes are malformed.
+    """
+    image = np.asarray(image)
+    expected = (calibration.height, calibration.width, 3)
+    if image.shape != expected:
+        raise UserError(
+            f"image has shape {image.shape}, the calibration is for {expected}; "
+            "K-Radar's front images are stereo pairs of which the left half is meant "
+            "(radejax.geometry.camera.left_half), and CameraCalibration.resized "
+            "follows a resized image"
+        )
+    if ax is None:
+        width = 9.0
+        height = width * calibration.height / calibration.width
+        total = height + (0.35 if title else 0.0)
+        ax = new_figure(width, total).add_axes((0, 0, 1, height / total))
+    ax.imshow(image, interpolation="bilinear")
+    ax.set_axis_off()
+    # Pixel centers are whole numbers in imshow, half numbers in the calibration.
+    ax.set(xlim=(-0.5, calibration.width - 0.5), ylim=(calibration.height - 0.5, -0.5))
+    ax.apply_aspect()
+    truth, found = both_sets(ground_truth, predictions, class_names)
+    outlines, texts, colors = [], [], []
+    for objects, color, text_color, width in (
+        (truth, GROUND_TRUTH_COLOR, GROUND_TRUTH_COLOR, 1.6),
+        (found, PREDICTION_COLOR, PREDICTION_TEXT_COLOR, 1.2),
+    ):
+        if objects is None or not len(objects.boxes):
+            continue
+        drawn, hulls = _draw_boxes(ax, calibration, objects, image_kind, color, width)
+        labels = label_texts(objects)
+        outlines += hulls
+        texts += [labels[i] for i in drawn]
+        colors += [text_color] * len(hulls)
+    if show_labels and outlines:
+        # Small, far boxes stand close together: they get the places next to them.
+        order = np.argsort([np.ptp(hull[:, 1]) for hull in outlines])
+        draw_labels(
+            ax,
+            [outlines[i] for i in order],
+            [texts[i] for i in order],
+            [colors[i] for i in order],
+            ["above"] * len(order),
+            font_size=6.5,
+            keep_boxes_clear=False,
+        )
+    if title:
+        ax.set_title(title)
+    return ax
+
+
+def _draw_boxes(
+    ax: Axes,
+    calibration: CameraCalibration,
+    objects: Objects,
+    kind: ImageKind,
+    color: str,
+    width: float,
+) -> tuple[list[int], list[np.ndarray]]:
+    """Draws what is in front of the camera; indices drawn and their points."""
+    segments, is_visible = calibration.project_boxes(objects.boxes, kind, _NEAR_M)
+    segments = segments - 0.5
+    # Wild pixels far outside the image confuse the renderer's clipping.
+    limit = 20 * calibration.width
+    is_visible = is_visible & (np.abs(segments) < limit).all((-1, -2))
+    corners, depth = calibration.project_ego(_corners(objects.boxes), kind)
+    drawn = [i for i in range(len(objects.boxes)) if is_visible[i].any()]
+    fronts = [
+        corners[i, list(_FRONT)] - 0.5
+        for i in drawn
+        if (depth[i, list(_FRONT)] > _NEAR_M).all()
+    ]
+    ax.add_collection(
+        PolyCollection(fronts, facecolors=color, alpha=0.25, linewidths=0, zorder=3),
+        autolim=False,
+    )
+    hulls = [segments[i][is_visible[i]].reshape(-1, 2) for i in drawn]
+    lines = np.concatenate([segments[i][is_visible[i]] for i in drawn] or [[]])
+    heights = [np.repeat(np.ptp(hull[:, 1]), len(hull) // 2) for hull in hulls]
+    # Lines of a box of few pixels are thinner, or they would fill it.
+    widths = width * np.clip(np.concatenate(heights or [[]]) / 60.0, 0.4, 1.0)
+    for stroke, extra, order in (("black", 1.0, 4), (color, 0.0, 4.1)):
+        collection = LineCollection(
+            lines,
+            colors=stroke,
+            linewidths=widths + extra * widths / width,
+            capstyle="round",
+            zorder=order,
+        )
+        ax.add_collection(collection, autolim=False)
+    return drawn, hulls
+
+
+def _corners(boxes: np.ndarray) -> np.ndarray:
+    """`[N, 8, 3]` corners in the ego frame, the four lower ones first."""
+    local = _CORNERS * boxes[:, None, 3:6]
+    cos, sin = np.cos(boxes[:, 6:7]), np.sin(boxes[:, 6:7])
+    x = local[..., 0] * cos - local[..., 1] * sin
+    y = local[..., 0] * sin + local[..., 1] * cos
+    return boxes[:, None, :3] + np.stack([x, y, local[..., 2]], -1)
