@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 from radejax.errors import UserError
 from radejax.structures import CLASSES
@@ -127,6 +128,16 @@ def _train() -> ConfigDict:
             "learning_rate": 1e-3,
             "final_learning_rate": 1e-4,  # cosine, per step
             "weight_decay": 0.01,
+            "warmup_steps": 0,
+            "gradient_clip_norm": placeholder(float),
+            "ema_decay": placeholder(float),  # of a moving average of the parameters
+            "num_accumulate": 1,  # parts of a batch, one after the other
+            "parameter_sharding": "replicated",  # "fsdp"
+            "log_every_steps": 20,
+            "checkpoint_every_steps": 500,
+            "checkpoints_to_keep": 2,
+            "evaluate_every_epochs": 0,  # 0: at the end only
+            "max_skipped_steps": 20,  # in a row, for loss or gradient not finite
         }
     )
 
@@ -150,5 +161,7 @@ def _evaluation() -> ConfigDict:
             "skip_empty": "frame",  # "class", "none"; pooled protocols only
             "iou_thresholds": (0.3, 0.5),
             "score_threshold": 0.3,
+            "batch_size": 8,
+            "num_pictures": 8,
         }
     )

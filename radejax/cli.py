@@ -1,0 +1,214 @@
+"""`radejax`: the command line."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from radejax import entry
+
+PATH = click.Path(path_type=pathlib.Path)
+EXISTING = click.Path(path_type=pathlib.Path, exists=True)
+
+
+class _Group(click.Group):
+    """Turns the user's errors into one line and an exit code, for every command."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with entry.exit_codes(debug=ctx.params.get("debug", False)):
+            return super().invoke(ctx)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
+@click.version_option(package_name="radejax")
+def main(debug: bool) -> None:
+    """3D object detection in 4D radar tensors: data, detection, pictures.
+
+    Training is `python train.py`, evaluation `python evaluate.py`.
+    """
+    del debug  # read by _Group
+
+
+def _json_option(command: Callable) -> Callable:
+    return click.option(
+        "--json", "as_json", is_flag=True, help="Print the result as JSON."
+    )(command)
+
+
+def _report(as_json: bool, values: dict[str, Any], text: str) -> None:
+    click.echo(json.dumps(values) if as_json else text)
+
+
+@main.command()
+@click.option("--config", default="configs/quickstart.py", show_default=True, type=str)
+@click.option("--out", required=True, type=PATH, help="Root of the new data set.")
+@click.option("--seed", type=int, help="Instead of the config's.")
+@_json_option
+def simulate(config: str, out: pathlib.Path, seed: int | None, as_json: bool) -> None:
+    """Simulate a data set in K-Radar's folders and file formats.
+
+    Example: radejax simulate --config configs/quickstart.py --out data/sim
+    """
+    from radejax.errors import UserError
+    from radejax.simulation.dataset import simulate_dataset
+
+    simulation = _load_config(config).get("simulation")
+    if simulation is None:
+        raise UserError(f"{config} has no `simulation` section")
+    if seed is not None:
+        simulation.seed = seed
+    simulate_dataset(simulation, out)
+    _report(as_json, {"root": str(out)}, f"simulated data set in {out}")
+
+
+@main.group()
+def data() -> None:
+    """Look at a copy of K-Radar."""
+
+
+@data.command()
+@click.argument("roots", nargs=-1, required=True, type=EXISTING)
+@click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
+@click.option("--label-version", default="v2.1", show_default=True)
+@_json_option
+def check(
+    roots: tuple[pathlib.Path, ...],
+    labels: pathlib.Path | None,
+    label_version: str,
+    as_json: bool,
+) -> None:
+    """Report what is there, what is missing and what is damaged.
+
+    Example: radejax data check /disk1/kradar /disk2/kradar
+    """
+    from radejax.data.check import check_dataset
+
+    report = check_dataset(roots, labels=labels, version=label_version)
+    _report(as_json, report.to_dict(), report.to_text())
+
+
+@main.command()
+@click.argument("roots", nargs=-1, required=True, type=EXISTING)
+@click.option("--out", required=True, type=PATH, help="Folder of the records.")
+@click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
+@click.option("--label-version", default="v2.1", show_default=True)
+@click.option("--dtype", type=click.Choice(["float16", "uint8"]), default="float16")
+@click.option("--workers", type=int, help="Processes; one per core by default.")
+@click.option(
+    "--shard", default="0/1", show_default=True, help="Part i of n, i from 0."
+)
+@click.option(
+    "--skip-bad", "--skip_bad", is_flag=True, help="Leave out what is corrupt."
+)
+@_json_option
+def project(
+    roots: tuple[pathlib.Path, ...],
+    out: pathlib.Path,
+    labels: pathlib.Path | None,
+    label_version: str,
+    dtype: str,
+    workers: int | None,
+    shard: str,
+    skip_bad: bool,
+    as_json: bool,
+) -> None:
+    """Project tesseracts to range-azimuth records; resumes where it stopped.
+
+    Example: radejax project /disk1/kradar --out /fast/records --shard 3/16
+    """
+    from radejax.data.kradar import KRadar
+    from radejax.data.projection_job import project_dataset
+
+    frames = KRadar(roots, labels, version=label_version)
+    summary = project_dataset(
+        frames, out, dtype=dtype, num_workers=workers, shard=shard, skip_bad=skip_bad
+    )
+    _report(as_json, summary.to_dict(), summary.to_text())
+
+
+@main.command()
+@click.argument("roots", nargs=-1, required=True, type=EXISTING)
+@click.option("--workdir", required=True, type=EXISTING, help="Run of train.py.")
+@click.option("--out", required=True, type=PATH, help="Folder of the boxes.")
+@click.option("--step", type=int, help="Of the checkpoint; the newest by default.")
+@click.option("--score-threshold", type=float, help="Instead of the config's.")
+@click.option("--nms-iou", type=float, help="Instead of the config's.")
+@click.option("--batch-size", type=int, default=8, show_default=True)
+@_json_option
+def detect(
+    roots: tuple[pathlib.Path, ...],
+    workdir: pathlib.Path,
+    out: pathlib.Path,
+    step: int | None,
+    score_threshold: float | None,
+    nms_iou: float | None,
+    batch_size: int,
+    as_json: bool,
+) -> None:
+    """Find boxes in every frame below the folders; one JSON file a frame.
+
+    A folder is a K-Radar root, a folder with tesseract_*.mat or projection files, or
+    such a file itself. No labels are needed.
+
+    Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
+    """
+    from radejax.detect_files import detect_files
+
+    entry.set_up_jax()
+    count = detect_files(
+        workdir,
+        roots,
+        out,
+        step=step,
+        batch_size=batch_size,
+        score_threshold=score_threshold,
+        nms_iou=nms_iou,
+    )
+    _report(
+        as_json,
+        {**count, "out": str(out)},
+        f"{count['boxes']} boxes in {count['frames']} frames written to {out}",
+    )
+
+
+@main.command()
+@click.argument("name", metavar="FRAME")
+@click.option("--data", "roots", multiple=True, required=True, type=EXISTING)
+@click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
+@click.option("--label-version", default="v2.1", show_default=True)
+@click.option("--out", type=PATH, default="overlay.png", show_default=True)
+@_json_option
+def overlay(
+    name: str,
+    roots: tuple[pathlib.Path, ...],
+    labels: pathlib.Path | None,
+    label_version: str,
+    out: pathlib.Path,
+    as_json: bool,
+) -> None:
+    """Draw one frame's labels on radar and camera: the first look at new data.
+
+    FRAME is sequence/radar_lidar. Example: radejax overlay 1/00033_00001 --data ROOT
+    """
+    from radejax.overlay import draw_overlay
+
+    draw_overlay(name, roots, out, labels=labels, version=label_version)
+    _report(as_json, {"picture": str(out)}, f"drew {out}")
+
+
+def _load_config(path_and_words: str) -> Any:
+    """The config of a file such as "configs/radenet.py:stem"."""
+    import importlib.util
+
+    path, _, words = path_and_words.partition(":")
+    if not pathlib.Path(path).is_file():
+        raise FileNotFoundError(f"no such config file: {path}")
+    spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.get_config(words) if words else module.get_config()

@@ -1,0 +1,85 @@
+"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pathlib
+import sys
+from collections.abc import Iterator, Sequence
+
+import jax
+from absl import flags, logging
+
+from radejax.errors import DataError, UserError
+
+FAILED = 1
+WRONG_USE = 2
+
+
+@contextlib.contextmanager
+def exit_codes(*, debug: bool = False) -> Iterator[None]:
+    """Ends the program with one line instead of a traceback for the user's errors.
+
+    Exit code 2 for wrong use (arguments, folders, full disk), 1 for damaged data.
+
+    Args:
+        debug: Let the traceback through.
+    """
+    try:
+        yield
+    except (UserError, FileNotFoundError, NotADirectoryError) as error:
+        _fail(error, WRONG_USE, debug)
+    except DataError as error:
+        _fail(error, FAILED, debug)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        _fail(error, WRONG_USE, debug)
+
+
+def _fail(error: Exception, code: int, debug: bool) -> None:
+    if debug:
+        raise error
+    message = str(error)
+    if isinstance(error, FileNotFoundError) and error.filename is not None:
+        message = f"no such file or folder: {error.filename}"
+    sys.stderr.write(f"error: {message}\n")
+    raise SystemExit(code)
+
+
+def parse_flags(argv: Sequence[str]) -> list[str]:
+    """Parses absl flags and the config; an unknown field is one line and exit code 2.
+
+    For `app.run(main, flags_parser=parse_flags)`.
+    """
+    try:
+        with exit_codes():
+            return flags.FLAGS(argv)
+    except (flags.Error, AttributeError, KeyError, ValueError, TypeError) as error:
+        # ml_collections reports unknown fields by AttributeError or KeyError, whose
+        # text names the nearest field, and values of a wrong type by the other two.
+        text = error.args[0] if error.args else error
+        sys.stderr.write("error: " + " ".join(str(text).split()) + "\n")
+        raise SystemExit(WRONG_USE) from None
+
+
+def set_up_jax(*, cache: bool = True) -> None:
+    """Logging at level info without noise, and a compilation cache that persists.
+
+    Args:
+        cache: Keep compiled programs in the folder that the environment variable
+            JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
+    """
+    logging.use_absl_handler()
+    logging.set_verbosity(logging.INFO)
+    logging.get_absl_handler().setFormatter(None)
+    if not cache:
+        return
+    home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
+    folder = os.environ.get(
+        "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(home) / "radejax" / "jax")
+    )
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)

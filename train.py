@@ -1,0 +1,56 @@
+"""Trains a detector, then evaluates it.
+
+    python train.py --config configs/quickstart.py
+    python train.py --config configs/radenet.py:official --data /data/kradar1,/data/kradar2
+    python train.py --config configs/radenet.py --config.train.batch_size=4 ...
+
+Run the same command again to continue where an earlier start ended.
+"""
+
+from absl import app, flags
+from ml_collections import config_flags
+
+from radejax import entry
+
+_CONFIG = config_flags.DEFINE_config_file("config", None, "Config file, with :words.")
+_WORKDIR = flags.DEFINE_string(
+    "workdir", None, "Folder of the run; runs/<name of the config> by default."
+)
+_DATA = flags.DEFINE_list(
+    "data",
+    None,
+    "Root folders of K-Radar. Without it, configs with a `simulation` section simulate "
+    "one under data/.",
+)
+_LABELS = flags.DEFINE_string(
+    "labels", None, "Folder or zip of a label revision; the sequences' own by default."
+)
+_RECORDS = flags.DEFINE_string(
+    "records", None, "Folder of projected frames; made beside the data if missing."
+)
+_INIT = flags.DEFINE_string(
+    "init_from", None, "Start from these weights: official .pth, or another workdir."
+)
+_DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
+flags.mark_flag_as_required("config")
+
+
+def main(_: list[str]) -> None:
+    """Runs the whole way from data to metrics."""
+    entry.set_up_jax()
+    with entry.exit_codes(debug=_DEBUG.value):
+        from radejax import experiment
+
+        experiment.run(
+            _CONFIG.value,
+            name=experiment.config_name(flags.FLAGS["config"].config_filename),
+            workdir=_WORKDIR.value,
+            data=_DATA.value,
+            labels=_LABELS.value,
+            records=_RECORDS.value,
+            init_from=_INIT.value,
+        )
+
+
+if __name__ == "__main__":
+    app.run(main, flags_parser=entry.parse_flags)
