@@ -216,6 +216,8 @@ def color_limits_of(values: np.ndarray) -> tuple[float, float]:
     if finite.size == 0:
         return 0.0, 1.0
     low, high = np.percentile(finite, [20.0, 99.9])
+    if high <= low:  # a few peaks on nothing, such as a heatmap
+        high = finite.max()
     return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)
 
 

@@ -1,0 +1,220 @@
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.visualize import bev
+from radejax.visualize.canvas import Objects, footprints
+
+GRID = RadarGrid.reduced(num_doppler=4, num_range=60, num_elevation=3, num_azimuth=54)
+ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
+
+
+def blob_at(range_idx: int, azimuth_idx: int) -> np.ndarray:
+    projection = np.full(GRID.projection_shape, 0.2, np.float32)
+    projection[range_idx, azimuth_idx, 2] = 0.6
+    return projection
+
+
+def pixels_of(figure) -> np.ndarray:
+    """`[H, W, 3]`, row 0 at the bottom as in display coordinates."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[::-1, :, :3].astype(int)
+
+
+def brightest_tile(figure, ax) -> np.ndarray:
+    """Center, in display coordinates, of the pixels in the strongest colour."""
+    picture = pixels_of(figure)
+    frame = np.round(ax.get_window_extent().extents).astype(int)
+    inside = picture[frame[1] : frame[3], frame[0] : frame[2]]
+    color = np.round(255 * np.array(bev.COLOR_MAP(1.0)[:3])).astype(int)
+    rows, columns = np.nonzero((np.abs(inside - color) <= 2).all(-1))
+    assert rows.size > 10
+    return np.array([columns.mean() + 0.5, rows.mean() + 0.5]) + frame[:2]
+
+
+@pytest.mark.parametrize(("range_idx", "azimuth_idx"), [(20, 5), (30, 27), (33, 44)])
+def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
+    projection = blob_at(range_idx, azimuth_idx)
+    ax = bev.draw_bev(projection, GRID, extent="fov", show_legend=False)
+    x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
+    tile = brightest_tile(ax.figure, ax)
+    # At 5 pixels a metre a bin is 10 pixels deep; its center is hit to one pixel.
+    np.testing.assert_allclose(tile, ax.transData.transform((y, x)), atol=1.0)
+
+
+@pytest.mark.parametrize(("range_idx", "azimuth_idx"), [(20, 5), (50, 44)])
+def test_polar_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
+    projection = blob_at(range_idx, azimuth_idx)
+    ax = bev.draw_polar(projection, GRID, show_legend=False)
+    x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
+    outline = bev._to_polar(np.array([x, y]))
+    tile = brightest_tile(ax.figure, ax)
+    np.testing.assert_allclose(tile, ax.transData.transform(outline), atol=1.0)
+
+
+def test_left_is_left_and_ahead_is_up():
+    ax = bev.draw_bev(blob_at(3, 3), GRID, roi=ROI)
+    to_display = ax.transData.transform
+    left, right = to_display((5.0, 20.0)), to_display((-5.0, 20.0))
+    assert left[0] < right[0]
+    assert to_display((0.0, 30.0))[1] > to_display((0.0, 10.0))[1]
+    assert ax.get_aspect() == 1.0
+    assert "[m]" in ax.get_xlabel()
+    assert "[m]" in ax.get_ylabel()
+
+
+def test_boxes_are_drawn_where_they_are():
+    truth = ([[10.0, 3.0, 0.0, 4.0, 2.0, 1.5, np.pi / 2]], ["Sedan"])
+    found = ([[20.0, -3.0, 0.0, 4.0, 2.0, 1.5, 0.0]], [0.875], [1])
+    ax = bev.draw_bev(
+        blob_at(3, 3), GRID, roi=ROI, ground_truth=truth, predictions=found
+    )
+    boxes = [c for c in ax.collections if hasattr(c, "get_segments")]
+    first, second = (c.get_segments()[0] for c in boxes)
+    # Turned by 90 degrees: 4 m along y, 2 m along x. Axes hold (y, x).
+    assert first.min(0) == pytest.approx([1.0, 9.0])
+    assert first.max(0) == pytest.approx([5.0, 11.0])
+    assert second.min(0) == pytest.approx([-4.0, 18.0])
+    assert second.max(0) == pytest.approx([-2.0, 22.0])
+    # Heading marks leave through the front: +y (left) and +x (up).
+    assert boxes[0].get_segments()[1][:, 0] == pytest.approx([5.0, 6.4])
+    assert boxes[1].get_segments()[1][:, 1] == pytest.approx([22.0, 23.4])
+    texts = {t.get_text() for t in ax.texts}
+    assert texts == {"Sedan", "Bus or Truck 0.88"}
+    legend = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert legend == ["ground truth (1)", "prediction (1)", "region of interest"]
+
+
+def test_roi_is_a_dashed_rectangle():
+    ax = bev.draw_bev(blob_at(3, 3), GRID, roi=ROI)
+    line = next(line for line in ax.lines if line.is_dashed())
+    y, x = line.get_data()
+    assert (min(x), max(x), min(y), max(y)) == ROI[:4]
+
+
+def test_color_bar_names_unit_and_reduction():
+    ax = bev.draw_bev(blob_at(3, 3), GRID, units="db", reduce="mean")
+    labels = [a.get_ylabel() for a in [*ax.figure.axes, *ax.child_axes]]
+    assert "power [dB], mean over Doppler and elevation" in labels
+
+
+def test_frame_has_radar_camera_and_polar_view():
+    image = np.zeros((72, 128, 3), np.uint8)
+    figure = bev.draw_frame(
+        blob_at(20, 20),
+        GRID,
+        ground_truth=(footprint_boxes(3), ["Sedan"] * 3),
+        predictions=(np.zeros((0, 7)), np.zeros(0), []),
+        roi=ROI,
+        image=image,
+        title="sequence 1",
+    )
+    assert len(figure.axes) == 3
+    assert figure.get_suptitle() == "sequence 1"
+    assert any(ax.images for ax in figure.axes)
+    without = bev.draw_frame(blob_at(20, 20), GRID)
+    assert any("no camera" in t.get_text() for ax in without.axes for t in ax.texts)
+
+
+def footprint_boxes(count: int) -> np.ndarray:
+    boxes = np.tile([20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3], (count, 1))
+    boxes[:, 0] += 10.0 * np.arange(count)
+    return boxes
+
+
+def test_padded_maps_need_the_padded_grid():
+    values = np.zeros((64, 56))
+    with pytest.raises(UserError, match=r"\(64, 56\).*\(60, 54\)"):
+        bev.draw_map(values, GRID)
+    bev.draw_map(values, GRID.padded(8), color_limits=(0, 1), label="gate")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"roi": (0, 72, -6.4)}, "roi must be"),
+        ({"roi": (72, 0, -6.4, 6.4)}, "roi must be"),
+        ({"extent": "all"}, "extent must be"),
+        ({"extent": (0, 1, 2)}, "extent must be"),
+        ({"channels": "power"}, "all, doppler, elevation"),
+        ({"reduce": "sum"}, "max, mean"),
+        ({"units": "dbm"}, "normalized, db"),
+        ({"ground_truth": (np.zeros((1, 8)), ["Sedan"])}, r"\[N, 7\].*\(1, 8\)"),
+        ({"ground_truth": (np.zeros((1, 7)), [])}, "1 boxes but 0 classes"),
+        ({"predictions": (np.zeros((1, 7)), [0.5], [9])}, "class index 9"),
+    ],
+)
+def test_wrong_use_is_named(arguments, message):
+    with pytest.raises(UserError, match=message):
+        bev.draw_bev(blob_at(3, 3), GRID, **arguments)
+
+
+def test_batched_projection_is_refused():
+    with pytest.raises(UserError, match="one frame"):
+        bev.draw_bev(blob_at(3, 3)[None], GRID)
+
+
+def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
+    import sys
+
+    errors = []
+
+    def draw(i):
+        try:
+            figure = bev.draw_frame(blob_at(20, 20), GRID, roi=ROI)
+            bev.save_figure(figure, tmp_path / f"{i}.png")
+        except Exception as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=draw, args=(i,)) for i in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not errors
+    assert len(list(tmp_path.iterdir())) == 3
+    if "matplotlib.pyplot" in sys.modules:
+        assert not sys.modules["matplotlib.pyplot"].get_fignums()
+
+
+def test_a_frame_takes_less_than_two_seconds(tmp_path):
+    """Half a second on an idle core; the bound leaves room for a busy machine."""
+    truth = Objects(footprint_boxes(3), ("Sedan",) * 3)
+    bev.save_figure(bev.draw_frame(blob_at(9, 9), GRID), tmp_path / "warm.png")
+    start = time.process_time()
+    figure = bev.draw_frame(blob_at(9, 9), GRID, ground_truth=truth, roi=ROI)
+    bev.save_figure(figure, tmp_path / "frame.png")
+    assert time.process_time() - start < 2.0
+
+
+def test_map_shows_every_bin_of_a_partial_extent():
+    """Bins left out for speed must lie outside the picture."""
+    extent = (30.0, 60.0, -20.0, 5.0)
+    values = np.arange(60.0)[:, None] + np.arange(54.0)[None] / 100
+    ax = bev.draw_map(values, GRID, extent=extent, show_colorbar=False)
+    mesh = ax.collections[0]
+    shown = set(np.round(mesh.get_array().ravel().astype(float), 2))
+    centers = GRID.cell_centers_ego()
+    inside = (
+        (centers[..., 0] >= extent[0])
+        & (centers[..., 0] <= extent[1])
+        & (centers[..., 1] >= extent[2])
+        & (centers[..., 1] <= extent[3])
+    )
+    assert set(np.round(values[inside], 2)) <= shown
+    assert len(shown) < values.size
+
+
+def test_footprint_of_a_turned_box():
+    outline = footprints(np.array([[1.0, 2.0, 0.0, 4.0, 2.0, 1.0, np.pi / 2]]))[0]
+    # Front left corner first: ahead is +y, left is -x.
+    np.testing.assert_allclose(
+        outline, [[0, 4], [0, 0], [2, 0], [2, 4], [0, 4]], atol=1e-12
+    )

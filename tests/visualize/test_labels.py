@@ -1,0 +1,68 @@
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.visualize import labels
+from radejax.visualize.canvas import new_figure
+
+FRAME = np.array([0.0, 0.0, 400.0, 400.0])
+
+
+def place(anchors, prefer, obstacles=None, size=(40.0, 10.0)):
+    anchors = np.asarray(anchors, float)
+    return labels.place_labels(
+        anchors if obstacles is None else np.asarray(obstacles, float),
+        anchors,
+        np.tile(size, (len(anchors), 1)),
+        prefer,
+        FRAME,
+        gap=2.0,
+    )
+
+
+def test_free_labels_stand_where_they_should():
+    anchor = [[100.0, 100.0, 110.0, 120.0]]
+    np.testing.assert_allclose(place(anchor, ["left"]), [[58.0, 105.0]])
+    np.testing.assert_allclose(place(anchor, ["right"]), [[112.0, 105.0]])
+    np.testing.assert_allclose(place(anchor, ["above"]), [[85.0, 122.0]])
+
+
+def test_label_changes_sides_at_the_border():
+    np.testing.assert_allclose(
+        place([[10.0, 100.0, 20.0, 120.0]], ["left"]), [[22.0, 105.0]]
+    )
+
+
+def test_overlap_by_hand():
+    a = np.array([[0.0, 0.0, 2.0, 2.0]])
+    b = np.array([[1.0, 1.0, 4.0, 3.0], [2.0, 0.0, 3.0, 1.0]])
+    np.testing.assert_array_equal(labels._overlap(a, b), [[1.0, 0.0]])
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.lists(
+        st.tuples(st.floats(100, 290), st.floats(100, 290)), min_size=5, max_size=5
+    )
+)
+def test_a_handful_of_labels_never_cover_each_other(points):
+    xy = np.array(points)
+    corners = place(np.concatenate([xy, xy + 8], -1), ["left", "right"] * 2 + ["left"])
+    boxes = np.concatenate([corners, corners + np.array([40.0, 10.0])], -1)
+    shared = labels._overlap(boxes, boxes)
+    np.fill_diagonal(shared, 0.0)
+    assert shared.max() <= 0.1 * 40.0 * 10.0  # a tenth of a label at most
+
+
+def test_outlines_out_of_sight_get_no_text():
+    ax = new_figure(4, 4).add_subplot()
+    ax.set(xlim=(0, 10), ylim=(0, 10))
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    labels.draw_labels(
+        ax,
+        [square + 4, square + 40],
+        ["seen", "unseen"],
+        ["white", "white"],
+        ["left", "left"],
+    )
+    assert [t.get_text() for t in ax.texts] == ["seen"]
