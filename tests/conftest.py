@@ -7,6 +7,7 @@ import pytest
 from absl import flags
 
 jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 8)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # grain's multiprocess prefetch reads an absl flag.
 flags.FLAGS.mark_as_parsed()

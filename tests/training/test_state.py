@@ -1,0 +1,70 @@
+"""Schedule and optimizer against numbers worked out by hand and torch's AdamW rule."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.training.state import create_state, make_optimizer, make_schedule
+
+
+def test_cosine_at_start_middle_and_end() -> None:
+    schedule = make_schedule(
+        learning_rate=1e-3, final_learning_rate=1e-4, num_steps=100, warmup_steps=0
+    )
+    values = [float(schedule(step)) for step in (0, 50, 100, 150)]
+    np.testing.assert_allclose(values, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
+
+
+def test_warm_up_is_linear_from_zero() -> None:
+    schedule = make_schedule(
+        learning_rate=1e-3, final_learning_rate=1e-4, num_steps=100, warmup_steps=10
+    )
+    values = [float(schedule(step)) for step in (0, 5, 10, 55, 100)]
+    np.testing.assert_allclose(values, [0, 5e-4, 1e-3, 5.5e-4, 1e-4], rtol=1e-5)
+
+
+def test_warm_up_longer_than_the_training_is_refused() -> None:
+    with pytest.raises(UserError, match=r"warmup_steps=100 must be less than the 100"):
+        make_schedule(
+            learning_rate=1e-3, final_learning_rate=0.0, num_steps=100, warmup_steps=100
+        )
+
+
+def test_first_step_is_adamw_with_torch_defaults() -> None:
+    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.01)
+    params = {"kernel": jnp.array([2.0, -3.0]), "bias": jnp.array([0.5])}
+    grads = {"kernel": jnp.array([0.1, 4.0]), "bias": jnp.array([-1.0])}
+    updates, _ = optimizer.update(grads, optimizer.init(params), params)
+
+    def expected(p: np.ndarray, g: np.ndarray) -> np.ndarray:
+        # Bias-corrected moments of one step are g and g^2; decay is on every parameter.
+        return -1e-3 * (g / (np.abs(g) + 1e-8) + 0.01 * p)
+
+    chex.assert_trees_all_close(
+        updates, jax.tree.map(expected, params, grads), rtol=1e-5
+    )
+
+
+def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
+    optimizer = make_optimizer(
+        lambda _: 1e-3, weight_decay=0.1, is_frozen=lambda name: name.startswith("vit/")
+    )
+    params = {"vit": {"kernel": jnp.ones((7, 5))}, "head": {"kernel": jnp.ones((3,))}}
+    state = optimizer.init(params)
+    updates, _ = optimizer.update(params, state, params)
+    assert not updates["vit"]["kernel"].any()
+    assert updates["head"]["kernel"].all()
+    assert (7, 5) not in {x.shape for x in jax.tree.leaves(state)}
+
+
+def test_eval_variables_are_the_averaged_ones_where_there_are_any() -> None:
+    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.0)
+    variables = {"params": {"w": jnp.ones(2)}, "batch_stats": {"mean": jnp.zeros(2)}}
+    state = create_state(variables, optimizer, batch_size=3, use_ema=True)
+    state = state.replace(ema_params={"w": jnp.full(2, 5.0)})
+    assert state.eval_variables["params"]["w"][0] == 5.0
+    assert "batch_stats" in state.eval_variables
+    assert state.skipped_frames.shape == (3,)
