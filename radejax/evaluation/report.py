@@ -1,0 +1,267 @@
+"""The report of a run: console table, JSON, CSV, Markdown, LaTeX, curves, pictures."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from radejax import files
+from radejax.evaluation import breakdown, layouts, measure, protocols
+from radejax.evaluation.average_precision import EvaluationSet
+from radejax.evaluation.measure import Measured, Options
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What `write_report` found and wrote.
+
+    Attributes:
+        text: The console table.
+        metrics: The content of metrics.json.
+        rows: All APs.
+        files: Paths written.
+    """
+
+    text: str
+    metrics: dict[str, Any]
+    rows: list[Measured]
+    files: list[pathlib.Path]
+
+
+def evaluate_predictions(
+    ground_truth: Mapping[str, np.ndarray],
+    predictions: Mapping[str, np.ndarray],
+    frames: Mapping[str, np.ndarray],
+    out_dir: str | pathlib.Path,
+    options: Options | None = None,
+) -> Report:
+    """Evaluates a run in every protocol and writes its report.
+
+    Args:
+        ground_truth: Columns as in `average_precision.evaluate`.
+        predictions: The same with scores.
+        frames: Frame table: frame `[F]` ids, and as far as known name, sequence,
+            weather, environment and time.
+        out_dir: Folder of the report; made if missing, files in it are replaced.
+        options: What to compute.
+
+    Raises:
+        UserError: Wrong options or missing columns.
+        DataError: A bad row, named by table, frame and row.
+    """
+    return write_report(ground_truth, predictions, frames, out_dir, options)
+
+
+def write_report(
+    ground_truth: Mapping[str, np.ndarray],
+    predictions: Mapping[str, np.ndarray],
+    frames: Mapping[str, np.ndarray],
+    out_dir: str | pathlib.Path,
+    options: Options | None = None,
+    **changes: Any,
+) -> Report:
+    """As `evaluate_predictions`; `changes` are fields of `Options` given by name."""
+    options = dataclasses.replace(options or Options(), **changes)
+    predictions, repaired = measure.repair_sizes(predictions, options.invalid_sizes)
+    data = EvaluationSet(
+        ground_truth,
+        predictions,
+        classes=options.classes,
+        frames=frames,
+        roi=options.roi,
+        label_version=options.label_version,
+    )
+    rows = measure.measure(data, frames, options)
+    metrics = collect(data, frames, rows, options)
+    metrics["left_out"]["predictions: size not positive, kept as false positives"] = (
+        repaired
+    )
+    text = console_text(metrics, rows, options)
+    out_dir = pathlib.Path(out_dir)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    written = [
+        _write(out_dir / "metrics.json", files.write_json, plain(metrics)),
+        _write(out_dir / "metrics.csv", files.write_text, csv_text(rows)),
+        _write(out_dir / "report.txt", files.write_text, text),
+    ]
+    tables = paper_tables(rows, options)
+    for style, name in (("markdown", "tables.md"), ("latex", "tables.tex")):
+        content = "\n".join(table.render(style) for table in tables)
+        written.append(_write(out_dir / name, files.write_text, content))
+    written += _draw(data, frames, metrics, out_dir, options)
+    return Report(text, metrics, rows, written)
+
+
+def _write(path: pathlib.Path, write: Any, content: Any) -> pathlib.Path:
+    write(path, content)
+    return path
+
+
+def collect(
+    data: EvaluationSet,
+    frames: Mapping[str, np.ndarray],
+    rows: list[Measured],
+    options: Options,
+) -> dict[str, Any]:
+    """Everything of metrics.json, as plain values (NaN where nothing is defined)."""
+    iou = options.iou_thresholds[0]
+    cut = options.operating_score
+    slices = {"distance": breakdown.by_distance(data, "3d", iou, operating_score=cut)}
+    for kind in ("weather", "environment", "time"):
+        masks = measure.condition_masks(frames, kind)
+        if masks:
+            slices[kind] = breakdown.by_condition(
+                data, masks, "3d", iou, operating_score=cut
+            )
+    return {
+        "run": options.run,
+        "options": options.to_dict(),
+        "num_frames": int(data.frame.size),
+        "num_ground_truth": len(data.gt),
+        "num_predictions": len(data.pred),
+        "left_out": measure.left_out(data, options),
+        "protocols": {
+            name: protocols.PROTOCOLS[name].summary for name in options.protocols
+        },
+        "ap": [row.to_dict() for row in rows],
+        "slices": {
+            "protocol": f"{protocols.RECOMMENDED}, 3d, IoU {iou:g}, score > {cut:g}",
+            **{
+                kind: [
+                    {kind: key[0], "cls": key[1], **dataclasses.asdict(values)}
+                    for key, values in numbers.items()
+                ]
+                for kind, numbers in slices.items()
+            },
+        },
+        "calibration": breakdown.calibration(data, "3d", iou),
+        "box_errors": breakdown.box_errors(data, "bev", iou),
+        "confusion": {
+            "labels": [*data.classes, "none"],
+            "rows": "true class",
+            "columns": "predicted class",
+            "counts": breakdown.confusion(
+                data, "bev", iou, operating_score=cut
+            ).tolist(),
+        },
+        "worst_frames": _name_frames(
+            breakdown.worst_frames(
+                data, "3d", iou, count=options.worst_frames, operating_score=cut
+            ),
+            frames,
+        ),
+    }
+
+
+def _name_frames(worst: list[dict], frames: Mapping[str, np.ndarray]) -> list[dict]:
+    """Adds name and sequence of the frame table."""
+    for entry in worst:
+        for column in ("name", "sequence"):
+            if column in frames:
+                value = np.asarray(frames[column])[entry["index"]]
+                entry[column] = value.item() if hasattr(value, "item") else str(value)
+    return worst
+
+
+def paper_tables(rows: list[Measured], options: Options) -> list[layouts.Table]:
+    """Tables beside the published ones, then one per protocol and IoU threshold."""
+    table = layouts.index(rows)
+    iou = options.iou_thresholds[0]
+    result = []
+    if options.paper_protocol in options.protocols and 0.3 in options.iou_thresholds:
+        if "Sedan" in options.classes:
+            result.append(layouts.table_1(table, options))
+            result.append(layouts.table_3({options.run: table}, options.paper_protocol))
+        result.append(layouts.table_2(table, options))
+    for space in ("3d", "bev"):
+        result.append(layouts.protocols_at_a_glance(table, options, space, iou))
+    for protocol in options.protocols:
+        for threshold in options.iou_thresholds:
+            result.append(layouts.class_by_weather(table, options, protocol, threshold))
+    return result
+
+
+def console_text(
+    metrics: Mapping[str, Any], rows: list[Measured], options: Options
+) -> str:
+    """What a reader needs on one screen."""
+    table = layouts.index(rows)
+    iou = options.iou_thresholds[0]
+    parts = [
+        f"{options.run}: {metrics['num_frames']} frames, {metrics['num_ground_truth']}"
+        f" objects, {metrics['num_predictions']} predictions\n"
+    ]
+    shown = [p for p in ("exact", "kradar_r40", "coco101") if p in options.protocols]
+    for protocol in shown or options.protocols[:1]:
+        parts.append(layouts.class_by_weather(table, options, protocol, iou).render())
+    parts.append(layouts.protocols_at_a_glance(table, options, "3d", iou).render())
+    distance = metrics["slices"]["distance"]
+    parts.append(
+        layouts.Table(
+            "By distance, " + metrics["slices"]["protocol"],
+            ["Distance", "Class", "AP", "Precision", "Recall", "Objects"],
+            [
+                [
+                    entry["distance"],
+                    entry["cls"],
+                    layouts.number(entry["ap"]),
+                    layouts.number(entry["precision"]),
+                    layouts.number(entry["recall"]),
+                    str(entry["num_gt"]),
+                ]
+                for entry in distance
+                if entry["num_gt"] or entry["num_det"]
+            ],
+        ).render()
+    )
+    parts.append("Left out, or kept with a remark:")
+    parts += [f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()]
+    return "\n".join(parts) + "\n"
+
+
+def csv_text(rows: list[Measured]) -> str:
+    """metrics.csv: one line per AP."""
+    buffer = io.StringIO()
+    entries = [row.to_dict() for row in rows]
+    writer = csv.DictWriter(buffer, list(entries[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(entries)
+    return buffer.getvalue()
+
+
+def plain(value: Any) -> Any:
+    """Values that strict JSON can hold: NaN and infinities become null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def _draw(
+    data: EvaluationSet,
+    frames: Mapping[str, np.ndarray],
+    metrics: Mapping[str, Any],
+    out_dir: pathlib.Path,
+    options: Options,
+) -> list[pathlib.Path]:
+    """Pictures of the worst frames, if somebody can draw them."""
+    written = []
+    if options.draw_frame is not None:
+        folder = out_dir / "worst_frames"
+        folder.mkdir(exist_ok=True)
+        for rank, entry in enumerate(metrics["worst_frames"]):
+            path = folder / f"{rank:02d}_frame_{entry['frame']}.png"
+            options.draw_frame(entry["frame"], path)
+            written.append(path)
+    return written
