@@ -6,6 +6,8 @@ import itertools
 
 import numpy as np
 
+from radejax.geometry.rotated_iou import bev_intersection_np
+
 PAIRS_PER_CHUNK = 2_000_000
 
 
@@ -48,60 +50,6 @@ def candidate_pairs(
     return np.concatenate(parts_a), np.concatenate(parts_b)
 
 
-def bev_intersection(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Area shared by rotated rectangles, pair by pair, in float64.
-
-    In the frame of rectangle a, the vertical line at x cuts rectangle b in an interval;
-    what of it lies in [-w/2, w/2] is the difference of its clamped ends. The area is
-    therefore the contour integral of clamp(y) dx around b over |x| <= l/2. Nothing has
-    to be sorted and no case is special: coinciding edges are as good as any.
-
-    Args:
-        a: `[P, 7]` boxes x, y, z, l, w, h, yaw.
-        b: `[P, 7]` boxes.
-
-    Returns:
-        `[P]` areas in square metres.
-    """
-    half = 0.5 * a[:, None, 3:5]  # [P, 1, 2]
-    cos_a, sin_a = np.cos(a[:, 6]), np.sin(a[:, 6])
-    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    center = np.stack([cos_a * dx + sin_a * dy, cos_a * dy - sin_a * dx], -1)
-    turn = b[:, 6] - a[:, 6]
-    axis = np.stack([np.cos(turn), np.sin(turn)], -1)  # [P, 2]
-    side = np.stack([-axis[:, 1], axis[:, 0]], -1)
-    along = 0.5 * b[:, 3, None] * axis
-    across = 0.5 * b[:, 4, None] * side
-    corners = center[:, None] + np.stack(
-        [along + across, across - along, -along - across, along - across], 1
-    )  # [P, 4, 2], counter-clockwise
-    start, stop = corners, np.roll(corners, -1, axis=1)
-    x0, x1 = (np.clip(p[..., 0], -half[..., 0], half[..., 0]) for p in (start, stop))
-    run = stop[..., 0] - start[..., 0]
-    rise = stop[..., 1] - start[..., 1]
-    slope = np.divide(rise, run, out=np.zeros_like(run), where=run != 0)
-    # Beyond the ends of the edge y is extrapolated by nothing: x0, x1 lie on it, or
-    # the edge is outside and x0 == x1.
-    y0 = start[..., 1] + slope * (x0 - start[..., 0])
-    y1 = start[..., 1] + slope * (x1 - start[..., 0])
-    return np.maximum(-((x1 - x0) * _mean_clamped(y0, y1, half[..., 1])).sum(-1), 0.0)
-
-
-def _mean_clamped(y0: np.ndarray, y1: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """Mean of clamp(y, -bound, bound) for y running evenly from y0 to y1."""
-    step = y1 - y0
-    safe = np.where(step == 0, 1.0, step)
-    with np.errstate(over="ignore"):
-        t_low = np.clip(np.where(step == 0, 0.0, (-bound - y0) / safe), 0.0, 1.0)
-        t_high = np.clip(np.where(step == 0, 0.0, (bound - y0) / safe), 0.0, 1.0)
-    t1, t2 = np.minimum(t_low, t_high), np.maximum(t_low, t_high)
-    v0, v3 = np.clip(y0, -bound, bound), np.clip(y1, -bound, bound)
-    v1 = np.clip(y0 + t1 * step, -bound, bound)
-    v2 = np.clip(y0 + t2 * step, -bound, bound)
-    # Linear on each of the three pieces, so the trapezoid rule is exact.
-    return 0.5 * (t1 * (v0 + v1) + (t2 - t1) * (v1 + v2) + (1 - t2) * (v2 + v3))
-
-
 def pair_iou(
     a: np.ndarray, b: np.ndarray, *, z_center: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -125,7 +73,7 @@ def pair_iou(
 def _pair_iou(
     a: np.ndarray, b: np.ndarray, z_center: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    area = bev_intersection(a, b)
+    area = bev_intersection_np(a, b)
     area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
     top = np.minimum(
         a[:, 2] + (1 - z_center) * a[:, 5], b[:, 2] + (1 - z_center) * b[:, 5]
