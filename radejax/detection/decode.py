@@ -139,7 +139,7 @@ def find_peaks(
     _check_shapes(maps, grid)
     if max_peaks < 1:
         raise ValueError(f"at least 1 peak must enter NMS, got {max_peaks}")
-    num_range, num_azimuth = maps.heatmap_logits.shape[1:3]
+    num_azimuth = maps.heatmap_logits.shape[2]
     scores = jax.nn.sigmoid(maps.heatmap_logits.astype(jnp.float32))
     above = (
         scores >= score_threshold if threshold_inclusive else scores > score_threshold
