@@ -1,0 +1,190 @@
+"""What a simulated data set depends on, as plain values, and the checks on them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from radejax.errors import UserError
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation.radar import RadarParameters
+from radejax.simulation.traffic import ENVIRONMENTS
+from radejax.simulation.weather import WEATHERS
+
+# Environment, time and weather of the procedural sequences, in turn.
+CONDITIONS = (
+    ("urban", "day", "normal"),
+    ("highway", "day", "overcast"),
+    ("mountain", "day", "fog"),
+    ("countryside", "night", "rain"),
+    ("parkinglots", "day", "sleet"),
+    ("highway", "night", "lightsnow"),
+    ("urban", "day", "heavysnow"),
+    ("alleyway", "night", "normal"),
+    ("university", "day", "normal"),
+    ("shoulder", "day", "fog"),
+    ("urban", "night", "rain"),
+    ("highway", "day", "normal"),
+    ("countryside", "day", "sleet"),
+    ("urban", "day", "lightsnow"),
+    ("highway", "night", "heavysnow"),
+    ("mountain", "day", "fog"),
+)
+
+
+def default_config() -> dict[str, Any]:
+    """Values of the quickstart's data set: small, but with every kind of thing in it.
+
+    Returns:
+        A fresh dictionary of plain values:
+
+        - `seed`: everything random follows from it.
+        - `train_sequences`, `test_sequences`: how many; numbered from 1, training
+          first. Conditions go round `CONDITIONS`.
+        - `frames_per_sequence`: at 10 frames a second.
+        - `grid`: arguments of `RadarGrid.reduced`, or "kradar".
+        - `radar`: fields of `RadarParameters` that differ from its defaults.
+        - `output`: "tesseract" for K-Radar's files, "projection" for the projections
+          alone.
+        - `image_width`, `image_height`: of one of the two stereo images; 0 for none.
+        - `lidar_to_radar_m`: radar position = LiDAR position + this; z as in K-Radar's
+          own loaders.
+        - `label_distance_m`: farther objects get no label.
+    """
+    return {
+        "seed": 0,
+        "train_sequences": 10,
+        "test_sequences": 5,
+        "frames_per_sequence": 40,
+        "grid": {
+            "num_doppler": 16,
+            "num_range": 64,
+            "num_elevation": 9,
+            "num_azimuth": 56,
+            "max_range_m": 75.6,
+        },
+        "radar": {"azimuth_elements": 40.0, "elevation_elements": 12.0},
+        "output": "tesseract",
+        "image_width": 320,
+        "image_height": 180,
+        "lidar_to_radar_m": [-2.54, 0.3, 0.7],
+        "label_distance_m": 90.0,
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationConfig:
+    """Checked values of a simulation; see `default_config` for the fields."""
+
+    seed: int
+    train_sequences: int
+    test_sequences: int
+    frames_per_sequence: int
+    grid: Any
+    radar: Mapping[str, Any]
+    output: str
+    image_width: int
+    image_height: int
+    lidar_to_radar_m: tuple[float, float, float]
+    label_distance_m: float
+
+    @classmethod
+    def from_mapping(cls, config: Any) -> SimulationConfig:
+        """Checks a mapping (or ConfigDict) of plain values.
+
+        Raises:
+            UserError: A field is unknown, missing or has a value out of range.
+        """
+        values = plain(config)
+        names = [f.name for f in dataclasses.fields(cls)]
+        for key in values:
+            if key not in names:
+                raise UserError(
+                    f"unknown simulation field {key!r}; fields: {', '.join(names)}"
+                )
+        for name in names:
+            if name not in values:
+                raise UserError(f"simulation field {name!r} is missing")
+        values["lidar_to_radar_m"] = tuple(map(float, values["lidar_to_radar_m"]))
+        result = cls(**values)
+        result._check()
+        return result
+
+    def _check(self) -> None:
+        for name, least in (
+            ("train_sequences", 0),
+            ("test_sequences", 0),
+            ("frames_per_sequence", 1),
+            ("image_width", 0),
+            ("image_height", 0),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise UserError(
+                    f"simulation.{name} must be an integer of at least {least},"
+                    f" got {value!r}"
+                )
+        if self.train_sequences + self.test_sequences == 0:
+            raise UserError("simulation has no sequences: train_sequences is 0")
+        if self.output not in ("tesseract", "projection"):
+            raise UserError(
+                "simulation.output must be 'tesseract' or 'projection',"
+                f" got {self.output!r}"
+            )
+        if len(self.lidar_to_radar_m) != 3:
+            raise UserError("simulation.lidar_to_radar_m must be three numbers")
+        self.make_grid()
+        self.make_parameters()
+
+    def make_grid(self) -> RadarGrid:
+        """The radar's axes."""
+        if isinstance(self.grid, str):
+            if self.grid != "kradar":
+                raise UserError(
+                    f"simulation.grid must be 'kradar' or sizes, got {self.grid!r}"
+                )
+            return RadarGrid.kradar()
+        try:
+            return RadarGrid.reduced(**self.grid)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"simulation.grid: {error}") from None
+
+    def make_parameters(self) -> RadarParameters:
+        """The rest of the radar."""
+        try:
+            return RadarParameters(**self.radar)
+        except TypeError:
+            names = [f.name for f in dataclasses.fields(RadarParameters)]
+            raise UserError(
+                f"simulation.radar: unknown field in {sorted(self.radar)};"
+                f" fields: {', '.join(names)}"
+            ) from None
+
+    def to_json(self) -> str:
+        """Canonical text: equal configs give equal text."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+    def fingerprint(self) -> str:
+        """Short hash of everything the files depend on."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()[:16]
+
+    def conditions(self, number: int) -> tuple[str, str, str]:
+        """Environment, time and weather of sequence `number` (from 1)."""
+        environment, time, weather = CONDITIONS[(number - 1) % len(CONDITIONS)]
+        assert environment in ENVIRONMENTS
+        assert weather in WEATHERS
+        return environment, time, weather
+
+
+def plain(config: Any) -> Any:
+    """ConfigDicts and other mappings as dictionaries, tuples as lists, recursively."""
+    if hasattr(config, "to_dict"):
+        config = config.to_dict()
+    if isinstance(config, Mapping):
+        return {str(key): plain(value) for key, value in config.items()}
+    if isinstance(config, list | tuple):
+        return [plain(value) for value in config]
+    return config

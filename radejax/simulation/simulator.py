@@ -1,0 +1,161 @@
+"""One simulated sequence, frame by frame: what the radar receives, what the labels say."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from radejax.data.labels import Label
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation import radar, scattering, weather
+from radejax.simulation.scene import SceneFrame, Sequence
+from radejax.structures import CLASSES
+
+MIN_SNR_DB = 8.0
+"""An object is visible to the radar from this ratio of its power to the noise on."""
+
+MIN_LIT = 0.15
+"""... and with this part of its power not blocked by other objects."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RadarInput:
+    """Everything that decides one radar frame.
+
+    Attributes:
+        scatterers: Point targets.
+        noise_power: `[R, D]` mean noise power.
+        key: Seed of the noise.
+        snr_db: `[N]` power of each box's scatterers over the receiver noise.
+        lit: `[N]` part of each box's power that no other box blocks.
+    """
+
+    scatterers: radar.Scatterers
+    noise_power: np.ndarray
+    key: np.ndarray
+    snr_db: np.ndarray
+    lit: np.ndarray
+
+
+class SequenceSimulator:
+    """Radar frames and labels of one sequence, the same for the same seed.
+
+    Frames are independent of each other: any frame, in any order, on any thread.
+
+    Args:
+        sequence: The scene.
+        grid: Axes of the radar.
+        parameters: The rest of the radar.
+        seed: Scattering centers, phases and noise follow from it, the sequence's
+            number and the frame's index.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        grid: RadarGrid,
+        parameters: radar.RadarParameters,
+        seed: int,
+    ) -> None:
+        self.sequence, self.grid = sequence, grid
+        self.parameters, self.seed = parameters, seed
+        rng = np.random.default_rng([seed, sequence.name, 11])
+        tracks = sequence.tracks
+        self._centers = scattering.make_object_scatterers(
+            tracks.cls, tracks.size_m, rng
+        )
+        count = len(sequence.reflectors.kind)
+        self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
+
+    def radar_input(self, index: int, frame: SceneFrame | None = None) -> RadarInput:
+        """Scatterers and noise of a frame: NumPy, ready for `radar.simulate`."""
+        sequence, parameters = self.sequence, self.parameters
+        frame = sequence.frame(index) if frame is None else frame
+        objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
+        surroundings = scattering.scatter_surroundings(
+            frame, sequence, self._static_phase, parameters
+        )
+        parts = [
+            dataclasses.replace(
+                part,
+                power=part.power
+                * weather.attenuation(
+                    sequence.weather, np.linalg.norm(part.position_m, axis=1)
+                ),
+            )
+            for part in (objects, surroundings)
+        ]
+        power = np.bincount(parts[0].owner, parts[0].power, len(frame.boxes))
+        return RadarInput(
+            scatterers=scattering.to_scatterers(
+                parts, frame.ego_velocity_mps, parameters
+            ),
+            noise_power=weather.noise_profile(
+                sequence.weather, self.grid, parameters, frame.ego_velocity_mps
+            ),
+            key=radar.frame_key(self.seed, sequence.name, index),
+            snr_db=10.0 * np.log10(power + 1e-30) - parameters.noise_db,
+            lit=lit,
+        )
+
+    def radar_frame(
+        self, index: int, output: radar.Output = "projection", rows_per_step: int = 1
+    ) -> np.ndarray:
+        """One frame of the radar; see `radar.simulate`."""
+        return self.run(self.radar_input(index), output, rows_per_step)
+
+    def run(
+        self,
+        given: RadarInput,
+        output: radar.Output = "projection",
+        rows_per_step: int = 1,
+    ) -> np.ndarray:
+        """The radar frame of an input; see `radar.simulate`."""
+        return np.asarray(
+            radar.simulate(
+                given.scatterers,
+                given.noise_power,
+                given.key,
+                grid=self.grid,
+                parameters=self.parameters,
+                output=output,
+                rows_per_step=rows_per_step,
+            )
+        )
+
+    def is_radar_visible(self, frame: SceneFrame, given: RadarInput) -> np.ndarray:
+        """`[N]` bool: in the field of view, strong enough, and not hidden."""
+        inside = self.grid.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
+        return inside & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
+
+    def labels(
+        self,
+        frame: SceneFrame,
+        given: RadarInput,
+        lidar_to_radar_m: tuple[float, float, float],
+        max_distance_m: float,
+    ) -> list[Label]:
+        """Labels of a frame, in the LiDAR frame as K-Radar's files have them.
+
+        Args:
+            frame: Scene of the frame.
+            given: Radar input of the same frame.
+            lidar_to_radar_m: Metres from LiDAR to radar positions.
+            max_distance_m: Farther objects get no label.
+        """
+        visible = self.is_radar_visible(frame, given)
+        distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
+        labels = []
+        for n in np.flatnonzero(distance < max_distance_m):
+            box = frame.boxes[n].copy()
+            box[:3] -= lidar_to_radar_m
+            labels.append(
+                Label(
+                    cls=CLASSES[frame.cls[n]],
+                    box=tuple(box.tolist()),
+                    visibility="R" if visible[n] else "L",
+                    track_id=int(frame.track_id[n]),
+                )
+            )
+        return labels
