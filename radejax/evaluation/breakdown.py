@@ -12,7 +12,8 @@ import itertools
 import numpy as np
 
 from radejax.evaluation import matching, overlap, protocols
-from radejax.evaluation.average_precision import SPACES, EvaluationSet
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.results import SPACES
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0)
 

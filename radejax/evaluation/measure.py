@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from radejax.errors import UserError
-from radejax.evaluation import average_precision, protocols
-from radejax.evaluation.average_precision import EvaluationSet, Result
+from radejax.evaluation import protocols
+from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.results import Result, mean_ap
 from radejax.structures import CLASSES
 
 ORDER = {
@@ -72,7 +73,7 @@ class Options:
     protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
     paper_protocol: str = "coco101"
     score_threshold: float = 0.0
-    skip_empty: str | None = average_precision.PROTOCOL_DEFAULT
+    skip_empty: str | None = PROTOCOL_DEFAULT
     roi: str | Sequence[float] | None = "narrow"
     label_version: str | None = None
     operating_score: float = 0.3
@@ -194,7 +195,7 @@ def with_means(results: Sequence[Result], data: EvaluationSet) -> list[Result]:
         mean = dataclasses.replace(
             group[0],
             cls="mean",
-            ap=average_precision.mean_ap(group),
+            ap=mean_ap(group),
             num_gt=sum(result.num_gt for result in group),
             num_det=sum(result.num_det for result in group),
             num_frames=max(result.num_frames for result in group),

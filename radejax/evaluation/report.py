@@ -13,7 +13,7 @@ import numpy as np
 
 from radejax import files
 from radejax.evaluation import breakdown, layouts, measure, protocols
-from radejax.evaluation.average_precision import EvaluationSet
+from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import Measured, Options
 
 

@@ -1,0 +1,95 @@
+"""One average precision with everything it depends on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+SPACES = ("bev", "3d")
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One average precision and what it means.
+
+    Attributes:
+        cls: Class name.
+        space: "bev" or "3d".
+        iou: IoU threshold; a match needs more.
+        ap: Average precision, 0 to 100. Without any object of the class it is NaN, except
+            in K-Radar's protocols, which define it as 0; test `num_gt`.
+        num_gt: Objects of the class in the frames that take part.
+        num_det: Predictions of the class in those frames, after the score cut.
+        protocol: Name of the protocol.
+        num_frames: Frames that take part.
+        score_threshold: Predictions need a score above this.
+        skip_empty: Frame rule that was used.
+        roi: Name of the region of interest.
+        label_version: Label revision of the ground truth, if known.
+        precision: `[K]` precision along the curve (K-Radar: after making it monotone).
+        recall: `[K]` recall along the curve.
+        score: `[K]` score threshold along the curve, falling.
+    """
+
+    cls: str
+    space: str
+    iou: float
+    ap: float
+    num_gt: int
+    num_det: int
+    protocol: str
+    num_frames: int
+    score_threshold: float
+    skip_empty: str | None
+    roi: str
+    label_version: str | None
+    precision: np.ndarray = dataclasses.field(repr=False)
+    recall: np.ndarray = dataclasses.field(repr=False)
+    score: np.ndarray = dataclasses.field(repr=False)
+
+    @property
+    def is_defined(self) -> bool:
+        """Whether the class occurs at all; reports show `-` where it does not."""
+        return self.num_gt > 0
+
+    @property
+    def metric(self) -> str:
+        """Name with everything the number depends on but the class and the frames."""
+        return metric_name(
+            self.space,
+            self.iou,
+            self.protocol,
+            self.score_threshold,
+            self.skip_empty,
+            self.label_version,
+            self.roi,
+        )
+
+
+def metric_name(
+    space: str,
+    iou: float,
+    protocol: str,
+    score_threshold: float,
+    skip_empty: str | None,
+    label_version: str | None,
+    roi: str,
+) -> str:
+    """A metric's full name.
+
+    Examples:
+        >>> metric_name("3d", 0.3, "kradar_r40", 0.0, "frame", "v2.1", "narrow")
+        'ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow'
+    """
+    return (
+        f"ap_{space}_iou{100 * iou:.4g}/{protocol}/score>{score_threshold:g}"
+        f"/skip={skip_empty or 'none'}/labels={label_version or 'unknown'}/roi={roi}"
+    )
+
+
+def mean_ap(results: Sequence[Result]) -> float:
+    """Mean AP over the classes that occur; NaN if none does."""
+    present = [result.ap for result in results if result.is_defined]
+    return float(np.mean(present)) if present else float("nan")
