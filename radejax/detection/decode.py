@@ -55,6 +55,7 @@ def decode(
     per_class_nms: bool = False,
     threshold_inclusive: bool = False,
     z0_m: float | jax.Array = 0.0,
+    normalize_yaw: bool = False,
 ) -> Detections:
     """Boxes of a batch of detection maps.
 
@@ -77,6 +78,8 @@ def decode(
         threshold_inclusive: Peaks that score exactly the threshold count (the paper's
             reading; the released code's is exclusive).
         z0_m: Height added to the regressed z: the paper's sensor height.
+        normalize_yaw: NMS compares boxes of their regressed size, whatever the length
+            of the yaw vector.
 
     Returns:
         Detections by descending score; equal scores in order of range, then azimuth.
@@ -105,21 +108,30 @@ def decode(
         threshold_inclusive=threshold_inclusive,
         z0_m=z0_m,
     )
-    keep = suppress(peaks, nms_iou, per_class=per_class_nms)
+    keep = suppress(
+        peaks, nms_iou, per_class=per_class_nms, normalize_yaw=normalize_yaw
+    )
     return _compact(peaks, keep, max_detections)
 
 
 def suppress(
-    peaks: Peaks, nms_iou: float | jax.Array, *, per_class: bool = False
+    peaks: Peaks,
+    nms_iou: float | jax.Array,
+    *,
+    per_class: bool = False,
+    normalize_yaw: bool = False,
 ) -> jax.Array:
-    """`[B, P]` bool: which peaks survive rotated NMS, across classes or per class."""
+    """`[B, P]` bool: which peaks survive rotated NMS; arguments as for `decode`."""
+    boxes = boxes7_from_8(peaks.boxes) if normalize_yaw else peaks.boxes
 
-    def one_frame(boxes: jax.Array, is_valid: jax.Array, classes: jax.Array):
+    def one_frame(
+        boxes: jax.Array, is_valid: jax.Array, classes: jax.Array
+    ) -> jax.Array:
         return rotated_nms(
             boxes, is_valid, nms_iou, classes=classes if per_class else None
         )
 
-    return jax.vmap(one_frame)(peaks.boxes, peaks.is_valid, peaks.classes)
+    return jax.vmap(one_frame)(boxes, peaks.is_valid, peaks.classes)
 
 
 def find_peaks(

@@ -204,7 +204,7 @@ class RadarGrid:
             `[..., 2]` x (forward) and y (left) in metres; NumPy float64 for NumPy
             or Python input, else a JAX array.
         """
-        xp = array_module(range_cell, azimuth_cell)
+        xp, range_cell, azimuth_cell = _as_float(range_cell, azimuth_cell)
         range_m = self.range_m[0] + range_cell * self.range_step_m
         azimuth = self.azimuth_rad[0] + azimuth_cell * self.azimuth_step_rad
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
@@ -215,7 +215,7 @@ class RadarGrid:
         Returns:
             `[..., 2]` range and azimuth in bins; not clipped to the grid.
         """
-        xp = array_module(x_m, y_m)
+        xp, x_m, y_m = _as_float(x_m, y_m)
         # The order of operations decides which way exact half bins round. This one
         # gives the released code's bins, and straight ahead the exact middle even in
         # float32: azimuth is counted from the middle of the axis, not from its edge.
@@ -237,7 +237,7 @@ class RadarGrid:
         Returns:
             `[..., 2]` int32 range and azimuth indices.
         """
-        xp = array_module(x_m, y_m)
+        xp, x_m, y_m = _as_float(x_m, y_m)
         cell = xp.round(self.ego_to_cell(x_m, y_m))
         range_idx = xp.clip(cell[..., 0], 0, self.num_range - 1)
         azimuth_idx = xp.clip(cell[..., 1], 0, self.num_azimuth - 1)
@@ -251,12 +251,12 @@ class RadarGrid:
 
     def in_field_of_view(self, x_m: Any, y_m: Any) -> Any:
         """True where the sensor looks: in front, within maximum azimuth and range."""
-        xp = array_module(x_m, y_m)
+        xp, x_m, y_m = _as_float(x_m, y_m)
         azimuth = xp.arctan2(y_m, x_m)
         return (
             (xp.abs(azimuth) <= self.fov_azimuth_rad)
             & (x_m >= 0)
-            & (xp.hypot(x_m, y_m) <= self.fov_range_m)
+            & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)
         )
 
     # Value semantics -----------------------------------------------------------------
@@ -272,3 +272,13 @@ class RadarGrid:
 
     def __hash__(self) -> int:
         return hash(self._key())
+
+
+def _as_float(*values: Any) -> tuple[Any, ...]:
+    """The array module, then the values: float64 on the host, at least float32 in JAX."""
+    xp = array_module(*values)
+    if xp is np:
+        return (np, *(np.asarray(v, np.float64) for v in values))
+    values = [xp.asarray(v) for v in values]
+    dtype = xp.promote_types(xp.result_type(*values), xp.float32)
+    return (xp, *(v.astype(dtype) for v in values))
