@@ -207,6 +207,8 @@ class CameraRenderer:
 
 def _hash_noise(i: np.ndarray, j: np.ndarray) -> np.ndarray:
     """Uniform numbers in [0, 1) that depend on two integers only."""
-    bits = (i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263) & 0xFFFFFFFF
+    bits = (
+        i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
+    ) & 0xFFFFFFFF
     bits = ((bits ^ (bits >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((bits ^ (bits >> 16)) & 0xFFFF) / 65536.0

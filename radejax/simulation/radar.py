@@ -48,7 +48,7 @@ class RadarParameters:
             ones; what lies below them is dropped.
     """
 
-    gain_db: float = 176.0
+    gain_db: float = 184.0
     noise_db: float = 95.0
     wavelength_m: float = 0.0039
     azimuth_elements: float = 48.0
@@ -202,7 +202,10 @@ def _simulate(scatterers, noise_power, key, grid, parameters, output, rows_per_s
             -1, num_kept
         )  # [D E, K]
         right = jnp.concatenate(
-            [azimuth[:, index].T * amplitude[:, :1], azimuth[:, index].T * amplitude[:, 1:]],
+            [
+                azimuth[:, index].T * amplitude[:, :1],
+                azimuth[:, index].T * amplitude[:, 1:],
+            ],
             axis=1,
         )  # [K, 2 A]
         field = jnp.dot(left, right, precision=lax.Precision.HIGHEST)

@@ -255,9 +255,7 @@ def scatter_objects(
 _ON_FOOT = [CLASSES.index("Pedestrian")]
 
 
-def is_blocked(
-    targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray
-) -> np.ndarray:
+def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.ndarray:
     """True where the straight way from the radar to a point crosses a box.
 
     Args:
@@ -306,7 +304,9 @@ def received_power(
 
 
 def scatter_surroundings(
-    frame: SceneFrame, sequence: Sequence, phase_rad: np.ndarray,
+    frame: SceneFrame,
+    sequence: Sequence,
+    phase_rad: np.ndarray,
     parameters: RadarParameters,
 ) -> FrameScattering:
     """Scatterers of the static surroundings: ground, rails, walls, poles, trees.

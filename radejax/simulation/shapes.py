@@ -6,12 +6,16 @@ import dataclasses
 
 import numpy as np
 
-from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.camera import CameraCalibration, project
 
 # A block in units of the half extents: x, y, z ranges; colour role; share kept of the
 # length and width at its top (a taper).
 _Block = tuple[
-    tuple[float, float], tuple[float, float], tuple[float, float], str, tuple[float, float]
+    tuple[float, float],
+    tuple[float, float],
+    tuple[float, float],
+    str,
+    tuple[float, float],
 ]
 
 _STRAIGHT = (1.0, 1.0)
@@ -67,6 +71,7 @@ _FACES = (
     ((3, 2, 6, 7), (0.0, -1.0, 0.0)),  # right
     ((4, 7, 6, 5), (0.0, 0.0, 1.0)),  # top
 )
+_EDGE_PARTS = 3
 _SUN = np.array([0.35, 0.45, 0.82])
 
 
@@ -130,55 +135,80 @@ def visible_polygons(
     origin = calibration.ego_from_lidar_m - (
         calibration.rotation.T @ calibration.translation_m
     )
-    order = np.argsort(-np.linalg.norm(boxes[:, :3] - origin, axis=1))
-    polygons: list[Polygon] = []
-    for index in order:
-        if boxes[index, 0] > -3.0:
-            polygons += _object_polygons(
-                int(index), boxes[index], classes[index], colors[index], calibration,
-                origin, near_m, light,
-            )  # fmt: skip
-    return polygons
-
-
-def _object_polygons(
-    index, box, cls, colors, calibration, origin, near_m, light
-) -> list[Polygon]:
-    """Faces of one object, its far blocks first."""
-    cos, sin = np.cos(box[6]), np.sin(box[6])
-    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-    corners = (blocks_of(cls) * box[3:6] / 2.0) @ turn.T + box[:3]  # [K, 8, 3]
-    far_first = np.argsort(-np.linalg.norm(corners.mean(1) - origin, axis=1))
-    depth = float(np.linalg.norm(box[:3] - origin))
-    result = []
-    for block in far_first:
-        role = BLOCKS[cls][block][3]
-        for vertices, normal in _FACES:
-            face = corners[block, list(vertices)]  # [4, 3]
-            outward = turn @ np.array(normal)
-            if (face.mean(0) - origin) @ outward >= 0:
-                continue
-            points = _project_face(face, calibration, near_m)
-            if points:
-                color = _shade(role, normal, outward, colors, light)
-                result.append(Polygon(points, color, depth, index))
-    return result
-
-
-def _project_face(face, calibration, near_m) -> list[tuple[float, float]]:
-    """Pixels of a face cut at the near plane; its edges bend with the lens."""
-    following = np.roll(face, -1, axis=0)
-    part = np.linspace(0.0, 1.0, 4, endpoint=False)[None, :, None]
-    outline = (face[:, None] + part * (following - face)[:, None]).reshape(-1, 3)
-    pixels, depth = calibration.project_ego(outline)
-    if depth.max() < near_m:
+    faces, normals, depth, keys, owner, rgb = _faces(boxes, classes, colors, origin)
+    outward = ((faces.mean(1) - origin) * normals).sum(1)
+    shown = np.flatnonzero(outward < 0)
+    if not len(shown):
         return []
-    if depth.min() < near_m:
-        outline = _cut_near(outline, depth, near_m)
-        pixels, _ = calibration.project_ego(outline)
-    low = np.array([-2.0 * calibration.width, -2.0 * calibration.height])
-    pixels = np.clip(pixels, low, -low + [calibration.width, calibration.height])
-    return [tuple(p) for p in pixels.tolist()]
+    shown = shown[np.lexsort((-keys[shown], -depth[shown]))]
+    brightness = light * (0.62 + 0.38 * np.maximum(normals[shown] @ _SUN, 0.0))
+    rgb = np.clip(rgb[shown] * brightness[:, None], 0, 255).astype(int)
+    outlines = _project_faces(faces[shown], calibration, near_m)
+    return [
+        Polygon(points, tuple(color), float(depth[face]), int(owner[face]))
+        for points, color, face in zip(outlines, rgb.tolist(), shown, strict=True)
+        if points
+    ]
+
+
+def _faces(boxes, classes, colors, origin):
+    """All faces of all objects in front of the camera.
+
+    Returns:
+        Corners `[F, 4, 3]`, normals `[F, 3]`, distance of the object `[F]`, distance
+        of the block `[F]`, index of the box `[F]`, colours `[F, 3]`.
+    """
+    parts = [[np.zeros((0, 4, 3))], [np.zeros((0, 3))], [], [], [], [np.zeros((0, 3))]]
+    vertices = np.array([v for v, _ in _FACES])
+    normals = np.array([n for _, n in _FACES])
+    for index in np.flatnonzero(boxes[:, 0] > -3.0):
+        box, blocks = boxes[index], _BLOCK_CORNERS[classes[index]]
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+        corners = (blocks * box[3:6] / 2.0) @ turn.T + box[:3]  # [K, 8, 3]
+        count = len(blocks)
+        block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)
+        roles = [
+            {"body": colors[index, 0], "legs": colors[index, 1]}.get(role)
+            if role in ("body", "legs")
+            else _ROLE_COLORS[role]
+            for *_, role, _ in BLOCKS[classes[index]]
+        ]
+        parts[0].append(corners[:, vertices].reshape(-1, 4, 3))
+        parts[1].append(np.tile(normals @ turn.T, (count, 1)))
+        parts[2].append(np.full(count * 5, np.linalg.norm(box[:3] - origin)))
+        parts[3].append(np.repeat(block_depth, 5))
+        parts[4].append(np.full(count * 5, index))
+        parts[5].append(np.repeat(np.array(roles, float), 5, axis=0))
+    return [np.concatenate(p) if p else np.zeros(0) for p in parts]
+
+
+def _project_faces(faces, calibration, near_m) -> list[list[tuple[float, float]]]:
+    """Pixels of faces `[F, 4, 3]` cut at the near plane; edges bend with the lens.
+
+    A face wholly nearer than the plane gives an empty list.
+    """
+    camera = calibration.camera("raw")
+    following = np.roll(faces, -1, axis=1)
+    part = np.linspace(0.0, 1.0, _EDGE_PARTS, endpoint=False)[:, None]
+    outline = faces[:, :, None] + part * (following - faces)[:, :, None]
+    outline = outline.reshape(len(faces), -1, 3)
+    pixels, depth = project(outline, camera)
+    size = np.array([calibration.width, calibration.height], float)
+    result = []
+    for i in range(len(faces)):
+        points = pixels[i]
+        if depth[i].min() < near_m:
+            if depth[i].max() < near_m:
+                result.append([])
+                continue
+            points, _ = project(_cut_near(outline[i], depth[i], near_m), camera)
+        if (points.max(0) < 0).any() or (points.min(0) > size).any():
+            result.append([])  # off the image
+            continue
+        points = np.clip(points, -2.0 * size, 3.0 * size)
+        result.append(list(map(tuple, points.tolist())))
+    return result
 
 
 def _cut_near(outline, depth, near_m) -> np.ndarray:
@@ -194,9 +224,4 @@ def _cut_near(outline, depth, near_m) -> np.ndarray:
     return np.array(kept)
 
 
-def _shade(role, normal, outward, colors, light) -> tuple[int, int, int]:
-    """Colour of a face under a fixed sun."""
-    base = {"body": colors[0], "legs": colors[1]}.get(role)
-    base = np.array(_ROLE_COLORS[role]) if base is None else base
-    brightness = light * (0.62 + 0.38 * max(float(outward @ _SUN), 0.0))
-    return tuple(int(c) for c in np.clip(base * brightness, 0, 255))
+_BLOCK_CORNERS = {name: blocks_of(name) for name in BLOCKS}

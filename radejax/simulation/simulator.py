@@ -12,7 +12,7 @@ from radejax.simulation import radar, scattering, weather
 from radejax.simulation.scene import SceneFrame, Sequence
 from radejax.structures import CLASSES
 
-MIN_SNR_DB = 8.0
+MIN_SNR_DB = 10.0
 """An object is visible to the radar from this ratio of its power to the noise on."""
 
 MIN_LIT = 0.15

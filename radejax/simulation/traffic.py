@@ -213,7 +213,9 @@ class _Traffic:
 
     def _size(self, cls: str) -> np.ndarray:
         mean, deviation = SIZES[cls]
-        return np.array(mean) + np.array(deviation) * self.rng.normal(size=3).clip(-2, 2)
+        return np.array(mean) + np.array(deviation) * self.rng.normal(size=3).clip(
+            -2, 2
+        )
 
     def _vehicle_class(self) -> str:
         draw = self.rng.random()
@@ -225,7 +227,9 @@ class _Traffic:
 
     def _lane(self, left_m, speed, direction, *, is_ego_lane=False) -> None:
         """A file of vehicles that keep their distances."""
-        way = np.concatenate([[0.0], np.cumsum(speed[:-1] * FRAME_PERIOD_S)]) * direction
+        way = (
+            np.concatenate([[0.0], np.cumsum(speed[:-1] * FRAME_PERIOD_S)]) * direction
+        )
         relative = way - self.ego_along
         first = -30.0 - max(relative.max(), 0.0)
         last = _SIGHT_M - min(relative.min(), 0.0)
