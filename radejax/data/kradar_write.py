@@ -7,6 +7,7 @@ when it is complete: writers write beside it and rename.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -47,7 +48,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
         os.replace(temporary, path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno in _NO_SPACE:
+        if is_no_space(error):
             raise no_space_error(path) from error
         raise
 
@@ -150,7 +151,15 @@ def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
         file.write(json.dumps(grid.to_dict()).encode("ascii"))
 
 
-_NO_SPACE = (28, 122)  # ENOSPC, EDQUOT
+def is_no_space(error: BaseException) -> bool:
+    """True if an error says that the disk is full or a quota is used up.
+
+    Libraries in C++ keep the system's message but not its number.
+    """
+    numbers = (errno.ENOSPC, errno.EDQUOT)
+    if isinstance(error, OSError) and error.errno in numbers:
+        return True
+    return any(os.strerror(number) in str(error) for number in numbers)
 
 
 def no_space_error(path: str | os.PathLike) -> UserError:

@@ -7,6 +7,7 @@ import math
 import os
 import pathlib
 import struct
+import time
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
@@ -56,6 +57,7 @@ def project_file(
     *,
     shape_drea: tuple[int, ...] | None = None,
     dtype: Any = np.float32,
+    timings: dict[str, float] | None = None,
 ) -> np.ndarray:
     """`projection.project` of a file; arguments and errors as in `read_tesseract`.
 
@@ -63,29 +65,39 @@ def project_file(
     the cache, and 260 MB are never held. (A memory map would do the same, but a bad
     disk sector would kill the process instead of raising an error.)
 
+    `timings["reading"]`, if given, grows by the seconds that reading took.
+
     Returns:
         `[R, A, D+E]` projection.
     """
+    timings = {"reading": 0.0} if timings is None else timings
     with _open(path) as file, _damage_named(path):
         layout = _parse_mat5(file)
         if layout is not None:
             stored, (doppler, range_, elevation, azimuth) = layout
             _check(path, np.broadcast_to(stored.type(0), layout[1]), shape_drea)
             slab = np.empty((elevation, range_, doppler), stored)
-            columns = _read_slabs(file, slab, azimuth)
+            columns = _read_slabs(file, slab, azimuth, timings)
             projection = project_columns(columns, azimuth, dtype=dtype)
     if layout is None:
+        began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)
+        timings["reading"] += time.perf_counter() - began
         projection = project(tesseract, dtype=dtype)
     if not np.isfinite(projection).all():
         raise DataError(f"{path}: damaged, {VARIABLE} has negative or non-finite power")
     return projection
 
 
-def _read_slabs(file: BinaryIO, slab: np.ndarray, count: int) -> Iterator[np.ndarray]:
+def _read_slabs(
+    file: BinaryIO, slab: np.ndarray, count: int, timings: dict[str, float]
+) -> Iterator[np.ndarray]:
     """The next `count` slabs of a file, all in the same buffer."""
     for i in range(count):
-        if file.readinto(slab) != slab.nbytes:
+        began = time.perf_counter()
+        num_bytes = file.readinto(slab)
+        timings["reading"] += time.perf_counter() - began
+        if num_bytes != slab.nbytes:
             raise EOFError(f"the file ends in column {i} of {count}")
         yield slab
 
