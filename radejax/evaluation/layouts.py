@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from tabulate import tabulate
 
 from radejax.evaluation import published
+from radejax.evaluation.bootstrap import Comparison
 from radejax.evaluation.measure import Measured, Options
 
 TITLES = {
@@ -131,6 +132,66 @@ def protocols_at_a_glance(
     return Table(
         f"AP {SPACE_TITLES[space]} at IoU {iou:g} in every protocol, all weathers",
         ["Protocol", *options.classes, "mean"],
+        body,
+    )
+
+
+def intervals(rows: Mapping[Key, Measured], options: Options, iou: float) -> Table:
+    """AP with its 95 % interval over sequences, all weathers."""
+    shown = [p for p in ("exact", "kradar_r40", "coco101") if p in options.protocols]
+    body = []
+    for protocol in shown or options.protocols[:1]:
+        for space in ("3d", "bev"):
+            cells = []
+            for cls in (*options.classes, "mean"):
+                row = rows.get((protocol, "all", cls, space, iou))
+                if row is None or row.shown is None:
+                    cells.append("-")
+                elif row.low is None:
+                    cells.append(number(row.shown))
+                else:
+                    low, high = number(row.low, digits=1), number(row.high, digits=1)
+                    cells.append(f"{number(row.shown, digits=1)} [{low}, {high}]")
+            body.append([protocol, SPACE_TITLES[space], *cells])
+    return Table(
+        f"AP at IoU {iou:g} with 95 % intervals ({options.bootstrap} resamples of"
+        " sequences)",
+        ["Protocol", "AP", *options.classes, "mean"],
+        body,
+    )
+
+
+def comparison(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
+    """Two runs and which of their differences are real."""
+    body = [
+        [
+            row.cls,
+            row.protocol,
+            SPACE_TITLES[row.space],
+            f"{row.iou:g}",
+            number(row.ap_a),
+            number(row.ap_b),
+            number(row.difference, signed=True),
+            f"[{number(row.low, signed=True)}, {number(row.high, signed=True)}]",
+            f"{row.p_adjusted:.3f}",
+            "real" if row.is_real else "not shown",
+        ]
+        for row in rows
+    ]
+    return Table(
+        f"B = {run_b} against A = {run_a}: 95 % intervals over sequences, p after Holm",
+        [
+            "Class",
+            "Protocol",
+            "AP",
+            "IoU",
+            "A",
+            "B",
+            "B - A",
+            "95 %",
+            "p",
+            "Difference",
+        ],
         body,
     )
 

@@ -12,9 +12,17 @@ from typing import Any
 import numpy as np
 
 from radejax import files
-from radejax.evaluation import breakdown, layouts, measure, protocols
+from radejax.evaluation import (
+    bootstrap,
+    breakdown,
+    layouts,
+    measure,
+    predictions_io,
+    protocols,
+)
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import Measured, Options
+from radejax.evaluation.results import SPACES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +86,8 @@ def write_report(
         label_version=options.label_version,
     )
     rows = measure.measure(data, frames, options)
+    if options.bootstrap:
+        rows = with_intervals(data, frames, rows, options)
     metrics = collect(data, frames, rows, options)
     metrics["left_out"]["predictions: size not positive, kept as false positives"] = (
         repaired
@@ -90,6 +100,11 @@ def write_report(
         _write(out_dir / "metrics.csv", files.write_text, csv_text(rows)),
         _write(out_dir / "report.txt", files.write_text, text),
     ]
+    # The inputs stay with the report, so that two reports can be compared later.
+    for name, table in (("predictions", predictions), ("ground_truth", ground_truth)):
+        predictions_io.write_table(out_dir / f"{name}.npz", table)
+        written.append(out_dir / f"{name}.npz")
+    written.append(_write(out_dir / "frames.json", files.write_json, _lists(frames)))
     tables = paper_tables(rows, options)
     for style, name in (("markdown", "tables.md"), ("latex", "tables.tex")):
         content = "\n".join(table.render(style) for table in tables)
@@ -101,6 +116,42 @@ def write_report(
 def _write(path: pathlib.Path, write: Any, content: Any) -> pathlib.Path:
     write(path, content)
     return path
+
+
+def _lists(frames: Mapping[str, np.ndarray]) -> dict[str, list]:
+    return {name: np.asarray(column).tolist() for name, column in frames.items()}
+
+
+def with_intervals(
+    data: EvaluationSet,
+    frames: Mapping[str, np.ndarray],
+    rows: list[Measured],
+    options: Options,
+) -> list[Measured]:
+    """The rows with 95 % intervals, for every metric over all frames and per weather."""
+    terms = [
+        (protocol, space, iou)
+        for protocol in options.protocols
+        for space in SPACES
+        for iou in options.iou_thresholds
+    ]
+    found = bootstrap.add_intervals(
+        data,
+        frames,
+        terms,
+        resamples=options.bootstrap,
+        seed=options.seed,
+        masks=measure.condition_masks(frames, "weather"),
+        skip_empty=options.skip_empty,
+        score_threshold=options.score_threshold,
+    )
+    result = []
+    for row in rows:
+        made = row.result
+        key = (made.protocol, row.condition, made.cls, made.space, made.iou)
+        low, high = found.get(key, (None, None)) if made.is_defined else (None, None)
+        result.append(dataclasses.replace(row, low=low, high=high))
+    return result
 
 
 def collect(
@@ -201,6 +252,8 @@ def console_text(
     for protocol in shown or options.protocols[:1]:
         parts.append(layouts.class_by_weather(table, options, protocol, iou).render())
     parts.append(layouts.protocols_at_a_glance(table, options, "3d", iou).render())
+    if options.bootstrap:
+        parts.append(layouts.intervals(table, options, iou).render())
     distance = metrics["slices"]["distance"]
     parts.append(
         layouts.Table(
@@ -255,8 +308,26 @@ def _draw(
     out_dir: pathlib.Path,
     options: Options,
 ) -> list[pathlib.Path]:
-    """Pictures of the worst frames, if somebody can draw them."""
+    """Curves, and pictures of the worst frames if somebody can draw them."""
     written = []
+    if options.plots:
+        from radejax.evaluation import plots  # matplotlib takes a second to load
+
+        masks = measure.condition_masks(frames, "weather")
+        for space in SPACES:
+            for iou in options.iou_thresholds:
+                path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
+                plots.precision_recall(
+                    data,
+                    masks,
+                    path,
+                    iou=iou,
+                    space=space,
+                    score_threshold=options.score_threshold,
+                )
+                written.append(path)
+        plots.calibration(metrics["calibration"], out_dir / "calibration.png")
+        written.append(out_dir / "calibration.png")
     if options.draw_frame is not None:
         folder = out_dir / "worst_frames"
         folder.mkdir(exist_ok=True)
