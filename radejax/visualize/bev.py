@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_bev", "draw_frame", "draw_map", "draw_polar", "save_figure"]
 
+_POLAR_OPTIONS = ("channels", "reduce", "units", "color_limits")
+
 
 def draw_bev(
     projection: Any,
@@ -198,7 +200,7 @@ def draw_frame(
     title: str | None = None,
     **bev_options: Any,
 ) -> Figure:
-    """Figure of one frame: bird's-eye view, camera image and polar view.
+    """Figure of one frame: bird's-eye view, camera image (if any) and polar view.
 
     Args:
         projection: `[R, A, D+E]` normalised log power of one frame.
@@ -221,29 +223,27 @@ def draw_frame(
     options = {"show_legend": False, **bev_options}
     bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
     draw_bev(projection, grid, ax=bev_ax, **shared, **options)
-    view_ax = figure.add_axes((0.53, 0.40, 0.45, 0.52))
-    polar_ax = figure.add_axes((0.57, 0.085, 0.41, 0.26))
-    polar_options = {
-        k: v
-        for k, v in options.items()
-        if k in ("channels", "reduce", "units", "color_limits")
-    }
+    has_image = image is not None
+    polar_place = (0.57, 0.085, 0.41, 0.26 if has_image else 0.77)
     draw_polar(
         projection,
         grid,
-        ax=polar_ax,
+        ax=figure.add_axes(polar_place),
         **shared,
-        **polar_options,
-        show_labels=False,
+        **{k: v for k, v in options.items() if k in _POLAR_OPTIONS},
+        show_labels=not has_image,
         show_legend=False,
         show_colorbar=False,
     )
-    _draw_view(view_ax, image, camera, truth, found)
+    if has_image:
+        view_ax = figure.add_axes((0.53, 0.40, 0.45, 0.52))
+        _draw_view(view_ax, image, camera, truth, found)
     figure.legend(
         handles=legend_handles(truth, found, roi),
-        loc="lower left",
-        bbox_to_anchor=(0.55, 0.36),
-        ncols=4,
+        loc="lower center",
+        bbox_to_anchor=(0.765, polar_place[1] + polar_place[3] + 0.01),
+        ncols=3,
+        frameon=False,
     )
     if title:
         figure.suptitle(title)
@@ -260,10 +260,6 @@ def _draw_view(
     ax: Axes, image: Any, camera: Any, truth: Objects | None, found: Objects | None
 ) -> None:
     """Camera image, with the boxes where a calibration is given."""
-    if image is None:
-        ax.set_axis_off()
-        ax.text(0.5, 0.5, "no camera image", ha="center", va="center", color="0.5")
-        return
     if camera is None:
         ax.imshow(np.asarray(image))
         ax.set_axis_off()

@@ -1,0 +1,162 @@
+"""Animated sequences: GIF through Pillow, MP4 through the ffmpeg program."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+from radejax.errors import UserError
+from radejax.files import atomic_path
+from radejax.visualize.canvas import (
+    COLOR_MAP,
+    GROUND_TRUTH_COLOR,
+    PREDICTION_COLOR,
+    PREDICTION_TEXT_COLOR,
+)
+
+_LINE_COLORS = (
+    "black",
+    GROUND_TRUTH_COLOR,
+    PREDICTION_COLOR,
+    PREDICTION_TEXT_COLOR,
+)
+_MAP_COLORS = 32
+
+
+def render(figure: Figure) -> np.ndarray:
+    """Pixels of a figure at its own resolution, `[H, W, 3]` uint8."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def animate(
+    figures: Iterable[Figure | np.ndarray],
+    path: str | os.PathLike,
+    *,
+    frames_per_second: float = 10.0,
+    num_colors: int = 128,
+) -> pathlib.Path:
+    """Writes figures one after another into a GIF or MP4, completely or not at all.
+
+    Frames are drawn as they are needed, so a generator keeps memory constant::
+
+        animate((draw_frame(p, grid) for p in projections), "sequence.gif")
+
+    Args:
+        figures: Figures, or images `[H, W, 3]` uint8, of one size.
+        path: Target; the suffix decides: .gif, or .mp4, which needs ffmpeg.
+        frames_per_second: K-Radar's sensors run at 10.
+        num_colors: Of a GIF's palette, which is common to all frames; at most 256.
+
+    Returns:
+        The path written.
+
+    Raises:
+        UserError: Another suffix, no frames, frames of different sizes, no ffmpeg.
+    """
+    path = pathlib.Path(path)
+    writers = {".gif": _write_gif, ".mp4": _write_mp4}
+    suffix = path.suffix.lower()
+    if suffix not in writers:
+        raise UserError(f"animations are written as .gif or .mp4, got {path.name!r}")
+    if not frames_per_second > 0:
+        raise UserError(f"frames_per_second must be positive, got {frames_per_second}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        writers[suffix](_pictures(figures), temporary, frames_per_second, num_colors)
+    return path
+
+
+def _pictures(figures: Iterable[Figure | np.ndarray]) -> Iterator[np.ndarray]:
+    """Rendered frames, checked to have one size; at least one."""
+    shape = None
+    for i, figure in enumerate(figures):
+        pixels = render(figure) if isinstance(figure, Figure) else np.asarray(figure)
+        shape = shape or pixels.shape
+        if pixels.shape != shape or pixels.ndim != 3 or pixels.shape[-1] != 3:
+            raise UserError(
+                f"frame {i} has shape {pixels.shape}, expected {shape} as the first"
+                if i
+                else f"frames must be [H, W, 3], got {pixels.shape}"
+            )
+        yield pixels
+    if shape is None:
+        raise UserError("no frames to animate")
+
+
+def _write_gif(
+    pictures: Iterator[np.ndarray], path: pathlib.Path, rate: float, num_colors: int
+) -> None:
+    """One palette for all frames: per-frame palettes flicker."""
+    first = Image.fromarray(next(pictures))
+    palette = _palette(first, num_colors)
+    frames = (
+        Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
+        for pixels in pictures
+    )
+    first.quantize(palette=palette, dither=Image.Dither.NONE).save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=frames,
+        duration=round(1000 / rate),
+        loop=0,
+    )
+
+
+def _palette(first: Image.Image, num_colors: int) -> Image.Image:
+    """Colours of the first frame, of the radar map and of lines that come later."""
+    lines = np.array([to_rgb(c) for c in _LINE_COLORS])
+    lines = np.concatenate([lines, COLOR_MAP(np.linspace(0, 1, _MAP_COLORS))[:, :3]])
+    kept = max(2, min(num_colors, 256) - len(lines))
+    colors = first.quantize(kept, dither=Image.Dither.NONE).getpalette()[: 3 * kept]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colors + np.round(255 * lines).astype(int).ravel().tolist())
+    return palette
+
+
+def _write_mp4(
+    pictures: Iterator[np.ndarray], path: pathlib.Path, rate: float, _: int
+) -> None:
+    """Raw frames through a pipe; H.264 with the pixel format that browsers play."""
+    program = shutil.which("ffmpeg")
+    if program is None:
+        raise UserError(
+            "writing .mp4 needs the ffmpeg program, which is not on the PATH; install "
+            "it (apt install ffmpeg, conda install ffmpeg) or write a .gif"
+        )
+    first = next(pictures)
+    height, width = first.shape[:2]
+    command = [program, "-y", "-loglevel", "error"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command += ["-r", f"{rate:g}", "-i", "-"]
+    # The pixel format halves colour resolution, so sizes must be even.
+    command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"]
+    command += ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-f", "mp4", str(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            process.stdin.write(first.tobytes())
+            for picture in pictures:
+                process.stdin.write(picture.tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass  # ffmpeg gave up; its own words say why
+        except BaseException:
+            process.kill()
+            raise
+        message = process.stderr.read().decode(errors="replace").strip()
+        if process.wait() != 0:
+            last = message.splitlines()[-1] if message else "no message"
+            raise UserError(f"ffmpeg could not write the video: {last}")

@@ -1,0 +1,268 @@
+"""Curves over data: precision and recall, training, score calibration."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from radejax.errors import DataError, UserError
+from radejax.visualize.canvas import SERIES_COLORS, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LOSS_KEYS = ("focal", "gwd", "smooth_l1")
+_LINE_STYLES = ("-", "--", "-.", ":")
+_AXIS_LABELS = {
+    "frames_per_s": "frames per second",
+    "learning_rate": "learning rate",
+    "data_wait_share": "share of time without a batch",
+}
+
+
+def draw_precision_recall(
+    curves: Mapping[str, tuple[Any, Any]] | Iterable[Any],
+    *,
+    ax: Axes | None = None,
+    title: str | None = None,
+) -> Axes:
+    """Draws precision over recall, one line a class or model.
+
+    Lines differ in colour and in dash pattern.
+
+    Args:
+        curves: Name to `(recall [K], precision [K])`, both in [0, 1]; or results of
+            `evaluation.average_precision.evaluate`, which are named by class and AP.
+            Results of classes without any object are left out.
+        ax: Where to draw; a new figure by default.
+        title: Title; for results, their metric's full name by default.
+
+    Raises:
+        UserError: Results of several metrics in one picture, or vectors that differ in
+            length.
+    """
+    if not isinstance(curves, Mapping):
+        curves, name = _named_curves(curves)
+        title = title or name
+    ax = new_figure(5.2, 4.6, layout="constrained").add_subplot() if ax is None else ax
+    for i, (label, (recall, precision)) in enumerate(curves.items()):
+        recall, precision = np.asarray(recall, float), np.asarray(precision, float)
+        if recall.ndim != 1 or recall.shape != precision.shape:
+            raise UserError(
+                f"{label}: recall {recall.shape} and precision {precision.shape} must "
+                "be vectors of one length"
+            )
+        order = np.argsort(recall, kind="stable")
+        ax.plot(recall[order], precision[order], label=label, **_line(i))
+    ax.set(
+        xlim=(0, 1.02),
+        ylim=(0, 1.02),
+        xlabel="recall",
+        ylabel="precision",
+        title=title or "",
+    )
+    ax.title.set_fontsize(9)
+    ax.grid(alpha=0.3)
+    if curves:
+        ax.legend(fontsize=8, loc="lower left")
+    return ax
+
+
+def _named_curves(results: Iterable[Any]) -> tuple[dict[str, tuple], str | None]:
+    """Curves and common metric of evaluation results."""
+    results = list(results)
+    metrics = sorted({result.metric for result in results})
+    if len(metrics) > 1:
+        raise UserError(
+            f"one picture shows one metric, got {', '.join(metrics)}; filter the results"
+        )
+    curves = {
+        f"{result.cls}, AP {result.ap:.1f} ({result.num_gt} objects)": (
+            result.recall,
+            result.precision,
+        )
+        for result in results
+        if result.num_gt > 0
+    }
+    return curves, metrics[0] if metrics else None
+
+
+def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Series of a run's `metrics.jsonl`: name to `(step [N], value [N])`.
+
+    An unfinished last line, as an interrupted run leaves it, is ignored.
+
+    Raises:
+        FileNotFoundError: Names the file.
+        DataError: A line is not a JSON object with a step; names file and line.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no metrics of a run at {path}")
+    series: dict[str, list[tuple[float, float]]] = {}
+    lines = path.read_text(encoding="utf-8").split("\n")
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            record = json.loads(line)
+            step = float(record.pop("step"))
+        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            if number == len(lines):
+                break
+            raise DataError(
+                f"{path}, line {number}: expected a JSON object with a step, got "
+                f"{line[:60]!r}"
+            ) from error
+        for name, value in record.items():
+            if isinstance(value, int | float):
+                series.setdefault(name, []).append((step, float(value)))
+    return {name: tuple(np.array(rows).T) for name, rows in series.items()}
+
+
+def draw_training(
+    metrics: str | os.PathLike | Mapping[str, tuple[Any, Any]],
+    *,
+    keys: Sequence[str] | None = None,
+    smoothing: float = 0.05,
+    title: str | None = None,
+) -> Figure:
+    """Figure of a run's losses over steps, one panel each.
+
+    Args:
+        metrics: Path of `metrics.jsonl`, or name to `(step [N], value [N])`.
+        keys: Names to show; by default the loss parts that are there.
+        smoothing: Share of the run over which the bold line averages.
+        title: Title of the figure.
+
+    Raises:
+        UserError: A key is not in the metrics; lists those that are.
+    """
+    series = metrics if isinstance(metrics, Mapping) else read_metrics(metrics)
+    keys = keys or [k for k in LOSS_KEYS if k in series] or sorted(series)[:3]
+    unknown = [key for key in keys if key not in series]
+    if unknown or not keys:
+        raise UserError(
+            f"no {', '.join(unknown) or 'values'} in the metrics; there are: "
+            f"{', '.join(sorted(series)) or 'none'}"
+        )
+    figure = new_figure(4.0 * len(keys), 3.4, layout="constrained")
+    for i, (key, ax) in enumerate(
+        zip(keys, figure.subplots(1, len(keys), squeeze=False)[0], strict=True)
+    ):
+        step, value = (np.asarray(v, float) for v in series[key])
+        color = SERIES_COLORS[i % len(SERIES_COLORS)]
+        ax.plot(step, value, color=color, alpha=0.3, lw=0.8, label="logged")
+        smooth = moving_mean(value, max(1, round(smoothing * value.size)))
+        ax.plot(step, smooth, color=color, lw=1.8, label="moving mean")
+        ax.set(xlabel="step", title=_AXIS_LABELS.get(key, key))
+        finite = value[np.isfinite(value)]
+        if finite.size and finite.min() > 0 and finite.max() > 20 * finite.min():
+            ax.set_yscale("log")
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=8)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def moving_mean(values: np.ndarray, width: int) -> np.ndarray:
+    """Mean over the last `width` finite values, fewer at the start; `[N]`."""
+    is_finite = np.isfinite(values)
+    total = np.cumsum(np.where(is_finite, values, 0.0))
+    count = np.cumsum(is_finite)
+    total[width:], count[width:] = (
+        total[width:] - total[:-width],
+        count[width:] - count[:-width],
+    )
+    return np.divide(total, count, out=np.full(values.shape, np.nan), where=count > 0)
+
+
+def calibration_bins(
+    scores: Any, is_match: Any, num_bins: int = 10
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean score, share of matches and number of detections in equal score bins.
+
+    Args:
+        scores: `[N]` in [0, 1].
+        is_match: `[N]` bool, True where the detection matches an object.
+        num_bins: Of equal width over [0, 1].
+
+    Returns:
+        `[num_bins]` each; mean score and share are NaN in empty bins.
+    """
+    scores, is_match = np.asarray(scores, float), np.asarray(is_match, bool)
+    if scores.shape != is_match.shape or scores.ndim != 1:
+        raise UserError(
+            f"scores {scores.shape} and matches {is_match.shape} must be vectors of "
+            "one length"
+        )
+    if scores.size and not (0 <= scores.min() <= scores.max() <= 1):
+        raise UserError(f"scores must lie in [0, 1], got up to {scores.max()}")
+    idx = np.minimum((scores * num_bins).astype(int), num_bins - 1)
+    count = np.bincount(idx, minlength=num_bins)
+    sums = np.bincount(idx, scores, num_bins), np.bincount(idx, is_match, num_bins)
+    mean, share = (
+        np.divide(s, count, out=np.full(num_bins, np.nan), where=count > 0)
+        for s in sums
+    )
+    return mean, share, count
+
+
+def draw_calibration(
+    scores: Any,
+    is_match: Any,
+    *,
+    num_bins: int = 10,
+    ax: Axes | None = None,
+    title: str | None = None,
+) -> Axes:
+    """Draws what share of detections with a score really are objects.
+
+    On the diagonal a score is a probability; below it the detector is too sure. The
+    text gives the expected calibration error, the mean distance to the diagonal weighted
+    by the number of detections.
+
+    Args:
+        scores: `[N]` in [0, 1].
+        is_match: `[N]` bool, True where the detection matches an object.
+        num_bins: Of equal width over [0, 1].
+        ax: Where to draw; a new figure by default.
+        title: Title of the axes.
+    """
+    mean, share, count = calibration_bins(scores, is_match, num_bins)
+    ax = new_figure(5.0, 4.4, layout="constrained").add_subplot() if ax is None else ax
+    ax.plot([0, 1], [0, 1], color="0.4", lw=1, ls="--", label="calibrated")
+    ax.plot(mean, share, "o-", color=SERIES_COLORS[0], label="detections")
+    histogram = ax.twinx()
+    edges = np.linspace(0, 1, num_bins + 1)
+    histogram.bar(
+        edges[:-1], count, 1 / num_bins, align="edge", color=SERIES_COLORS[5], alpha=0.3
+    )
+    histogram.set(ylabel="detections in the bin", ylim=(0, 3 * max(count.max(), 1)))
+    error = np.nansum(np.abs(mean - share) * count) / max(count.sum(), 1)
+    ax.set(
+        xlim=(0, 1),
+        ylim=(0, 1.02),
+        xlabel="score",
+        ylabel="share that matches an object",
+    )
+    text = f"expected calibration error {error:.3f}, {count.sum()} detections"
+    ax.set_title("\n".join(filter(None, (title, text))), fontsize=9)
+    ax.legend(fontsize=8, loc="upper left")
+    return ax
+
+
+def _line(i: int) -> dict[str, Any]:
+    """Colour and dash pattern of the i-th line; no two alike among the first 24."""
+    return {
+        "color": SERIES_COLORS[i % len(SERIES_COLORS)],
+        "linestyle": _LINE_STYLES[(i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)],
+        "linewidth": 1.8,
+    }

@@ -1,0 +1,106 @@
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from radejax.errors import DataError, UserError
+from radejax.visualize import curves
+
+
+def result(cls="Sedan", metric="AP3D_R41@0.3", num_gt=3):
+    return SimpleNamespace(
+        cls=cls,
+        metric=metric,
+        ap=70.0,
+        num_gt=num_gt,
+        recall=np.array([0.5, 0.1]),
+        precision=np.array([0.8, 1.0]),
+    )
+
+
+def test_precision_over_recall_in_order_of_recall():
+    ax = curves.draw_precision_recall([result(), result("Bicycle", num_gt=0)])
+    (line,) = ax.lines
+    np.testing.assert_array_equal(line.get_xydata(), [[0.1, 1.0], [0.5, 0.8]])
+    assert line.get_label() == "Sedan, AP 70.0 (3 objects)"
+    assert ax.get_title() == "AP3D_R41@0.3"
+
+
+def test_lines_differ_beyond_colour():
+    many = {str(i): ([0, 1], [1, 0]) for i in range(12)}
+    ax = curves.draw_precision_recall(many)
+    looks = {(line.get_color(), line.get_linestyle()) for line in ax.lines}
+    assert len(looks) == 12
+    assert len({line.get_linestyle() for line in ax.lines[:4]}) == 4
+
+
+def test_evaluation_results_can_be_drawn():
+    from radejax.evaluation.average_precision import evaluate
+
+    box = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [30.0, 0, 0, 4, 2, 1.5, 0]])
+    truth = {"frame": np.zeros(2, int), "box": box, "cls": np.array(["Sedan"] * 2)}
+    found = {**truth, "score": np.array([0.9, 0.8])}
+    results = evaluate(truth, found, classes=("Sedan",), iou_thresholds=(0.3,))
+    bev = [r for r in results if r.space == "bev"]
+    ax = curves.draw_precision_recall(bev)
+    assert len(ax.lines) == 1
+    with pytest.raises(UserError, match="one metric"):
+        curves.draw_precision_recall(results)
+
+
+def test_precision_recall_lengths_must_agree():
+    with pytest.raises(UserError, match="Sedan"):
+        curves.draw_precision_recall({"Sedan": ([0, 1], [1])})
+
+
+def write_metrics(path, extra=""):
+    lines = [json.dumps({"step": s, "focal": 1 / s, "gwd": 0.5}) for s in (1, 2, 4)]
+    path.write_text("\n".join(lines) + "\n" + extra)
+    return path
+
+
+def test_metrics_are_read_by_name(tmp_path):
+    path = write_metrics(tmp_path / "metrics.jsonl", '{"step": 5, "foc')
+    series = curves.read_metrics(path)
+    np.testing.assert_array_equal(series["focal"], [[1, 2, 4], [1, 0.5, 0.25]])
+    figure = curves.draw_training(path, title="run")
+    assert [ax.get_title() for ax in figure.axes] == ["focal", "gwd"]
+
+
+def test_damaged_metrics_are_named(tmp_path):
+    path = write_metrics(tmp_path / "metrics.jsonl", "oops\n")
+    with pytest.raises(DataError, match=r"metrics\.jsonl, line 4"):
+        curves.read_metrics(path)
+    with pytest.raises(FileNotFoundError, match=r"none\.jsonl"):
+        curves.read_metrics(tmp_path / "none.jsonl")
+    with pytest.raises(UserError, match=r"loss.*there are: gwd"):
+        curves.draw_training({"gwd": ([1], [2])}, keys=["loss"])
+
+
+def test_moving_mean_by_hand():
+    values = np.array([1.0, 3.0, np.nan, 5.0, 7.0])
+    mean = curves.moving_mean(values, 2)
+    np.testing.assert_allclose(mean, [1.0, 2.0, 3.0, 5.0, 6.0])
+    np.testing.assert_array_equal(curves.moving_mean(values[:1], 3), [1.0])
+    assert values[0] == 1.0
+
+
+def test_calibration_by_hand():
+    scores = [0.05, 0.15, 0.95, 1.0]
+    mean, share, count = curves.calibration_bins(scores, [False, True, True, False])
+    np.testing.assert_array_equal(count, [1, 1, 0, 0, 0, 0, 0, 0, 0, 2])
+    np.testing.assert_allclose(mean[[0, 1, 9]], [0.05, 0.15, 0.975])
+    np.testing.assert_array_equal(share[[0, 1, 9]], [0.0, 1.0, 0.5])
+    assert np.isnan(share[5])
+    ax = curves.draw_calibration(scores, [False, True, True, False])
+    # (0.05 + 0.85 + 2 * 0.475) / 4
+    assert "error 0.463, 4 detections" in ax.get_title()
+
+
+def test_calibration_without_detections_and_with_bad_ones():
+    assert "0 detections" in curves.draw_calibration([], []).get_title()
+    with pytest.raises(UserError, match=r"\[0, 1\]"):
+        curves.calibration_bins([1.5], [True])
+    with pytest.raises(UserError, match="one length"):
+        curves.calibration_bins([0.5], [True, False])
