@@ -147,7 +147,7 @@ def simulate(
     key: jax.Array,
     *,
     grid: RadarGrid,
-    parameters: RadarParameters = RadarParameters(),  # noqa: B008 (frozen)
+    parameters: RadarParameters = RadarParameters(),
     output: Output = "projection",
     rows_per_step: int = 1,
 ) -> jax.Array:

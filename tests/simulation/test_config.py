@@ -1,0 +1,82 @@
+"""Checks on the values a simulation depends on."""
+
+import json
+
+import ml_collections
+import pytest
+
+from radejax.errors import UserError
+from radejax.simulation.config import (
+    CONDITIONS,
+    SimulationConfig,
+    default_config,
+)
+from radejax.simulation.traffic import ENVIRONMENTS
+from radejax.simulation.weather import WEATHERS
+
+
+def test_default_has_every_weather_in_training_and_several_held_out():
+    config = SimulationConfig.from_mapping(default_config())
+    train = [config.conditions(n)[2] for n in range(1, config.train_sequences + 1)]
+    assert set(train) == set(WEATHERS)
+    last = config.train_sequences + config.test_sequences
+    held_out = [
+        config.conditions(n)[2] for n in range(config.train_sequences + 1, last + 1)
+    ]
+    assert len(set(held_out)) >= 4
+
+
+def test_conditions_are_kradars():
+    for environment, time, weather in CONDITIONS:
+        assert environment in ENVIRONMENTS
+        assert weather in WEATHERS
+        assert time in ("day", "night")
+    assert {c[0] for c in CONDITIONS} == set(ENVIRONMENTS)
+
+
+def test_config_dict_and_mapping_give_the_same_fingerprint():
+    plain = default_config()
+    as_config_dict = ml_collections.ConfigDict(default_config())
+    a = SimulationConfig.from_mapping(plain)
+    b = SimulationConfig.from_mapping(as_config_dict)
+    assert a.fingerprint() == b.fingerprint()
+    again = SimulationConfig.from_mapping(json.loads(a.to_json()))
+    assert again.fingerprint() == a.fingerprint()
+
+
+def test_fingerprint_follows_every_change():
+    base = SimulationConfig.from_mapping(default_config()).fingerprint()
+    changed = default_config()
+    changed["grid"]["num_range"] = 65
+    assert SimulationConfig.from_mapping(changed).fingerprint() != base
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sead": 1}, "unknown simulation field 'sead'"),
+        ({"frames_per_sequence": 0}, "frames_per_sequence must be an integer"),
+        ({"train_sequences": 2.5}, "train_sequences must be an integer"),
+        ({"train_sequences": 0, "test_sequences": 0}, "no sequences"),
+        ({"output": "video"}, "'tesseract' or 'projection', got 'video'"),
+        ({"grid": "velodyne"}, "'kradar' or sizes"),
+        ({"grid": {"num_range": 3}}, "simulation.grid"),
+        ({"radar": {"power": 3}}, "simulation.radar: unknown field"),
+        ({"lidar_to_radar_m": [0.0]}, "three numbers"),
+    ],
+)
+def test_wrong_values(change, message):
+    with pytest.raises(UserError, match=message):
+        SimulationConfig.from_mapping(default_config() | change)
+
+
+def test_missing_field():
+    config = default_config()
+    del config["seed"]
+    with pytest.raises(UserError, match="'seed' is missing"):
+        SimulationConfig.from_mapping(config)
+
+
+def test_kradar_grid():
+    config = SimulationConfig.from_mapping(default_config() | {"grid": "kradar"})
+    assert config.make_grid().shape_drea == (64, 256, 37, 107)

@@ -1,0 +1,172 @@
+"""The written tree: readable as K-Radar's, the same bytes, resumable, guarded."""
+
+import hashlib
+import json
+import os
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from radejax.data.kradar import KRadar, read_labels
+from radejax.errors import UserError
+from radejax.simulation import dataset
+from radejax.simulation.dataset import default_config, simulate_dataset
+
+
+def small_config(**changes):
+    config = default_config()
+    config |= {
+        "train_sequences": 2,
+        "test_sequences": 1,
+        "frames_per_sequence": 3,
+        "image_width": 64,
+        "image_height": 36,
+        "grid": {
+            "num_doppler": 8,
+            "num_range": 32,
+            "num_elevation": 5,
+            "num_azimuth": 24,
+            "max_range_m": 62.0,
+        },
+    }
+    return config | changes
+
+
+def digests(root):
+    files = sorted(p for p in root.rglob("*") if p.is_file())
+    return {
+        str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in files
+    }
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    root = tmp_path_factory.mktemp("simulated") / "kradar"
+    return simulate_dataset(small_config(), root, progress=False)
+
+
+class TestTree:
+    def test_reads_as_kradar_without_a_problem(self, tree):
+        data = KRadar(tree, split="train", strict=True)
+        assert len(data) == 6
+        assert data.grid.shape_drea == (8, 32, 5, 24)
+        assert len(KRadar(tree, split="test")) == 3
+        frame = data[0]
+        assert frame.tesseract_path.is_file()
+        assert (frame.environment, frame.time, frame.weather) == (
+            "urban",
+            "day",
+            "normal",
+        )
+        assert np.asarray(Image.open(frame.camera_path)).shape == (36, 128, 3)
+
+    def test_tesseract_has_kradars_variable_axes_and_level(self, tree):
+        import scipy.io
+
+        path = KRadar(tree)[0].tesseract_path
+        power = scipy.io.loadmat(path)["arrDREA"]
+        assert power.shape == (8, 32, 5, 24)
+        assert power.dtype == np.float32
+        normalised = (10.0 * np.log10(power + 1e-10) + 1.2) / 184.3
+        assert normalised.min() >= 0.0
+        assert normalised.max() <= 1.0
+        assert 0.45 < np.median(normalised) < 0.6  # the noise floor
+
+    def test_file_numbers_agree_with_the_header(self, tree):
+        for frame in KRadar(tree):
+            header = frame.header
+            assert frame.name == f"{header.radar:05d}_{header.lidar:05d}"
+            assert frame.tesseract_path.name == f"tesseract_{header.radar:05d}.mat"
+            assert frame.camera_path.name == f"cam-front_{header.camera_front:05d}.png"
+        text = (tree / "1" / "info_calib" / "calib_radar_lidar.txt").read_text()
+        first = KRadar(tree)[0].header
+        assert text.splitlines()[1] == f"{first.radar - first.lidar},-2.54,0.3"
+
+    def test_tracks_keep_identity_class_and_size(self, tree):
+        folder = tree / "1" / "info_label_v2_1"
+        frames = [read_labels(p) for p in sorted(folder.iterdir())]
+        first, second = ({x.track_id: x for x in f} for f in frames[:2])
+        both = first.keys() & second.keys()
+        assert len(both) >= 5
+        for track in both:
+            a, b = first[track], second[track]
+            assert a.cls == b.cls
+            np.testing.assert_allclose(a.box[3:6], b.box[3:6])
+            assert np.hypot(a.box[0] - b.box[0], a.box[1] - b.box[1]) < 6.0
+
+    def test_both_visibilities_occur(self, tree):
+        flags = {
+            label.visibility
+            for f in KRadar(tree, visibility=None)
+            for label in f.labels
+        }
+        assert flags == {"R", "L"}
+
+
+class TestRepeating:
+    def test_same_seed_same_bytes_on_any_number_of_threads(self, tree, tmp_path):
+        again = simulate_dataset(
+            small_config(), tmp_path / "again", num_threads=1, progress=False
+        )
+        assert digests(again) == digests(tree)
+
+    def test_another_seed_gives_other_bytes(self, tree, tmp_path):
+        config = small_config(
+            seed=1, train_sequences=1, test_sequences=0, frames_per_sequence=1
+        )
+        other = simulate_dataset(config, tmp_path / "other", progress=False)
+        label = next((other / "1" / "info_label_v2_1").iterdir())
+        mine = sorted((tree / "1" / "info_label_v2_1").iterdir())[0]
+        assert label.read_bytes() != mine.read_bytes()
+
+    def test_resumes_after_an_interruption_with_the_same_bytes(
+        self, tree, tmp_path, monkeypatch
+    ):
+        root = tmp_path / "interrupted"
+        write, calls = dataset._SequenceWriter.write, []
+
+        def stops(self, index):
+            if len(calls) == 4:
+                raise KeyboardInterrupt
+            calls.append(index)
+            write(self, index)
+
+        monkeypatch.setattr(dataset._SequenceWriter, "write", stops)
+        with pytest.raises(KeyboardInterrupt):
+            simulate_dataset(small_config(), root, num_threads=1, progress=False)
+        assert not json.loads((root / dataset.MARKER).read_text())["finished"]
+        monkeypatch.setattr(dataset._SequenceWriter, "write", write)
+        simulate_dataset(small_config(), root, progress=False)
+        assert digests(root) == digests(tree)
+
+    def test_finished_data_set_is_reused_untouched(self, tree, monkeypatch):
+        monkeypatch.setattr(
+            dataset, "_write_frames", lambda *a: pytest.fail("simulated again")
+        )
+        assert simulate_dataset(small_config(), tree, progress=False) == tree
+
+
+class TestWrongUse:
+    def test_other_config_names_the_field(self, tree):
+        with pytest.raises(UserError, match="another simulation config.*seed"):
+            simulate_dataset(small_config(seed=5), tree, progress=False)
+
+    def test_alien_folder_is_left_alone(self, tmp_path):
+        (tmp_path / "holiday.txt").write_text("mine")
+        with pytest.raises(UserError, match="not empty"):
+            simulate_dataset(small_config(), tmp_path, progress=False)
+
+    def test_file_instead_of_folder(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(UserError, match="is a file"):
+            simulate_dataset(small_config(), tmp_path / "file", progress=False)
+
+    def test_full_disk(self, tmp_path, monkeypatch):
+        def full(*args, **kwargs):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "replace", full)
+        with pytest.raises(UserError, match="no space left"):
+            simulate_dataset(small_config(), tmp_path / "full", progress=False)
