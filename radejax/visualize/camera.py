@@ -150,8 +150,11 @@ def _draw_boxes(
     hulls = [segments[i][is_visible[i]].reshape(-1, 2) for i in drawn]
     lines = np.concatenate([segments[i][is_visible[i]] for i in drawn] or [[]])
     heights = [np.repeat(np.ptp(hull[:, 1]), len(hull) // 2) for hull in hulls]
-    # Lines of a box of few pixels are thinner, or they would fill it.
-    widths = width * np.clip(np.concatenate(heights or [[]]) / 60.0, 0.4, 1.0)
+    # Lines of a small box are thinner, or they would fill it.
+    points_per_pixel = ax.get_window_extent().width / calibration.width
+    points_per_pixel *= 72 / ax.figure.dpi
+    heights_pt = np.concatenate(heights or [[]]) * points_per_pixel
+    widths = width * np.clip(heights_pt / 24.0, 0.4, 1.0)
     for stroke, extra, order in (("black", 1.0, 4), (color, 0.0, 4.1)):
         collection = LineCollection(
             lines,
