@@ -326,7 +326,9 @@ def _draw(
                     score_threshold=options.score_threshold,
                 )
                 written.append(path)
-        plots.calibration(metrics["calibration"], out_dir / "calibration.png")
+        plots.calibration(
+            data, out_dir / "calibration.png", iou=options.iou_thresholds[0]
+        )
         written.append(out_dir / "calibration.png")
     if options.draw_frame is not None:
         folder = out_dir / "worst_frames"

@@ -1,0 +1,150 @@
+"""Evaluates a run, or predictions made elsewhere, or compares two.
+
+    python evaluate.py --workdir runs/quickstart
+    python evaluate.py --predictions found.json --data /data/kradar --out results
+    python evaluate.py --predictions kitti_folder --out results
+    python evaluate.py --compare results_a results_b
+
+Predictions: .npz, .json, .csv, or a folder of text files as K-Radar's tools write them.
+Ground truth: --data (K-Radar), --labels (a label revision alone), --ground_truth (a file),
+or what lies in the folder of predictions. docs/evaluation.md explains every number.
+"""
+
+import sys
+
+from absl import app, flags
+
+from radejax import entry
+
+_WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run of train.py.")
+_CHECKPOINT = flags.DEFINE_integer("checkpoint", None, "Step; the newest by default.")
+_PREDICTIONS = flags.DEFINE_string("predictions", None, "File or folder.")
+_COMPARE = flags.DEFINE_string(
+    "compare", None, "Run A; run B follows: --compare A B. Reports or predictions."
+)
+_OUT = flags.DEFINE_string(
+    "out",
+    None,
+    "Folder of the report; beside the predictions or in the workdir if none.",
+)
+_DATA = flags.DEFINE_list("data", [], "Root folders of K-Radar.")
+_LABELS = flags.DEFINE_string("labels", None, "Folder or zip of a label revision.")
+_LABEL_VERSION = flags.DEFINE_string("label_version", "v2.1", "v1.0, v1.1, v2.0, v2.1.")
+_SPLIT = flags.DEFINE_string("split", "test", "train, test, all or a split file.")
+_GROUND_TRUTH = flags.DEFINE_string("ground_truth", None, "File of ground truth.")
+_FRAMES = flags.DEFINE_string("frames", None, "JSON of frame columns, for it.")
+_CLASSES = flags.DEFINE_list("classes", None, "Classes; K-Radar's five by default.")
+_PROTOCOLS = flags.DEFINE_list("protocols", None, "Protocols; all by default.")
+_IOU = flags.DEFINE_list("iou", ["0.3", "0.5", "0.7"], "IoU thresholds.")
+_ROI = flags.DEFINE_string("roi", "narrow", "narrow, wide or none.")
+_SCORE = flags.DEFINE_float("score_threshold", 0.0, "Predictions need more than this.")
+_BOOTSTRAP = flags.DEFINE_integer(
+    "bootstrap", 0, "Resamples of sequences for intervals (2000 in --compare if 0)."
+)
+_NAME = flags.DEFINE_string("name", None, "Name of the run in tables.")
+_SIZES = flags.DEFINE_enum(
+    "invalid_sizes",
+    "error",
+    ["error", "false_positive"],
+    "Predicted sizes that are not positive.",
+)
+_DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
+
+
+def main(argv: list[str]) -> None:
+    """Chooses between a run, files and a comparison."""
+    with entry.exit_codes(debug=_DEBUG.value):
+        from radejax.errors import UserError
+
+        modes = [f for f in (_WORKDIR, _PREDICTIONS, _COMPARE) if f.value is not None]
+        if len(modes) != 1:
+            raise UserError("give one of --workdir, --predictions and --compare A B")
+        if len(argv) != (2 if _COMPARE.value is not None else 1):
+            raise UserError(
+                f"unexpected arguments: {' '.join(argv[1:]) or 'run B lacks'}"
+            )
+        if _WORKDIR.value is not None:
+            evaluate_workdir()
+        elif _PREDICTIONS.value is not None:
+            evaluate_files()
+        else:
+            compare(argv[1])
+
+
+def evaluate_workdir() -> None:
+    """Runs the detector of a run over a split; the config of the run has the options."""
+    entry.set_up_jax()
+    from radejax.evaluate_run import evaluate_run
+
+    evaluate_run(
+        _WORKDIR.value, step=_CHECKPOINT.value, split=_SPLIT.value, out=_OUT.value
+    )
+
+
+def evaluate_files() -> None:
+    """Evaluates predictions in files."""
+    import pathlib
+
+    from radejax.evaluation import commands
+
+    path = pathlib.Path(_PREDICTIONS.value)
+    out = _OUT.value or path.with_name(f"{path.stem}_evaluation")
+    report = commands.evaluate_files(path, out, _source(), _options(path.stem))
+    sys.stdout.write(f"{report.text}\nWritten to {out}\n")
+
+
+def compare(path_b: str) -> None:
+    """Compares two runs."""
+    from radejax.evaluation import commands
+
+    text, _ = commands.compare_files(
+        _COMPARE.value,
+        path_b,
+        _OUT.value,
+        _source(),
+        _options("comparison"),
+        resamples=_BOOTSTRAP.value or 2000,
+    )
+    sys.stdout.write(text)
+
+
+def _source() -> object:
+    from radejax.evaluation.commands import Source
+
+    return Source(
+        data=tuple(_DATA.value),
+        labels=_LABELS.value,
+        label_version=_LABEL_VERSION.value,
+        split=None if _SPLIT.value == "all" else _SPLIT.value,
+        ground_truth=_GROUND_TRUTH.value,
+        frames=_FRAMES.value,
+    )
+
+
+def _options(name: str) -> object:
+    from radejax.errors import UserError
+    from radejax.evaluation.measure import Options
+
+    try:
+        thresholds = tuple(float(value) for value in _IOU.value)
+    except ValueError:
+        raise UserError(f"--iou must be numbers, got {','.join(_IOU.value)}") from None
+    changes = {}
+    if _CLASSES.value:
+        changes["classes"] = tuple(_CLASSES.value)
+    if _PROTOCOLS.value:
+        changes["protocols"] = tuple(_PROTOCOLS.value)
+    return Options(
+        run=_NAME.value or name,
+        iou_thresholds=thresholds,
+        score_threshold=_SCORE.value,
+        roi=None if _ROI.value == "none" else _ROI.value,
+        label_version=_LABEL_VERSION.value,
+        bootstrap=_BOOTSTRAP.value,
+        invalid_sizes=_SIZES.value,
+        **changes,
+    )
+
+
+if __name__ == "__main__":
+    app.run(main, flags_parser=entry.parse_flags)
