@@ -7,6 +7,7 @@ root that has it.
 
 from __future__ import annotations
 
+import json
 import os
 import pathlib
 import re
@@ -14,6 +15,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 
 from radejax.errors import DataError, UserError
+from radejax.geometry.radar_grid import RadarGrid
 
 _OWN_LABEL_FOLDERS = {
     "v1.0": ("info_label_v1_0", "info_label"),
@@ -189,3 +191,25 @@ def find_camera_calibration(
             if (folder / name).is_file():
                 return folder / name
     return None
+
+
+def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
+    """Sensor axes of a data set: `radar_grid.json` in a root, else K-Radar's.
+
+    Raises:
+        DataError: The file is malformed, or two roots have different axes.
+    """
+    found: dict[pathlib.Path, RadarGrid] = {}
+    for root in roots:
+        path = root / "radar_grid.json"
+        if path.is_file():
+            try:
+                found[path] = RadarGrid.from_dict(json.loads(path.read_bytes()))
+            except (ValueError, KeyError, TypeError) as error:
+                raise DataError(f"{path}: no radar grid: {error!r}") from None
+    if len(set(found.values())) > 1:
+        raise DataError(
+            f"different sensor axes in {', '.join(map(str, found))}; data sets of "
+            "different sensors cannot be read as one"
+        )
+    return next(iter(found.values()), RadarGrid.kradar())

@@ -1,4 +1,4 @@
-"""What opening a data set found: counts, problems with file and line, notes."""
+"""What reading a data set found: counts, problems with file and line, notes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any
 
 from radejax.data.labels import Problem
+from radejax.errors import DataError
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -49,3 +50,37 @@ class Summary:
             if number > max_problems:
                 lines.append(f"    ... and {number - max_problems:,} more")
         return "\n".join(lines)
+
+
+class Findings:
+    """Collects a `Summary` while files are read; `strict` raises the first problem."""
+
+    def __init__(self, *, strict: bool) -> None:
+        self.strict = strict
+        self.counts: collections.Counter[str] = collections.Counter()
+        self.problems: list[Problem] = []
+        self.notes: list[str] = []
+
+    def report(
+        self,
+        kind: str,
+        where: str,
+        message: str,
+        error: type[Exception] = DataError,
+    ) -> None:
+        """Keeps a problem, or raises it when strict.
+
+        Args:
+            kind: What is counted together.
+            where: File, line or frame.
+            message: What was found and what was expected; may repeat `where`.
+            error: What strict reading raises.
+        """
+        problem = Problem(kind, where, message.removeprefix(f"{where}:").strip())
+        if self.strict:
+            raise error(str(problem))
+        self.problems.append(problem)
+
+    def summary(self) -> Summary:
+        """A copy of everything so far."""
+        return Summary(dict(self.counts), list(self.problems), list(self.notes))
