@@ -78,10 +78,12 @@ def load(
             f"{path} holds predictions only: say where the ground truth is, with --data,"
             " --labels or --ground_truth"
         )
-    if path.is_dir():
-        found = kitti.read_kitti(path)[1]
-    else:
-        found = predictions_io.read_table(path, frames)
+    is_folder = path.is_dir()
+    found = (
+        kitti.read_kitti(path)[1]
+        if is_folder
+        else predictions_io.read_table(path, frames)
+    )
     if frames is None:
         both = np.concatenate([truth["frame"], found["frame"]])
         frames = {"frame": np.unique(both)}

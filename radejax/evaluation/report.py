@@ -102,7 +102,8 @@ def write_report(
     ]
     # The inputs stay with the report, so that two reports can be compared later.
     for name, table in (("predictions", predictions), ("ground_truth", ground_truth)):
-        predictions_io.write_table(out_dir / f"{name}.npz", table)
+        keys = frames if "name" in frames else None
+        predictions_io.write_table(out_dir / f"{name}.npz", table, keys)
         written.append(out_dir / f"{name}.npz")
     written.append(_write(out_dir / "frames.json", files.write_json, _lists(frames)))
     tables = paper_tables(rows, options)
@@ -314,21 +315,19 @@ def _draw(
         from radejax.evaluation import plots  # matplotlib takes a second to load
 
         masks = measure.condition_masks(frames, "weather")
+        iou = options.iou_thresholds[0]
         for space in SPACES:
-            for iou in options.iou_thresholds:
-                path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
-                plots.precision_recall(
-                    data,
-                    masks,
-                    path,
-                    iou=iou,
-                    space=space,
-                    score_threshold=options.score_threshold,
-                )
-                written.append(path)
-        plots.calibration(
-            data, out_dir / "calibration.png", iou=options.iou_thresholds[0]
-        )
+            path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
+            plots.precision_recall(
+                data,
+                masks,
+                path,
+                iou=iou,
+                space=space,
+                score_threshold=options.score_threshold,
+            )
+            written.append(path)
+        plots.calibration(data, out_dir / "calibration.png", iou=iou)
         written.append(out_dir / "calibration.png")
     if options.draw_frame is not None:
         folder = out_dir / "worst_frames"
