@@ -6,98 +6,32 @@ never on threads or workers; the state of the iterator is one number.
 
 from __future__ import annotations
 
-import dataclasses
-import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 import grain
 import numpy as np
 
-from radejax.data.kradar import Frame
+from radejax.data.frame import Frame
+from radejax.data.frame_table import (
+    IMAGE_SHAPE,
+    FrameTable,
+    frames_with_records,
+    make_table,
+    read_left_image,
+)
 from radejax.data.records import RecordSource
 from radejax.errors import UserError
 from radejax.structures import CLASSES, Batch
 
-MIN_OBJECTS = 1
-IMAGE_SHAPE = (720, 1280, 3)
-"""Left half of K-Radar's 2560 x 720 stereo images."""
-
-
-@dataclasses.dataclass(frozen=True)
-class FrameTable:
-    """Labels of a data set as arrays of fixed shape, F frames with up to N objects.
-
-    Attributes:
-        record: `[F]` int64 index of each frame's record.
-        boxes: `[F, N, 8]` float32 x, y, z, l, w, h, sin yaw, cos yaw; zeros as padding.
-        classes: `[F, N]` int32 class indices; -1 as padding.
-        is_valid: `[F, N]` bool, True where a row is an object.
-        image_paths: Front image of every frame, None when images are not loaded.
-    """
-
-    record: np.ndarray
-    boxes: np.ndarray
-    classes: np.ndarray
-    is_valid: np.ndarray
-    image_paths: tuple[pathlib.Path, ...] | None
-
-    def __len__(self) -> int:
-        return len(self.record)
-
-
-def make_table(
-    records: RecordSource,
-    frames: Sequence[Frame],
-    *,
-    max_objects: int,
-    classes: Sequence[str] = CLASSES,
-    images: bool = False,
-    label_permutation_seed: int | None = None,
-) -> FrameTable:
-    """Labels of the frames, padded, next to the indices of their records.
-
-    Args:
-        records: Projections, of these frames at least.
-        frames: Labelled frames, normally a split of a `KRadar`.
-        max_objects: Rows N of every frame.
-        classes: Class names in the order of the class indices; objects of other
-            classes are not targets and are left out.
-        images: Also note the front images.
-        label_permutation_seed: Exchange the labels of the frames at random. Training
-            on such labels must fail: a check that a result is not an accident.
-
-    Raises:
-        UserError: A frame has more than `max_objects` objects (the message says how
-            many would do), or has no record or image, or there are no frames.
-    """
-    if not len(frames):
-        raise UserError("no frames: the data set or the split is empty")
-    record = _record_indices(records, frames)
-    class_index = {cls: index for index, cls in enumerate(classes)}
-    kept = [[cls in class_index for cls in frame.classes] for frame in frames]
-    largest = max(range(len(frames)), key=lambda i: sum(kept[i]))
-    if sum(kept[largest]) > max_objects:
-        raise UserError(
-            f"frame {frames[largest].key} has {sum(kept[largest])} objects, but "
-            f"max_objects is {max_objects}; {sum(kept[largest])} would do for all "
-            f"{len(frames)} frames"
-        )
-    shape = (len(frames), max_objects)
-    boxes = np.zeros((*shape, 8), np.float32)
-    indices = np.full(shape, -1, np.int32)
-    for i, frame in enumerate(frames):
-        rows = np.flatnonzero(kept[i])
-        yaw = frame.boxes[rows, 6:]
-        boxes[i, : len(rows)] = np.concatenate(
-            [frame.boxes[rows, :6], np.sin(yaw), np.cos(yaw)], axis=-1
-        )
-        indices[i, : len(rows)] = [class_index[frame.classes[row]] for row in rows]
-    if label_permutation_seed is not None:
-        order = np.random.default_rng(label_permutation_seed).permutation(len(frames))
-        boxes, indices = boxes[order], indices[order]
-    paths = tuple(_image_path(frame) for frame in frames) if images else None
-    return FrameTable(record, boxes, indices, indices >= 0, paths)
+__all__ = [
+    "FrameTable",
+    "frames_with_records",
+    "make_loader",
+    "make_table",
+    "read_left_image",
+    "steps_per_epoch",
+]
 
 
 def make_loader(
@@ -119,6 +53,8 @@ def make_loader(
     process_count: int | None = None,
     augment: Any = None,
     images: bool = False,
+    cameras: Sequence[Any] | None = None,
+    allow_missing_images: bool = False,
     device: Any = None,
     label_permutation_seed: int | None = None,
 ) -> grain.DatasetIterator[Batch]:
@@ -150,6 +86,8 @@ def make_loader(
         process_count: Number of hosts; None asks jax.
         augment: `augment.Augmentation` applied to every frame, or None.
         images: Fill `Batch.image` with left front images, uint8.
+        cameras: Fill `Batch.camera` from one `geometry.camera.Camera` a frame.
+        allow_missing_images: As in `make_table`.
         device: Device or sharding to put batches on ahead of use; None: host arrays.
         label_permutation_seed: As in `make_table`.
 
@@ -167,6 +105,8 @@ def make_loader(
         max_objects=max_objects,
         classes=classes,
         images=images,
+        cameras=cameras,
+        allow_missing_images=allow_missing_images,
         label_permutation_seed=label_permutation_seed,
     )
     if process_count is None or process_index is None:
@@ -182,9 +122,7 @@ def make_loader(
         pad_remainder,
         (process_index, process_count),
     )
-    dataset = order.repeat(num_epochs).map(
-        _LoadBatch(records, table, augment, max_objects)
-    )
+    dataset = order.repeat(num_epochs).map(_LoadBatch(records, table, augment))
     threads = grain.ReadOptions(
         num_threads=num_threads, prefetch_buffer_size=max(prefetch, num_threads)
     )
@@ -263,36 +201,53 @@ class _AddSeed(grain.transforms.RandomMap):
 class _LoadBatch(grain.transforms.Map):
     """Reads the frames of a batch, each straight into its place."""
 
-    def __init__(
-        self, records: RecordSource, table: FrameTable, augment: Any, max_objects: int
-    ) -> None:
-        self._records, self._table = records, table
-        self._augment, self._max_objects = augment, max_objects
+    def __init__(self, records: RecordSource, table: FrameTable, augment: Any) -> None:
+        self._records, self._table, self._augment = records, table, augment
 
     def __repr__(self) -> str:
         return "_LoadBatch()"
 
     def map(self, element: np.ndarray) -> Batch:
         batch = self._empty(len(element))
+        cameras = []
         for row, (index, seed) in enumerate(element):
             if index >= len(self._table):
+                cameras.append(self._camera(0, is_valid=False))
                 continue
-            record = self._records[int(self._table.record[index])]
-            frame = {
-                "projection": record["projection"],
-                "boxes": self._table.boxes[index],
-                "image": self._image(index),
-            }
+            sample = self._sample(index)
             if self._augment is not None:
-                frame = self._augment(frame, np.random.default_rng(int(seed)))
-            batch.projection[row] = frame["projection"]
-            batch.boxes[row] = frame["boxes"]
+                sample = self._augment(sample, np.random.default_rng(int(seed)))
+            batch.projection[row] = sample["projection"]
+            batch.boxes[row] = sample["boxes"]
             batch.classes[row] = self._table.classes[index]
             batch.is_valid[row] = self._table.is_valid[index]
             batch.frame[row] = index
+            cameras.append(sample["camera"])
             if batch.image is not None:
-                batch.image[row] = frame["image"]
-        return batch
+                batch.image[row] = sample["image"]
+        if self._table.cameras is None:
+            return batch
+        return batch.replace(camera=_stack(cameras))
+
+    def _sample(self, index: int) -> dict[str, Any]:
+        """One frame; images and cameras None where they are not asked for."""
+        record = self._records[int(self._table.record[index])]
+        image = self._image(index)
+        return {
+            "projection": record["projection"],
+            "boxes": self._table.boxes[index],
+            "image": image,
+            "camera": self._camera(index),
+        }
+
+    def _camera(self, index: int, is_valid: bool = True) -> Any:
+        if self._table.cameras is None:
+            return None
+        camera = self._table.cameras[index]
+        paths = self._table.image_paths
+        if not is_valid or (paths is not None and paths[index] is None):
+            camera = camera.replace(is_valid=np.bool_(False))
+        return camera
 
     def _empty(self, size: int) -> Batch:
         """Nothing but padding."""
@@ -300,11 +255,12 @@ class _LoadBatch(grain.transforms.Map):
         image = None
         if self._table.image_paths is not None:
             image = np.zeros((size, *IMAGE_SHAPE), np.uint8)
+        rows = (size, self._table.boxes.shape[1])
         return Batch(
             projection=np.zeros((size, *shape), dtype),
-            boxes=np.zeros((size, self._max_objects, 8), np.float32),
-            classes=np.full((size, self._max_objects), -1, np.int32),
-            is_valid=np.zeros((size, self._max_objects), bool),
+            boxes=np.zeros((*rows, 8), np.float32),
+            classes=np.full(rows, -1, np.int32),
+            is_valid=np.zeros(rows, bool),
             frame=np.full(size, -1, np.int32),
             image=image,
         )
@@ -312,57 +268,18 @@ class _LoadBatch(grain.transforms.Map):
     def _image(self, index: int) -> np.ndarray | None:
         if self._table.image_paths is None:
             return None
-        return read_left_image(self._table.image_paths[index])
-
-
-def read_left_image(path: pathlib.Path) -> np.ndarray:
-    """`[720, 1280, 3]` uint8 left half of a front image (a stereo pair, or left only).
-
-    Raises:
-        DataError: The file is damaged or of another size.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    from radejax.errors import DataError
-
-    height, width, _ = IMAGE_SHAPE
-    try:
-        with Image.open(path) as file:
-            if file.size not in ((2 * width, height), (width, height)):
-                raise DataError(
-                    f"{path}: {file.size[0]} x {file.size[1]} pixels, expected "
-                    f"{2 * width} x {height} (stereo) or {width} x {height}"
-                )
-            return np.asarray(file.convert("RGB").crop((0, 0, width, height)))
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise DataError(f"{path}: damaged image ({error})") from None
-
-
-def _record_indices(records: RecordSource, frames: Sequence[Frame]) -> np.ndarray:
-    """`[F]` record of every frame; `UserError` if one has none."""
-    index_of = records.index_of()
-    missing = [frame.key for frame in frames if frame.key not in index_of]
-    if missing:
-        skipped = records.manifest.skipped
-        reason = f" ({skipped[missing[0]]})" if missing[0] in skipped else ""
-        raise UserError(
-            f"{records.folder}: {len(missing)} of {len(frames)} frames have no record, "
-            f"the first is {missing[0]}{reason}; project them, or leave them out with "
-            "pipeline.frames_with_records"
+        path = self._table.image_paths[index]
+        return (
+            np.zeros(IMAGE_SHAPE, np.uint8) if path is None else read_left_image(path)
         )
-    return np.array([index_of[frame.key] for frame in frames], np.int64)
 
 
-def frames_with_records(
-    records: RecordSource, frames: Sequence[Frame]
-) -> tuple[list[Frame], list[str]]:
-    """Frames that have a record, and the keys of those that have none."""
-    index_of = records.index_of()
-    missing = [frame.key for frame in frames if frame.key not in index_of]
-    return [frame for frame in frames if frame.key in index_of], missing
+def _stack(cameras: Sequence[Any]) -> Any:
+    """Leaves `[B, ...]`, float32 or bool, as the device computes."""
+    import jax
 
+    def stack(*leaves: Any) -> np.ndarray:
+        stacked = np.stack(leaves)
+        return stacked if stacked.dtype == bool else stacked.astype(np.float32)
 
-def _image_path(frame: Frame) -> pathlib.Path:
-    if frame.camera_path is None:
-        raise UserError(f"frame {frame.key} has no front image (cam-front_*.png)")
-    return frame.camera_path
+    return jax.tree.map(stack, *cameras)

@@ -1,0 +1,137 @@
+"""Augmentation of single frames: radar, boxes, image and camera stay in register.
+
+Off by default: the papers train without. Mirroring is exact on any grid whose azimuth
+axis is symmetric. Range-dependent gain imitates that received power varies with range
+for reasons that no label shows (weather, antenna, amplifier).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from radejax.data.encoding import decode, encode
+from radejax.data.projection import LOG_SCALE_DB
+from radejax.errors import UserError
+from radejax.geometry.radar_grid import RadarGrid
+
+Sample = dict[str, Any]
+"""One frame: projection `[R, A, D+E]`, boxes `[N, 8]`, image and camera or None."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Augmentation:
+    """Random changes of a frame; call it with a sample and a generator.
+
+    Attributes:
+        grid: Sensor axes of the projections.
+        mirror_probability: Of exchanging left and right.
+        gain_db: Standard deviation of a gain at all ranges, in decibels of power.
+        gain_slope_db: Standard deviation of a gain that grows linearly from 0 at the
+            sensor to this at the last range.
+
+    Raises:
+        UserError: Mirroring a grid that is not symmetric, or a negative strength.
+    """
+
+    grid: RadarGrid
+    mirror_probability: float = 0.5
+    gain_db: float = 1.0
+    gain_slope_db: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.mirror_probability <= 1:
+            raise UserError(
+                f"mirror_probability {self.mirror_probability} is not in [0, 1]"
+            )
+        if min(self.gain_db, self.gain_slope_db) < 0:
+            raise UserError(
+                "gain_db and gain_slope_db are standard deviations, at least 0"
+            )
+        azimuth = self.grid.azimuth_rad
+        tolerance = 1e-3 * self.grid.azimuth_step_rad
+        if (
+            self.mirror_probability
+            and np.abs(azimuth + azimuth[::-1]).max() > tolerance
+        ):
+            raise UserError(
+                f"cannot mirror: azimuths {azimuth[0]:.4f} to {azimuth[-1]:.4f} rad are "
+                "not symmetric; set mirror_probability to 0"
+            )
+
+    def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
+        """A changed copy of a sample; the input is left as it is."""
+        # Draw everything always: one option must not change another's numbers.
+        is_mirrored = rng.random() < self.mirror_probability
+        gain_db, slope_db = rng.normal(size=2) * (self.gain_db, self.gain_slope_db)
+        if is_mirrored:
+            sample = mirror(sample)
+        if gain_db or slope_db:
+            projection = add_range_gain(
+                sample["projection"], self.grid, gain_db, slope_db
+            )
+            sample = {**sample, "projection": projection}
+        return sample
+
+
+def mirror(sample: Sample) -> Sample:
+    """Left and right exchanged: y to -y in the radar frame, u to W - u in the image.
+
+    Radial velocity, elevation and range do not change. Padded boxes stay zero.
+    """
+    camera = sample.get("camera")
+    image = sample.get("image")
+    return {
+        **sample,
+        "projection": sample["projection"][:, ::-1],
+        "boxes": mirror_boxes(sample["boxes"]),
+        "image": None if image is None else image[:, ::-1],
+        "camera": None if camera is None else mirror_camera(camera),
+    }
+
+
+def mirror_boxes(boxes: np.ndarray) -> np.ndarray:
+    """Boxes `[..., 8]` on the other side: y and sin yaw change sign."""
+    return boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype)
+
+
+def mirror_camera(camera: Any) -> Any:
+    """The camera that sees a mirrored world as the mirrored image.
+
+    With M = diag(-1, 1, 1) on camera axes: p_cam' = M [R | t] (x, -y, z, 1), and
+    u' = W - u. The lens term p2 is odd in x.
+
+    Args:
+        camera: `geometry.camera.Camera` of one frame.
+    """
+    cam_from_ego = np.array(camera.cam_from_ego)
+    cam_from_ego[..., 0, :] *= -1
+    cam_from_ego[..., :, 1] *= -1
+    intrinsics = np.array(camera.intrinsics)
+    intrinsics[..., 2] = np.asarray(camera.size_px)[..., 0] - intrinsics[..., 2]
+    distortion = np.array(camera.distortion)
+    distortion[..., 3] *= -1
+    return camera.replace(
+        cam_from_ego=cam_from_ego, intrinsics=intrinsics, distortion=distortion
+    )
+
+
+def add_range_gain(
+    projection: np.ndarray, grid: RadarGrid, gain_db: float, slope_db: float
+) -> np.ndarray:
+    """A projection received with another gain: gain + slope * range / largest range.
+
+    Args:
+        projection: `[R, A, D+E]` in the type of the records.
+        grid: Its sensor axes.
+        gain_db: At all ranges, decibels of power.
+        slope_db: At the last range, in addition.
+
+    Returns:
+        `[R, A, D+E]` in the same type; 8-bit values are clipped to their scale.
+    """
+    db = gain_db + slope_db * grid.range_m / grid.range_m[-1]
+    shift = np.float32(db / LOG_SCALE_DB)[:, None, None]
+    return encode(decode(projection) + shift, projection.dtype.name)
