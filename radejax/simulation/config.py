@@ -42,9 +42,13 @@ def default_config() -> dict[str, Any]:
         A fresh dictionary of plain values:
 
         - `seed`: everything random follows from it.
-        - `train_sequences`, `test_sequences`: how many; numbered from 1, training
-          first. Conditions go round `CONDITIONS`.
-        - `frames_per_sequence`: at 10 frames a second.
+        - `scenes`: "procedural", or the path of a K-Radar label folder or zip.
+        - `train_sequences`, `test_sequences`: how many procedural ones; numbered from
+          1, training first. Conditions go round `CONDITIONS`.
+        - `sequences`: numbers of the sequences of real labels; None for all.
+        - `label_version`: version of real labels.
+        - `frames_per_sequence`: at 10 frames a second; 0 for all of real labels.
+        - `frame_stride`: use every n-th frame of real labels.
         - `grid`: arguments of `RadarGrid.reduced`, or "kradar".
         - `radar`: fields of `RadarParameters` that differ from its defaults.
         - `output`: "tesseract" for K-Radar's files, "projection" for the projections
@@ -56,9 +60,13 @@ def default_config() -> dict[str, Any]:
     """
     return {
         "seed": 0,
+        "scenes": "procedural",
         "train_sequences": 10,
         "test_sequences": 5,
+        "sequences": None,
+        "label_version": "v2.1",
         "frames_per_sequence": 40,
+        "frame_stride": 1,
         "grid": {
             "num_doppler": 16,
             "num_range": 64,
@@ -80,9 +88,13 @@ class SimulationConfig:
     """Checked values of a simulation; see `default_config` for the fields."""
 
     seed: int
+    scenes: str
     train_sequences: int
     test_sequences: int
+    sequences: list[int] | None
+    label_version: str
     frames_per_sequence: int
+    frame_stride: int
     grid: Any
     radar: Mapping[str, Any]
     output: str
@@ -117,7 +129,8 @@ class SimulationConfig:
         for name, least in (
             ("train_sequences", 0),
             ("test_sequences", 0),
-            ("frames_per_sequence", 1),
+            ("frames_per_sequence", 1 if self.scenes == "procedural" else 0),
+            ("frame_stride", 1),
             ("image_width", 0),
             ("image_height", 0),
         ):
@@ -127,7 +140,14 @@ class SimulationConfig:
                     f"simulation.{name} must be an integer of at least {least},"
                     f" got {value!r}"
                 )
-        if self.train_sequences + self.test_sequences == 0:
+        if not isinstance(self.scenes, str):
+            raise UserError(
+                "simulation.scenes must be 'procedural' or a path of labels,"
+                f" got {self.scenes!r}"
+            )
+        if self.scenes == "procedural" and (
+            self.train_sequences + self.test_sequences == 0
+        ):
             raise UserError("simulation has no sequences: train_sequences is 0")
         if self.output not in ("tesseract", "projection"):
             raise UserError(

@@ -7,7 +7,6 @@ file is. A killed run goes on where it stopped and ends with the same bytes.
 from __future__ import annotations
 
 import concurrent.futures
-import functools
 import io
 import json
 import logging
@@ -23,14 +22,12 @@ from radejax.data import kradar_write
 from radejax.errors import UserError
 from radejax.simulation.camera import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
-from radejax.simulation.scene import FRAME_PERIOD_S, Sequence
 from radejax.simulation.simulator import SequenceSimulator
-from radejax.simulation.traffic import make_sequence
+from radejax.simulation.sources import FrameSpec, SceneSource, make_source
 
 __all__ = ["default_config", "simulate_dataset"]
 
 MARKER = "simulation.json"
-_FIRST_TIMESTAMP_S = 1.65e9
 
 
 def simulate_dataset(
@@ -62,11 +59,12 @@ def simulate_dataset(
     if _is_finished(root, checked):
         logging.info("Simulated data set %s is complete: reused.", root)
         return root
+    source = make_source(checked)
     try:
         root.mkdir(parents=True, exist_ok=True)
         _write_marker(root, checked, finished=False)
-        _write_common(root, checked)
-        _write_frames(root, checked, num_threads, progress)
+        _write_common(root, checked, source)
+        _write_frames(root, checked, source, num_threads, progress)
         _write_marker(root, checked, finished=True)
     except OSError as error:
         if error.errno in (28, 122):  # no space left, quota exceeded
@@ -113,17 +111,16 @@ def _write_marker(
         file.write(json.dumps(content, indent=1, sort_keys=True).encode())
 
 
-def _write_common(root: pathlib.Path, config: SimulationConfig) -> None:
+def _write_common(
+    root: pathlib.Path, config: SimulationConfig, source: SceneSource
+) -> None:
     """Splits, sensor axes, camera calibrations."""
-    train = range(1, config.train_sequences + 1)
-    test = range(
-        config.train_sequences + 1, config.train_sequences + config.test_sequences + 1
-    )
+    frames = [(n, spec) for n in source.numbers for spec in source.frames(n)]
     kradar_write.write_splits(
         root / "split",
         *(
-            [(n, name) for n in part for name in _frame_names(config, n)]
-            for part in (train, test)
+            [(n, spec.name) for n, spec in frames if spec.split == split]
+            for split in ("train", "test")
         ),
     )
     if config.grid != "kradar":
@@ -138,40 +135,22 @@ def _write_common(root: pathlib.Path, config: SimulationConfig) -> None:
                 file.write(calibration.to_kradar_text().encode("ascii"))
 
 
-def _offsets(config: SimulationConfig, number: int) -> np.ndarray:
-    """Frame numbers of radar, front camera, long LiDAR, others at LiDAR frame 0."""
-    rng = np.random.default_rng([config.seed, number, 3])
-    return rng.integers(1, 42, size=4)
-
-
-def _indices(
-    config: SimulationConfig, number: int, frame: int
-) -> tuple[int, int, int, int, int]:
-    """Frame numbers of the five sensors in the order of a label header."""
-    radar, camera, long_lidar, others = map(int, _offsets(config, number))
-    lidar = frame + 1
-    return lidar + radar, lidar, lidar + camera, lidar + long_lidar, lidar + others
-
-
-def _frame_names(config: SimulationConfig, number: int) -> list[str]:
-    """`<radar>_<lidar>` of every frame of a sequence."""
-    indices = (_indices(config, number, i) for i in range(config.frames_per_sequence))
-    return [f"{radar:05d}_{lidar:05d}" for radar, lidar, *_ in indices]
-
-
 def _write_frames(
-    root: pathlib.Path, config: SimulationConfig, num_threads: int, progress: bool
+    root: pathlib.Path,
+    config: SimulationConfig,
+    source: SceneSource,
+    num_threads: int,
+    progress: bool,
 ) -> None:
     """Every frame that is not there yet."""
-    count = config.train_sequences + config.test_sequences
-    total = count * config.frames_per_sequence
+    total = sum(len(source.frames(n)) for n in source.numbers)
     bar = tqdm(total=total, unit="frame", desc="simulate", disable=not progress)
     with bar, concurrent.futures.ThreadPoolExecutor(max(num_threads, 1)) as pool:
-        for number in range(1, count + 1):
-            writer = _SequenceWriter(root, config, number)
+        for number in source.numbers:
+            writer = _SequenceWriter(root, config, source, number)
             missing = writer.missing_frames()
-            bar.update(config.frames_per_sequence - len(missing))
-            futures = [pool.submit(writer.write, index) for index in missing]
+            bar.update(len(writer.specs) - len(missing))
+            futures = [pool.submit(writer.write, spec) for spec in missing]
             try:
                 for future in concurrent.futures.as_completed(futures):
                     future.result()
@@ -186,79 +165,74 @@ class _SequenceWriter:
     """Writes frames of one sequence into `<root>/<number>/`."""
 
     def __init__(
-        self, root: pathlib.Path, config: SimulationConfig, number: int
+        self,
+        root: pathlib.Path,
+        config: SimulationConfig,
+        source: SceneSource,
+        number: int,
     ) -> None:
-        self.root, self.config, self.number = root, config, number
+        self.config, self.source, self.number = config, source, number
         self.folder = root / str(number)
-        self.names = _frame_names(config, number)
-        environment, time, weather = config.conditions(number)
+        self.specs = source.frames(number)
         kradar_write.write_description(
-            self.folder / "description.txt", environment, time, weather
+            self.folder / "description.txt", *source.conditions(number)
         )
+        radar_idx, lidar_idx, *_ = self.specs[0].indices
         kradar_write.write_calibration(
             self.folder / "info_calib" / "calib_radar_lidar.txt",
-            int(_offsets(config, number)[0]),
+            radar_idx - lidar_idx,
             *config.lidar_to_radar_m[:2],
         )
 
-    @functools.cached_property
-    def sequence(self) -> Sequence:
-        environment, time, weather = self.config.conditions(self.number)
-        return make_sequence(
-            self.number,
-            environment=environment,
-            time=time,
-            weather=weather,
-            num_frames=self.config.frames_per_sequence,
-            rng=np.random.default_rng([self.config.seed, self.number]),
-        )
-
-    def missing_frames(self) -> list[int]:
+    def missing_frames(self) -> list[FrameSpec]:
         """Frames without a label file; makes the simulator if there are any."""
         labels = self.folder / "info_label_v2_1"
         there = set(os.listdir(labels)) if labels.is_dir() else set()
-        missing = [i for i, n in enumerate(self.names) if f"{n}.txt" not in there]
+        missing = [s for s in self.specs if f"{s.name}.txt" not in there]
         if missing:
-            config = self.config
-            self.simulator = SequenceSimulator(
-                self.sequence, config.make_grid(), config.make_parameters(), config.seed
-            )
-            if config.image_width:
-                pair = stereo_calibration(
-                    config.lidar_to_radar_m, config.image_width, config.image_height
-                )
-                self.renderer = CameraRenderer(self.sequence, pair, config.seed)
+            self._prepare()
         return missing
 
-    def write(self, index: int) -> None:
+    def _prepare(self) -> None:
+        config = self.config
+        self.sequence = self.source.make(self.number)
+        self.simulator = SequenceSimulator(
+            self.sequence, config.make_grid(), config.make_parameters(), config.seed
+        )
+        if config.image_width:
+            pair = stereo_calibration(
+                config.lidar_to_radar_m, config.image_width, config.image_height
+            )
+            self.renderer = CameraRenderer(self.sequence, pair, config.seed)
+
+    def write(self, spec: FrameSpec) -> None:
         """One frame: radar, image, then labels."""
         config, simulator = self.config, self.simulator
-        indices = _indices(config, self.number, index)
-        radar_idx, _, camera_idx, *_ = indices
-        frame = self.sequence.frame(index)
-        given = simulator.radar_input(index, frame)
+        radar_idx, _, camera_idx, *_ = spec.indices
+        frame = self.sequence.frame(spec.scene_idx)
+        given = simulator.radar_input(spec.scene_idx, frame)
         output = simulator.run(given, config.output)
         if config.output == "tesseract":
             path = self.folder / "radar_tesseract" / f"tesseract_{radar_idx:05d}.mat"
             kradar_write.write_tesseract(path, output)
         else:
-            self._write_array(f"projection_{radar_idx:05d}.npy", output)
+            name = f"DERA_tesseract_{radar_idx:05d}.npy"
+            with kradar_write.atomic_write(
+                self.folder / "DERA_tesseract" / name
+            ) as file:
+                np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
         if config.image_width:
             path = self.folder / "cam-front" / f"cam-front_{camera_idx:05d}.png"
             with kradar_write.atomic_write(path) as file:
                 file.write(_png(self.renderer.render(frame)))
         kradar_write.write_labels(
-            self.folder / "info_label_v2_1" / f"{self.names[index]}.txt",
-            indices,
-            _FIRST_TIMESTAMP_S + 1000.0 * self.number + FRAME_PERIOD_S * index,
+            self.folder / "info_label_v2_1" / f"{spec.name}.txt",
+            spec.indices,
+            spec.timestamp_s,
             simulator.labels(
                 frame, given, config.lidar_to_radar_m, config.label_distance_m
             ),
         )
-
-    def _write_array(self, name: str, values: np.ndarray) -> None:
-        with kradar_write.atomic_write(self.folder / "projections" / name) as file:
-            np.save(file, values)
 
 
 def _png(image: np.ndarray) -> bytes:

@@ -50,9 +50,10 @@ class Tracks:
         yaw_rad: `[F, N]` headings.
         velocity_mps: `[F, N, 2]` over ground.
         is_present: `[F, N]` bool.
-        size_m: `[N, 3]` length, width, height.
+        size_m: `[F, N, 3]` length, width, height.
         cls: `[N]` index into `CLASSES`.
         track_id: `[N]` identity written to the labels.
+        label_cls: Class names written to the labels.
     """
 
     position_m: np.ndarray
@@ -62,6 +63,7 @@ class Tracks:
     size_m: np.ndarray
     cls: np.ndarray
     track_id: np.ndarray
+    label_cls: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +134,8 @@ class Sequence:
         lanes_m: Borders of the lanes, metres left of the centerline.
         ego_left_m: Lateral position of the ego on its road.
         ground_m: Height of the ground in the radar's frame (negative).
+        mirrors_m: Rails and walls that reflect like mirrors: metres left of the
+            centerline.
     """
 
     name: int
@@ -147,6 +151,7 @@ class Sequence:
     lanes_m: tuple[float, ...]
     ego_left_m: float
     ground_m: float
+    mirrors_m: tuple[float, ...] = ()
 
     @property
     def num_frames(self) -> int:
@@ -161,7 +166,7 @@ class Sequence:
         )
         chosen = np.flatnonzero(is_near)
         yaw = wrap_angle(tracks.yaw_rad[index] - pose[2])
-        boxes = np.concatenate([ego, tracks.size_m, yaw[:, None]], 1)[chosen]
+        boxes = np.concatenate([ego, tracks.size_m[index], yaw[:, None]], 1)[chosen]
         velocity = _rotate(tracks.velocity_mps[index, chosen], -pose[2])
 
         points = _to_ego(fixed.position_m, pose)

@@ -10,7 +10,6 @@ from radejax.data.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation import radar, scattering, weather
 from radejax.simulation.scene import SceneFrame, Sequence
-from radejax.structures import CLASSES
 
 MIN_SNR_DB = 10.0
 """An object is visible to the radar from this ratio of its power to the noise on."""
@@ -63,7 +62,7 @@ class SequenceSimulator:
         rng = np.random.default_rng([seed, sequence.name, 11])
         tracks = sequence.tracks
         self._centers = scattering.make_object_scatterers(
-            tracks.cls, tracks.size_m, rng
+            tracks.cls, np.median(tracks.size_m, axis=0), rng
         )
         count = len(sequence.reflectors.kind)
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -76,6 +75,7 @@ class SequenceSimulator:
         surroundings = scattering.scatter_surroundings(
             frame, sequence, self._static_phase, parameters
         )
+        ghosts = scattering.scatter_ghosts(objects, frame, sequence)
         parts = [
             dataclasses.replace(
                 part,
@@ -84,7 +84,7 @@ class SequenceSimulator:
                     sequence.weather, np.linalg.norm(part.position_m, axis=1)
                 ),
             )
-            for part in (objects, surroundings)
+            for part in (objects, surroundings, ghosts)
         ]
         power = np.bincount(parts[0].owner, parts[0].power, len(frame.boxes))
         return RadarInput(
@@ -152,7 +152,7 @@ class SequenceSimulator:
             box[:3] -= lidar_to_radar_m
             labels.append(
                 Label(
-                    cls=CLASSES[frame.cls[n]],
+                    cls=self.sequence.tracks.label_cls[frame.track[n]],
                     box=tuple(box.tolist()),
                     visibility="R" if visible[n] else "L",
                     track_id=int(frame.track_id[n]),

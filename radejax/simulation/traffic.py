@@ -23,7 +23,8 @@ from radejax.simulation.scene import (
 GROUND_M = -0.9
 """The ground in the radar's frame: K-Radar's radar is mounted at bumper height."""
 
-_SIGHT_M = 130.0
+SIGHT_M = 130.0
+"""How far ahead of the ego objects are placed."""
 
 # Length, width, height in metres and their standard deviations.
 SIZES = {
@@ -145,6 +146,9 @@ def make_sequence(
     x, y, heading = road.position(along, 0.0)
     traffic = _Traffic(law, road, clock, along, speed, rng)
     edges = traffic.fill()
+    surroundings, mirrors = make_surroundings(
+        law, road, along[-1] + SIGHT_M, edges, rng, GROUND_M
+    )
     return Sequence(
         name=name,
         environment=environment,
@@ -154,11 +158,12 @@ def make_sequence(
         ego_along_m=along,
         ego_velocity_mps=np.stack([speed, np.zeros_like(speed)], 1),
         tracks=traffic.tracks(),
-        reflectors=_surroundings(law, road, along[-1] + _SIGHT_M, edges, rng),
+        reflectors=surroundings,
         road=road,
         lanes_m=traffic.lane_borders,
         ego_left_m=0.0,
         ground_m=GROUND_M,
+        mirrors_m=mirrors,
     )
 
 
@@ -232,7 +237,7 @@ class _Traffic:
         )
         relative = way - self.ego_along
         first = -30.0 - max(relative.max(), 0.0)
-        last = _SIGHT_M - min(relative.min(), 0.0)
+        last = SIGHT_M - min(relative.min(), 0.0)
         along = first + self.rng.uniform(0.0, 20.0)
         while along < last:
             cls = self._vehicle_class()
@@ -254,7 +259,7 @@ class _Traffic:
         """Vehicles at rest along the edge."""
         rng, still = self.rng, np.zeros_like(self.clock)
         along = self.rng.uniform(-20.0, 0.0)
-        while along < self.ego_along[-1] + _SIGHT_M:
+        while along < self.ego_along[-1] + SIGHT_M:
             cls = "Bus or Truck" if rng.random() < 0.1 else "Sedan"
             size = self._size(cls)
             if self.law.perpendicular:
@@ -320,10 +325,11 @@ class _Traffic:
             position_m=np.stack([x, y, z], -1),
             yaw_rad=yaw,
             velocity_mps=np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], -1),
-            is_present=np.abs(along - self.ego_along[:, None]) < _SIGHT_M + 20.0,
-            size_m=size,
+            is_present=np.abs(along - self.ego_along[:, None]) < SIGHT_M + 20.0,
+            size_m=np.broadcast_to(size, (count, *size.shape)),
             cls=np.array([class_index(c) for c in cls]),
             track_id=np.arange(1, len(paths) + 1),
+            label_cls=cls,
         )
 
 
@@ -333,21 +339,37 @@ def _no_tracks(num_frames: int) -> Tracks:
         np.zeros((num_frames, 0)),
         np.zeros((num_frames, 0, 2)),
         np.zeros((num_frames, 0), bool),
-        np.zeros((0, 3)),
+        np.zeros((num_frames, 0, 3)),
         np.zeros(0, int),
         np.zeros(0, int),
+        (),
     )
 
 
-def _surroundings(
+def make_surroundings(
     law: Environment,
     road: Road,
     length_m: float,
     edges: tuple[float, float],
     rng: np.random.Generator,
-) -> Reflectors:
-    """Static scatterers along the road: ground, rails, walls, trees and poles."""
+    ground_m: float,
+) -> tuple[Reflectors, tuple[float, ...]]:
+    """Static scatterers along the road: ground, rails, walls, trees and poles.
+
+    Args:
+        law: Road type.
+        road: Centerline.
+        length_m: How far they reach.
+        edges: Right and left edge, metres left of the centerline.
+        rng: Source of everything random.
+        ground_m: Height of the ground in the radar's frame.
+
+    Returns:
+        The scatterers in the world frame, and the lateral positions of the rails and
+        walls, which mirror objects.
+    """
     parts: list[tuple] = []  # (kind, along, left, height over ground, dBsm, normal)
+    mirrors: list[float] = []
     right, left = edges
     count = int(length_m * 1.2)
     parts.append(
@@ -357,18 +379,19 @@ def _surroundings(
     )  # fmt: skip
     for side, edge in ((-1.0, right), (1.0, left)):
         if rng.random() < law.rails:
-            along = np.arange(0.0, length_m, 2.0)
+            along = np.arange(0.0, length_m, 2.0)  # posts
+            mirrors.append(edge + side * 0.6)
             parts.append(
-                ("rail", along, edge + side * 0.6 + 0 * along, 0.6 + 0 * along,
+                ("rail", along, mirrors[-1] + 0 * along, 0.6 + 0 * along,
                  rng.normal(-9.0, 3.0, along.size), -side)
             )  # fmt: skip
         if rng.random() < law.walls:
             count = int(length_m * 0.8)
             along = rng.uniform(0.0, length_m, count)
-            keep = np.sin(along / rng.uniform(6.0, 14.0)) > -0.6  # gaps
-            along = along[keep]
+            along = along[np.sin(along / rng.uniform(6.0, 14.0)) > -0.6]  # gaps
+            mirrors.append(edge + side * law.wall_m)
             parts.append(
-                ("wall", along, edge + side * law.wall_m + 0 * along,
+                ("wall", along, mirrors[-1] + 0 * along,
                  rng.uniform(0.2, 6.0, along.size), rng.normal(-7.0, 4.0, along.size),
                  -side)
             )  # fmt: skip
@@ -379,14 +402,14 @@ def _surroundings(
              edge + side * rng.uniform(0.5, 6.0, count), rng.uniform(0.3, 3.0, count),
              rng.normal(-5.0, 4.0, count), None)
         )  # fmt: skip
-    return _to_world(parts, road)
+    return _to_world(parts, road, ground_m), tuple(mirrors)
 
 
-def _to_world(parts: list[tuple], road: Road) -> Reflectors:
+def _to_world(parts: list[tuple], road: Road, ground_m: float) -> Reflectors:
     kind, position, rcs, normal = [], [], [], []
     for name, along, left, height, dbsm, side in parts:
         x, y, heading = road.position(along, left)
-        position.append(np.stack([x, y, GROUND_M + height], 1))
+        position.append(np.stack([x, y, ground_m + height], 1))
         rcs.append(dbsm)
         kind.append(np.full(len(x), REFLECTOR_KINDS.index(name)))
         facing = heading + (0.0 if side is None else side * np.pi / 2.0)

@@ -150,7 +150,7 @@ class TestRepeating:
 
 class TestWrongUse:
     def test_other_config_names_the_field(self, tree):
-        with pytest.raises(UserError, match="another simulation config.*seed"):
+        with pytest.raises(UserError, match=r"another simulation config.*seed"):
             simulate_dataset(small_config(seed=5), tree, progress=False)
 
     def test_alien_folder_is_left_alone(self, tmp_path):

@@ -1,0 +1,166 @@
+"""Where the sequences of a data set come from: procedural, or real label files.
+
+A source names its sequences and their frames (numbers, time stamps, split) without
+simulating anything, and makes the scene of one sequence when asked.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import numpy as np
+
+from radejax.data import sequences
+from radejax.data.kradar import Frame, KRadar
+from radejax.errors import UserError
+from radejax.simulation.config import SimulationConfig
+from radejax.simulation.real_scenes import make_real_sequence
+from radejax.simulation.scene import FRAME_PERIOD_S, Sequence
+from radejax.simulation.traffic import make_sequence
+
+_FIRST_TIMESTAMP_S = 1.65e9
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameSpec:
+    """One frame of a data set before it is simulated.
+
+    Attributes:
+        scene_idx: Its index in the scene of the sequence.
+        indices: Frame numbers of radar, LiDAR OS2-64, front camera, LiDAR OS1-128 and
+            the other cameras: the header of its label file.
+        timestamp_s: Unix time.
+        split: "train" or "test".
+    """
+
+    scene_idx: int
+    indices: tuple[int, int, int, int, int]
+    timestamp_s: float
+    split: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.indices[0]:05d}_{self.indices[1]:05d}"
+
+
+class SceneSource(Protocol):
+    """What `dataset` needs of a kind of scenes."""
+
+    numbers: list[int]
+
+    def conditions(self, number: int) -> tuple[str, str, str]:
+        """Environment, time and weather of a sequence."""
+
+    def frames(self, number: int) -> list[FrameSpec]:
+        """Frames of a sequence, in order."""
+
+    def make(self, number: int) -> Sequence:
+        """The scene of a sequence."""
+
+
+def make_source(config: SimulationConfig) -> SceneSource:
+    """The source that a config names."""
+    if config.scenes == "procedural":
+        return ProceduralSource(config)
+    return LabelSource(config)
+
+
+class ProceduralSource:
+    """Invented sequences numbered from 1, the training ones first."""
+
+    def __init__(self, config: SimulationConfig) -> None:
+        self._config = config
+        self.numbers = list(
+            range(1, config.train_sequences + config.test_sequences + 1)
+        )
+
+    def conditions(self, number: int) -> tuple[str, str, str]:
+        return self._config.conditions(number)
+
+    def frames(self, number: int) -> list[FrameSpec]:
+        config = self._config
+        rng = np.random.default_rng([config.seed, number, 3])
+        radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
+        split = "train" if number <= config.train_sequences else "test"
+        start = _FIRST_TIMESTAMP_S + 1000.0 * number
+        return [
+            FrameSpec(
+                scene_idx=i,
+                indices=(n + radar, n, n + camera, n + long_lidar, n + others),
+                timestamp_s=start + FRAME_PERIOD_S * i,
+                split=split,
+            )
+            for i, n in enumerate(range(1, config.frames_per_sequence + 1))
+        ]
+
+    def make(self, number: int) -> Sequence:
+        environment, time, weather = self.conditions(number)
+        return make_sequence(
+            number,
+            environment=environment,
+            time=time,
+            weather=weather,
+            num_frames=self._config.frames_per_sequence,
+            rng=np.random.default_rng([self._config.seed, number]),
+        )
+
+
+class LabelSource:
+    """Sequences of a K-Radar label folder or zip, with K-Radar's own split."""
+
+    def __init__(self, config: SimulationConfig) -> None:
+        self._config = config
+        # Objects outside the field of view block and appear in images: keep all.
+        data = KRadar(
+            labels=config.scenes,
+            version=config.label_version,
+            visibility=None,
+            field_of_view=False,
+            sequence_numbers=config.sequences,
+        )
+        self._frames: dict[int, list[Frame]] = {}
+        for frame in data:
+            self._frames.setdefault(frame.sequence, []).append(frame)
+        if not self._frames:
+            raise UserError(f"{config.scenes}: no frames of the chosen sequences")
+        self.numbers = sorted(self._frames)
+        self.summary = data.summary()
+
+    def conditions(self, number: int) -> tuple[str, str, str]:
+        frame = self._frames[number][0]
+        return frame.environment, frame.time, frame.weather
+
+    def frames(self, number: int) -> list[FrameSpec]:
+        config, frames = self._config, self._frames[number]
+        names = [f.name for f in frames]
+        train = set(sequences.split_by_rule(names, "train"))
+        chosen = range(0, len(frames), config.frame_stride)
+        if config.frames_per_sequence:
+            chosen = chosen[: config.frames_per_sequence]
+        specs = []
+        for index in chosen:
+            header = frames[index].header
+            numbers = (
+                header.radar,
+                header.lidar,
+                header.camera_front,
+                header.lidar_long,
+                header.camera_lrr,
+            )
+            specs.append(
+                FrameSpec(
+                    scene_idx=index,
+                    indices=tuple(header.lidar if n is None else n for n in numbers),
+                    timestamp_s=header.timestamp_s,
+                    split="train" if names[index] in train else "test",
+                )
+            )
+        return specs
+
+    def make(self, number: int) -> Sequence:
+        return make_real_sequence(
+            self._frames[number],
+            lidar_to_radar_m=self._config.lidar_to_radar_m,
+            rng=np.random.default_rng([self._config.seed, number]),
+        )
