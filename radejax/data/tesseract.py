@@ -146,6 +146,27 @@ def _check(
         )
 
 
+def check_tesseract(
+    path: str | os.PathLike,
+    *,
+    shape_drea: tuple[int, ...] | None = None,
+    deep: bool = False,
+) -> None:
+    """Raises what `project_file` would, from the head and the size of the file alone.
+
+    Compressed and v7.3 files say little in their head: of them only `deep`, which reads
+    and projects every file, finds damage.
+    """
+    if deep:
+        project_file(path, shape_drea=shape_drea)
+        return
+    with _open(path) as file:
+        layout = _parse_mat5(file)
+    if layout is not None:
+        dtype, shape = layout
+        _check(path, np.broadcast_to(dtype.type(0), shape), shape_drea)
+
+
 def read_projection_npy(
     path: str | os.PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> np.ndarray:
