@@ -49,7 +49,7 @@ PRESETS = {
         "train.num_epochs": 10,
         "data.azimuth_mapping": "true",
         "evaluation.protocols": ("kradar_r40",),
-        "evaluation.skip_empty": "frame",
+        "evaluation.skip_empty": "protocol",
     },
     "official": {
         "model.cbam": "official",

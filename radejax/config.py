@@ -86,6 +86,7 @@ def _model() -> ConfigDict:
             "crop_output": True,
             "dtype": "float32",  # of the computation; parameters are float32
             "remat": False,
+            "heatmap_prior": 0.5,  # confidence of an untrained model, as released
         }
     )
 
@@ -158,7 +159,7 @@ def _evaluation() -> ConfigDict:
         {
             "roi": NARROW_ROI,
             "protocols": ("kradar_r40",),
-            "skip_empty": "frame",  # "class", "none"; pooled protocols only
+            "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
             "score_threshold": 0.3,
             "batch_size": 8,

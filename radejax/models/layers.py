@@ -15,9 +15,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-Initializer = Callable[..., jax.Array]
+from radejax.models.convolution import conv2d
 
-_DIMENSION_NUMBERS = ("NHWC", "HWIO", "NHWC")
+Initializer = Callable[..., jax.Array]
 
 
 def uniform_fan_in(fan_in: int) -> Initializer:
@@ -33,34 +33,6 @@ def uniform_fan_in(fan_in: int) -> Initializer:
     return init
 
 
-def conv2d(
-    x: jax.Array, kernel: jax.Array, *, dilation: int = 1, padding: int | None = None
-) -> jax.Array:
-    """Convolution with stride 1 that keeps the map's size.
-
-    Args:
-        x: `[B, R, A, C]`.
-        kernel: `[k, k, C, C']`, k odd.
-        dilation: Distance of taps in bins.
-        padding: Zeros at each border; by default what keeps the size.
-
-    Returns:
-        `[B, R, A, C']` in the dtype of `x`.
-    """
-    if padding is None:
-        padding = dilation * (kernel.shape[0] // 2)
-    if kernel.shape[:2] == (1, 1):
-        return x @ kernel[0, 0]
-    return jax.lax.conv_general_dilated(
-        x,
-        kernel,
-        window_strides=(1, 1),
-        padding=((padding, padding),) * 2,
-        rhs_dilation=(dilation, dilation),
-        dimension_numbers=_DIMENSION_NUMBERS,
-    )
-
-
 class Conv(nn.Module):
     """Stride-1 convolution that keeps the size, `[B, R, A, C]` -> `[B, R, A, C']`.
 
@@ -69,6 +41,7 @@ class Conv(nn.Module):
         size: Taps per axis, odd. 1 is a matrix product.
         dilation: Distance of taps in bins.
         use_bias: Add a vector per output channel.
+        initial_bias: What the initial biases scatter around.
         dtype: Dtype of the computation and the output.
     """
 
@@ -76,6 +49,7 @@ class Conv(nn.Module):
     size: int = 3
     dilation: int = 1
     use_bias: bool = True
+    initial_bias: float = 0.0
     dtype: Any = jnp.float32
 
     @nn.compact
@@ -83,11 +57,11 @@ class Conv(nn.Module):
         init = uniform_fan_in(self.size**2 * x.shape[-1])
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", init, shape)
-        y = conv2d(
-            x.astype(self.dtype), kernel.astype(self.dtype), dilation=self.dilation
-        )
+        y = conv2d(x.astype(self.dtype), kernel.astype(self.dtype), self.dilation)
         if self.use_bias:
-            bias = self.param("bias", init, (self.features,))
+            bias = self.param(
+                "bias", lambda *args: init(*args) + self.initial_bias, (self.features,)
+            )
             y = y + jnp.expand_dims(bias.astype(self.dtype), (0, 1, 2))
         return y
 

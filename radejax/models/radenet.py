@@ -44,6 +44,7 @@ class RadeNet(nn.Module):
         crop_output: Cut the maps back to the projection's bins.
         dtype: "float32" or "bfloat16", of the computation; outputs are float32.
         remat: Recompute blocks in the backward pass: less memory, more time.
+        heatmap_prior: Confidence of an untrained model; see `radejax.models.heads.Heads`.
     """
 
     num_classes: int
@@ -60,6 +61,7 @@ class RadeNet(nn.Module):
     crop_output: bool = False
     dtype: str = "float32"
     remat: bool = False
+    heatmap_prior: float = 0.5
 
     @nn.compact
     def __call__(self, projection: jax.Array, train: bool = False) -> DetectionMaps:
@@ -101,6 +103,7 @@ class RadeNet(nn.Module):
             self.num_groups,
             dtype,
             self.remat,
+            self.heatmap_prior,
             name="heads",
         )(x)
         if self.crop_output:
@@ -130,6 +133,7 @@ FIELDS = (
     "crop_output",
     "dtype",
     "remat",
+    "heatmap_prior",
 )
 """Fields of a model config beside `name`."""
 
