@@ -1,0 +1,308 @@
+"""Weighted sums of bilinear samples of a map: what deformable attention computes.
+
+Two forms. The plain one takes any queries and several maps. The lifted one averages
+over the queries of a radar bin while it samples, see `lifted_attention`. Both take
+queries in chunks, and the backward pass samples again, so that memory depends on the
+chunk and not on the number of queries.
+
+Locations are (x, y) with 0..1 from edge to edge of the map; the center of the top-left
+pixel is at half a pixel, and samples outside the map read zero.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Sizes = Sequence[tuple[int, int]]
+
+
+def deformable_attention(
+    value: jax.Array,
+    sizes: Sizes,
+    locations: jax.Array,
+    weights: jax.Array,
+    *,
+    chunk_size: int = 4096,
+) -> jax.Array:
+    """Weighted sums of bilinear samples, per query and head.
+
+    Args:
+        value: `[B, sum of H W, heads, D]`, the maps flattened row by row.
+        sizes: Height and width of each of the L maps.
+        locations: `[B, Q, heads, L, P, 2]` (x, y), 0..1 from edge to edge.
+        weights: `[B, Q, heads, L, P]`.
+        chunk_size: Queries sampled at a time.
+
+    Returns:
+        `[B, Q, heads * D]`. Differentiable in value, locations and weights.
+
+    Raises:
+        ValueError: `sizes` do not add up to the length of `value`.
+    """
+    b, queries, heads = locations.shape[:3]
+    starts = np.cumsum([0] + [h * w for h, w in sizes])
+    if starts[-1] != value.shape[1]:
+        raise ValueError(
+            f"maps of sizes {tuple(sizes)} have {starts[-1]} pixels, value has "
+            f"{value.shape[1]}"
+        )
+    chunk_size = min(chunk_size, queries)
+
+    def flat(x: jax.Array) -> jax.Array:  # [B heads, queries or pixels, ...]
+        x = jnp.moveaxis(x, 2, 1)
+        return x.reshape(b * heads, *x.shape[2:])
+
+    def one_head(arrays: tuple[jax.Array, ...]) -> jax.Array:
+        value, locations, weights = arrays
+
+        @jax.checkpoint
+        def chunk(arrays: tuple[jax.Array, jax.Array]) -> jax.Array:
+            locations, weights = arrays  # [n, L, P, 2], [n, L, P]
+            out = 0.0
+            for level, (height, width) in enumerate(sizes):
+                pixels = value[starts[level] : starts[level + 1]]
+                x = locations[:, level, :, 0] * width - 0.5
+                y = locations[:, level, :, 1] * height - 0.5
+                index, share = _corners(x, y, height, width)  # [n, P, 4]
+                share = share * weights[:, level, :, None]
+                out = out + _weighted_rows(pixels, index, share)
+            return out
+
+        out = jax.lax.map(chunk, tuple(_to_chunks([locations, weights], chunk_size)))
+        return out.reshape(-1, out.shape[-1])[:queries]
+
+    out = jax.lax.map(one_head, (flat(value), flat(locations), flat(weights)))
+    out = out.reshape(b, heads, queries, -1)
+    return jnp.moveaxis(out, 1, 2).reshape(b, queries, -1)
+
+
+def lifted_attention(
+    value: jax.Array,
+    offsets: jax.Array,
+    logits: jax.Array,
+    scale: jax.Array,
+    reference: jax.Array,
+    query_weights: jax.Array,
+    offset_bias: jax.Array,
+    logit_bias: jax.Array,
+    *,
+    chunk_size: int,
+) -> jax.Array:
+    """Weighted mean over a bin's E queries of their attention, per head.
+
+    Query e of bin n is `scale[n, e]` times the bin's feature, so its offsets are
+    `scale * offsets + offset_bias` and its attention logits likewise, where `offsets`
+    and `logits` are linear images of the feature without bias.
+
+    Args:
+        value: `[B, H, W, heads, D]`.
+        offsets: `[B, N, heads, P, 2]` in pixels (x, y).
+        logits: `[B, N, heads, P]`.
+        scale: `[B, N, E]`.
+        reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
+        query_weights: `[B or 1, N, E]` weights of the mean.
+        offset_bias: `[heads, P, 2]`.
+        logit_bias: `[heads, P]`.
+        chunk_size: Bins at a time.
+
+    Returns:
+        `[B, N, heads, D]`.
+    """
+    b, bins = offsets.shape[:2]
+    chunk_size = min(chunk_size, bins)
+    value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
+    by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
+
+    def sample(arrays: tuple[jax.Array, ...]) -> jax.Array:
+        value, offsets, logits, scale, *own = arrays
+        # Geometry is per sample, or one for the whole batch.
+        points, weights = own or (reference[0], query_weights[0])
+
+        def head(arrays: tuple[jax.Array, ...]) -> jax.Array:
+            value, offsets, logits, offset_bias, logit_bias = arrays
+            return _lifted_head(
+                chunk_size,
+                value,
+                offsets,
+                logits,
+                scale,
+                points,
+                weights,
+                offset_bias,
+                logit_bias,
+            )
+
+        return jax.lax.map(head, (value, offsets, logits, offset_bias, logit_bias))
+
+    arrays = (value, *by_head, scale)
+    if reference.shape[0] != 1 or query_weights.shape[0] != 1:
+        arrays += tuple(
+            jnp.broadcast_to(x, (b, *x.shape[1:])) for x in (reference, query_weights)
+        )
+    if b == 1:  # a loop of one step is still a loop to the compiler
+        return jnp.moveaxis(sample([x[0] for x in arrays]), 0, 1)[None]
+    return jnp.moveaxis(jax.lax.map(sample, arrays), 1, 2)
+
+
+# One sample, one head ----------------------------------------------------------------
+#
+# The backward pass is written out so that the gradient of the map is added up in
+# place; transposing the loop would allocate and add a whole map per chunk.
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _lifted_head(chunk_size: int, value: jax.Array, *arrays: jax.Array) -> jax.Array:
+    """`[N, D]` of one head: value `[H, W, D]`, the rest as in `lifted_attention`."""
+    *per_bin, offset_bias, logit_bias = arrays
+    pixels = value.reshape(-1, value.shape[-1])
+
+    def chunk(parts: tuple[jax.Array, ...]) -> jax.Array:
+        index, share = _lifted_samples(value.shape[:2], parts, offset_bias, logit_bias)
+        return _weighted_rows(pixels, index, share)
+
+    out = jax.lax.map(chunk, _to_chunks(per_bin, chunk_size))
+    return out.reshape(-1, out.shape[-1])[: per_bin[0].shape[0]]
+
+
+def _lifted_head_forward(chunk_size: int, *arrays: jax.Array) -> tuple[jax.Array, Any]:
+    return _lifted_head(chunk_size, *arrays), arrays
+
+
+def _lifted_head_backward(chunk_size: int, saved: Any, grad: jax.Array) -> tuple:
+    value, *per_bin, offset_bias, logit_bias = saved
+    size, bins = value.shape[:2], per_bin[0].shape[0]
+    pixels = value.reshape(-1, value.shape[-1])
+
+    def chunk(sums: tuple, arrays: tuple) -> tuple[tuple, tuple]:
+        grad_pixels, grad_offset_bias, grad_logit_bias = sums
+        parts, grad = arrays  # grad [n, D]
+
+        def samples(*arrays: Any) -> tuple[jax.Array, jax.Array]:
+            index, share = _lifted_samples(size, *arrays)
+            return share, index
+
+        share, pull, index = jax.vjp(
+            samples, parts, offset_bias, logit_bias, has_aux=True
+        )
+        n = index.shape[0]
+        rows = _rows(pixels, index).reshape(n, -1, pixels.shape[-1])  # [n, E P 4, D]
+        grad_share = jnp.einsum(
+            "nd,nkd->nk", grad, rows, preferred_element_type=wide_dtype(pixels.dtype)
+        )
+        wide = grad.astype(wide_dtype(grad.dtype))[:, None]
+        grad_rows = share.reshape(n, -1, 1) * wide  # [n, E P 4, D]
+        grad_pixels = grad_pixels.at[index.reshape(-1)].add(
+            grad_rows.reshape(-1, pixels.shape[-1]), mode="promise_in_bounds"
+        )
+        grad_parts, *grad_biases = pull(grad_share.reshape(share.shape))
+        sums = (
+            grad_pixels,
+            grad_offset_bias + grad_biases[0],
+            grad_logit_bias + grad_biases[1],
+        )
+        return sums, grad_parts
+
+    zeros = (
+        jnp.zeros(pixels.shape, wide_dtype(pixels.dtype)),
+        jnp.zeros_like(offset_bias),
+        jnp.zeros_like(logit_bias),
+    )
+    chunks = (_to_chunks(per_bin, chunk_size), _to_chunks([grad], chunk_size)[0])
+    (grad_pixels, *grad_biases), grad_parts = jax.lax.scan(chunk, zeros, chunks)
+    grad_parts = [x.reshape(-1, *x.shape[2:])[:bins] for x in grad_parts]
+    grad_value = grad_pixels.reshape(value.shape).astype(value.dtype)
+    return (grad_value, *grad_parts, *grad_biases)
+
+
+_lifted_head.defvjp(_lifted_head_forward, _lifted_head_backward)
+
+
+def _lifted_samples(
+    size: tuple[int, int],
+    parts: Sequence[jax.Array],
+    offset_bias: jax.Array,
+    logit_bias: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Pixel indices and shares `[n, E, P, 4]` of a chunk of n bins."""
+    offsets, logits, scale, reference, query_weights = parts
+    height, width = size
+    shift = scale[:, :, None, None] * offsets[:, None] + offset_bias[None, None]
+    x = reference[..., None, 0] * width - 0.5 + shift[..., 0]  # [n, E, P]
+    y = reference[..., None, 1] * height - 0.5 + shift[..., 1]
+    weights = jax.nn.softmax(
+        scale[..., None] * logits[:, None] + logit_bias[None, None], -1
+    )
+    index, share = _corners(x, y, height, width)
+    return index, share * (weights * query_weights[..., None])[..., None]
+
+
+# Sampling ----------------------------------------------------------------------------
+
+
+def _corners(
+    x: jax.Array, y: jax.Array, height: int, width: int
+) -> tuple[jax.Array, jax.Array]:
+    """Row-major indices and bilinear shares `[..., 4]` of the pixels around a place.
+
+    Args:
+        x: `[...]` in pixels, 0 at the center of the first.
+        y: `[...]` likewise.
+        height: Of the map.
+        width: Of the map.
+    """
+    x_low, y_low = jnp.floor(x), jnp.floor(y)
+    x_part, y_part = x - x_low, y - y_low
+    index, share = [], []
+    for step_y in (0, 1):
+        for step_x in (0, 1):
+            column, row = x_low + step_x, y_low + step_y
+            is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            part = (x_part if step_x else 1 - x_part) * (
+                y_part if step_y else 1 - y_part
+            )
+            share.append(jnp.where(is_inside, part, 0.0))
+            # Outside the share is zero and any index will do.
+            column = jnp.clip(column, 0, width - 1)
+            row = jnp.clip(row, 0, height - 1)
+            index.append((row * width + column).astype(jnp.int32))
+    return jnp.stack(index, -1), jnp.stack(share, -1)
+
+
+def wide_dtype(dtype: Any) -> Any:
+    """Dtype for sums and locations: float32 for half precision, else unchanged."""
+    return jnp.promote_types(dtype, jnp.float32)
+
+
+def _rows(pixels: jax.Array, index: jax.Array) -> jax.Array:
+    # Indices were clipped when made; not checking them again is faster.
+    return pixels.at[index.reshape(-1)].get(mode="promise_in_bounds")
+
+
+def _weighted_rows(pixels: jax.Array, index: jax.Array, share: jax.Array) -> jax.Array:
+    """Sums `[n, D]` of rows of `[pixels, D]` by `[n, ...]` indices and shares."""
+    n = index.shape[0]
+    rows = _rows(pixels, index).reshape(n, -1, pixels.shape[-1])
+    return jnp.einsum(
+        "nk,nkd->nd",
+        share.reshape(n, -1).astype(pixels.dtype),
+        rows,
+        preferred_element_type=wide_dtype(pixels.dtype),
+    ).astype(pixels.dtype)
+
+
+def _pad_axis(x: jax.Array, axis: int, multiple: int) -> jax.Array:
+    padding = [(0, 0)] * x.ndim
+    padding[axis] = (0, -x.shape[axis] % multiple)
+    return jnp.pad(x, padding)
+
+
+def _to_chunks(arrays: Sequence[jax.Array], size: int) -> list[jax.Array]:
+    """`[N, ...]` -> `[chunks, size, ...]`, padded with zeros."""
+    padded = (_pad_axis(x, 0, size) for x in arrays)
+    return [x.reshape(-1, size, *x.shape[1:]) for x in padded]
