@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 
 from radejax.errors import UserError
+from radejax.geometry.boxes import corners
 from radejax.geometry.camera import CameraCalibration, ImageKind
 from radejax.structures import CLASSES
 from radejax.visualize.canvas import (
@@ -30,15 +31,7 @@ from radejax.visualize.overlays import both_sets
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Corners in units of length, width and height, and the edges between them.
-_CORNERS = np.array(
-    [
-        [x, y, z]
-        for z in (-0.5, 0.5)
-        for x, y in ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
-    ]
-)
-_FRONT = (0, 1, 5, 4)
+_FRONT = [0, 3, 7, 4]  # of geometry.boxes.corners
 _NEAR_M = 0.5
 
 
@@ -136,12 +129,10 @@ def _draw_boxes(
     # Wild pixels far outside the image confuse the renderer's clipping.
     limit = 20 * calibration.width
     is_visible = is_visible & (np.abs(segments) < limit).all((-1, -2))
-    corners, depth = calibration.project_ego(_corners(objects.boxes), kind)
+    points, depth = calibration.project_ego(corners(objects.boxes), kind)
     drawn = [i for i in range(len(objects.boxes)) if is_visible[i].any()]
     fronts = [
-        corners[i, list(_FRONT)] - 0.5
-        for i in drawn
-        if (depth[i, list(_FRONT)] > _NEAR_M).all()
+        points[i, _FRONT] - 0.5 for i in drawn if (depth[i, _FRONT] > _NEAR_M).all()
     ]
     ax.add_collection(
         PolyCollection(fronts, facecolors=color, alpha=0.25, linewidths=0, zorder=3),
@@ -165,12 +156,3 @@ def _draw_boxes(
         )
         ax.add_collection(collection, autolim=False)
     return drawn, hulls
-
-
-def _corners(boxes: np.ndarray) -> np.ndarray:
-    """`[N, 8, 3]` corners in the ego frame, the four lower ones first."""
-    local = _CORNERS * boxes[:, None, 3:6]
-    cos, sin = np.cos(boxes[:, 6:7]), np.sin(boxes[:, 6:7])
-    x = local[..., 0] * cos - local[..., 1] * sin
-    y = local[..., 0] * sin + local[..., 1] * cos
-    return boxes[:, None, :3] + np.stack([x, y, local[..., 2]], -1)

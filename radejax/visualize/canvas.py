@@ -20,6 +20,7 @@ from matplotlib.patheffects import Normal, Stroke
 
 from radejax.errors import UserError
 from radejax.files import atomic_path
+from radejax.geometry.boxes import bev_corners
 from radejax.structures import CLASSES
 
 if TYPE_CHECKING:
@@ -165,11 +166,12 @@ def footprints(boxes: np.ndarray, points_per_edge: int = 1) -> np.ndarray:
     Returns:
         `[N, 4 * points_per_edge + 1, 2]` x and y, closed, counter-clockwise.
     """
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) / 2.0
+    corners = bev_corners(boxes)
+    following = np.roll(corners, -1, axis=1)
     t = np.arange(points_per_edge)[:, None] / points_per_edge
-    edges = corners[:-1, None] * (1 - t) + corners[1:, None] * t  # [4, P, 2]
-    unit = np.concatenate([edges.reshape(-1, 2), corners[-1:]])
-    return _place(unit, boxes)
+    edges = corners[:, :, None] * (1 - t) + following[:, :, None] * t  # [N, 4, P, 2]
+    points = edges.reshape(len(boxes), 4 * points_per_edge, 2)
+    return np.concatenate([points, corners[:, :1]], 1)
 
 
 def heading_marks(boxes: np.ndarray) -> np.ndarray:
@@ -177,16 +179,8 @@ def heading_marks(boxes: np.ndarray) -> np.ndarray:
 
     Outwards, so that the echo inside the box stays visible.
     """
-    return _place(np.array([[0.5, 0.0], [0.85, 0.0]]), boxes)
-
-
-def _place(unit: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Points `[P, 2]` in units of length and width, at every box: `[N, P, 2]`."""
-    along, across = np.moveaxis(unit[None] * boxes[:, None, 3:5], -1, 0)  # [N, P]
-    cos, sin = np.cos(boxes[:, 6:7]), np.sin(boxes[:, 6:7])
-    x = boxes[:, 0:1] + along * cos - across * sin
-    y = boxes[:, 1:2] + along * sin + across * cos
-    return np.stack([x, y], -1)
+    front = bev_corners(boxes)[:, [0, 3]].mean(1)
+    return np.stack([front, front + 0.7 * (front - boxes[:, :2])], 1)
 
 
 def add_colorbar(mesh: Any, ax: Axes, label: str) -> None:
