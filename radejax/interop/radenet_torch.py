@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import pathlib
 import re
 from collections.abc import Callable, Mapping
@@ -172,28 +173,26 @@ def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
     last_head = f"head.heatmap_head.head.{9 if heads == 'expanded' else 3}."
     has_cbam = any(name.startswith("backbone.cbam_") for name in shapes)
     is_dilated = any(name.startswith("neck.neck.0.conv1.") for name in shapes)
-    config = {
-        "name": "radenet",
+    shown = {
         "num_classes": _common_size(shapes, last_head, 0),
         "widths": widths,
         "decoder_width": _common_size(
             shapes, f"backbone.decoder_block_{len(widths)}.", 0
         ),
-        "num_groups": 32,
         "cbam": "official" if has_cbam else None,
         "neck": "dilated" if is_dilated else "plain",
         "heads": heads,
         "pad_multiple": 2 ** len(widths),
-        "crop_output": False,
-        "dtype": "float32",
-        "remat": False,
     }
-    if None in (config["num_classes"], config["decoder_width"], *widths) or not widths:
+    if None in (shown["num_classes"], shown["decoder_width"], *widths) or not widths:
         raise DataError(
             "not a state dict of RADE-Net: encoder, decoder or head are missing; its "
             f"names are {_some_names(shapes)}"
         )
-    return config | _infer_input(shapes, overrides) | overrides
+    fields = {f.name: f.default for f in dataclasses.fields(RadeNet)}
+    defaults = {name: fields[name] for name in FIELDS}
+    shown |= _infer_input(shapes, overrides)
+    return {"name": "radenet"} | defaults | shown | overrides
 
 
 _ENCODER = re.compile(r"backbone\.encoder_block_(\d+)\.")

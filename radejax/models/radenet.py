@@ -185,6 +185,11 @@ def check_keys(
 
 
 def _check_sizes(model: RadeNet) -> None:
+    if not 0.0 < model.heatmap_prior < 1.0:
+        raise UserError(
+            f"config.model.heatmap_prior is {model.heatmap_prior}, expected a "
+            "probability between 0 and 1"
+        )
     stride = 2 ** len(model.widths)
     if model.pad_multiple < 1 or model.pad_multiple % stride:
         raise UserError(
