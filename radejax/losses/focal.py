@@ -133,7 +133,10 @@ def focal_loss_per_bin(
     log p and log(1 - p) are taken from the logits: log(1 - sigmoid(x)) rounds to 0 or
     -inf in float32 where log_sigmoid(-x) is accurate.
     """
-    logits = jnp.clip(logits.astype(jnp.float32), _LOWEST, _HIGHEST)
+    logits = logits.astype(jnp.float32)
+    # Unlike jnp.clip, full gradient on the bounds themselves, as the released clamp.
+    logits = jnp.where(logits < _LOWEST, _LOWEST, logits)
+    logits = jnp.where(logits > _HIGHEST, _HIGHEST, logits)
     target = target.astype(jnp.float32)
     hit = -jax.nn.log_sigmoid(logits) * _power(jax.nn.sigmoid(-logits), alpha)
     miss = -jax.nn.log_sigmoid(-logits) * _power(jax.nn.sigmoid(logits), alpha)

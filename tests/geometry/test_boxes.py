@@ -1,0 +1,74 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.geometry import boxes as B
+
+CAR = np.array([10.0, 2.0, 1.0, 4.0, 2.0, 1.5, np.pi / 2])
+
+
+def test_corners_by_hand():
+    # Heading left (+y): front is +y, the left side is -x.
+    expected = [[9, 4], [9, 0], [11, 0], [11, 4]]
+    np.testing.assert_allclose(B.bev_corners(CAR), expected, atol=1e-12)
+    cube = B.corners(CAR)
+    np.testing.assert_allclose(cube[:4, :2], expected, atol=1e-12)
+    np.testing.assert_allclose(cube[4:, :2], expected, atol=1e-12)
+    np.testing.assert_allclose(cube[:, 2], [0.25] * 4 + [1.75] * 4)
+
+
+def test_corners_turn_counter_clockwise():
+    corners = B.bev_corners(CAR)
+    after = np.roll(corners, -1, axis=0)
+    area = (corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]).sum() / 2
+    np.testing.assert_allclose(area, 8.0)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    st.lists(st.floats(-50, 50), min_size=3, max_size=3),
+    st.floats(-np.pi + 1e-9, np.pi),
+    st.floats(0.1, 3),
+)
+def test_yaw_vector_round_trip(center, yaw, length):
+    box = np.array([*center, 4.0, 2.0, 1.5, yaw])
+    eight = B.boxes8_from_7(box)
+    np.testing.assert_allclose(B.boxes7_from_8(eight), box, atol=1e-12)
+    eight[6:] *= length
+    np.testing.assert_allclose(B.boxes7_from_8(eight), box, atol=1e-12)
+
+
+def test_yaw_vector_of_zero_is_yaw_zero():
+    assert B.boxes7_from_8(np.zeros(8))[6] == 0
+
+
+def test_corners_of_both_forms_agree_in_jax_and_numpy():
+    boxes = np.random.default_rng(0).normal(size=(2, 3, 7)).astype(np.float32)
+    from_7 = jax.jit(B.corners)(boxes)
+    from_8 = B.corners(B.boxes8_from_7(jnp.asarray(boxes)))
+    assert from_7.shape == (2, 3, 8, 3)
+    np.testing.assert_allclose(from_7, B.corners(boxes), atol=2e-6)
+    np.testing.assert_allclose(from_7, from_8, atol=2e-6)
+    assert isinstance(B.corners(boxes), np.ndarray)
+
+
+def test_transform_turns_then_shifts():
+    moved = B.transform_boxes(CAR, np.array([1.0, 0.0, -0.5]), np.pi / 2)
+    np.testing.assert_allclose(moved, [-1, 10, 0.5, 4, 2, 1.5, np.pi], atol=1e-12)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.floats(-3, 3), st.floats(-20, 20), st.floats(-20, 20))
+def test_transform_moves_corners_as_points(yaw, x, y):
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    moved = B.bev_corners(B.transform_boxes(CAR, np.array([x, y, 0.0]), yaw))
+    np.testing.assert_allclose(moved, B.bev_corners(CAR) @ turn.T + [x, y], atol=1e-9)
+
+
+@pytest.mark.parametrize("function", [B.boxes8_from_7, B.boxes7_from_8, B.bev_corners])
+def test_wrong_width_is_refused(function):
+    with pytest.raises(ValueError, match=r"must be \[..., [78]\], got shape \(2, 5\)"):
+        function(np.zeros((2, 5)))

@@ -1,0 +1,236 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.losses import focal as F
+
+GRID = RadarGrid.reduced(num_doppler=4, num_range=24, num_elevation=4, num_azimuth=16)
+C = 3
+
+heatmap = jax.jit(
+    F.gaussian_heatmap, static_argnames=("grid", "num_classes", "sigma", "sigma_cells")
+)
+
+
+def objects(cells, sizes=((4.0, 2.0),)):
+    """Boxes centered near given bins, a little off the bin centers."""
+    cells = np.asarray(cells, np.float64)
+    ground = GRID.cell_to_ego(cells[:, 0] + 0.2, cells[:, 1] - 0.3)
+    boxes = np.zeros((len(cells), 8), np.float32)
+    boxes[:, :2] = ground
+    boxes[:, 3:5] = np.broadcast_to(sizes, (len(cells), 2))
+    boxes[:, 7] = 1
+    return boxes
+
+
+def naive_heatmap(cells, classes, sigmas):
+    """The definition, bin by bin and object by object."""
+    target = np.zeros((GRID.num_range, GRID.num_azimuth, C))
+    for (i0, j0), cls, (sr, sa) in zip(cells, classes, sigmas, strict=True):
+        for i in range(GRID.num_range):
+            for j in range(GRID.num_azimuth):
+                distance = (i - i0) ** 2 / sr**2 + (j - j0) ** 2 / sa**2
+                target[i, j, cls] += np.exp(-distance / 2)
+    return np.minimum(target, 1)
+
+
+CELLS = [(3, 4), (10, 9), (10, 10), (23, 15), (12, 0)]
+CLASSES = np.array([0, 1, 1, 2, 0])
+SIZES = np.array([(4.0, 2), (9, 3), (1, 0.8), (2, 5), (4, 2)])
+
+
+@pytest.mark.parametrize(
+    ("sigma", "sigmas"),
+    [
+        ("fixed", np.full((5, 2), 1.5)),
+        ("adaptive", 0.3 * SIZES.max(1, keepdims=True).repeat(2, 1)),
+        ("anisotropic", SIZES / 6),
+    ],
+)
+def test_targets_equal_the_definition(sigma, sigmas):
+    found = heatmap(
+        objects(CELLS, SIZES),
+        CLASSES,
+        np.ones(5, bool),
+        GRID,
+        num_classes=C,
+        sigma=sigma,
+        sigma_cells=1.5,
+    )
+    np.testing.assert_allclose(found, naive_heatmap(CELLS, CLASSES, sigmas), atol=1e-6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 23), st.integers(0, 15), st.integers(0, 2)),
+        min_size=4,
+        max_size=4,
+    ),
+    st.integers(0, 4),
+)
+def test_centers_are_exactly_1_and_nothing_exceeds_it(rows, num_valid):
+    rows = np.array(rows)
+    is_valid = np.arange(4) < num_valid
+    found = np.asarray(
+        heatmap(objects(rows[:, :2]), rows[:, 2], is_valid, GRID, num_classes=C)
+    )
+    for i, j, cls in rows[:num_valid]:
+        assert found[i, j, cls] == 1
+    assert found.min() >= 0
+    assert found.max() == (1 if num_valid else 0)
+
+
+def test_padding_rows_draw_nothing_whatever_they_hold():
+    boxes = objects(CELLS)
+    boxes[2:] = np.nan
+    is_valid = np.arange(5) < 2
+    found = heatmap(boxes, CLASSES, is_valid, GRID, num_classes=C)
+    alone = heatmap(boxes[:2], CLASSES[:2], is_valid[:2], GRID, num_classes=C)
+    np.testing.assert_allclose(found, alone, atol=1e-7)
+
+
+def test_class_outside_the_maps_draws_nothing():
+    found = heatmap(
+        objects(CELLS[:2]), np.array([-1, 7]), np.ones(2, bool), GRID, num_classes=C
+    )
+    assert not np.asarray(found).any()
+
+
+@pytest.mark.parametrize("sigma", ["adaptive", "anisotropic"])
+def test_object_of_zero_size_is_one_bin(sigma):
+    found = np.asarray(
+        heatmap(
+            objects([(5, 5)], (0.0, 0.0)),
+            np.array([1]),
+            np.array([True]),
+            GRID,
+            num_classes=C,
+            sigma=sigma,
+        )
+    )
+    assert found[5, 5, 1] == 1
+    assert found.sum() == 1
+
+
+def test_batches_and_vmap_agree():
+    boxes = np.stack([objects(CELLS), objects(CELLS[::-1])])
+    classes, is_valid = np.stack([CLASSES, CLASSES]), np.ones((2, 5), bool)
+    batch = heatmap(boxes, classes, is_valid, GRID, num_classes=C)
+    one = lambda *a: F.gaussian_heatmap(*a, GRID, num_classes=C)  # noqa: E731
+    mapped = jax.jit(jax.vmap(one))(boxes, classes, is_valid)
+    assert batch.shape == (2, 24, 16, C)
+    np.testing.assert_allclose(batch, mapped, atol=1e-7)
+
+
+def test_unknown_sigma_is_refused():
+    with pytest.raises(ValueError, match="'fixed', 'adaptive' or 'anisotropic', got"):
+        F.gaussian_heatmap(
+            jnp.zeros((1, 8)),
+            jnp.zeros(1, int),
+            jnp.ones(1, bool),
+            GRID,
+            num_classes=C,
+            sigma="round",
+        )
+
+
+# Focal loss -----------------------------------------------------------------------
+
+
+def logit(p):
+    return np.log(p) - np.log1p(-np.asarray(p, np.float64))
+
+
+def naive_focal(p, target, alpha=2, gamma=4):
+    p = np.clip(p, 1e-6, 1 - 1e-6)
+    hit = -np.log(p) * (1 - p) ** alpha
+    miss = -np.log(1 - p) * p**alpha * (1 - target) ** gamma
+    return np.where(target == 1, hit, miss)
+
+
+def test_single_bins_by_hand():
+    # p = 1/2: log 2 / 4 at a center, the same far from one, 1/16 of it half way.
+    loss = F.focal_loss_per_bin(jnp.zeros(3), jnp.array([1.0, 0.0, 0.5]))
+    quarter = np.log(2) / 4
+    np.testing.assert_allclose(loss, [quarter, quarter, quarter / 16], rtol=1e-6)
+
+
+def test_single_bins_and_gradients_of_the_released_code(golden):
+    reference = np.load(golden / "losses_focal.npz")
+    p = reference["heatmap"].astype(np.float64)
+    with np.errstate(divide="ignore"):
+        x = jnp.asarray(np.log(p) - np.log1p(-p), jnp.float32)
+    target = jnp.asarray(reference["target"])
+    loss = F.focal_loss_per_bin(x, target)
+    np.testing.assert_allclose(loss, reference["loss"], rtol=2e-5, atol=1e-11)
+    grad = jax.grad(lambda x: F.focal_loss_per_bin(x, target).sum())(x)
+    expected = reference["grad"] * p * (1 - p)
+    np.testing.assert_allclose(grad, expected, rtol=2e-5, atol=2e-11)
+    assert (grad[(p == 0) | (p == 1)] == 0).all()
+
+
+def test_batch_is_divided_by_the_number_of_positive_bins():
+    rng = np.random.default_rng(0)
+    p, target = rng.uniform(0.01, 0.99, (2, 2, 6, 5, 3))
+    target[0, 1, 2, 0] = target[1, 3, 3, 2] = 1
+    expected = naive_focal(p, target).sum() / 2
+    loss = jax.jit(F.focal_loss)(logit(p), target)
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+
+
+def test_without_positive_bins_the_mean_over_all():
+    rng = np.random.default_rng(1)
+    p, target = rng.uniform(0.01, 0.99, (2, 2, 6, 5, 3))
+    loss = F.focal_loss(logit(p), target)
+    np.testing.assert_allclose(loss, naive_focal(p, target).mean(), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("alpha", "gamma"), [(2, 4), (1, 0), (1.5, 3.5)])
+def test_exponents(alpha, gamma):
+    rng = np.random.default_rng(2)
+    p, target = rng.uniform(0.01, 0.99, (2, 40))
+    loss = F.focal_loss_per_bin(logit(p), target, alpha, gamma)
+    expected = naive_focal(p, target, alpha, gamma)
+    np.testing.assert_allclose(loss, expected, rtol=2e-5)
+
+
+@pytest.mark.parametrize("has_positive", [True, False])
+def test_frames_that_fill_up_a_batch_do_not_count(has_positive):
+    rng = np.random.default_rng(3)
+    p, target = rng.uniform(0.01, 0.99, (2, 3, 6, 5, 3)).astype(np.float32)
+    target[:, 0, 0, 0] = 1 if has_positive else 0.5
+    is_frame_valid = jnp.array([True, True, False])
+    loss = F.focal_loss(logit(p), target, is_frame_valid=is_frame_valid)
+    alone = F.focal_loss(logit(p[:2]), target[:2])
+    np.testing.assert_allclose(loss, alone, rtol=1e-6)
+    none = F.focal_loss(logit(p), target, is_frame_valid=jnp.zeros(3, bool))
+    assert none == 0
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_saturated_logits_stay_finite(dtype):
+    x = jnp.array([-200.0, -30, -14, 0, 14, 30, 200], dtype)
+    for t in (0.0, 0.3, 1.0):
+        target = jnp.full(7, t)
+        loss, grad = jax.jit(
+            jax.value_and_grad(lambda x, t=target: F.focal_loss_per_bin(x, t).sum())
+        )(x)
+        assert loss.dtype == jnp.float32
+        assert np.isfinite(loss)
+        assert np.isfinite(np.asarray(grad, np.float32)).all()
+
+
+def test_gradient_by_finite_differences():
+    rng = np.random.default_rng(4)
+    target = np.where(rng.random(20) < 0.3, 1.0, rng.random(20)).astype(np.float32)
+    x = rng.normal(0, 2, 20)
+    step = 1e-5
+    change = naive_focal(1 / (1 + np.exp(-x - step)), target)
+    change -= naive_focal(1 / (1 + np.exp(-x + step)), target)
+    grad = jax.grad(lambda x: F.focal_loss_per_bin(x, target).sum())(x.astype("f4"))
+    np.testing.assert_allclose(grad, change / (2 * step), rtol=1e-4, atol=1e-6)

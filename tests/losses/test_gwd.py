@@ -1,0 +1,322 @@
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.losses import gwd as G
+
+ROOTS = ("eigh", "closed_form")
+# The released code has NaN or finite but wrong gradients here (see losses_make.py).
+NO_REFERENCE_GRADIENT = {
+    "both_square",
+    "identical_square",
+    "rotated_90",
+    "zero_size",
+    "zero_yaw_vector",
+}
+NO_SQRT_GRADIENT = NO_REFERENCE_GRADIENT | {"identical", "nearly_identical"}
+COLUMN = {"none": "none", "sqrt": "sqrt", "log1p": "log"}
+
+distance = jax.jit(G.gwd, static_argnames="root")
+loss = jax.jit(G.gwd_loss, static_argnames=("transform", "root"))
+
+
+@partial(jax.jit, static_argnames="root")
+def distance_and_grad(a, b, root="eigh"):
+    values, pull = jax.vjp(lambda a: G.gwd(a, b, root=root), a)
+    return values, pull(jnp.ones_like(values))[0]
+
+
+@partial(jax.jit, static_argnames=("transform", "root"))
+def loss_grad(a, b, transform="sqrt", root="eigh"):
+    """Gradients of every pair's loss with respect to its first box."""
+    return jax.grad(lambda a: G.gwd_loss(a, b, transform=transform, root=root).sum())(a)
+
+
+@pytest.fixture(scope="module")
+def pairs(golden):
+    return dict(np.load(golden / "losses_gwd.npz"))
+
+
+def rows(pairs, excluded=()):
+    return ~np.isin(pairs["kind"], list(excluded))
+
+
+def scale(pairs):
+    """Size of the terms whose difference the distance is."""
+    offset = pairs["pred"][:, :2] - pairs["gt"][:, :2]
+    roots = pairs["sigma_pred_f64"] ** 2 + pairs["sigma_gt_f64"] ** 2
+    return roots.sum((1, 2)) + (offset**2).sum(1)
+
+
+def box(x=0.0, y=0.0, length=4.0, width=2.0, yaw=0.0):
+    return np.array([x, y, 0, length, width, 1.5, np.sin(yaw), np.cos(yaw)], np.float32)
+
+
+def random_boxes(rng, count):
+    boxes = rng.normal(0, 2, (count, 8))
+    boxes[:, 3:6] = rng.uniform(0.3, 9, (count, 3))
+    yaw = rng.uniform(-np.pi, np.pi, count)
+    boxes[:, 6], boxes[:, 7] = np.sin(yaw), np.cos(yaw)
+    return boxes
+
+
+@pytest.mark.parametrize("root", ROOTS)
+def test_by_hand(root):
+    # Shifted by (3, 4); half lengths 2 and 3 along one axis; widths exchanged.
+    assert float(distance(box(), box(3, 4), root=root)) == 25
+    np.testing.assert_allclose(distance(box(), box(length=6), root=root), 1, rtol=1e-6)
+    turned = box(yaw=np.pi / 2)
+    np.testing.assert_allclose(distance(box(), turned, root=root), 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("root", ROOTS)
+def test_distance_of_the_released_code(pairs, root):
+    found = distance(pairs["pred"], pairs["gt"], root=root)
+    error = np.abs(found - pairs["gwd_f64"]) / scale(pairs).clip(1e-6)
+    # Zero sizes: the released clamp of eigenvalues, absent from the closed form.
+    kept = rows(pairs, () if root == "eigh" else ("zero_size", "zero_yaw_vector"))
+    assert error[kept].max() < 1e-6
+    assert np.abs(found - pairs["gwd_f64"])[~kept].max(initial=0) < 1e-5
+
+
+@pytest.mark.parametrize("transform", COLUMN)
+@pytest.mark.parametrize("root", ROOTS)
+def test_loss_of_the_released_code(pairs, root, transform):
+    found = loss(pairs["pred"], pairs["gt"], transform=transform, root=root)
+    expected = pairs[f"loss_{COLUMN[transform]}_f64"]
+    reference_is_nan = ~np.isfinite(expected)
+    assert reference_is_nan.sum() <= 10
+    np.testing.assert_allclose(
+        found[~reference_is_nan], expected[~reference_is_nan], atol=2e-6
+    )
+    np.testing.assert_allclose(found[reference_is_nan], 1 - 1 / 1.65, atol=1e-5)
+
+
+@pytest.mark.parametrize("transform", [None, *COLUMN])
+@pytest.mark.parametrize("root", ROOTS)
+def test_gradient_of_the_released_code(pairs, root, transform):
+    if transform is None:
+        _, grad = distance_and_grad(pairs["pred"], pairs["gt"], root=root)
+        expected = pairs["gwd_grad_f64"]
+    else:
+        grad = loss_grad(pairs["pred"], pairs["gt"], transform, root)
+        expected = pairs[f"grad_{COLUMN[transform]}_f64"]
+    assert np.isfinite(grad).all()
+    kept = rows(
+        pairs, NO_SQRT_GRADIENT if transform == "sqrt" else NO_REFERENCE_GRADIENT
+    )
+    tolerance = 2e-5 * np.maximum(np.abs(expected).max(1, keepdims=True), 1)
+    assert (np.abs(grad - expected) < tolerance)[kept].all()
+
+
+@pytest.mark.parametrize("root", ROOTS)
+def test_closed_form_gradient_where_the_released_one_is_wrong(pairs, root):
+    _, grad = distance_and_grad(pairs["pred"], pairs["gt"], root=root)
+    expected = pairs["gwd_closed_form_grad_f64"]
+    kept = rows(pairs, ("zero_size", "zero_yaw_vector"))
+    size = np.maximum(np.abs(expected[kept]).max(1, keepdims=True), 1)
+    np.testing.assert_array_less(np.abs(grad[kept] - expected[kept]) / size, 2e-5)
+
+
+def test_golden_pairs_are_the_reference(pairs, shared):
+    reference = np.load(shared / "fixtures/gwd/gwd_pairs.npz")
+    assert pairs["kind"].size == 229
+    for name in reference:
+        np.testing.assert_array_equal(pairs[name], reference[name])
+
+
+def test_roots_of_the_released_code(pairs):
+    # It puts the width where we put the length: the same root, turned by 90 degrees.
+    turn = np.array([[0, -1], [1, 0]])
+    found = turn @ np.asarray(G.gaussian_root(jnp.asarray(pairs["pred"]))) @ turn.T
+    np.testing.assert_allclose(found, pairs["sigma_pred_f64"], atol=1e-4, rtol=1e-5)
+    root = G.sqrtm_2x2(jnp.asarray(pairs["inner"]))
+    size = np.abs(pairs["inner_sqrt_f64"]).max((1, 2), keepdims=True)
+    error = np.abs(root - pairs["inner_sqrt_f64"]) / size
+    assert error[rows(pairs, ("zero_size", "zero_yaw_vector"))].max() < 2e-3
+
+
+@pytest.mark.parametrize("root", ROOTS)
+def test_double_precision_against_scipy(root):
+    rng = np.random.default_rng(0)
+    a, b = random_boxes(rng, 20), random_boxes(rng, 20)
+    with jax.enable_x64(True):
+        found = np.asarray(G.gwd(jnp.asarray(a), jnp.asarray(b), root=root))
+        sa, sb = (np.asarray(G.gaussian_root(jnp.asarray(x))) for x in (a, b))
+    for i in range(20):
+        root_term = scipy.linalg.sqrtm(sa[i] @ sb[i] @ sb[i] @ sa[i]).real
+        expected = np.trace(sa[i] @ sa[i] + sb[i] @ sb[i] - 2 * root_term)
+        expected += ((a[i, :2] - b[i, :2]) ** 2).sum()
+        np.testing.assert_allclose(found[i], expected, rtol=1e-9)
+
+
+def smooth_pairs():
+    """Pairs where the distance is smooth, though plain eigenvectors are not."""
+    rng = np.random.default_rng(1)
+    a, b = random_boxes(rng, 16), random_boxes(rng, 16)
+    square, turned, same_heading = slice(4, 8), slice(8, 12), slice(12, 16)
+    a[square, 3], b[square, 3] = a[square, 4], b[square, 4]
+    b[turned, 3:5] = a[turned, 3:5]
+    b[turned, 6:] = np.stack([-a[turned, 7], a[turned, 6]], 1)
+    b[same_heading, 6:] = a[same_heading, 6:]
+    return a, b
+
+
+@pytest.mark.parametrize("transform", COLUMN)
+@pytest.mark.parametrize("root", ROOTS)
+def test_gradients_by_finite_differences(root, transform):
+    a, b = smooth_pairs()
+    step = 1e-5 * np.eye(8)[:, None, :]  # [8, 1, 8]
+    with jax.enable_x64(True):
+        found = loss_grad(a, b, transform, root)
+        plus, minus = (
+            np.asarray(loss(a + s, b[None], transform=transform, root=root))
+            for s in (step, -step)
+        )
+    np.testing.assert_allclose(found, (plus - minus).T / 2e-5, atol=1e-7)
+
+
+def test_derivative_of_the_root_at_equal_eigenvalues():
+    with jax.enable_x64(True):
+        tangent = jnp.array([[0.3, -0.7], [-0.7, 1.1]])
+        for matrix in (4.0 * jnp.eye(2), jnp.array([[4.0, 1.0], [1.0, 4.0]])):
+            root, change = jax.jvp(G.sqrtm_2x2, (matrix,), (tangent,))
+            np.testing.assert_allclose(root @ root, matrix, atol=1e-12)
+            np.testing.assert_allclose(root @ change + change @ root, tangent)
+            reverse = jax.grad(lambda m: jnp.sum(G.sqrtm_2x2(m) * tangent))(matrix)
+            # The map dM -> dS is its own transpose.
+            np.testing.assert_allclose(reverse, change, atol=1e-12)
+
+
+numbers = st.tuples(
+    st.floats(-20, 20, width=32),
+    st.floats(-20, 20, width=32),
+    st.floats(0.25, 12, width=32),
+    st.floats(0.25, 4, width=32),
+    st.sampled_from([0.0, np.pi / 2, 1.0]) | st.floats(-3, 3, width=32),
+)
+
+
+@settings(deadline=None, max_examples=60)
+@given(numbers, numbers, st.sampled_from(ROOTS))
+def test_symmetric_and_not_negative(a, b, root):
+    a, b = box(*a), box(*b)
+    forth, back = distance(a, b, root=root), distance(b, a, root=root)
+    assert forth >= 0
+    np.testing.assert_allclose(forth, back, rtol=1e-5, atol=1e-10)
+
+
+@settings(deadline=None, max_examples=60)
+@given(numbers, st.sampled_from(ROOTS))
+def test_exactly_zero_at_identity_with_zero_gradient(a, root):
+    a = box(*a)[None]
+    value, grad = distance_and_grad(a, a, root=root)
+    assert value == 0
+    np.testing.assert_array_equal(grad, 0)
+    for transform in COLUMN:
+        perfect = loss(a, a, transform=transform, root=root)
+        np.testing.assert_allclose(perfect, 1 - 1 / 1.65, rtol=1e-6)
+
+
+@settings(deadline=None, max_examples=60)
+@given(numbers, numbers, st.floats(-3, 3), st.floats(-20, 20))
+def test_unchanged_by_a_common_rigid_motion(a, b, turn, shift):
+    def moved(x, y, length, width, yaw):
+        cos, sin = np.cos(turn), np.sin(turn)
+        x, y = x * cos - y * sin + shift, x * sin + y * cos - shift
+        return box(x, y, length, width, yaw + turn)
+
+    before, after = distance(box(*a), box(*b)), distance(moved(*a), moved(*b))
+    np.testing.assert_allclose(after, before, rtol=1e-4, atol=1e-3)
+
+
+@settings(deadline=None, max_examples=40)
+@given(numbers, st.floats(0.25, 8, width=32), st.floats(-3, 3))
+def test_turning_a_square_changes_nothing(a, side, yaw):
+    a = box(*a)
+    still, turned = box(1, 2, side, side, 0.0), box(1, 2, side, side, yaw)
+    expected = distance(a, still)
+    np.testing.assert_allclose(distance(a, turned), expected, rtol=1e-4, atol=1e-5)
+
+
+@settings(deadline=None, max_examples=40)
+@given(numbers, st.floats(-3, 3), st.floats(0.125, 5), st.floats(0.125, 5))
+def test_grows_with_distance(a, direction, near, further):
+    x, y, *rest = a
+    ahead, left = np.cos(direction), np.sin(direction)
+    close = box(x + near * ahead, y + near * left, *rest)
+    far = near + further
+    distant = box(x + far * ahead, y + far * left, *rest)
+    for transform in COLUMN:
+        losses = [loss(box(*a), b, transform=transform) for b in (close, distant)]
+        assert losses[0] < losses[1]
+
+
+def test_released_axes_give_the_same_distance_and_gradient():
+    # Length across the heading instead of along it, yaw vectors of any length.
+    rng = np.random.default_rng(2)
+    a, b = random_boxes(rng, 50), random_boxes(rng, 50)
+    a[:, 6:] *= rng.uniform(0.3, 2, (50, 1))
+    exchange = np.array([0, 1, 2, 4, 3, 5, 6, 7])
+    with jax.enable_x64(True):
+        value, grad = distance_and_grad(a, b)
+        other, other_grad = distance_and_grad(a[:, exchange], b[:, exchange])
+    np.testing.assert_allclose(value, other, rtol=1e-9)
+    np.testing.assert_allclose(grad, other_grad[:, exchange], atol=1e-9)
+
+
+DEGENERATE = np.array(
+    [
+        [0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 0, 1],
+        [0, 0, 0, 4, 0, 1, 0, 1],
+        [0, 0, 0, 0, 2, 1, 1, 0],
+        [0, 0, 0, -4, 2, 1, 0, 1],
+        [0, 0, 0, -4, -2, 1, 0, 1],
+        [0, 0, 0, 2, 2, 1, 0.6, 0.8],
+        [0, 0, 0, 4, 2, 1, 0, 0],
+        [0, 0, 0, 1e-4, 1e-4, 1, 0, 1],
+        [1e4, -1e4, 0, 500, 300, 1, 3, 4],
+    ]
+)
+
+
+@pytest.mark.parametrize(
+    ("root", "transform", "dtype"),
+    [
+        ("eigh", "none", jnp.float32),
+        ("eigh", "sqrt", jnp.float32),
+        ("eigh", "sqrt", jnp.bfloat16),
+        ("eigh", "log1p", jnp.float32),
+        ("closed_form", "sqrt", jnp.float32),
+    ],
+)
+def test_degenerate_boxes_give_finite_values_and_gradients(root, transform, dtype):
+    a, b = np.broadcast_arrays(DEGENERATE[:, None], DEGENERATE[None])
+    a, b = jnp.asarray(a, dtype), jnp.asarray(b, dtype)
+    values = loss(a, b, transform=transform, root=root)
+    assert values.shape == (10, 10)
+    assert values.dtype == jnp.float32
+    assert np.isfinite(values).all()
+    assert (values >= 1 - 1 / 1.65 - 1e-6).all()
+    grads = np.asarray(loss_grad(a, b, transform, root), np.float32)
+    assert np.isfinite(grads).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda a: G.gwd(a[..., :7], a), r"must be \[..., 8\], got \(2, 7\)"),
+        (lambda a: G.gwd(a, a, root="cholesky"), "'eigh' or 'closed_form', got"),
+        (lambda a: G.gwd_loss(a, a, transform="log"), "'none', 'sqrt' or 'log1p', got"),
+    ],
+)
+def test_bad_arguments_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(jnp.ones((2, 8)))
