@@ -21,6 +21,7 @@ from radejax.data.labels import VERSIONS, normalise_version
 from radejax.data.splits import read_split_entries
 from radejax.data.tesseract import check_tesseract
 from radejax.errors import DataError, UserError
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.structures import CLASSES
 
 
@@ -245,7 +246,8 @@ def _check_sequence(
     split_counts = collections.Counter(splits.get(frame.key) for frame in frames)
     files = {} if folder is None else folder.listing("radar_tesseract")
     tesseracts = {name: path for name, path in files.items() if name.endswith(".mat")}
-    conditions = _check_conditions(number, folder, findings)
+    is_kradar = how[0] == RadarGrid.kradar().shape_drea
+    conditions = _check_conditions(number, folder, findings, is_kradar)
     has_files = folder is not None
     return SequenceHealth(
         number,
@@ -284,7 +286,7 @@ def _check_tesseracts(
 
 
 def _check_conditions(
-    number: int, folder: SequenceFolder | None, findings: Findings
+    number: int, folder: SequenceFolder | None, findings: Findings, is_kradar: bool
 ) -> sequences.Conditions:
     """Conditions of a sequence; a contradiction to K-Radar's own is noted."""
     published = sequences.KRADAR_CONDITIONS.get(number, sequences.UNKNOWN_CONDITIONS)
@@ -295,7 +297,8 @@ def _check_conditions(
         found = sequences.read_description(path)
     except DataError:  # KRadar has reported it
         return published
-    if number in sequences.KRADAR_CONDITIONS and found != published:
+    is_published = is_kradar and number in sequences.KRADAR_CONDITIONS
+    if is_published and found != published:
         findings.notes.append(
             f"{path}: {','.join(dataclasses.astuple(found))}; K-Radar published "
             f"{','.join(dataclasses.astuple(published))} for sequence {number}"

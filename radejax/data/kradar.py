@@ -196,9 +196,7 @@ class KRadar(Sequence[Frame]):
                     content, self.version, where=where, problems=problems
                 )
             except DataError as error:
-                self._findings.report(
-                    "label file", where, str(error).removeprefix(where + ":")
-                )
+                self._findings.report("label file", where, str(error))
                 continue
             if problems and not any(file.labels for file in files.values()):
                 self._raise_on_other_version(problems[0], source)

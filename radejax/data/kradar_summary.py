@@ -73,10 +73,10 @@ class Findings:
         Args:
             kind: What is counted together.
             where: File, line or frame.
-            message: What was found and what was expected; may repeat `where`.
+            message: What was found and what was expected; may begin with `where`.
             error: What strict reading raises.
         """
-        problem = Problem(kind, where, message.removeprefix(f"{where}:").strip())
+        problem = Problem(kind, where, message)
         if self.strict:
             raise error(str(problem))
         self.problems.append(problem)

@@ -118,6 +118,8 @@ class Problem:
     message: str
 
     def __str__(self) -> str:
+        if self.message.startswith(self.where):
+            return self.message
         return f"{self.where}: {self.message}"
 
 
@@ -176,9 +178,11 @@ def read_label_file(
     problems: list[Problem] | None = None,
 ) -> LabelFile:
     """Header and objects of one label file; arguments as in `read_labels`."""
-    path = pathlib.Path(path)
+    version, path = normalise_version(version), pathlib.Path(path)
     try:
         content = path.read_bytes()
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: no such label file") from None
     except IsADirectoryError:
         raise DataError(f"{path}: is a folder, expected a label file") from None
     return parse_label_file(content, version, where=str(path), problems=problems)

@@ -36,7 +36,9 @@ def write_kradar(
         kradar_write.write_calibration(
             folder / "info_calib/calib_radar_lidar.txt", 3, -2.5, 0.25
         )
-        kradar_write.write_description(folder / "description.txt", "urban", "day", "fog")
+        kradar_write.write_description(
+            folder / "description.txt", "urban", "day", "fog"
+        )
         for lidar in range(1, num_frames + 1):
             name = f"{lidar + 3:05d}_{lidar:05d}"
             kradar_write.write_labels(
