@@ -150,6 +150,10 @@ def _data() -> ConfigDict:
             "visibility": ("R",),  # what the radar can see
             "max_objects": 32,  # per frame; 14 is the most in K-Radar v2.1
             "azimuth_mapping": "true",  # "stretched": released checkpoints
+            "num_threads": 2,  # that prepare batches
+            "num_workers": 0,  # processes; slower than threads for large frames
+            # Exchanges the labels of training frames: what is learnt then is no skill.
+            "label_permutation_seed": placeholder(int),
         }
     )
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from radejax.data import projection as projection_lib
-from radejax.data.pipeline import to_float
+from radejax.data.encoding import to_float
 from radejax.detection.decode import decode
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
 import pathlib
 import sys
 from collections.abc import Iterator, Sequence
 
 import jax
-from absl import flags, logging
+from absl import flags
+from absl import logging as absl_logging
 
 from radejax.errors import DataError, UserError
 
@@ -72,9 +74,14 @@ def set_up_jax(*, cache: bool = True) -> None:
         cache: Keep compiled programs in the folder that the environment variable
             JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
     """
-    logging.use_absl_handler()
-    logging.set_verbosity(logging.INFO)
-    logging.get_absl_handler().setFormatter(None)
+    log = logging.getLogger("radejax")
+    if not log.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+        log.propagate = False
+    absl_logging.set_verbosity(absl_logging.WARNING)  # orbax tells every step it takes
     if not cache:
         return
     home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")

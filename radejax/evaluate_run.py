@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+import logging
 import os
 import pathlib
 from collections.abc import Mapping
@@ -9,13 +11,17 @@ from typing import Any
 
 import numpy as np
 import tqdm
-from absl import logging
 
-from radejax import files
+from radejax.data.encoding import decode as decode_array
 from radejax.data.kradar import KRadar
-from radejax.data.records import Records
+from radejax.data.pipeline import make_loader
+from radejax.data.records import RecordSource
 from radejax.detector import Detector
-from radejax.experiment import frame_table, ground_truth_table, load_run
+from radejax.errors import UserError
+from radejax.evaluation.report import Report, write_report
+from radejax.experiment import load_run
+
+_log = logging.getLogger(__name__)
 
 
 def evaluate_run(
@@ -25,7 +31,7 @@ def evaluate_run(
     split: str = "test",
     out: str | os.PathLike | None = None,
     num_pictures: int | None = None,
-) -> dict[str, Any]:
+) -> Report:
     """Evaluates a run's checkpoint as its config says.
 
     Args:
@@ -36,42 +42,47 @@ def evaluate_run(
         num_pictures: Frames drawn; as the config says if None.
 
     Returns:
-        What `write_report` returns.
+        The report that was written.
     """
-    from radejax.evaluation.report import write_report
-
     run = load_run(workdir, step)
     config = run.config
     out = pathlib.Path(out or run.workdir / "evaluation")
     out.mkdir(parents=True, exist_ok=True)
     frames = run.paths.open(config, split)
-    records = Records(run.paths.records)
+    records = RecordSource(run.paths.records)
     options = config.evaluation
     detector = Detector.from_config(
         config, run.variables, run.grid, score_threshold=options.score_threshold
     )
     predictions = predict_dataset(detector, records, frames, options.batch_size)
+    drawer = FrameDrawer(records, frames, predictions, config)
     report = write_report(
         ground_truth_table(frames),
         predictions,
         frame_table(frames),
         out,
-        classes=config.classes,
-        protocols=options.protocols,
-        iou_thresholds=options.iou_thresholds,
-        roi=options.roi,
+        run=run.workdir.name,
+        classes=tuple(config.classes),
+        protocols=tuple(options.protocols),
+        paper_protocol=options.protocols[0],
+        iou_thresholds=tuple(options.iou_thresholds),
+        roi=tuple(options.roi),
         score_threshold=options.score_threshold,
+        skip_empty=None if options.skip_empty == "none" else options.skip_empty,
         label_version=config.data.label_version,
+        invalid_sizes="false_positive",
+        draw_frame=drawer,
     )
-    logging.info("step %d, split %s\n%s", run.step, split, report.text)
+    _log.info("step %d, split %s\n%s", run.step, split, report.text)
     count = options.num_pictures if num_pictures is None else num_pictures
-    draw_frames(records, frames, predictions, out / "pictures", config, count)
+    pictures = drawer.draw_spread(out / "pictures", count)
+    _log.info("drew %d frames in %s", len(pictures), out / "pictures")
     return report
 
 
 def predict_dataset(
     detector: Detector,
-    records: Records,
+    records: RecordSource,
     frames: KRadar,
     batch_size: int = 8,
     **settings: Any,
@@ -88,69 +99,108 @@ def predict_dataset(
     Returns:
         Columns "frame" (position in `frames`), "box", "cls", "score".
     """
-    positions = [records.index_of(frame) for frame in frames]
-    starts = range(0, len(positions), batch_size)
-    bar = tqdm.tqdm(total=len(positions), desc="detect", unit="frame")
+    loader = make_loader(
+        records,
+        frames,
+        batch_size=batch_size,
+        max_objects=max(len(frame.boxes) for frame in frames) or 1,
+        classes=detector.classes,
+        shuffle=False,
+        num_epochs=1,
+        pad_remainder=True,
+    )
+    taken: collections.deque[np.ndarray] = collections.deque()
 
     def batches() -> Any:
-        for start in starts:
-            chunk = positions[start : start + batch_size]
-            yield np.stack([records[i]["projection"] for i in chunk])
+        for batch in loader:
+            taken.append(batch.frame)
+            yield batch.projection
 
     parts = []
-    found = detector.stream(batches(), **settings)
-    for start, detections in zip(starts, found, strict=True):
-        columns = detections.to_columns(detector.classes)
-        parts.append({**columns, "frame": columns["frame"] + start})
-        bar.update(detections.is_valid.shape[0])
-    bar.close()
+    with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:
+        for detections in detector.stream(batches(), **settings):
+            columns = detections.to_columns(detector.classes)
+            frame = taken.popleft()  # -1 where a batch was filled up
+            columns["frame"] = frame[columns["frame"]]
+            is_real = columns["frame"] >= 0
+            parts.append({name: c[is_real] for name, c in columns.items()})
+            bar.update(int((frame >= 0).sum()))
     return {
         name: np.concatenate([part[name] for part in parts])
         for name in ("frame", "box", "cls", "score")
     }
 
 
-def draw_frames(
-    records: Records,
-    frames: KRadar,
-    predictions: Mapping[str, np.ndarray],
-    folder: pathlib.Path,
-    config: Any,
-    count: int,
-) -> list[pathlib.Path]:
-    """Draws frames spread evenly over a data set, those with objects first choice.
+def record_positions(records: RecordSource, frames: KRadar) -> list[int]:
+    """Index of the record of every frame.
 
-    Returns:
-        The pictures.
+    Raises:
+        UserError: Frames have no record; says how many and names the first.
     """
-    from radejax.visualize import bev
+    index_of = records.index_of()
+    missing = [frame.key for frame in frames if frame.key not in index_of]
+    if missing:
+        raise UserError(
+            f"{len(missing)} of {len(frames)} frames have no record in "
+            f"{records.folder}, the first is {missing[0]}: project the data set again"
+        )
+    return [index_of[frame.key] for frame in frames]
 
-    candidates = [i for i, frame in enumerate(frames) if len(frame.boxes)]
-    if not candidates or count < 1:
-        return []
-    folder.mkdir(parents=True, exist_ok=True)
-    spread = np.linspace(0, len(candidates) - 1, min(count, len(candidates)))
-    paths = []
-    for index in np.array(candidates)[np.round(spread).astype(int)]:
-        frame = frames[index]
-        mine = predictions["frame"] == index
+
+class FrameDrawer:
+    """Draws frames of a data set with their ground truth and predictions.
+
+    Args:
+        records: Projections.
+        frames: The data set.
+        predictions: Columns as `predict_dataset` returns.
+        config: Of the run, for the region of interest.
+    """
+
+    def __init__(
+        self,
+        records: RecordSource,
+        frames: KRadar,
+        predictions: Mapping[str, np.ndarray],
+        config: Any,
+    ) -> None:
+        self._records = records
+        self._frames = frames
+        self._positions = record_positions(records, frames)
+        self._predictions = predictions
+        self._roi = tuple(config.evaluation.roi)
+
+    def __call__(self, index: int, path: str | os.PathLike) -> None:
+        """Draws the frame at a position of the data set into a picture file."""
+        from radejax.visualize import bev
+
+        frame = self._frames[int(index)]
+        mine = self._predictions["frame"] == index
+        columns = {k: v[mine] for k, v in self._predictions.items()}
         figure = bev.draw_frame(
-            records[records.index_of(frame)]["projection"],
-            records.grid,
+            decode_array(self._records[self._positions[int(index)]]["projection"]),
+            self._records.grid,
             ground_truth=(frame.boxes, list(frame.classes)),
-            predictions=(
-                predictions["box"][mine],
-                predictions["score"][mine],
-                list(predictions["cls"][mine]),
-            ),
-            roi=config.evaluation.roi,
+            predictions=(columns["box"], columns["score"], list(columns["cls"])),
+            roi=self._roi,
             image=read_left_image(frame.camera_path),
             title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
         )
-        paths.append(folder / f"{frame.sequence:02d}_{frame.name}.png")
-        bev.save_figure(figure, paths[-1])
-    logging.info("drew %d frames in %s", len(paths), folder)
-    return paths
+        bev.save_figure(figure, path)
+
+    def draw_spread(self, folder: pathlib.Path, count: int) -> list[pathlib.Path]:
+        """Draws frames with objects, spread evenly over the data set."""
+        candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
+        if not candidates or count < 1:
+            return []
+        folder.mkdir(parents=True, exist_ok=True)
+        spread = np.linspace(0, len(candidates) - 1, min(count, len(candidates)))
+        paths = []
+        for index in np.array(candidates)[np.round(spread).astype(int)]:
+            frame = self._frames[index]
+            paths.append(folder / f"{frame.sequence:02d}_{frame.name}.png")
+            self(index, paths[-1])
+        return paths
 
 
 def read_left_image(path: pathlib.Path | None) -> np.ndarray | None:
@@ -164,19 +214,25 @@ def read_left_image(path: pathlib.Path | None) -> np.ndarray | None:
     return pixels[:, : pixels.shape[1] // 2]
 
 
-def write_boxes(
-    predictions: Mapping[str, np.ndarray], frames: KRadar, out: pathlib.Path
-) -> None:
-    """Writes one JSON file a frame: its boxes, scores and classes."""
-    out.mkdir(parents=True, exist_ok=True)
-    for index, frame in enumerate(frames):
-        mine = np.flatnonzero(predictions["frame"] == index)
-        boxes = [
-            {
-                "cls": str(predictions["cls"][i]),
-                "score": float(predictions["score"][i]),
-                "box": predictions["box"][i].tolist(),
-            }
-            for i in mine
-        ]
-        files.write_json(out / f"{frame.sequence}_{frame.name}.json", boxes)
+def frame_table(frames: KRadar) -> dict[str, np.ndarray]:
+    """Columns of the frames of a data set, as evaluation takes them."""
+    return {
+        "frame": np.arange(len(frames)),
+        "name": np.array([f"{f.sequence}/{f.name}" for f in frames]),
+        "sequence": np.array([f.sequence for f in frames]),
+        "weather": np.array([f.weather for f in frames]),
+        "environment": np.array([f.environment for f in frames]),
+        "time": np.array([f.time for f in frames]),
+    }
+
+
+def ground_truth_table(frames: KRadar) -> dict[str, np.ndarray]:
+    """Columns of all boxes: frame (position in `frames`), box, cls."""
+    counts = [len(f.boxes) for f in frames]
+    boxes = [f.boxes for f in frames if len(f.boxes)]
+    classes = [np.asarray(f.classes, str) for f in frames if len(f.boxes)]
+    return {
+        "frame": np.repeat(np.arange(len(frames)), counts),
+        "box": np.concatenate(boxes) if boxes else np.zeros((0, 7)),
+        "cls": np.concatenate(classes) if classes else np.zeros(0, str),
+    }

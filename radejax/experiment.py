@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import os
 import pathlib
 import shlex
@@ -23,20 +24,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import numpy as np
-from absl import logging
 from ml_collections import ConfigDict
 
 import radejax
 from radejax import files, models
 from radejax.data import pipeline, projection_job
 from radejax.data.kradar import KRadar
-from radejax.data.records import Records
+from radejax.data.records import RecordSource
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.training import loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.step import map_grid
+
+_log = logging.getLogger(__name__)
+
 
 PathLike = str | os.PathLike
 
@@ -131,15 +133,13 @@ def run(
     files.write_json(workdir / "run.json", info)
     result = train(config, workdir, paths, info=info, init_from=init_from)
     if not result.finished:
-        logging.info(
-            "stopped at step %d; run the same command to continue", result.step
-        )
+        _log.info("stopped at step %d; run the same command to continue", result.step)
         return workdir
     from radejax.evaluate_run import evaluate_run  # drawing and tables: not to train
 
     evaluate_run(workdir)
     minutes = (time.perf_counter() - started) / 60
-    logging.info(_CLOSING.format(minutes=minutes, workdir=_relative(workdir)))
+    _log.info(_CLOSING.format(minutes=minutes, workdir=_relative(workdir)))
     return workdir
 
 
@@ -246,7 +246,7 @@ def prepare_data(
     labels = labels and str(pathlib.Path(labels).absolute())
     paths = DataPaths(roots=roots, labels=labels, records=records)
     frames = paths.open(config, split=None)
-    logging.info("%s", frames.summary().to_text())
+    _log.info("%s", frames.summary().to_text())
     projection_job.project_dataset(frames, records)
     return paths
 
@@ -263,25 +263,21 @@ def train(
     init_from: str | None = None,
 ) -> loop.TrainResult:
     """Trains on the train split until the configured epochs are done."""
-    records = Records(paths.records)
+    records = RecordSource(paths.records)
     frames = paths.open(config, split="train")
     if not len(frames):
         raise UserError(f"no frames of the train split in {', '.join(paths.roots)}")
     loader = pipeline.make_loader(
         records,
         frames,
-        batch_size=config.train.batch_size,
+        batch_size=config.train.batch_size // jax.process_count(),
         max_objects=config.data.max_objects,
         classes=config.classes,
         seed=config.seed,
+        num_threads=config.data.num_threads,
+        num_workers=config.data.num_workers,
         label_permutation_seed=config.data.label_permutation_seed,
     )
-    steps_per_epoch = len(frames) // config.train.batch_size
-    if steps_per_epoch == 0:
-        raise UserError(
-            f"train.batch_size={config.train.batch_size} is more than the "
-            f"{len(frames)} frames of the train split"
-        )
     model, variables = models.build(config.model), None
     if init_from is not None:
         variables = initial_variables(init_from, config)
@@ -297,7 +293,7 @@ def train(
             "grid": records.grid.to_dict(),
             "run": dict(info),
         },
-        steps_per_epoch=steps_per_epoch,
+        steps_per_epoch=len(frames) // config.train.batch_size,
     )
 
 
@@ -369,27 +365,3 @@ def load_run(workdir: PathLike, step: int | None = None) -> Run:
         variables={"params": params, **(state.get("model_state") or {})},
         step=step,
     )
-
-
-def frame_table(frames: KRadar) -> dict[str, np.ndarray]:
-    """Columns of the frames of a data set, as evaluation takes them."""
-    return {
-        "frame": np.arange(len(frames)),
-        "name": np.array([f"{f.sequence}/{f.name}" for f in frames]),
-        "sequence": np.array([f.sequence for f in frames]),
-        "weather": np.array([f.weather for f in frames]),
-        "environment": np.array([f.environment for f in frames]),
-        "time": np.array([f.time for f in frames]),
-    }
-
-
-def ground_truth_table(frames: KRadar) -> dict[str, np.ndarray]:
-    """Columns of all boxes: frame (position in `frames`), box, cls."""
-    counts = [len(f.boxes) for f in frames]
-    boxes = [f.boxes for f in frames if len(f.boxes)]
-    classes = [np.asarray(f.classes, str) for f in frames if len(f.boxes)]
-    return {
-        "frame": np.repeat(np.arange(len(frames)), counts),
-        "box": np.concatenate(boxes) if boxes else np.zeros((0, 7)),
-        "cls": np.concatenate(classes) if classes else np.zeros(0, str),
-    }

@@ -8,6 +8,7 @@ the one before is used.
 from __future__ import annotations
 
 import errno
+import logging
 import pathlib
 import shutil
 from collections.abc import Mapping
@@ -16,9 +17,10 @@ from typing import Any
 import grain
 import jax
 import orbax.checkpoint as ocp
-from absl import logging
 
 from radejax.errors import DataError, UserError
+
+_log = logging.getLogger(__name__)
 
 
 class Checkpoints:
@@ -130,7 +132,7 @@ class Checkpoints:
             # Whatever a damaged file makes orbax, tensorstore or json raise.
             except Exception as error:
                 reason = str(error).strip().split("\n")[0]
-                logging.warning("checkpoint %d does not restore: %s", step, reason)
+                _log.warning("checkpoint %d does not restore: %s", step, reason)
                 self._set_aside(step)
                 continue
             return restored["state"], step
@@ -176,7 +178,7 @@ class Checkpoints:
             shutil.rmtree(target)
         target.parent.mkdir(exist_ok=True)
         damaged.rename(target)
-        logging.warning("moved it to %s", target)
+        _log.warning("moved it to %s", target)
         self._manager.reload()
 
     def close(self) -> None:

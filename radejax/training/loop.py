@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import pathlib
 import signal
 import threading
@@ -14,7 +15,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from absl import logging
 
 from radejax.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
@@ -28,6 +28,8 @@ from radejax.training.state import (
 )
 from radejax.training.step import make_train_step, model_inputs
 from radejax.training.watch import Watch
+
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +126,7 @@ def train(
             state, start = jax.jit(init, out_shardings=placement)(inputs), 0
         else:
             state, start = restored
-            logging.info("continuing from step %d of %d", start, num_steps)
+            _log.info("continuing from step %d of %d", start, num_steps)
         run = _Run(step_fn, loader, mesh, rng, checkpoints, info, options, evaluate)
         with Watch(
             workdir,
@@ -266,7 +268,7 @@ class _StopOnSignal:
     def _handle(self, number: int, _: Any) -> None:
         if self._event.is_set():
             raise KeyboardInterrupt(f"second {signal.Signals(number).name}")
-        logging.warning(
+        _log.warning(
             "%s: saving a checkpoint, then stopping", signal.Signals(number).name
         )
         self._event.set()

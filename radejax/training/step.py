@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from radejax.data.pipeline import to_float
+from radejax.data.encoding import to_float
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
 from radejax.structures import Batch
