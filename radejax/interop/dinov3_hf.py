@@ -1,0 +1,169 @@
+"""DINOv3 weights as Hugging Face distributes them, to Flax. torch is not needed.
+
+The weights are gated and their licence restricts passing them on: download them
+yourself, and keep them out of checkpoints that are published.
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from radejax.errors import DataError, UserError
+from radejax.interop.state_dict import StateDictReader
+from radejax.models.vit import ViT
+
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "model.safetensors"
+
+_PREFIX = "model."  # transformers 5 saves some models with it
+_FIELDS = {
+    "hidden_size": "hidden_size",
+    "num_hidden_layers": "num_layers",
+    "num_attention_heads": "num_heads",
+    "intermediate_size": "mlp_dim",
+    "patch_size": "patch_size",
+    "num_register_tokens": "num_registers",
+    "rope_theta": "rope_theta",
+    "layer_norm_eps": "epsilon",
+    "use_gated_mlp": "gated_mlp",
+    "hidden_act": "activation",
+    "proj_bias": "proj_bias",
+    "mlp_bias": "mlp_bias",
+    "layerscale_value": "layer_scale",
+}
+
+
+def load(
+    folder: str | pathlib.Path, **model_overrides: Any
+) -> tuple[ViT, dict[str, Any]]:
+    """Model and variables from a folder with `config.json` and `model.safetensors`.
+
+    Args:
+        folder: For instance a download of `facebook/dinov3-vits16-pretrain-lvd1689m`.
+        **model_overrides: Fields of `ViT` that do not change the weights, such as
+            `dtype`, `attention`, `remat`.
+
+    Returns:
+        The model, and `{"params": ...}` with float32 arrays. Applied to normalised
+        images it gives transformers' `last_hidden_state`.
+
+    Raises:
+        FileNotFoundError: The folder or one of its files is missing.
+        DataError: A file is damaged, or tensors are missing, unexpected or
+            mis-shaped; all are listed.
+        UserError: The folder holds another kind of model, or an override is unknown.
+    """
+    folder = pathlib.Path(folder)
+    missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 model folder"
+            " as downloaded from Hugging Face"
+        )
+    model = model_from_config(_read_config(folder / CONFIG_FILE), **model_overrides)
+    path = folder / WEIGHTS_FILE
+    try:
+        tensors = safetensors.numpy.load_file(path)
+    except safetensors.SafetensorError as error:
+        raise DataError(f"{path}: damaged safetensors file ({error})") from error
+    return model, {"params": to_params(model, tensors, str(path))}
+
+
+def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
+    """The model a Hugging Face `config.json` describes.
+
+    Raises:
+        UserError: It is not a DINOv3 ViT, a field is missing or not supported, or an
+            override is unknown.
+    """
+    if config.get("model_type") != "dinov3_vit":
+        raise UserError(
+            f"model_type is {config.get('model_type')!r}, expected 'dinov3_vit'"
+        )
+    if missing := sorted(set(_FIELDS) - set(config)):
+        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
+    if config["hidden_act"] not in ("gelu", "silu"):
+        raise UserError(
+            f"hidden_act is {config['hidden_act']!r}, expected 'gelu' or 'silu'"
+        )
+    fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
+    fields["qkv_bias"] = tuple(
+        bool(config.get(f"{name}_bias", default))
+        for name, default in (("query", True), ("key", False), ("value", True))
+    )
+    known = set(ViT.__dataclass_fields__) - {"parent", "name"}
+    if unknown := sorted(set(model_overrides) - known):
+        raise UserError(f"unknown ViT fields {unknown}; available: {sorted(known)}")
+    return ViT(**(fields | model_overrides))
+
+
+def to_params(
+    model: ViT, tensors: Mapping[str, Any], source: str = "state dict"
+) -> dict[str, Any]:
+    """Parameters of `model` from DINOv3 tensors by name.
+
+    Raises:
+        DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
+    """
+    tensors = {name.removeprefix(_PREFIX): t for name, t in tensors.items()}
+    reader = StateDictReader(tensors, source)
+    channels = model.hidden_size
+    patches = reader.conv(
+        "embeddings.patch_embeddings", 3, channels, model.patch_size
+    )  # kernel [patch, patch, 3, C]: rows, columns, colours, as patches are flattened
+    patches["kernel"] = patches["kernel"].reshape(-1, channels)
+    prefix = [
+        reader.take(f"embeddings.{name}", (1, count, channels))
+        for name, count in (
+            ("cls_token", 1),
+            ("register_tokens", model.num_registers),
+        )
+        if count or f"embeddings.{name}" in reader
+    ]
+    layers = [_layer(reader, model, f"layer.{i}.") for i in range(model.num_layers)]
+    params = {
+        "prefix_tokens": np.concatenate(prefix, 1),
+        "patch_embed": patches,
+        "layers": jax.tree.map(lambda *leaves: np.stack(leaves), *layers),
+        "norm": reader.norm("norm", channels),
+    }
+    # The mask token serves pretraining only.
+    reader.finish(ignored=(r"embeddings\.mask_token$",))
+    return params
+
+
+def _layer(reader: StateDictReader, model: ViT, prefix: str) -> dict[str, Any]:
+    channels, hidden = model.hidden_size, model.mlp_dim
+
+    def linear(name: str, size_in: int, size_out: int, bias: bool) -> dict[str, Any]:
+        return reader.linear(prefix + name, size_in, size_out, use_bias=bias)
+
+    layer = {
+        "norm_1": reader.norm(f"{prefix}norm1", channels),
+        "norm_2": reader.norm(f"{prefix}norm2", channels),
+        "scale_1": reader.take(f"{prefix}layer_scale1.lambda1", (channels,)),
+        "scale_2": reader.take(f"{prefix}layer_scale2.lambda1", (channels,)),
+        "out": linear("attention.o_proj", channels, channels, model.proj_bias),
+        "up": linear("mlp.up_proj", channels, hidden, model.mlp_bias),
+        "down": linear("mlp.down_proj", hidden, channels, model.mlp_bias),
+    }
+    for name, bias in zip(("query", "key", "value"), model.qkv_bias, strict=True):
+        layer[name] = linear(f"attention.{name[0]}_proj", channels, channels, bias)
+    if model.gated_mlp:
+        layer["gate"] = linear("mlp.gate_proj", channels, hidden, model.mlp_bias)
+    return layer
+
+
+def _read_config(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise DataError(f"{path}: not a JSON file ({error})") from error

@@ -1,0 +1,232 @@
+"""Tests of radejax.interop.dinov3_hf."""
+
+import importlib.util
+import json
+import shutil
+
+import chex
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from radejax.errors import DataError, UserError
+from radejax.interop import dinov3_hf
+
+TOLERANCE = 5e-5
+
+TINY_CONFIG = {
+    "model_type": "dinov3_vit",
+    "hidden_size": 96,
+    "num_hidden_layers": 3,
+    "num_attention_heads": 4,
+    "intermediate_size": 192,
+    "patch_size": 16,
+    "num_register_tokens": 4,
+    "rope_theta": 100.0,
+    "layer_norm_eps": 1e-5,
+    "layerscale_value": 1.0,
+    "use_gated_mlp": False,
+    "hidden_act": "gelu",
+    "query_bias": True,
+    "key_bias": False,
+    "value_bias": True,
+    "proj_bias": True,
+    "mlp_bias": True,
+}
+_LAYER = {
+    "norm1.weight": (96,),
+    "norm1.bias": (96,),
+    "attention.q_proj.weight": (96, 96),
+    "attention.q_proj.bias": (96,),
+    "attention.k_proj.weight": (96, 96),
+    "attention.v_proj.weight": (96, 96),
+    "attention.v_proj.bias": (96,),
+    "attention.o_proj.weight": (96, 96),
+    "attention.o_proj.bias": (96,),
+    "layer_scale1.lambda1": (96,),
+    "norm2.weight": (96,),
+    "norm2.bias": (96,),
+    "mlp.up_proj.weight": (192, 96),
+    "mlp.up_proj.bias": (192,),
+    "mlp.down_proj.weight": (96, 192),
+    "mlp.down_proj.bias": (96,),
+    "layer_scale2.lambda1": (96,),
+}
+TINY_SHAPES = {
+    "embeddings.cls_token": (1, 1, 96),
+    "embeddings.mask_token": (1, 1, 96),
+    "embeddings.register_tokens": (1, 4, 96),
+    "embeddings.patch_embeddings.weight": (96, 3, 16, 16),
+    "embeddings.patch_embeddings.bias": (96,),
+    **{f"layer.{i}.{k}": s for i in range(3) for k, s in _LAYER.items()},
+    "norm.weight": (96,),
+    "norm.bias": (96,),
+}
+
+
+@pytest.fixture(scope="module")
+def make(golden):
+    """The recipes beside the golden files."""
+    spec = importlib.util.spec_from_file_location(
+        "dinorade_make", golden / "dinorade_make.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def tensors(make):
+    return {name: make.seeded_tensor(name, s) for name, s in TINY_SHAPES.items()}
+
+
+@pytest.fixture
+def folder(tmp_path, tensors):
+    """A model folder as Hugging Face lays it out."""
+    (tmp_path / "config.json").write_text(json.dumps(TINY_CONFIG))
+    safetensors.numpy.save_file(tensors, tmp_path / "model.safetensors")
+    return tmp_path
+
+
+def image_of(make, stream, height, width):
+    image = make.normal_input(stream, (1, 3, height, width))
+    return image.transpose(0, 2, 3, 1)
+
+
+def test_tokens_of_the_tiny_model(folder, golden, make):
+    model, variables = dinov3_hf.load(folder)
+    assert sum(x.size for x in jax.tree.leaves(variables)) == 299232 - 96  # mask token
+    tokens = jax.jit(model.apply)(variables, image_of(make, 195, 64, 96))
+    expected = np.load(golden / "dinorade_vit.npz")["last_hidden_state"]
+    chex.assert_shape(tokens, (1, 29, 96))
+    np.testing.assert_allclose(tokens[0], expected, atol=TOLERANCE)
+
+
+def test_the_first_layers_alone(golden, make, tensors):
+    # Without the final normalisation's statistics, to see where an error starts.
+    expected = np.load(golden / "dinorade_vit.npz")
+    config = TINY_CONFIG | {"num_hidden_layers": 1}
+    kept = {
+        k: v for k, v in tensors.items() if not k.startswith(("layer.1", "layer.2"))
+    }
+    model = dinov3_hf.model_from_config(config)
+    variables = {"params": dinov3_hf.to_params(model, kept)}
+    tokens = jax.jit(model.apply)(variables, image_of(make, 195, 64, 96))
+    after = expected["after_layer_0"]
+    mean, deviation = after.mean(-1, keepdims=True), after.std(-1, keepdims=True)
+    normed = (after - mean) / np.sqrt(deviation**2 + 1e-5)
+    normed = normed * tensors["norm.weight"] + tensors["norm.bias"]
+    np.testing.assert_allclose(tokens[0], normed, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(("size", "stream"), [("64x96", 195), ("224x224", 355)])
+def test_tiny_model_folder_of_transformers(shared, make, size, stream):
+    model, variables = dinov3_hf.load(shared / "fixtures" / "dinov3" / "tiny_model")
+    check_tokens(shared, "tiny", model, variables, make, size, stream)
+
+
+@pytest.mark.parametrize(
+    ("size", "stream"),
+    [
+        ("64x96", 195),
+        ("224x224", 355),
+        pytest.param("720x1280", 851, marks=pytest.mark.slow),
+    ],
+)
+def test_full_size_model(shared, make, size, stream):
+    folder = shared / "fixtures" / "dinov3"
+    listing = json.loads((folder / "vits16_params.json").read_text())["tensors"]
+    config = json.loads((folder / "vits16_config.json").read_text())
+    model = dinov3_hf.model_from_config(config)
+    variables = {"params": dinov3_hf.to_params(model, make.seeded_state_dict(listing))}
+    assert sum(x.size for x in jax.tree.leaves(variables)) == 21596544 - 384
+    check_tokens(shared, "vits16", model, variables, make, size, stream)
+
+
+def check_tokens(shared, name, model, variables, make, size, stream):
+    height, width = map(int, size.split("x"))
+    tokens = jax.jit(model.apply)(variables, image_of(make, stream, height, width))[0]
+    file = np.load(shared / "fixtures" / "dinov3" / f"{name}.npz")
+    index = file[f"{size}__token_index"]
+    expected = file[f"{size}__last_hidden_state"]
+    np.testing.assert_allclose(tokens[index], expected, atol=TOLERANCE)
+    norms = np.linalg.norm(tokens, axis=-1)
+    np.testing.assert_allclose(norms, file[f"{size}__token_norms"], atol=TOLERANCE)
+
+
+def test_names_of_transformers_5_in_memory(tensors):
+    model = dinov3_hf.model_from_config(TINY_CONFIG)
+    plain = dinov3_hf.to_params(model, tensors)
+    prefixed = {f"model.{k}": v for k, v in tensors.items()}
+    chex.assert_trees_all_equal(dinov3_hf.to_params(model, prefixed), plain)
+
+
+def test_larger_models_have_a_gated_mlp(make):
+    config = TINY_CONFIG | {"use_gated_mlp": True, "hidden_act": "silu"}
+    shapes = dict(TINY_SHAPES)
+    for i in range(3):
+        shapes[f"layer.{i}.mlp.gate_proj.weight"] = (192, 96)
+        shapes[f"layer.{i}.mlp.gate_proj.bias"] = (192,)
+    model = dinov3_hf.model_from_config(config)
+    params = dinov3_hf.to_params(
+        model, {k: make.seeded_tensor(k, s) for k, s in shapes.items()}
+    )
+    expected = jax.eval_shape(model.init, jax.random.key(0), np.zeros((1, 32, 32, 3)))
+    chex.assert_trees_all_equal_shapes(params, expected["params"])
+
+
+def test_overrides_reach_the_model(folder):
+    model, _ = dinov3_hf.load(folder, attention="xla", remat=True)
+    assert model.attention == "xla"
+    assert model.remat
+    with pytest.raises(UserError, match=r"unknown ViT fields \['precision'\]"):
+        dinov3_hf.load(folder, precision="high")
+
+
+def test_all_problems_are_listed_at_once(folder, tensors):
+    broken = dict(tensors)
+    del broken["layer.1.norm1.bias"]
+    del broken["norm.weight"]
+    broken["layer.0.mlp.up_proj.bias"] = np.zeros(7, np.float32)
+    broken["classifier.weight"] = np.zeros((2, 2), np.float32)
+    safetensors.numpy.save_file(broken, folder / "model.safetensors")
+    with pytest.raises(DataError, match=r"2 missing: layer.1.norm1.bias, norm.weight"):
+        dinov3_hf.load(folder)
+    with pytest.raises(DataError, match=r"1 unexpected: classifier.weight"):
+        dinov3_hf.load(folder)
+    with pytest.raises(
+        DataError, match=r"mis-shaped: layer.0.mlp.up_proj.bias is \[7\], expected"
+    ):
+        dinov3_hf.load(folder)
+
+
+def test_incomplete_or_damaged_folders(folder, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"config.json and model.safetensors"):
+        dinov3_hf.load(tmp_path / "nowhere")
+    weights = folder / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(DataError, match="damaged safetensors file"):
+        dinov3_hf.load(folder)
+    weights.unlink()
+    with pytest.raises(FileNotFoundError, match=r"lacks model.safetensors"):
+        dinov3_hf.load(folder)
+    shutil.copy(__file__, folder / "config.json")
+    weights.write_bytes(b"")
+    with pytest.raises(DataError, match="not a JSON file"):
+        dinov3_hf.load(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model_type": "dinov2"}, "'dinov2', expected 'dinov3_vit'"),
+        ({"hidden_act": "relu"}, "expected 'gelu' or 'silu'"),
+        ({"rope_theta": None}, "lacks rope_theta"),
+    ],
+)
+def test_other_models_are_refused(change, message):
+    config = TINY_CONFIG | change
+    config = {k: v for k, v in config.items() if v is not None}
+    with pytest.raises(UserError, match=message):
+        dinov3_hf.model_from_config(config)

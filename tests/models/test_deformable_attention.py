@@ -1,0 +1,344 @@
+"""Tests of radejax.models.deformable_attention and deformable_sampling."""
+
+import functools
+import importlib.util
+import itertools
+import json
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.models.deformable_attention import DeformableAttention
+from radejax.models.deformable_sampling import deformable_attention
+
+CORES = ("core_single_level", "core_two_levels", "core_inside")
+MODULES = ("module_single_level", "module_two_levels", "module_box_reference")
+
+
+def load_make(golden):
+    """The recipes beside the golden files."""
+    spec = importlib.util.spec_from_file_location(
+        "dinorade_make", golden / "dinorade_make.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module", params=["golden", "shared"])
+def reference(request, golden):
+    """Arrays and settings of the reference cases, the stored excerpt or all."""
+    if request.param == "golden":
+        file = np.load(golden / "dinorade_deform_attn.npz")
+        return json.loads(str(file["info"])), file
+    folder = request.getfixturevalue("shared") / "fixtures" / "deform_attn"
+    info = json.loads((folder / "deform_attn.json").read_text())
+    return info, np.load(folder / "deform_attn.npz")
+
+
+def case_of(reference, name):
+    info, file = reference
+    if name not in info:
+        pytest.skip("not in the stored excerpt")
+    prefix = f"{name}__"
+    keys = [k for k in file.files if k.startswith(prefix)]
+    return info[name], {k.removeprefix(prefix): file[k] for k in keys}
+
+
+def close_to_maximum(actual, desired, tolerance):
+    np.testing.assert_allclose(actual, desired, atol=tolerance * np.abs(desired).max())
+
+
+def test_samples_by_hand():
+    # One head, one channel, one query: a 2 x 3 map with values 0..5.
+    value = jnp.arange(6.0).reshape(1, 6, 1, 1)
+    places = {
+        (0.5, 0.5): 2.5,  # the middle: half way between 1 and 4
+        (0.5 / 3, 0.25): 0.0,  # center of the first pixel
+        (1.0 / 3, 0.25): 0.5,  # between the first two
+        (0.0, 0.25): 0.0,  # left edge: half of pixel 0, half outside
+        (1.0, 0.75): 2.5,  # right edge: half of pixel 5
+        (1.5, 0.5): 0.0,  # outside
+        (-1e9, 1e9): 0.0,  # far outside
+    }
+    locations = jnp.asarray(list(places)).reshape(1, -1, 1, 1, 1, 2)
+    weights = jnp.full(locations.shape[:-1], 2.0)
+    out = deformable_attention(value, [(2, 3)], locations, weights)
+    np.testing.assert_allclose(
+        out[0, :, 0], [2 * v for v in places.values()], atol=1e-6
+    )
+
+
+def naive(value, sizes, locations, weights):
+    """Loops in NumPy: sum over levels and points of weight times bilinear sample."""
+    b, q, heads = weights.shape[:3]
+    out = np.zeros((b, q, heads, value.shape[-1]))
+    starts = np.cumsum([0] + [h * w for h, w in sizes])
+    for i, j, k, n, p in itertools.product(*map(range, weights.shape)):
+        height, width = sizes[n]
+        grid = value[i, starts[n] : starts[n + 1], k].reshape(height, width, -1)
+        x, y = locations[i, j, k, n, p] * [width, height] - 0.5
+        for row, column in itertools.product(
+            (math.floor(y), math.floor(y) + 1), (math.floor(x), math.floor(x) + 1)
+        ):
+            if 0 <= row < height and 0 <= column < width:
+                share = (1 - abs(y - row)) * (1 - abs(x - column))
+                out[i, j, k] += weights[i, j, k, n, p] * share * grid[row, column]
+    return out.reshape(b, q, -1)
+
+
+@pytest.mark.parametrize("chunk_size", [1, 4, 100])
+def test_plain_form_equals_loops(chunk_size):
+    rng = np.random.default_rng(0)
+    sizes = [(3, 4), (2, 5)]
+    value = rng.standard_normal((2, 22, 2, 3))
+    locations = rng.uniform(-0.3, 1.3, (2, 7, 2, 2, 3, 2))
+    weights = rng.standard_normal((2, 7, 2, 2, 3))
+    out = jax.jit(
+        lambda v, x, w: deformable_attention(v, sizes, x, w, chunk_size=chunk_size)
+    )(value, locations, weights)
+    np.testing.assert_allclose(out, naive(value, sizes, locations, weights), atol=2e-5)
+
+
+@pytest.mark.parametrize("name", CORES)
+def test_reference_sampling_and_gradients(reference, name):
+    info, case = case_of(reference, name)
+    sizes = [tuple(s) for s in info["shapes_hw"]]
+
+    @jax.jit
+    def run(value, locations, weights, cotangent):
+        out, pull = jax.vjp(
+            lambda *a: deformable_attention(a[0], sizes, *a[1:], chunk_size=5),
+            value,
+            locations,
+            weights,
+        )
+        return out, pull(cotangent)
+
+    out, (grad_value, grad_locations, grad_weights) = run(
+        case["value"],
+        case["sampling_locations"],
+        case["attention_weights"],
+        case["cotangent"],
+    )
+    np.testing.assert_allclose(out, case["output"], atol=1e-5)
+    np.testing.assert_allclose(grad_value, case["grad_value"], atol=1e-5)
+    np.testing.assert_allclose(grad_weights, case["grad_weights"], atol=1e-5)
+    # On pixel centers the slope differs from one side to the other.
+    is_reliable = case["grad_locations_reliable"]
+    assert is_reliable.mean() > 0.9
+    close_to_maximum(
+        grad_locations[is_reliable], case["grad_locations"][is_reliable], 1e-5
+    )
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_reference_module_and_gradients(reference, name, golden):
+    info, case = case_of(reference, name)
+    sizes = [tuple(s) for s in info["shapes_hw"]]
+    module = DeformableAttention(
+        info["d_model"], info["n_heads"], info["n_points"], info["n_levels"]
+    )
+    params = {}
+    for key, tensor in load_make(golden).seeded_state_dict(info["tensors"]).items():
+        layer, kind = key.split(".")
+        entry = {"kernel": tensor.T} if kind == "weight" else {"bias": tensor}
+        params.setdefault(layer, {}).update(entry)
+    is_valid = ~case["padding_mask"] if info["padding_mask"] else None
+
+    def apply(params, query, points, value):
+        return module.apply({"params": params}, query, points, value, sizes, is_valid)
+
+    inputs = (params, case["query"], case["reference_points"], case["input_flatten"])
+
+    @jax.jit
+    def run(inputs, cotangent):
+        out, pull = jax.vjp(apply, *inputs)
+        return out, pull(cotangent)
+
+    out, grads = run(inputs, case["cotangent"])
+    np.testing.assert_allclose(out, case["output"], atol=1e-5)
+    names = ("grad_query", "grad_reference_points", "grad_input")
+    for grad, key in zip(grads[1:], names, strict=True):
+        close_to_maximum(grad, case[key], 1e-5)
+    for layer, grad in grads[0].items():
+        close_to_maximum(grad["kernel"].T, case[f"grad_param__{layer}.weight"], 1e-5)
+        close_to_maximum(grad["bias"], case[f"grad_param__{layer}.bias"], 1e-5)
+    locations, weights = module.apply(
+        {"params": params},
+        case["query"],
+        case["reference_points"],
+        sizes,
+        method="samples",
+    )
+    np.testing.assert_allclose(locations, case["sampling_locations"], atol=1e-5)
+    np.testing.assert_allclose(weights, case["attention_weights"], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("features", "levels", "heads", "points"),
+    [(128, 1, 4, 4), (128, 1, 4, 8), (256, 1, 4, 8), (256, 4, 8, 4)],
+)
+def test_initial_offsets_form_rings(shared, features, levels, heads, points):
+    file = np.load(shared / "fixtures" / "deform_attn" / "deform_attn.npz")
+    expected = file[f"initial_bias__d{features}_l{levels}_h{heads}_p{points}"]
+    module = DeformableAttention(features, heads, points, levels)
+    sizes = ((2, 2),) * levels
+    params = jax.jit(module.init, static_argnums=4)(
+        jax.random.key(0),
+        jnp.zeros((1, 1, features)),
+        jnp.zeros((1, 1, levels, 2)),
+        jnp.zeros((1, 4 * levels, features)),
+        sizes,
+    )["params"]
+    np.testing.assert_allclose(params["sampling_offsets"]["bias"], expected, atol=1e-5)
+    for name in ("sampling_offsets", "attention_weights"):
+        assert not params[name]["kernel"].any()
+    assert params["value_proj"]["kernel"].any()
+
+
+# The lifted form ---------------------------------------------------------------------
+
+B, N, E, C, H, W = 2, 13, 4, 16, 5, 7
+
+
+def lifted_case(shared_geometry, seed=0):
+    rng = np.random.default_rng(seed)
+    module = DeformableAttention(C, 4, 3, chunk_size=5, dtype=jnp.float64)
+    batch = 1 if shared_geometry else B
+    inputs = {
+        "feature": rng.standard_normal((B, N, C)),
+        "scale": rng.random((B, N, E)) * (rng.random((B, N, E)) > 0.3),
+        "reference": rng.uniform(-0.1, 1.1, (batch, N, E, 2)),
+        "query_weights": rng.random((batch, N, E)) * (rng.random((batch, N, E)) > 0.2),
+        "value": rng.standard_normal((B, H, W, C)),
+    }
+    inputs = {k: jnp.asarray(v) for k, v in inputs.items()}
+    return module, random_params(rng, module), inputs, rng.standard_normal((B, N, C))
+
+
+def random_params(rng, module):
+    samples = module.num_heads * module.num_points
+    sizes = {"sampling_offsets": 2 * samples, "attention_weights": samples}
+    sizes |= {"value_proj": C, "output_proj": C}
+    return {
+        "params": {
+            name: {
+                "kernel": jnp.asarray(0.5 * rng.standard_normal((C, size))),
+                "bias": jnp.asarray(0.5 * rng.standard_normal(size)),
+            }
+            for name, size in sizes.items()
+        }
+    }
+
+
+def through_plain_form(module, params, inputs):
+    query = inputs["scale"][..., None] * inputs["feature"][:, :, None]
+    points = jnp.broadcast_to(inputs["reference"], (B, N, E, 2))
+    out = module.apply(
+        params,
+        query.reshape(B, N * E, C),
+        points.reshape(B, N * E, 1, 2),
+        inputs["value"].reshape(B, H * W, C),
+        [(H, W)],
+    )
+    weights = inputs["query_weights"][..., None]
+    return (out.reshape(B, N, E, C) * weights).sum(2)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def through_lifted_form(module, params, inputs):
+    return module.apply(params, **inputs, method="lifted")
+
+
+@pytest.mark.parametrize("shared_geometry", [True, False])
+def test_lifted_form_equals_the_plain_one(shared_geometry):
+    # In double precision: in single, samples near a pixel center may fall on another
+    # side in the two forms, and their gradients differ.
+    with jax.enable_x64():
+        module, params, inputs, cotangent = lifted_case(shared_geometry)
+
+        def run(form, params, inputs, cotangent):
+            out, pull = jax.vjp(lambda *a: form(module, *a), params, inputs)
+            return out, pull(cotangent)
+
+        results = [
+            jax.jit(run, static_argnums=0)(form, params, inputs, cotangent)
+            for form in (through_plain_form, through_lifted_form)
+        ]
+        chex.assert_trees_all_close(results[1], results[0], rtol=0, atol=1e-11)
+        # So that the comparison means something: every gradient is at work.
+        sizes = jax.tree.map(lambda g: float(jnp.abs(g).max()), results[0][1])
+        assert min(jax.tree.leaves(sizes)) > 0.1
+
+
+def test_lifted_form_does_not_depend_on_the_chunk():
+    with jax.enable_x64():
+        module, params, inputs, _ = lifted_case(True)
+        expected = through_lifted_form(module, params, inputs)
+        for size in (1, 13, 100):
+            other = module.copy(chunk_size=size)
+            np.testing.assert_allclose(
+                through_lifted_form(other, params, inputs), expected, atol=1e-13
+            )
+
+
+def test_lifted_form_in_single_and_half_precision():
+    with jax.enable_x64():
+        module, params, inputs, _ = lifted_case(False)
+        exact = through_lifted_form(module, params, inputs)
+    narrow = jax.tree.map(lambda x: np.asarray(x, np.float32), (params, inputs))
+    for dtype, tolerance in ((jnp.float32, 1e-5), (jnp.bfloat16, 0.1)):
+        out = through_lifted_form(module.copy(dtype=dtype), *narrow)
+        assert out.dtype == dtype
+        np.testing.assert_allclose(np.asarray(out, np.float32), exact, atol=tolerance)
+
+
+def test_bins_without_a_query_get_zero():
+    module, params, inputs, _ = lifted_case(True)
+    params, inputs = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32), (params, inputs)
+    )
+    inputs["query_weights"] = inputs["query_weights"].at[:, 3].set(0.0)
+    out = through_lifted_form(module.copy(dtype=jnp.float32), params, inputs)
+    assert not out[:, 3].any()
+    assert out[:, 4].any()
+
+
+def test_memory_follows_the_chunk():
+    shapes = {
+        "feature": (1, 4096, C),
+        "scale": (1, 4096, 8),
+        "reference": (1, 4096, 8, 2),
+        "query_weights": (1, 4096, 8),
+        "value": (1, 16, 16, C),
+    }
+    inputs = {k: jax.ShapeDtypeStruct(s, jnp.float32) for k, s in shapes.items()}
+
+    def memory(chunk_size):
+        module = DeformableAttention(C, 2, 4, chunk_size=chunk_size)
+        params = random_params(np.random.default_rng(0), module)
+
+        def loss(params, inputs):
+            return through_lifted_form(module, params, inputs).sum()
+
+        compiled = jax.jit(jax.grad(loss)).lower(params, inputs).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    rows = 4096 * 8 * 4 * 4 * 8 * 4  # one head's sampled rows, all at once
+    assert memory(64) < memory(4096) - rows
+    assert memory(64) < 0.5 * rows
+
+
+def test_sizes_must_match_the_map():
+    with pytest.raises(ValueError, match="have 6 pixels, value has 7"):
+        deformable_attention(
+            jnp.zeros((1, 7, 1, 1)),
+            [(2, 3)],
+            jnp.zeros((1, 1, 1, 1, 1, 2)),
+            jnp.zeros((1, 1, 1, 1, 1)),
+        )

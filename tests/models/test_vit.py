@@ -1,0 +1,160 @@
+"""Tests of radejax.models.vit."""
+
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.models import vit
+from radejax.models.vit import ViT
+
+TINY = {
+    "hidden_size": 16,
+    "num_layers": 2,
+    "num_heads": 2,
+    "mlp_dim": 32,
+    "patch_size": 4,
+    "num_registers": 2,
+}
+
+
+def softmax_attention(*arrays):
+    """The formula in NumPy, one head after another."""
+    query, key, value = (a.astype(np.float64) for a in arrays)
+    out = np.zeros_like(query)
+    for b in range(query.shape[0]):
+        for h in range(query.shape[2]):
+            scores = query[b, :, h] @ key[b, :, h].T / np.sqrt(query.shape[-1])
+            weights = np.exp(scores - scores.max(-1, keepdims=True))
+            weights /= weights.sum(-1, keepdims=True)
+            out[b, :, h] = weights @ value[b, :, h]
+    return out
+
+
+def random_qkv(tokens, dtype=np.float32, heads=3, head_dim=8):
+    rng = np.random.default_rng(0)
+    shape = (2, tokens, heads, head_dim)
+    return [rng.standard_normal(shape).astype(dtype) * 2 for _ in range(3)]
+
+
+@pytest.mark.parametrize("kind", ["auto", "blocked", "xla"])
+@pytest.mark.parametrize("tokens", [1, 17, 700])  # below and above one block
+def test_attention_follows_the_formula(kind, tokens):
+    query, key, value = random_qkv(tokens)
+    actual = jax.jit(vit.attend, static_argnums=3)(query, key, value, kind)
+    np.testing.assert_allclose(actual, softmax_attention(query, key, value), atol=1e-5)
+
+
+def test_blocked_attention_has_the_gradients_of_the_plain_one():
+    arrays = random_qkv(530)
+
+    def loss(kind, *arrays):
+        return jnp.sum(jnp.sin(vit.attend(*arrays, kind)))
+
+    gradient = jax.jit(jax.grad(loss, (1, 2, 3)), static_argnums=0)
+    plain, blocked = gradient("xla", *arrays), gradient("blocked", *arrays)
+    chex.assert_trees_all_close(blocked, plain, atol=2e-5)
+
+
+def test_unknown_attention_is_refused():
+    with pytest.raises(UserError, match="auto, blocked, xla or cudnn"):
+        vit.attend(*random_qkv(4), "flash")
+
+
+def test_rotary_angles_by_hand():
+    cos, sin = vit.rotary_angles(1, 2, 8, theta=16.0)
+    # One row: y = 0. Columns: x = -0.5 and 0.5; frequencies 1 and 16^-0.5 = 1/4.
+    angle = 2 * np.pi * np.array([[0, 0, -0.5, -0.125], [0, 0, 0.5, 0.125]])
+    angle = np.concatenate([angle, angle], -1)
+    np.testing.assert_allclose(cos, np.cos(angle), atol=1e-6)
+    np.testing.assert_allclose(sin, np.sin(angle), atol=1e-6)
+
+
+def test_rotation_leaves_norms_and_the_prefix():
+    x = np.random.default_rng(0).standard_normal((2, 3 + 6, 2, 8)).astype(np.float32)
+    rope = vit.rotary_angles(2, 3, 8)
+    turned = vit.rotate(jnp.asarray(x), rope, 3)
+    np.testing.assert_array_equal(turned[:, :3], x[:, :3])
+    np.testing.assert_allclose(
+        np.linalg.norm(turned, axis=-1), np.linalg.norm(x, axis=-1), rtol=1e-5
+    )
+    assert np.abs(turned[:, 3:] - x[:, 3:]).max() > 0.5
+
+
+def test_scores_depend_on_relative_position_only():
+    x = np.random.default_rng(1).standard_normal((1, 1, 1, 8)).astype(np.float32)
+    same = jnp.asarray(np.broadcast_to(x, (1, 25, 1, 8)))
+    turned = vit.rotate(same, vit.rotary_angles(5, 5, 8), 0).reshape(5, 5, 8)
+    scores = np.einsum("abc,dec->abde", turned, turned)
+    np.testing.assert_allclose(scores[0, 1, 2, 4], scores[1, 0, 3, 3], rtol=1e-5)
+    assert abs(scores[0, 1, 2, 4] - scores[0, 1, 2, 3]) > 1e-3
+
+
+@pytest.mark.parametrize("fields", [{}, {"gated_mlp": True, "activation": "silu"}])
+def test_shapes_parameters_and_jit(fields):
+    model = ViT(**(TINY | fields))
+    image = np.random.default_rng(0).standard_normal((2, 8, 12, 3)).astype(np.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), image)
+    tokens = jax.jit(model.apply)(variables, image)
+    chex.assert_shape(tokens, (2, 3 + 2 * 3, 16))
+    assert model.num_prefix == 3
+    chex.assert_tree_all_finite(tokens)
+    # The final normalisation: zero mean, unit deviation over channels.
+    np.testing.assert_allclose(np.mean(tokens, -1), 0, atol=1e-5)
+    mlps = 3 if fields else 2
+    per_layer = 2 * 32 + 2 * 16 + 4 * 16 * 16 + 3 * 16
+    per_layer += mlps * 16 * 32 + (mlps - 1) * 32 + 16
+    expected = 3 * 16 + (48 * 16 + 16) + 2 * per_layer + 32
+    assert sum(x.size for x in jax.tree.leaves(variables)) == expected
+
+
+def test_another_image_size_uses_the_same_parameters():
+    model = ViT(**TINY)
+    variables = jax.jit(model.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 3)))
+    tokens = jax.jit(model.apply)(variables, jnp.zeros((1, 12, 20, 3)))
+    chex.assert_shape(tokens, (1, 18, 16))
+
+
+def test_remat_changes_nothing():
+    image = np.random.default_rng(0).standard_normal((1, 8, 8, 3)).astype(np.float32)
+    variables = jax.jit(ViT(**TINY).init)(jax.random.key(0), image)
+
+    @functools.partial(jax.jit, static_argnums=1)
+    @jax.grad
+    def gradient(variables, remat):
+        return jnp.sum(ViT(**TINY, remat=remat).apply(variables, image) ** 3)
+
+    plain = gradient(variables, False)
+    chex.assert_trees_all_close(gradient(variables, True), plain, rtol=1e-5, atol=1e-4)
+    chex.assert_tree_all_finite(plain)
+
+
+def test_bfloat16_stays_close():
+    image = np.random.default_rng(0).standard_normal((1, 16, 16, 3)).astype(np.float32)
+    variables = jax.jit(ViT(**TINY).init)(jax.random.key(0), image)
+    exact = jax.jit(ViT(**TINY).apply)(variables, image)
+    half = jax.jit(ViT(**TINY, dtype=jnp.bfloat16).apply)(variables, image)
+    assert half.dtype == jnp.float32
+    assert 0 < np.abs(half - exact).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((1, 8, 10, 3), "8 x 10 pixels; .* multiples of the patch size 4"),
+        ((1, 3, 8, 8), "colours last"),
+        ((8, 8, 3), "colours last"),
+    ],
+)
+def test_images_of_a_wrong_shape_are_refused(shape, message):
+    with pytest.raises(UserError, match=message):
+        ViT(**TINY).init(jax.random.key(0), jnp.zeros(shape))
+
+
+def test_heads_need_a_multiple_of_four_channels():
+    with pytest.raises(UserError, match="multiple of 4 channels, got 6"):
+        vit.rotary_angles(2, 2, 6)
