@@ -103,6 +103,8 @@ def read_table(
     if missing:
         raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
     table = {name: columns[name] for name in wanted}
+    if table["frame"].size == 0:  # an empty list has neither type nor width
+        table.update(cls=np.zeros(0, str), box=np.zeros((0, 7)))
     table["frame"] = find_frames(columns["frame"], frames, where=str(path))
     return table
 
@@ -201,16 +203,12 @@ def _columns_of_records(records: list[dict], path: pathlib.Path) -> dict[str, li
                 raise DataError(f"{path}: row {row}: lacks {name!r}")
             columns[name].append(str(record[name]))
         columns["box"].append(box)
-        if "score" in record:
-            columns["score"].append(record["score"])
-    if not records or not columns["score"]:
-        columns["score"] = columns["score"] if not records else []
-    if records and 0 < len(columns["score"]) < len(records):
-        row = next(i for i, record in enumerate(records) if "score" not in record)
-        raise DataError(f"{path}: row {row}: lacks 'score'")
-    if records and not columns["score"]:
+        columns["score"].append(record.get("score"))
+    lacking = [row for row, score in enumerate(columns["score"]) if score is None]
+    if lacking and len(lacking) < len(records):
+        raise DataError(f"{path}: row {lacking[0]}: lacks 'score'")
+    if lacking:
         del columns["score"]
-    columns["box"] = columns["box"] or np.zeros((0, 7))
     return columns
 
 

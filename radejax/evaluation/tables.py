@@ -220,7 +220,7 @@ def class_indices(
         row = int(np.flatnonzero(index == -2)[0])
         known = ", ".join(dict.fromkeys((*classes, *KNOWN_CLASSES)))
         raise DataError(
-            f"{name}: frame {frame[row]}, row {row}: unknown class {cls[row]!r};"
+            f"{name}: frame {frame[row]}, row {row}: unknown class {str(cls[row])!r};"
             f" known: {known}"
         )
     return index

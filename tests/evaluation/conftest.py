@@ -1,0 +1,48 @@
+"""Loads the slow reference and makes random scenes."""
+
+import importlib.util
+import pathlib
+
+import numpy as np
+import pytest
+
+HERE = pathlib.Path(__file__).parent
+
+
+def _load(name):
+    spec = importlib.util.spec_from_file_location(f"eval_{name}", HERE / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """The second, slow implementation."""
+    return _load("reference")
+
+
+@pytest.fixture(scope="session")
+def random_scene():
+    """Function (seed, ...) -> ground truth, predictions, frames."""
+    return _load("scenes").random_scene
+
+
+@pytest.fixture(scope="session")
+def kradar_fixture(shared):
+    """Columns of the shared K-Radar evaluation set, and the frame weathers."""
+    folder = shared / "fixtures" / "kradar_eval"
+    truth, found = (
+        np.load(folder / f"{name}.npz") for name in ("ground_truth", "predictions")
+    )
+    names = truth["class_names"]
+    frames = {
+        "frame": np.arange(truth["frame_name"].size),
+        "name": truth["frame_name"],
+        "sequence": truth["frame_seq"],
+        "weather": truth["frame_weather"],
+    }
+    ground_truth = {k: truth[k] for k in ("frame", "box")}
+    predictions = {k: found[k] for k in ("frame", "box", "score", "score_unique")}
+    ground_truth["cls"], predictions["cls"] = names[truth["cls"]], names[found["cls"]]
+    return ground_truth, predictions, frames

@@ -1,0 +1,648 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.errors import DataError, UserError
+from radejax.evaluation.average_precision import (
+    PROTOCOLS,
+    EvaluationSet,
+    evaluate,
+    mean_ap,
+)
+from radejax.structures import CLASSES
+
+TWO = ("Sedan", "Bus or Truck")
+METHODS = {
+    "voc11": "VOC",
+    "recall41": "K-Radar",
+    "coco101": "COCO",
+    "auc": "PR-AUC",
+}
+VARIANTS = {
+    "kradar_r40": "revised",
+    "kradar_r11": "legacy",
+    "kradar_r40_yaw": "revised_yaw_corrected",
+}
+PLAIN = ("voc11", "recall41", "coco101", "auc", "exact")
+
+
+def car(x=20.0, y=0.0, **changes):
+    box = {"x": x, "y": y, "z": 0.0, "l": 4.0, "w": 2.0, "h": 1.5, "yaw": 0.0}
+    return list({**box, **changes}.values())
+
+
+def table(rows, *, scored):
+    """Columns of rows (frame, box, class[, score])."""
+    columns = {
+        "frame": np.array([row[0] for row in rows], int),
+        "box": np.array([row[1] for row in rows], float).reshape(-1, 7),
+        "cls": np.array([row[2] for row in rows], str),
+    }
+    if scored:
+        columns["score"] = np.array([row[3] for row in rows], float)
+    return columns
+
+
+def truth_of(*rows):
+    return table(rows, scored=False)
+
+
+def found_of(*rows):
+    return table(rows, scored=True)
+
+
+# Numbers worked out by hand -------------------------------------------------------------
+
+
+def test_perfect_predictions_in_every_protocol():
+    truth = truth_of(*((f, car(10 + f), "Sedan") for f in range(10)))
+    found = found_of(*((f, car(10 + f), "Sedan", 0.9 - f / 100) for f in range(10)))
+    for protocol, expected in {
+        "exact": 100.0,
+        "voc11": 1000 / 11,
+        "recall41": 4000 / 41,
+        "coco101": 10000 / 101,
+        "auc": 100.0,
+        "kradar_r40": 1000 / 41,  # ten matches fill ten of 41 samples
+        "kradar_r40_yaw": 1000 / 41,
+        "kradar_r11": 300 / 11,  # samples 0, 4 and 8
+    }.items():
+        results = evaluate(truth, found, classes=["Sedan"], protocol=protocol)
+        for result in results:
+            assert result.ap == pytest.approx(expected, abs=1e-8), protocol
+            assert (result.num_gt, result.num_det) == (10, 10)
+
+
+def test_detections_without_a_hit_get_radenets_floor():
+    truth = truth_of((0, car(), "Sedan"))
+    found = found_of((0, car(60), "Sedan", 0.9))
+    for protocol, expected in {
+        "voc11": 100 / 11,
+        "recall41": 100 / 41,
+        "coco101": 100 / 101,
+        "auc": 0.0,
+        "exact": 0.0,
+        "kradar_r40": 0.0,
+    }.items():
+        result = evaluate(truth, found, classes=["Sedan"], protocol=protocol)[0]
+        assert result.ap == pytest.approx(expected, abs=1e-9), protocol
+
+
+def test_exact_by_hand():
+    # Hits and misses by falling score: + - + + -, four objects. Recall 1/4, 2/4, 3/4 at
+    # precision 1, 2/3, 3/4; made monotone 1, 3/4, 3/4: (1 + 3/4 + 3/4) / 4.
+    truth = truth_of(*((f, car(), "Sedan") for f in range(4)))
+    found = found_of(
+        (0, car(), "Sedan", 0.9),
+        (1, car(50), "Sedan", 0.8),
+        (1, car(), "Sedan", 0.7),
+        (2, car(), "Sedan", 0.6),
+        (3, car(50), "Sedan", 0.5),
+    )
+    result = evaluate(truth, found, classes=["Sedan"], protocol="exact")[0]
+    assert result.ap == pytest.approx(62.5, abs=1e-12)
+    np.testing.assert_allclose(result.precision, [1, 1 / 2, 2 / 3, 3 / 4, 3 / 5])
+    np.testing.assert_allclose(result.recall, [1 / 4, 1 / 4, 2 / 4, 3 / 4, 3 / 4])
+
+
+def test_equal_scores_are_one_threshold():
+    truth = truth_of((0, car(), "Sedan"), (1, car(), "Sedan"))
+    hit, miss = (0, car(), "Sedan", 0.5), (1, car(60), "Sedan", 0.5)
+    for rows in ((hit, miss), (miss, hit)):
+        result = evaluate(truth, found_of(*rows), classes=["Sedan"], protocol="exact")[
+            0
+        ]
+        assert result.ap == pytest.approx(25.0)  # recall 1/2 at precision 1/2
+
+
+def test_frame_rules_differ_as_described():
+    # A frame with a car, one with only a bus, one with nothing; a false car in each.
+    truth = truth_of((0, car(), "Sedan"), (1, car(40), "Bus or Truck"))
+    found = found_of(
+        (0, car(), "Sedan", 0.5),
+        (0, car(60), "Sedan", 0.9),
+        (1, car(60), "Sedan", 0.8),
+        (2, car(60), "Sedan", 0.7),
+    )
+    for skip, false in (("class", 1), ("frame", 2), (None, 3)):
+        result = evaluate(
+            truth, found, classes=TWO, protocol="exact", skip_empty=skip, spaces="bev"
+        )[0]
+        assert result.ap == pytest.approx(100 / (1 + false))
+        assert result.num_det == 1 + false
+        assert result.skip_empty == skip
+    # Only the classes that are evaluated decide which frames are empty.
+    result = evaluate(
+        truth, found, classes=["Sedan"], protocol="exact", skip_empty="frame"
+    )[0]
+    assert result.num_det == 2
+
+
+def test_kradar_compares_boxes_with_length_and_width_exchanged():
+    # Side by side 1.5 m apart: 2 m wide cars hardly overlap, 4 m wide ones do.
+    truth, found = (
+        truth_of((0, car(), "Sedan")),
+        found_of((0, car(y=1.5), "Sedan", 0.9)),
+    )
+    terms = {"classes": ["Sedan"], "iou_thresholds": 0.4, "spaces": "bev"}
+    assert evaluate(truth, found, protocol="kradar_r40", **terms)[0].ap > 0
+    assert evaluate(truth, found, protocol="kradar_r40_yaw", **terms)[0].ap == 0
+
+
+def test_kradar_r11_takes_z_as_the_top():
+    # The upper box stands on the lower one's middle, but both share their z.
+    tall, flat = car(h=3.0), car(h=1.0)
+    truth, found = truth_of((0, tall, "Sedan")), found_of((0, flat, "Sedan", 0.9))
+    data = EvaluationSet(truth, found, classes=["Sedan"])
+    assert data.overlaps("exchanged")[1] == pytest.approx(1 / 3)
+    assert data.overlaps("exchanged_top")[1] == pytest.approx(1 / 3)
+    found["box"][0, 2] = -1.0
+    data = EvaluationSet(truth, found, classes=["Sedan"])
+    assert data.overlaps("exchanged")[1] == pytest.approx(1 / 3)
+    assert data.overlaps("exchanged_top")[1] == pytest.approx(1 / 3)
+    found["box"][0, 2] = 0.5
+    data = EvaluationSet(truth, found, classes=["Sedan"])
+    assert data.overlaps("exchanged_top")[1] == pytest.approx(0.5 / 3.5)
+
+
+def test_kradar_rounds_ground_truth_only():
+    truth = truth_of((0, car(20.004), "Sedan"))
+    found = found_of((0, car(20.004), "Sedan", 0.9))
+    data = EvaluationSet(truth, found, classes=["Sedan"])
+    assert data.overlaps("plain")[0] == pytest.approx(1.0, abs=1e-12)
+    expected = np.float32((4 - 0.004) / (4 + 0.004))
+    assert data.overlaps("rounded")[0][0] == pytest.approx(float(expected), abs=1e-7)
+    assert data.overlaps("rounded")[0][0] == np.float32(data.overlaps("rounded")[0][0])
+
+
+@pytest.mark.parametrize("protocol", list(PROTOCOLS))
+def test_thresholds_are_strict(protocol):
+    # Half of a car: IoU exactly 1/2 in every geometry.
+    truth = truth_of((0, car(), "Sedan"))
+    found = found_of((0, car(l=2.0), "Sedan", 0.5))
+    for iou, hit in ((0.5, False), (0.499, True)):
+        result = evaluate(
+            truth, found, classes=["Sedan"], iou_thresholds=iou, protocol=protocol
+        )[0]
+        floor = {"voc11": 100 / 11, "recall41": 100 / 41, "coco101": 100 / 101}
+        assert (result.ap > floor.get(protocol, 0) + 1e-9) == hit
+
+
+def test_score_cut_is_strict_and_zero_keeps_all_in_plain_protocols():
+    truth = truth_of((0, car(), "Sedan"))
+    for protocol in ("exact", "kradar_r40"):
+        for score, cut, kept in ((0.3, 0.3, 0), (0.31, 0.3, 1)):
+            found = found_of((0, car(), "Sedan", score))
+            result = evaluate(
+                truth,
+                found,
+                classes=["Sedan"],
+                protocol=protocol,
+                score_threshold=cut,
+            )[0]
+            assert result.num_det == kept
+    found = found_of((0, car(), "Sedan", 0.0))
+    assert evaluate(truth, found, classes=["Sedan"], protocol="exact")[0].ap == 100
+    assert evaluate(truth, found, classes=["Sedan"])[0].num_det == 0
+
+
+def test_a_class_that_does_not_occur():
+    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
+    for protocol in PROTOCOLS:
+        results = evaluate(truth, found, classes=TWO, protocol=protocol, spaces="bev")
+        absent = results[1]
+        assert not absent.is_defined
+        assert (
+            absent.ap == 0 if protocol.startswith("kradar") else math.isnan(absent.ap)
+        )
+        assert mean_ap(results) == results[0].ap
+    assert math.isnan(mean_ap(results[1:]))
+
+
+def test_empty_tables():
+    nothing = found_of()
+    for protocol in PROTOCOLS:
+        for result in evaluate(truth_of(), nothing, protocol=protocol):
+            assert result.num_gt == result.num_det == result.num_frames == 0
+        truth = truth_of((0, car(), "Sedan"))
+        result = evaluate(truth, nothing, classes=["Sedan"], protocol=protocol)[0]
+        assert result.ap == 0
+        assert result.num_gt == 1
+
+
+def test_region_of_interest_is_inclusive_and_filters_both_sides():
+    truth = truth_of((0, car(72.0, 6.4), "Sedan"), (0, car(72.1), "Sedan"))
+    found = found_of(
+        (0, car(72.0, 6.4), "Sedan", 0.9), (0, car(20, -6.5), "Sedan", 0.8)
+    )
+    data = EvaluationSet(truth, found, roi="narrow")
+    assert (len(data.gt), len(data.pred)) == (1, 1)
+    assert data.left_out["ground truth: center outside the region of interest"] == 1
+    assert data.left_out["predictions: center outside the region of interest"] == 1
+    same = EvaluationSet(truth, found, roi=(0, 72, -6.4, 6.4, -2, 6))
+    assert (len(same.gt), same.roi) == (1, "narrow")
+
+
+def test_metric_names_carry_everything():
+    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
+    result = evaluate(
+        truth, found, score_threshold=0.3, roi="wide", label_version="v2.1"
+    )[-1]
+    assert (
+        result.metric
+        == "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=wide"
+    )
+
+
+# Parity ---------------------------------------------------------------------------------
+
+
+def test_golden_scenes(golden):
+    data = np.load(golden / "evaluation_scenes.npz")
+    classes = data["classes"].tolist()
+    for scene in range(3):
+        truth, found = (
+            {
+                column: data[f"{scene}_{name}_{column}"]
+                for column in ("frame", "box", "cls", "score")
+                if f"{scene}_{name}_{column}" in data
+            }
+            for name in ("truth", "found")
+        )
+        frames = {"frame": np.arange(data[f"{scene}_num_frames"])}
+        shared_set = EvaluationSet(truth, found, classes=classes, frames=frames)
+        for p, protocol in enumerate(data["protocols"].tolist()):
+            for c, cut in enumerate(data["cuts"].tolist()):
+                ap = [
+                    result.ap
+                    for result in shared_set.results(
+                        protocol, iou_thresholds=data["ious"], score_threshold=cut
+                    )
+                ]
+                expected = data[f"{scene}_ap"][p, c].reshape(-1)
+                np.testing.assert_allclose(ap, expected, atol=1e-9, err_msg=protocol)
+
+
+@settings(deadline=None, max_examples=12, derandomize=True)
+@given(seed=st.integers(0, 10**6), ties=st.booleans(), data=st.data())
+def test_equals_the_slow_implementation(reference, random_scene, seed, ties, data):
+    protocol = data.draw(st.sampled_from(list(PROTOCOLS)))
+    truth, found, frames = random_scene(seed, num_objects=20, ties=ties)
+    for result in evaluate(
+        truth,
+        found,
+        classes=TWO,
+        iou_thresholds=(0.2, 0.5),
+        protocol=protocol,
+        frames=frames,
+    ):
+        expected = reference.average_precision(
+            protocol, truth, found, result.cls, result.space, result.iou, classes=TWO
+        )
+        np.testing.assert_allclose(result.ap, expected, atol=1e-9)
+
+
+def test_kradar_fixture(kradar_fixture, shared):
+    truth, found, frames = kradar_fixture
+    expected = json.loads(
+        (shared / "fixtures/kradar_eval/expected_ap.json").read_text()
+    )
+    keys = {name: key for key, name in expected["classes"].items()}
+    data = EvaluationSet(truth, found, frames=frames)
+    checked = 0
+    for protocol, variant in VARIANTS.items():
+        for cut in (0.0, 0.3):
+            listed = expected["variants"][variant][f"conf_{cut}"]
+            for condition, numbers in listed.items():
+                mask = None if condition == "all" else frames["weather"] == condition
+                for result in data.results(
+                    protocol,
+                    iou_thresholds=expected["iou_thresholds"],
+                    score_threshold=cut,
+                    weights=mask,
+                ):
+                    entry = numbers["classes"][keys[result.cls]]
+                    assert result.num_frames == numbers["num_frames"]
+                    assert result.num_gt == entry["num_gt"]
+                    assert result.num_det == entry["num_det"]
+                    ap = entry[result.space][str(result.iou)]
+                    assert result.ap == pytest.approx(ap, abs=1e-9)
+                    checked += 1
+    assert checked == 3 * 2 * 8 * 2 * 3 * 5
+
+
+def test_kradar_fixture_through_single_calls(kradar_fixture, shared):
+    """Conditions given as separate sets, as a user would."""
+    truth, found, frames = kradar_fixture
+    expected = json.loads(
+        (shared / "fixtures/kradar_eval/expected_ap.json").read_text()
+    )
+    numbers = expected["variants"]["revised"]["conf_0.0"]["fog"]["classes"]
+    in_fog = frames["weather"] == "fog"
+    parts = [{k: v[in_fog[t["frame"]]] for k, v in t.items()} for t in (truth, found)]
+    for result in evaluate(*parts, iou_thresholds=(0.3, 0.5, 0.7)):
+        key = {n: k for k, n in expected["classes"].items()}[result.cls]
+        ap = numbers[key][result.space][str(result.iou)]
+        assert result.ap == pytest.approx(ap, abs=1e-9)
+
+
+def test_kradar_fixture_curves(kradar_fixture, shared):
+    truth, found, frames = kradar_fixture
+    folder = shared / "fixtures/kradar_eval"
+    expected = json.loads((folder / "expected_precision_all.json").read_text())
+    names = json.loads((folder / "expected_ap.json").read_text())["classes"]
+    keys = {name: key for key, name in names.items()}
+    data = EvaluationSet(truth, found, frames=frames)
+    for protocol, variant in list(VARIANTS.items())[::2]:
+        for result in data.results(protocol, iou_thresholds=(0.3, 0.5, 0.7)):
+            entry = expected[variant][keys[result.cls]][result.space][str(result.iou)]
+            assert result.score.tolist() == entry["score_thresholds"]
+            np.testing.assert_allclose(result.precision, entry["precision"], atol=1e-9)
+
+
+def test_radenet_fixture(kradar_fixture, shared):
+    truth, found, frames = kradar_fixture
+    path = shared / "fixtures/kradar_eval/expected_ap_radenet.json"
+    expected = json.loads(path.read_text())["results"]
+    found = {**found, "score": found["score_unique"]}
+    data = EvaluationSet(truth, found, frames=frames, roi="narrow")
+    checked = 0
+    for setting, conditions in expected.items():
+        skip = "class" if "skip_0_gt_frames=True" in setting else None
+        iou = float(setting.split("iou=")[1])
+        for condition, spaces in conditions.items():
+            mask = None if condition == "all" else frames["weather"] == condition
+            for protocol, method in METHODS.items():
+                results = data.results(
+                    protocol, iou_thresholds=iou, skip_empty=skip, weights=mask
+                )
+                for result in results:
+                    aps = spaces[result.space][method]["aps"]
+                    assert (result.cls in aps) == result.is_defined
+                    if result.is_defined:
+                        assert result.ap / 100 == pytest.approx(
+                            aps[result.cls], abs=1e-9
+                        )
+                        checked += 1
+                for space, numbers in spaces.items():
+                    mine = [r for r in results if r.space == space]
+                    assert mean_ap(mine) / 100 == pytest.approx(
+                        numbers[method]["mAP"], abs=1e-9
+                    )
+    assert checked > 500
+
+
+def test_map_fixture(shared):
+    """RADE-Net's evaluator on its own fixture; its IoU scales boxes by |(sin, cos)|."""
+    data = np.load(shared / "fixtures/map/frames.npz")
+    runs = json.loads((shared / "fixtures/map/map_results.json").read_text())["runs"]
+    names = np.array(["Sedan", "Bus or Truck", "Pedestrian"])
+    pred = data["pred"].astype(np.float64)
+    norm = np.hypot(pred[:, 6], pred[:, 7])[:, None]
+    yaw = np.arctan2(pred[:, 6], pred[:, 7])[:, None]
+    pred_box = np.hstack([pred[:, :3], pred[:, 3:5] * norm, pred[:, 5:6], yaw])
+    gt_box = data["gt_values"][:, [0, 1, 2, 4, 5, 6, 3]]
+    empty = np.setdiff1d(np.arange(80), data["gt_frame"])[:3]
+    selections = {"first9": np.arange(9), "no_gt_frames": empty}
+    checked = 0
+    for run in runs:
+        chosen = selections.get(run["selection"], np.arange(80))
+        gt, det = (np.isin(data[f"{n}_frame"], chosen) for n in ("gt", "pred"))
+        truth = {
+            "frame": data["gt_frame"][gt],
+            "box": gt_box[gt],
+            "cls": names[data["gt_class"][gt]],
+        }
+        found = {
+            "frame": data["pred_frame"][det],
+            "box": pred_box[det],
+            "cls": names[pred[det, 9].astype(int)],
+            "score": pred[det, 8],
+        }
+        for protocol, method in METHODS.items():
+            results = evaluate(
+                truth,
+                found,
+                classes=run["classes"],
+                iou_thresholds=run["iou_threshold"],
+                protocol=protocol,
+                roi=run["roi"],
+                spaces={"2D": "bev", "3D": "3d"}[run["dim"]],
+                skip_empty="class" if run["skip_frames_without_gt"] else None,
+            )
+            aps = run["results"][method]["aps"]
+            assert {r.cls for r in results if r.is_defined} == set(aps)
+            for result in results:
+                if result.is_defined:
+                    assert result.ap / 100 == pytest.approx(aps[result.cls], abs=1e-9)
+                    checked += 1
+    assert checked > 500
+
+
+# Laws -----------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=15, derandomize=True)
+@given(seed=st.integers(0, 10**6), protocol=st.sampled_from(list(PROTOCOLS)))
+def test_ap_lies_between_0_and_100(random_scene, seed, protocol):
+    truth, found, frames = random_scene(seed)
+    for result in evaluate(truth, found, protocol=protocol, frames=frames):
+        if result.is_defined:
+            assert 0 <= result.ap <= 100
+
+
+@settings(deadline=None, max_examples=15, derandomize=True)
+@given(seed=st.integers(0, 10**6))
+def test_perfect_predictions_are_worth_100_in_the_recommended_protocol(
+    random_scene, seed
+):
+    truth, _, frames = random_scene(seed)
+    score = np.random.default_rng(seed).random(len(truth["frame"]))
+    found = {**truth, "score": score}
+    for protocol in PROTOCOLS:
+        caps = {"voc11": 1000 / 11, "recall41": 4000 / 41, "coco101": 10000 / 101}
+        for result in evaluate(
+            truth, found, classes=TWO, protocol=protocol, frames=frames
+        ):
+            if protocol in ("exact", "auc") and result.is_defined:
+                assert result.ap == pytest.approx(100, abs=1e-6)
+            else:
+                assert not result.ap > caps.get(protocol, 100) + 1e-9
+
+
+@settings(deadline=None, max_examples=15, derandomize=True)
+@given(seed=st.integers(0, 10**6), protocol=st.sampled_from(list(PROTOCOLS)))
+def test_a_lower_scored_false_positive_never_raises_ap(random_scene, seed, protocol):
+    truth, found, frames = random_scene(seed)
+    worse = {
+        "frame": np.append(found["frame"], 0),
+        "box": np.vstack([found["box"], car(100.0)]),
+        "cls": np.append(found["cls"], "Sedan"),
+        "score": np.append(found["score"], found["score"].min() / 2),
+    }
+    terms = {"classes": TWO, "protocol": protocol, "frames": frames}
+    before, after = evaluate(truth, found, **terms), evaluate(truth, worse, **terms)
+    for one, other in zip(before, after, strict=True):
+        assert not other.ap > one.ap + 1e-12
+
+
+@settings(deadline=None, max_examples=10, derandomize=True)
+@given(seed=st.integers(0, 10**6), protocol=st.sampled_from(list(PROTOCOLS)))
+def test_the_order_of_frames_does_not_matter(random_scene, seed, protocol):
+    truth, found, frames = random_scene(seed, ties=False)
+    rng = np.random.default_rng(seed)
+    rename = rng.permutation(len(frames["frame"]))
+    moved = []
+    for columns in (truth, found):
+        frame = rename[columns["frame"]]
+        order = np.argsort(frame, kind="stable")
+        moved.append({k: v[order] for k, v in {**columns, "frame": frame}.items()})
+    terms = {"classes": TWO, "protocol": protocol, "frames": frames}
+    for one, other in zip(
+        evaluate(truth, found, **terms), evaluate(*moved, **terms), strict=True
+    ):
+        np.testing.assert_allclose(one.ap, other.ap, atol=1e-10)
+
+
+@settings(deadline=None, max_examples=10, derandomize=True)
+@given(
+    seed=st.integers(0, 10**6),
+    turn=st.floats(-4, 4),
+    shift=st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-2, 2)),
+    protocol=st.sampled_from(PLAIN),
+)
+def test_a_common_rigid_motion_does_not_matter(
+    random_scene, seed, turn, shift, protocol
+):
+    truth, found, frames = random_scene(seed)
+
+    def move(columns):
+        box = columns["box"].copy()
+        cos, sin = np.cos(turn), np.sin(turn)
+        box[:, :2] = box[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+        box[:, :3] += shift
+        box[:, 6] += turn
+        return {**columns, "box": box}
+
+    terms = {"classes": TWO, "protocol": protocol, "frames": frames}
+    for one, other in zip(
+        evaluate(truth, found, **terms),
+        evaluate(move(truth), move(found), **terms),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one.ap, other.ap, atol=1e-9)
+
+
+def test_weights_repeat_frames(random_scene):
+    """A frame of weight 2 counts as two equal frames, in every protocol."""
+    truth, found, frames = random_scene(3, ties=False)
+    weight = np.random.default_rng(0).integers(0, 3, len(frames["frame"]))
+    copies = []
+    for columns in (truth, found):
+        parts = []
+        for copy in range(2):
+            rows = np.flatnonzero(weight[columns["frame"]] > copy)
+            part = {k: v[rows] for k, v in columns.items()}
+            part["frame"] = part["frame"] + 1000 * copy
+            parts.append(part)
+        copies.append({k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
+    data = EvaluationSet(truth, found, classes=TWO, frames=frames)
+    for protocol in ("exact", "kradar_r40", "kradar_r11", "kradar_r40_yaw"):
+        weighted = data.results(protocol, iou_thresholds=(0.2, 0.5), weights=weight)
+        repeated = evaluate(
+            *copies, classes=TWO, protocol=protocol, iou_thresholds=(0.2, 0.5)
+        )
+        for one, other in zip(weighted, repeated, strict=True):
+            assert one.num_gt == other.num_gt
+            np.testing.assert_allclose(one.ap, other.ap, atol=1e-9)
+
+
+# Wrong use ------------------------------------------------------------------------------
+
+
+def test_unknown_things_are_named():
+    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
+    with pytest.raises(UserError, match="unknown protocol 'r40'; known: kradar_r40"):
+        evaluate(truth, found, protocol="r40")
+    with pytest.raises(UserError, match="spaces must be among"):
+        evaluate(truth, found, spaces="2d")
+    with pytest.raises(UserError, match="skip_empty must be"):
+        evaluate(truth, found, skip_empty="all")
+    with pytest.raises(UserError, match="unknown roi 'wider'; known: narrow, wide"):
+        evaluate(truth, found, roi="wider")
+    with pytest.raises(UserError, match="roi must be"):
+        evaluate(truth, found, roi=(0, 1, 2))
+    with pytest.raises(UserError, match="sequence of class names"):
+        evaluate(truth, found, classes="Sedan")
+    with pytest.raises(UserError, match="named twice"):
+        evaluate(truth, found, classes=("Sedan", "Sedan"))
+    with pytest.raises(UserError, match=r"must lie in \[0, 1\)"):
+        evaluate(truth, found, iou_thresholds=30)
+
+
+def test_bad_rows_are_named():
+    truth = truth_of((7, car(), "Sedan"), (9, car(), "Sedan"))
+
+    def raises(match, **changes):
+        found = found_of((7, car(), "Sedan", 0.9), (9, car(), "Sedan", 0.8))
+        for column, value in changes.items():
+            found[column] = value(found[column])
+        with pytest.raises(DataError, match=match):
+            evaluate(truth, found, frames={"frame": np.array([7, 9])})
+
+    def put(index, value):
+        def change(column):
+            column = column.astype(object) if isinstance(value, str) else column.copy()
+            column[index] = value
+            return column.astype(str) if isinstance(value, str) else column
+
+        return change
+
+    raises("predictions: frame 9, row 1: z of the box is nan", box=put((1, 2), np.nan))
+    raises("frame 7, row 0: yaw of the box is inf", box=put((0, 6), np.inf))
+    raises("frame 9, row 1: w of the box is 0 m", box=put((1, 4), 0.0))
+    raises("frame 9, row 1: score 1.2 is outside", score=put(1, 1.2))
+    raises("frame 7, row 0: score nan is outside", score=put(0, np.nan))
+    raises("frame 9, row 1: unknown class 'Tram'; known: Sedan", cls=put(1, "Tram"))
+    raises("frame 8, row 1: no such frame among the 2 frames", frame=put(1, 8))
+
+
+def test_ground_truth_and_frames_are_checked_too():
+    truth, found = truth_of((0, car(), "Sedan")), found_of()
+    with pytest.raises(DataError, match="frame 3 occurs twice, in rows"):
+        evaluate(truth, found, frames={"frame": np.array([0, 3, 3])})
+    with pytest.raises(DataError, match="ground truth: frame 0, row 0: no such frame"):
+        evaluate(truth, found, frames={"frame": np.array([1])})
+    truth["box"][0, 5] = -1
+    with pytest.raises(DataError, match="ground truth: frame 0, row 0: h of the box"):
+        evaluate(truth, found)
+
+
+def test_missing_and_misshapen_columns():
+    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
+    for column in ("frame", "box", "cls", "score"):
+        part = {k: v for k, v in found.items() if k != column}
+        with pytest.raises(UserError, match=f"predictions lack the columns.*{column}"):
+            evaluate(truth, part)
+    for column, value, match in (
+        ("box", np.zeros((1, 8)), r"shape \(1, 8\), expected \(1, 7\)"),
+        ("cls", np.zeros(1, int), "expected class names as strings"),
+        ("score", np.zeros(2), "column 'score' has shape"),
+        ("frame", np.zeros((1, 1), int), "column 'frame' has shape"),
+        ("frame", np.array([0.5]), "expected integer frame ids"),
+    ):
+        with pytest.raises(UserError, match=match):
+            evaluate(truth, {**found, column: value})
+
+
+def test_known_classes_that_were_not_asked_for_are_counted():
+    truth = truth_of((0, car(), "Sedan"), (0, car(40), "Bicycle Group"))
+    found = found_of((0, car(), "Bicycle", 0.5))
+    data = EvaluationSet(truth, found, classes=["Sedan"])
+    assert data.left_out["ground truth: class not evaluated"] == 1
+    assert data.left_out["predictions: class not evaluated"] == 1
+    assert set(CLASSES) > {"Sedan"}

@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.errors import UserError
+from radejax.evaluation import protocols
+
+
+def thresholds_step_by_step(scores, num_gt):
+    """The rule as the description states it."""
+    current, kept = 0.0, []
+    for i, score in enumerate(scores):
+        last = i == len(scores) - 1
+        left = (i + 1) / num_gt
+        right = left if last else (i + 2) / num_gt
+        if right - current < current - left and not last:
+            continue
+        kept.append(score)
+        current += 1 / 40.0
+    return kept
+
+
+def test_thresholds_by_hand():
+    # 120 objects, all found: the first score is kept at c = 0, then with c = 1/40 the
+    # middle of (i+1, i+2)/120 must reach 3/120: i = 2 is first with (3 + 4)/2 >= 3, but
+    # i = 1 already has (2 + 3)/2 < 3. So 0, 2, 5, 8, ... and the last one.
+    scores = np.linspace(1, 0.1, 120)
+    kept = protocols.score_thresholds(scores, np.ones(120, int), 120)
+    index = [int(np.flatnonzero(scores == s)[0]) for s in kept]
+    assert index[:4] == [0, 2, 5, 8]
+    assert index[-1] == 119
+    assert len(index) == 41
+
+
+def test_thresholds_for_every_small_count():
+    """Ties at half a step are decided by rounding: every (found, objects) must agree."""
+    for num_gt in [*range(1, 130), 155, 161, 615, 999, 1000, 1001, 2047]:
+        for found in {1, 2, num_gt // 3, num_gt // 2, num_gt - 1, num_gt} - {0}:
+            scores = np.linspace(1, 0, found + 1)[1:]
+            expected = thresholds_step_by_step(scores, num_gt)
+            kept = protocols.score_thresholds(scores, np.ones(found, int), num_gt)
+            assert kept.tolist() == expected, (num_gt, found)
+            assert len(expected) <= 41
+
+
+@settings(deadline=None, max_examples=60, derandomize=True)
+@given(
+    weight=st.lists(st.integers(0, 4), min_size=1, max_size=60),
+    missed=st.integers(0, 200),
+)
+def test_thresholds_of_weighted_scores(weight, missed):
+    scores = np.linspace(1, 0, len(weight) + 1)[1:]
+    repeated = np.repeat(scores, weight)
+    num_gt = repeated.size + missed
+    expected = thresholds_step_by_step(repeated, num_gt) if repeated.size else []
+    kept = protocols.score_thresholds(scores, np.array(weight), num_gt)
+    assert kept.tolist() == expected
+
+
+def test_no_matches_no_thresholds():
+    none = np.zeros(0)
+    assert protocols.score_thresholds(none, none.astype(int), 5).size == 0
+    weight = np.zeros(3, int)
+    assert protocols.score_thresholds(np.ones(3), weight, 5).size == 0
+
+
+@pytest.mark.parametrize(
+    ("curve", "expected"),
+    [
+        # Points (0, 1), (1/2, 1), (1/2, 1/2), (1, 2/3), up to 1e-12.
+        ("voc11", (5 * 1 + 5 * 2 / 3) / 11),
+        ("recall41", (20 * 1 + 20 * 2 / 3) / 41),
+        ("coco101", (50 * 1 + 50 * 2 / 3) / 101),
+        ("auc", 0.5 + 0.5 * (1 / 2 + 2 / 3) / 2),
+        ("exact", 0.5 + 0.5 * 2 / 3),
+    ],
+)
+def test_pooled_curves_by_hand(curve, expected):
+    result = protocols.pooled_curve(
+        score=np.array([0.9, 0.8, 0.7]),
+        is_tp=np.array([True, False, True]),
+        weight=np.ones(3, int),
+        num_gt=2,
+        curve=curve,
+    )
+    assert result.ap == pytest.approx(100 * expected, abs=1e-8)
+    assert (result.num_gt, result.num_det) == (2, 3)
+
+
+def test_frames_of_weight_zero_leave_no_trace():
+    terms = {"num_gt": 2, "curve": "auc"}
+    some = protocols.pooled_curve(
+        score=np.array([0.9, 0.8]),
+        is_tp=np.array([True, True]),
+        weight=np.ones(2, int),
+        **terms,
+    )
+    more = protocols.pooled_curve(
+        score=np.array([0.95, 0.9, 0.8, 0.7]),
+        is_tp=np.array([False, True, True, False]),
+        weight=np.array([0, 1, 1, 0]),
+        **terms,
+    )
+    assert some.ap == more.ap
+
+
+def test_registry():
+    assert protocols.RECOMMENDED in protocols.PROTOCOLS
+    for name, protocol in protocols.PROTOCOLS.items():
+        assert protocols.get_protocol(name) is protocol
+    with pytest.raises(UserError, match="unknown protocol 'coco'; known: kradar_r40"):
+        protocols.get_protocol("coco")
