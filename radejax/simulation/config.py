@@ -54,6 +54,7 @@ def default_config() -> dict[str, Any]:
         - `output`: "tesseract" for K-Radar's files, "projection" for the projections
           alone.
         - `image_width`, `image_height`: of one of the two stereo images; 0 for none.
+        - `cover_lens`: let bad weather cover the lens, as often as in K-Radar.
         - `lidar_to_radar_m`: radar position = LiDAR position + this; z as in K-Radar's
           own loaders.
         - `label_distance_m`: farther objects get no label.
@@ -78,6 +79,7 @@ def default_config() -> dict[str, Any]:
         "output": "tesseract",
         "image_width": 320,
         "image_height": 180,
+        "cover_lens": True,
         "lidar_to_radar_m": [-2.54, 0.3, 0.7],
         "label_distance_m": 90.0,
     }
@@ -100,6 +102,7 @@ class SimulationConfig:
     output: str
     image_width: int
     image_height: int
+    cover_lens: bool
     lidar_to_radar_m: tuple[float, float, float]
     label_distance_m: float
 

@@ -203,7 +203,9 @@ class _SequenceWriter:
             pair = stereo_calibration(
                 config.lidar_to_radar_m, config.image_width, config.image_height
             )
-            self.renderer = CameraRenderer(self.sequence, pair, config.seed)
+            self.renderer = CameraRenderer(
+                self.sequence, pair, config.seed, cover_lens=config.cover_lens
+            )
 
     def write(self, spec: FrameSpec) -> None:
         """One frame: radar, image, then labels."""
@@ -224,7 +226,7 @@ class _SequenceWriter:
         if config.image_width:
             path = self.folder / "cam-front" / f"cam-front_{camera_idx:05d}.png"
             with kradar_write.atomic_write(path) as file:
-                file.write(_png(self.renderer.render(frame)))
+                file.write(encode_png(self.renderer.render(frame)))
         kradar_write.write_labels(
             self.folder / "info_label_v2_1" / f"{spec.name}.txt",
             spec.indices,
@@ -235,7 +237,7 @@ class _SequenceWriter:
         )
 
 
-def _png(image: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray) -> bytes:
     """PNG, fast rather than small."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG", compress_level=1)

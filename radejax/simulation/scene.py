@@ -100,6 +100,7 @@ class SceneFrame:
         ego_velocity_mps: `[2]` of the radar over ground, along its own axes.
         reflectors: Static surroundings near the ego, in this frame.
         reflector_idx: `[M]` which reflectors of the sequence these are.
+        index: Of the frame in its sequence.
         time_s: Since the start of the sequence.
         ego_along_m: Position of the ego along its road (for drawing the road).
     """
@@ -112,6 +113,7 @@ class SceneFrame:
     ego_velocity_mps: np.ndarray
     reflectors: Reflectors
     reflector_idx: np.ndarray
+    index: int
     time_s: float
     ego_along_m: float
 
@@ -190,6 +192,7 @@ class Sequence:
             ego_velocity_mps=self.ego_velocity_mps[index],
             reflectors=reflectors,
             reflector_idx=seen,
+            index=index,
             time_s=index * FRAME_PERIOD_S,
             ego_along_m=float(self.ego_along_m[index]),
         )

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from radejax.geometry.camera import CameraCalibration, project
+from radejax.simulation import lens
 
 # A block in units of the half extents: x, y, z ranges; colour role; share kept of the
 # length and width at its top (a taper).
@@ -113,14 +114,42 @@ def blocks_of(cls: str) -> np.ndarray:
     return np.stack(corners)
 
 
+@dataclasses.dataclass(frozen=True)
+class Light:
+    """How bright and how hazy the scene is.
+
+    Attributes:
+        ambient: Brightness, 1 by day.
+        veil: `[3]` colour of the haze.
+        extinction_per_m: Density of the haze.
+        headlights: True if the ego vehicle lights up what is ahead.
+    """
+
+    ambient: float
+    veil: np.ndarray
+    extinction_per_m: float
+    headlights: bool
+
+    def apply(self, color: np.ndarray, x_m, y_m, depth_m) -> np.ndarray:
+        """Colours `[N, 3]` of surfaces at positions as they appear."""
+        brightness = np.full(np.shape(depth_m), self.ambient)
+        if self.headlights:
+            beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
+            brightness = brightness + 0.75 * beam * np.exp(-np.abs(x_m) / 28.0)
+        return lens.haze(
+            color * brightness[..., None], depth_m, self.veil, self.extinction_per_m
+        )
+
+
 def visible_polygons(
     boxes: np.ndarray,
     classes: list[str],
     colors: np.ndarray,
     calibration: CameraCalibration,
+    light: Light,
     *,
-    near_m: float,
-    light: float,
+    panels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    near_m: float = 0.3,
 ) -> list[Polygon]:
     """Faces that look at the camera, far objects first.
 
@@ -129,26 +158,43 @@ def visible_polygons(
         classes: Names, one a box.
         colors: `[N, 2, 3]` of `object_colors`.
         calibration: The camera.
+        light: Brightness and haze.
+        panels: Surroundings of `scenery.make_panels`.
         near_m: Faces nearer than this are cut away.
-        light: Brightness, 1 by day.
     """
-    origin = calibration.ego_from_lidar_m - (
-        calibration.rotation.T @ calibration.translation_m
+    origin = camera_position(calibration)
+    faces, normals, depth, block_depth, owner, rgb = _faces(
+        boxes, classes, colors, origin
     )
-    faces, normals, depth, keys, owner, rgb = _faces(boxes, classes, colors, origin)
-    outward = ((faces.mean(1) - origin) * normals).sum(1)
-    shown = np.flatnonzero(outward < 0)
-    if not len(shown):
+    shown = ((faces.mean(1) - origin) * normals).sum(1) < 0
+    rgb = rgb * (0.62 + 0.38 * np.maximum(normals @ _SUN, 0.0))[:, None]
+    if panels is not None:
+        corners, panel_depth, panel_rgb = panels
+        faces, rgb = np.concatenate([faces, corners]), np.concatenate([rgb, panel_rgb])
+        depth = np.concatenate([depth, panel_depth])
+        block_depth = np.concatenate([block_depth, panel_depth])
+        owner = np.concatenate([owner, np.full(len(corners), -1)])
+        shown = np.concatenate([shown, np.ones(len(corners), bool)])
+    chosen = np.flatnonzero(shown)
+    if not len(chosen):
         return []
-    shown = shown[np.lexsort((-keys[shown], -depth[shown]))]
-    brightness = light * (0.62 + 0.38 * np.maximum(normals[shown] @ _SUN, 0.0))
-    rgb = np.clip(rgb[shown] * brightness[:, None], 0, 255).astype(int)
-    outlines = _project_faces(faces[shown], calibration, near_m)
+    chosen = chosen[np.lexsort((-block_depth[chosen], -depth[chosen]))]
+    center = faces[chosen].mean(1)
+    rgb = light.apply(rgb[chosen], center[:, 0], center[:, 1], depth[chosen])
+    rgb = np.clip(rgb, 0, 255).astype(int).tolist()
+    outlines = _project_faces(faces[chosen], calibration, near_m)
     return [
         Polygon(points, tuple(color), float(depth[face]), int(owner[face]))
-        for points, color, face in zip(outlines, rgb.tolist(), shown, strict=True)
+        for points, color, face in zip(outlines, rgb, chosen, strict=True)
         if points
     ]
+
+
+def camera_position(calibration: CameraCalibration) -> np.ndarray:
+    """`[3]` of the camera in the radar's frame."""
+    return calibration.ego_from_lidar_m - (
+        calibration.rotation.T @ calibration.translation_m
+    )
 
 
 def _faces(boxes, classes, colors, origin):
