@@ -99,7 +99,7 @@ def _write_gif(
 ) -> None:
     """One palette for all frames: per-frame palettes flicker."""
     first = Image.fromarray(next(pictures))
-    palette = _palette(first, num_colors)
+    palette = make_palette(first, num_colors)
     frames = (
         Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
         for pixels in pictures
@@ -114,8 +114,16 @@ def _write_gif(
     )
 
 
-def _palette(first: Image.Image, num_colors: int) -> Image.Image:
-    """Colours of the first frame, of the radar map and of lines that come later."""
+def make_palette(first: Image.Image, num_colors: int) -> Image.Image:
+    """Colours of a picture, of the radar map and of lines that may come later.
+
+    Args:
+        first: The picture, RGB.
+        num_colors: Of the palette; 256 at most.
+
+    Returns:
+        An image whose palette serves `Image.quantize(palette=...)`.
+    """
     lines = np.array([to_rgb(c) for c in _LINE_COLORS])
     lines = np.concatenate([lines, COLOR_MAP(np.linspace(0, 1, _MAP_COLORS))[:, :3]])
     kept = max(2, min(num_colors, 256) - len(lines))

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from radejax.errors import UserError
-from radejax.visualize.animate import render
+from radejax.visualize.animate import make_palette, render
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +71,8 @@ def show(
         figure = getattr(what, "figure", what)
         figure.set_dpi(dpi)
         pixels = render(figure)
-    image = Image.fromarray(pixels).quantize(256, dither=Image.Dither.NONE)
+    image = Image.fromarray(pixels)
+    image = image.quantize(palette=make_palette(image, 256), dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
     return Picture(buffer.getvalue(), "image/png")
