@@ -169,12 +169,17 @@ def infer_ego_speed(
 
 
 def _ground_height(tracks: Tracks) -> float:
-    """Height of the ground under the boxes near the ego, in the radar's frame."""
+    """Height of the ground under the boxes near the ego, in the radar's frame.
+
+    Few boxes on a slope mislead: it stays near the height the radar is mounted at.
+    """
     bottom = tracks.position_m[..., 2] - tracks.size_m[..., 2] / 2.0
     near = tracks.is_present & (
         np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1]) < 30.0
     )
-    return float(np.median(bottom[near])) if near.any() else traffic.GROUND_M
+    if not near.any():
+        return traffic.GROUND_M
+    return float(np.clip(np.median(bottom[near]), -1.4, -0.4))
 
 
 def _road_edges(tracks: Tracks, law: traffic.Environment) -> tuple[float, float]:

@@ -1,0 +1,93 @@
+"""Radar frames of a sequence: where objects are, the radar map is bright."""
+
+import numpy as np
+import pytest
+
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation.radar import RadarParameters
+from radejax.simulation.simulator import SequenceSimulator
+from radejax.simulation.traffic import make_sequence
+
+GRID = RadarGrid.reduced(
+    num_doppler=16, num_range=64, num_elevation=9, num_azimuth=56, max_range_m=75.6
+)
+PARAMETERS = RadarParameters(azimuth_elements=40.0, elevation_elements=12.0)
+
+
+def simulator(weather="normal", environment="urban", seed=0, parameters=PARAMETERS):
+    scene = make_sequence(
+        1, environment=environment, time="day", weather=weather, num_frames=5,
+        rng=np.random.default_rng(seed),
+    )  # fmt: skip
+    return SequenceSimulator(scene, GRID, parameters, seed)
+
+
+@pytest.fixture(scope="module")
+def urban():
+    return simulator()
+
+
+def test_visible_objects_stand_out_of_the_noise(urban):
+    brightness, floor = [], []
+    for index in range(5):
+        frame = urban.sequence.frame(index)
+        given = urban.radar_input(index, frame)
+        projection = urban.run(given)
+        visible = urban.is_radar_visible(frame, given)
+        peak = projection[..., :16].max(-1)
+        floor.append(np.median(peak))
+        for box in frame.boxes[visible]:
+            toward = box[:2] * (1.0 - box[3] / 2 / np.hypot(*box[:2]))
+            r, a = GRID.nearest_cell(*toward)
+            near = peak[max(r - 2, 0) : r + 4, max(a - 2, 0) : a + 3]
+            brightness.append(near.max())
+    stands_out = np.array(brightness) > np.mean(floor) + 6.0 / 184.3
+    assert len(brightness) > 10
+    assert stands_out.mean() > 0.85
+
+
+def test_frames_repeat_and_differ(urban):
+    again = simulator()
+    np.testing.assert_array_equal(urban.radar_frame(2), again.radar_frame(2))
+    assert np.abs(urban.radar_frame(2) - urban.radar_frame(3)).max() > 0.01
+
+
+def test_normalised_values_have_a_floor_and_stay_below_one(urban):
+    for weather in ("normal", "rain", "heavysnow"):
+        projection = simulator(weather).radar_frame(0)
+        assert 0.4 < projection.min() < 0.55
+        assert 0.65 < projection.max() < 1.0
+
+
+def test_hidden_weak_and_outside_objects_are_not_visible(urban):
+    frame = urban.sequence.frame(0)
+    given = urban.radar_input(0, frame)
+    visible = urban.is_radar_visible(frame, given)
+    inside = GRID.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
+    assert visible.any()
+    assert not visible[~inside].any()
+    assert not visible[given.lit < 0.15].any()
+    deaf = simulator(parameters=RadarParameters(gain_db=100.0))
+    assert not deaf.is_radar_visible(frame, deaf.radar_input(0, frame)).any()
+
+
+def test_rain_weakens_targets(urban):
+    dry, wet = urban.radar_input(0), simulator("rain").radar_input(0)
+    boxes = urban.sequence.frame(0).boxes
+    inside = GRID.in_field_of_view(boxes[:, 0], boxes[:, 1])
+    difference = (dry.snr_db - wet.snr_db)[inside]
+    assert (difference > 1.99).all()  # the wet radome alone costs 2 dB
+    assert difference.max() < 4.0
+
+
+def test_labels_are_in_the_lidar_frame(urban):
+    frame = urban.sequence.frame(1)
+    labels = urban.labels(frame, urban.radar_input(1), (-2.54, 0.3, 0.7), 60.0)
+    by_id = {label.track_id: label for label in labels}
+    distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
+    assert len(labels) == (distance < 60.0).sum()
+    for n in np.flatnonzero(distance < 60.0):
+        box = by_id[frame.track_id[n]].box
+        np.testing.assert_allclose(
+            np.array(box[:3]) + (-2.54, 0.3, 0.7), frame.boxes[n, :3]
+        )
