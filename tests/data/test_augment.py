@@ -1,0 +1,159 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.data.augment import (
+    Augmentation,
+    add_range_gain,
+    mirror,
+    mirror_boxes,
+    mirror_camera,
+)
+from radejax.data.encoding import decode, encode
+from radejax.errors import UserError
+from radejax.geometry.camera import CameraCalibration, project
+from radejax.geometry.radar_grid import RadarGrid
+
+GRID = RadarGrid.reduced(num_doppler=6, num_range=16, num_elevation=5, num_azimuth=12)
+CAMERA = CameraCalibration.from_angles(
+    intrinsics=(560.0, 570.0, 600.0, 370.0),
+    distortion=(-0.03, 0.001, 0.004, -0.005, 0.0),
+    yaw_deg=88.6,
+    pitch_deg=0.6,
+    roll_deg=89.6,
+    translation_m=(0.2, -0.1, -0.02),
+)
+
+
+def sample(boxes, dtype=np.float16, seed=0):
+    """A frame whose projection has a blob at the nearest bin of every box."""
+    rng = np.random.default_rng(seed)
+    projection = rng.uniform(0.1, 0.3, GRID.projection_shape)
+    for x, y in boxes[:, :2]:
+        r, a = GRID.nearest_cell(x, y)
+        projection[r, a] = 0.9
+    return {"projection": encode(projection, np.dtype(dtype).name), "boxes": boxes}
+
+
+box = st.tuples(
+    st.floats(5, 60),  # x
+    st.floats(-40, 40),
+    st.floats(-2, 2),
+    *(st.floats(0.5, 9),) * 3,
+    st.floats(-1, 1),
+    st.floats(-1, 1),
+)
+boxes_st = st.lists(box, min_size=1, max_size=4).map(lambda b: np.array(b, np.float64))
+
+
+@settings(deadline=None, max_examples=60)
+@given(boxes=boxes_st, seed=st.integers(0, 9))
+def test_mirrored_boxes_and_maps_stay_in_register(boxes, seed):
+    before = sample(boxes, seed=seed)
+    after = mirror(before)
+    for old, new in zip(boxes, after["boxes"], strict=True):
+        (r, a), (r2, a2) = GRID.nearest_cell(*old[:2]), GRID.nearest_cell(*new[:2])
+        assert r == r2
+        assert abs((GRID.num_azimuth - 1 - a) - a2) <= 1  # halves round to even
+        np.testing.assert_array_equal(
+            after["projection"][r, GRID.num_azimuth - 1 - a], before["projection"][r, a]
+        )
+        # Heading (cos, sin) mirrors with the position.
+        np.testing.assert_array_equal(new[[7, 6]], old[[7, 6]] * (1, -1))
+        np.testing.assert_array_equal(new[[0, 2, 3, 4, 5]], old[[0, 2, 3, 4, 5]])
+    twice = mirror(after)
+    np.testing.assert_array_equal(twice["projection"], before["projection"])
+    np.testing.assert_array_equal(twice["boxes"], boxes)
+
+
+def test_blob_follows_its_box_by_hand():
+    x, y = GRID.cell_to_ego(4, 2)
+    boxes = np.array([[x, y, 0, 4, 2, 1, 0.6, 0.8]])
+    after = mirror(sample(boxes))
+    r, a = GRID.nearest_cell(*after["boxes"][0, :2])
+    assert (r, a) == (4, 9)
+    assert (after["projection"][4, 9] == np.float16(0.9)).all()
+    assert (after["projection"][4, 2] < 0.5).all()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    points=st.lists(
+        st.tuples(st.floats(5, 80), st.floats(-30, 30), st.floats(-2, 4)),
+        min_size=1,
+        max_size=5,
+    ),
+    kind=st.sampled_from(["raw", "rectified", "pinhole"]),
+)
+def test_mirrored_camera_sees_the_mirrored_world_in_the_mirrored_image(points, kind):
+    points = np.array(points)
+    camera = CAMERA.camera(kind)
+    before, depth = project(points, camera)
+    after, depth_after = project(points * (1, -1, 1), mirror_camera(camera))
+    np.testing.assert_allclose(depth_after, depth, rtol=1e-12)
+    np.testing.assert_allclose(after[:, 1], before[:, 1], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(after[:, 0], 1280 - before[:, 0], rtol=1e-9, atol=1e-9)
+
+
+def test_image_is_mirrored_with_its_camera():
+    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    boxes = np.array([[10.0, 1, 0, 4, 2, 1, 0, 1]])
+    before = {**sample(boxes), "image": image, "camera": CAMERA.camera()}
+    after = mirror(before)
+    np.testing.assert_array_equal(after["image"], image[:, ::-1])
+    assert after["camera"].intrinsics[2] == 1280 - 600
+    assert before["camera"].intrinsics[2] == 600
+    assert mirror(sample(boxes))["image"] is None
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint8])
+def test_gain_depends_on_range_alone(dtype):
+    before = sample(np.array([[20.0, 1, 0, 4, 2, 1, 0, 1]]), dtype)["projection"]
+    after = add_range_gain(before, GRID, 1.0, 2.0)
+    assert after.dtype == dtype
+    shift = decode(after) - decode(before)
+    wanted = (1.0 + 2.0 * np.arange(16) / 15) / 184.3
+    tolerance = {np.float16: 5e-4, np.float32: 1e-6, np.uint8: 0.51 / 255}[dtype]
+    np.testing.assert_allclose(
+        shift, np.broadcast_to(wanted[:, None, None], shift.shape), atol=tolerance
+    )
+
+
+def test_augmentation_is_a_function_of_its_seed():
+    augment = Augmentation(GRID)
+    before = sample(np.array([[20.0, 3, 0, 4, 2, 1, 0.6, 0.8]]))
+    outcomes = {}
+    for seed in range(40):
+        one = augment(before, np.random.default_rng(seed))
+        two = augment(before, np.random.default_rng(seed))
+        np.testing.assert_array_equal(one["projection"], two["projection"])
+        outcomes[one["boxes"][0, 1]] = outcomes.get(one["boxes"][0, 1], 0) + 1
+    assert set(outcomes) == {3.0, -3.0}
+    assert 10 <= outcomes[3.0] <= 30
+    np.testing.assert_array_equal(before["boxes"][0, 1], 3.0)
+
+
+def test_off_is_off():
+    augment = Augmentation(GRID, mirror_probability=0, gain_db=0, gain_slope_db=0)
+    before = sample(np.array([[20.0, 3, 0, 4, 2, 1, 0.6, 0.8]]))
+    assert augment(before, np.random.default_rng(0)) is before
+
+
+def test_padding_stays_zero():
+    padded = np.zeros((3, 8), np.float32)
+    np.testing.assert_array_equal(mirror_boxes(padded), padded)
+    assert mirror_boxes(padded).dtype == np.float32
+
+
+def test_wrong_settings():
+    skewed = dataclasses.replace(GRID, azimuth_rad=GRID.azimuth_rad + 0.1)
+    with pytest.raises(UserError, match="cannot mirror: azimuths"):
+        Augmentation(skewed)
+    Augmentation(skewed, mirror_probability=0)
+    with pytest.raises(UserError, match=r"1\.5 is not in"):
+        Augmentation(GRID, mirror_probability=1.5)
+    with pytest.raises(UserError, match="at least 0"):
+        Augmentation(GRID, gain_db=-1)

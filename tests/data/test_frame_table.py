@@ -1,0 +1,131 @@
+import types
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from radejax.data.frame_table import (
+    IMAGE_SHAPE,
+    frames_with_records,
+    make_table,
+    read_left_image,
+)
+from radejax.data.kradar import KRadar
+from radejax.data.projection_job import project_dataset
+from radejax.data.records import RecordSource
+from radejax.errors import DataError, UserError
+
+
+def frame(key, boxes=(), classes=(), camera_path=None):
+    """What of a frame the table looks at."""
+    boxes = np.array(boxes, np.float64).reshape(-1, 7)
+    return types.SimpleNamespace(
+        key=key, boxes=boxes, classes=np.array(classes, str), camera_path=camera_path
+    )
+
+
+def records(keys, skipped=()):
+    manifest = types.SimpleNamespace(skipped=dict(skipped))
+    index = {key: i for i, key in enumerate(keys)}
+    return types.SimpleNamespace(
+        index_of=lambda: index, manifest=manifest, folder="records"
+    )
+
+
+BOX = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, np.pi / 6]
+
+
+def test_table_by_hand():
+    frames = [
+        frame("1/b", [BOX, BOX], ["Bicycle", "Sedan"]),
+        frame("1/a"),
+        frame("1/c", [BOX], ["Pedestrian"]),
+    ]
+    table = make_table(
+        records(["1/a", "1/b", "1/c"]),
+        frames,
+        max_objects=2,
+        classes=("Sedan", "Bicycle"),
+    )
+    assert table.record.tolist() == [1, 0, 2]
+    assert table.classes.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+    assert table.is_valid.tolist() == [[True, True], [False, False], [False, False]]
+    wanted = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, 0.5, np.sqrt(3) / 2]
+    np.testing.assert_allclose(table.boxes[0, 1], wanted, rtol=1e-6)
+    assert table.boxes.dtype == np.float32
+    assert not table.boxes[1:].any()
+
+
+def test_too_many_objects_says_how_many_would_do():
+    frames = [
+        frame("1/a", [BOX] * 2, ["Sedan"] * 2),
+        frame("1/b", [BOX] * 5, ["Sedan"] * 5),
+    ]
+    with pytest.raises(UserError, match=r"frame 1/b has 5 objects.* is 3; 5 would do"):
+        make_table(records(["1/a", "1/b"]), frames, max_objects=3)
+    # Objects of other classes take no rows.
+    make_table(records(["1/a", "1/b"]), frames, max_objects=0, classes=("Bicycle",))
+
+
+def test_frames_without_records():
+    frames = [frame("1/a"), frame("1/b")]
+    source = records(["1/a"], {"1/b": "t.mat: truncated"})
+    with pytest.raises(UserError, match=r"1 of 2 frames .* 1/b \(t\.mat: truncated\)"):
+        make_table(source, frames, max_objects=1)
+    kept, missing = frames_with_records(source, frames)
+    assert [f.key for f in kept] == ["1/a"]
+    assert missing == ["1/b"]
+    with pytest.raises(UserError, match="no frames"):
+        make_table(source, [], max_objects=1)
+
+
+def test_labels_can_be_exchanged_between_frames(kradar_root, tmp_path):
+    data = KRadar(kradar_root, visibility=None, field_of_view=False)
+    project_dataset(data, tmp_path, num_workers=0, progress=False)
+    source = RecordSource(tmp_path)
+    plain = make_table(source, data, max_objects=9)
+    mixed = make_table(source, data, max_objects=9, label_permutation_seed=3)
+    np.testing.assert_array_equal(plain.record, mixed.record)
+    assert (plain.boxes != mixed.boxes).any()
+    assert sorted(map(bytes, plain.boxes)) == sorted(map(bytes, mixed.boxes))
+    again = make_table(source, data, max_objects=9, label_permutation_seed=3)
+    np.testing.assert_array_equal(again.boxes, mixed.boxes)
+    assert ((mixed.classes >= 0) == mixed.is_valid).all()
+
+
+def test_missing_images_and_cameras():
+    frames = [frame("1/a", camera_path="x.png"), frame("1/b")]
+    source = records(["1/a", "1/b"])
+    with pytest.raises(UserError, match=r"1 of 2 frames have no front image .* 1/b"):
+        make_table(source, frames, max_objects=1, images=True)
+    table = make_table(
+        source, frames, max_objects=1, images=True, allow_missing_images=True
+    )
+    assert table.image_paths == ("x.png", None)
+    with pytest.raises(UserError, match="1 cameras for 2 frames"):
+        make_table(source, frames, max_objects=1, cameras=[None])
+
+
+def test_left_half_of_the_stereo_pair(tmp_path):
+    height, width, _ = IMAGE_SHAPE
+    pixels = np.random.default_rng(0).integers(
+        0, 255, (height, 2 * width, 3), dtype=np.uint8
+    )
+    Image.fromarray(pixels).save(tmp_path / "a.png", compress_level=1)
+    np.testing.assert_array_equal(
+        read_left_image(tmp_path / "a.png"), pixels[:, :width]
+    )
+    Image.fromarray(pixels[:, :width]).save(tmp_path / "b.png", compress_level=1)
+    np.testing.assert_array_equal(
+        read_left_image(tmp_path / "b.png"), pixels[:, :width]
+    )
+    Image.fromarray(pixels[:50, :70]).save(tmp_path / "c.png")
+    with pytest.raises(DataError, match=r"c\.png: 70 x 50 pixels, expected 2560 x 720"):
+        read_left_image(tmp_path / "c.png")
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match=r"a\.png: damaged image"):
+        read_left_image(tmp_path / "a.png")
+    (tmp_path / "a.png").write_bytes(b"no image")
+    with pytest.raises(DataError, match=r"a\.png: damaged image"):
+        read_left_image(tmp_path / "a.png")

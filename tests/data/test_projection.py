@@ -1,0 +1,140 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.data.projection import (
+    project,
+    project_columns,
+    project_jax,
+    project_plain,
+    to_log_scale,
+)
+from radejax.errors import UserError
+
+SHAPE = (4, 6, 3, 5)  # D, R, E, A
+
+
+def random_power(seed=0, dtype=np.float32, shape=SHAPE):
+    """Powers over 18 decades, zeros among them."""
+    rng = np.random.default_rng(seed)
+    power = 10 ** rng.uniform(-3, 15, shape)
+    power[rng.random(shape) < 0.1] = 0.0
+    return power.astype(dtype)
+
+
+LAYOUTS = {
+    "C": np.ascontiguousarray,
+    "column-major": np.asfortranarray,
+    "strided": lambda t: np.repeat(t, 2, axis=3)[..., ::2],
+    "permuted": lambda t: np.ascontiguousarray(t.transpose(1, 3, 0, 2)).transpose(
+        2, 0, 3, 1
+    ),
+    "big-endian": lambda t: t.astype(t.dtype.newbyteorder(">")),
+    "read-only": lambda t: np.frombuffer(t.tobytes(), t.dtype).reshape(t.shape),
+}
+
+
+def test_levels_worked_out_by_hand():
+    # 10 log10(p) + 1.2 over 184.3.
+    power = np.array([1.0, 1e6, 10**18.31, 0.0])
+    wanted = [1.2 / 184.3, 61.2 / 184.3, 184.3 / 184.3, -98.8 / 184.3]
+    np.testing.assert_allclose(to_log_scale(power), wanted, atol=1e-12)
+
+
+def test_channels_are_doppler_then_elevation():
+    tesseract = np.full(SHAPE, 1.0)
+    tesseract[2, 4, 1, 3] = 1e6  # Doppler 2, range 4, elevation 1, azimuth 3
+    projection = project(tesseract)
+    assert projection.shape == (6, 5, 7)
+    strong = np.argwhere(projection > 0.1)
+    np.testing.assert_array_equal(strong, [[4, 3, 2], [4, 3, 4 + 1]])
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("num_threads", [1, 3])
+def test_equals_the_plain_formula(layout, dtype, num_threads):
+    tesseract = LAYOUTS[layout](random_power(dtype=dtype))
+    wanted = project_plain(random_power(dtype=dtype).astype(np.float64))
+    found = project(tesseract, num_threads=num_threads)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, wanted, atol=1e-6, rtol=0)
+    exact = project(tesseract, dtype=np.float64, num_threads=num_threads)
+    tolerance = 1e-14 if dtype == np.float64 else 1e-6
+    np.testing.assert_allclose(exact, wanted, atol=tolerance, rtol=0)
+
+
+def test_input_is_left_as_it_is():
+    tesseract = random_power()
+    copy = tesseract.copy()
+    project(tesseract)
+    np.testing.assert_array_equal(tesseract, copy)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    cells=st.lists(
+        st.tuples(
+            *(st.integers(0, n - 1) for n in SHAPE),
+            st.sampled_from([0.0, -0.0, -1.0, -1e-30, 1e-12, 3e38, np.inf, np.nan]),
+        ),
+        max_size=4,
+    ),
+    layout=st.sampled_from(["C", "column-major"]),
+)
+def test_odd_numbers_are_reduced_as_floats_are(cells, layout):
+    tesseract = random_power(dtype=np.float32) * 0 - 0.5
+    tesseract[::2] = 1.0
+    for *cell, value in cells:
+        tesseract[tuple(cell)] = value
+    with np.errstate(invalid="ignore"):
+        found = project(LAYOUTS[layout](tesseract))
+        maxima = [tesseract.max(2).transpose(1, 2, 0), tesseract.max(0).swapaxes(1, 2)]
+        wanted = to_log_scale(np.concatenate(maxima, -1))
+    np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.uint8, np.int32, np.uint64])
+def test_other_types(dtype):
+    tesseract = np.arange(np.prod(SHAPE)).reshape(SHAPE).astype(dtype)
+    wanted = project_plain(tesseract.astype(np.float64))
+    np.testing.assert_allclose(project(tesseract), wanted, atol=1e-6)
+
+
+def test_columns_one_by_one_in_the_same_buffer():
+    tesseract = np.asfortranarray(random_power())
+    buffer = np.empty(SHAPE[2::-1], np.float32)  # [E, R, D]
+
+    def columns():
+        for i in range(SHAPE[3]):
+            buffer[:] = tesseract[..., i].T
+            yield buffer
+
+    found = project_columns(columns(), SHAPE[3], dtype=np.float16)
+    np.testing.assert_array_equal(found, project(tesseract, dtype=np.float16))
+
+
+def test_jax_on_one_frame_and_on_batches():
+    frames = np.stack([random_power(seed) for seed in range(3)])
+    wanted = np.stack([project(frame) for frame in frames])
+    one = project_jax(jnp.asarray(frames[0]))
+    np.testing.assert_allclose(one, wanted[0], atol=1e-6, rtol=0)
+    many = project_jax(jnp.asarray(frames))
+    assert many.dtype == jnp.float32
+    np.testing.assert_allclose(many, wanted, atol=1e-6, rtol=0)
+    mapped = jax.vmap(project_jax)(jnp.asarray(frames))
+    np.testing.assert_allclose(mapped, wanted, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "tesseract",
+    [np.ones((2, 3, 4)), np.ones((2, 0, 3, 4)), np.ones(SHAPE, complex), "text"],
+)
+def test_what_is_no_tesseract(tesseract):
+    with pytest.raises(
+        UserError, match=r"a tesseract is a real array \[Doppler, range"
+    ):
+        project(tesseract)
