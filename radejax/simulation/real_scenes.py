@@ -15,6 +15,7 @@ import numpy as np
 from radejax.data.kradar import Frame
 from radejax.simulation import traffic
 from radejax.simulation.scene import FRAME_PERIOD_S, Road, Sequence, Tracks, class_index
+from radejax.simulation.surroundings import make_surroundings
 
 MAX_SPEED_MPS = 60.0
 """Faster relative motion is taken for a swap of identities."""
@@ -48,7 +49,7 @@ def make_real_sequence(
     ego_velocity = np.stack([speed, np.zeros_like(speed)], 1)
     ground = _ground_height(tracks)
     edges = _road_edges(tracks, law)
-    surroundings, mirrors = traffic.make_surroundings(
+    reflectors, mirrors = make_surroundings(
         law, Road(), along[-1] + traffic.SIGHT_M, edges, rng, ground
     )
     world = tracks.position_m + pose[:, None] * (1.0, 1.0, 0.0)
@@ -66,7 +67,7 @@ def make_real_sequence(
             position_m=world,
             velocity_mps=relative + ego_velocity[:, None],
         ),
-        reflectors=surroundings,
+        reflectors=reflectors,
         road=Road(),
         lanes_m=tuple((lanes * law.lane_width_m).tolist()),
         ego_left_m=0.0,

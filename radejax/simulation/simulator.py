@@ -8,7 +8,7 @@ import numpy as np
 
 from radejax.data.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation import radar, scattering, weather
+from radejax.simulation import radar, scattering, surroundings, weather
 from radejax.simulation.scene import SceneFrame, Sequence
 
 MIN_SNR_DB = 10.0
@@ -72,10 +72,10 @@ class SequenceSimulator:
         sequence, parameters = self.sequence, self.parameters
         frame = sequence.frame(index) if frame is None else frame
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
-        surroundings = scattering.scatter_surroundings(
+        static = surroundings.scatter_surroundings(
             frame, sequence, self._static_phase, parameters
         )
-        ghosts = scattering.scatter_ghosts(objects, frame, sequence)
+        ghosts = surroundings.scatter_ghosts(objects, frame, sequence)
         parts = [
             dataclasses.replace(
                 part,
@@ -84,7 +84,7 @@ class SequenceSimulator:
                     sequence.weather, np.linalg.norm(part.position_m, axis=1)
                 ),
             )
-            for part in (objects, surroundings, ghosts)
+            for part in (objects, static, ghosts)
         ]
         power = np.bincount(parts[0].owner, parts[0].power, len(frame.boxes))
         return RadarInput(

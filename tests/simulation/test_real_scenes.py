@@ -77,7 +77,7 @@ class TestScene:
         }
         assert len(boxes) == 5
         for label in boxes_at(5):
-            expected = np.array(label.box) + [*OFFSET, 0, 0, 0, 0]
+            expected = np.array(label.box) + np.array([*OFFSET, 0, 0, 0, 0])
             found = boxes[(label.cls, label.track_id)]
             np.testing.assert_allclose(found[:6], expected[:6], atol=1e-9)
             assert math.cos(found[6] - expected[6]) == pytest.approx(1.0)

@@ -187,36 +187,3 @@ class TestMotion:
         still = dataclasses.replace(walking, velocity_mps=np.zeros((40, 2)))
         found, _ = scattering.scatter_objects(still, centers, PARAMETERS)
         assert np.abs(found.velocity_mps).max() == 0.0
-
-
-class TestGhosts:
-    class Wall:
-        mirrors_m = (6.0,)
-        ego_left_m = 0.0
-
-    def test_mirror_image_position_velocity_and_loss(self):
-        part = scattering.FrameScattering(
-            np.array([[20.0, 2.0, 0.0], [20.0, 8.0, 0.0], [90.0, 0.0, 0.0]]),
-            np.array([[3.0, -1.0]] * 3),
-            np.ones(3),
-            np.zeros(3),
-            np.zeros(3, int),
-        )
-        ghosts = scattering.scatter_ghosts(part, make_frame([], []), self.Wall())
-        # Only the first: the second is behind the wall, the third too far.
-        np.testing.assert_allclose(ghosts.position_m, [[20.0, 10.0, 0.0]])
-        np.testing.assert_allclose(ghosts.velocity_mps, [[3.0, 1.0]])
-        expected = 10 ** (scattering.MIRROR_DB / 10) * (404.0 / 500.0) ** 2
-        assert ghosts.power[0] == pytest.approx(expected)
-        assert ghosts.owner.tolist() == [-1]
-
-    def test_without_walls_no_ghosts(self):
-        class Open:
-            mirrors_m = ()
-            ego_left_m = 0.0
-
-        part = scattering.FrameScattering(
-            np.ones((1, 3)), np.ones((1, 2)), np.ones(1), np.zeros(1), np.zeros(1, int)
-        )
-        ghosts = scattering.scatter_ghosts(part, make_frame([], []), Open())
-        assert len(ghosts.power) == 0

@@ -89,5 +89,5 @@ def test_labels_are_in_the_lidar_frame(urban):
     for n in np.flatnonzero(distance < 60.0):
         box = by_id[frame.track_id[n]].box
         np.testing.assert_allclose(
-            np.array(box[:3]) + (-2.54, 0.3, 0.7), frame.boxes[n, :3]
+            np.add(box[:3], (-2.54, 0.3, 0.7)), frame.boxes[n, :3]
         )

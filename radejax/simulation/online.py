@@ -1,0 +1,177 @@
+"""Training batches straight from the simulator: no disk, a new frame every time.
+
+The host draws scenes and scatterers; the accelerator makes the projections of a whole
+batch in one call. A batch depends on the seed and its step only, so a run resumes by
+knowing its step.
+"""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import functools
+import threading
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from radejax.geometry.boxes import boxes8_from_7
+from radejax.simulation import radar
+from radejax.simulation.config import SimulationConfig
+from radejax.simulation.simulator import RadarInput, SequenceSimulator
+from radejax.simulation.sources import make_source
+from radejax.structures import Batch
+
+_CACHED_SEQUENCES = 64
+
+
+class OnlineBatches:
+    """Endless iterator of freshly simulated batches.
+
+    Args:
+        config: Plain values as `default_config`; sequences of its training split.
+        batch_size: Frames a batch.
+        max_objects: Rows for boxes, N of `Batch`.
+        seed: Which frames are drawn, and their noise; the scenes follow the config's
+            own seed.
+        rows_per_step: Range rows at a time: 1 on CPU, 64 or more on accelerators.
+        num_threads: Threads that prepare scatterers.
+        start_step: First step; to resume, the step reached.
+
+    Attributes:
+        step: Step of the next batch; save it to resume.
+        num_cut: Boxes that did not fit into `max_objects` so far.
+    """
+
+    def __init__(
+        self,
+        config: Any,
+        *,
+        batch_size: int,
+        max_objects: int,
+        seed: int = 0,
+        rows_per_step: int = 1,
+        num_threads: int = 2,
+        start_step: int = 0,
+    ) -> None:
+        self._config = SimulationConfig.from_mapping(config)
+        self.grid = self._config.make_grid()
+        self._parameters = self._config.make_parameters()
+        self._source = make_source(self._config)
+        self._specs = [
+            (number, spec)
+            for number in self._source.numbers
+            for spec in self._source.frames(number)
+            if spec.split == "train"
+        ]
+        self._batch_size, self._max_objects = batch_size, max_objects
+        self._seed, self._rows_per_step = seed, rows_per_step
+        self.step, self.num_cut = start_step, 0
+        self._pool = concurrent.futures.ThreadPoolExecutor(max(num_threads, 1))
+        self._ahead: collections.deque = collections.deque()
+        self._lock = threading.Lock()
+        self._simulator = functools.lru_cache(_CACHED_SEQUENCES)(self._make_simulator)
+
+    def __iter__(self) -> OnlineBatches:
+        return self
+
+    def __next__(self) -> Batch:
+        """The next batch; the following one is prepared meanwhile."""
+        while len(self._ahead) < 2:
+            self._ahead.append(self._submit(self.step + len(self._ahead)))
+        batch = self._assemble([f.result() for f in self._ahead.popleft()])
+        self.step += 1
+        return batch
+
+    def batch(self, step: int) -> Batch:
+        """The batch of any step: a pure function of config, seed and step."""
+        return self._assemble([f.result() for f in self._submit(step)])
+
+    def _submit(self, step: int) -> list[concurrent.futures.Future]:
+        rng = np.random.default_rng([self._seed, step])
+        chosen = rng.integers(len(self._specs), size=self._batch_size)
+        return [
+            self._pool.submit(self._frame, int(index), step, row)
+            for row, index in enumerate(chosen)
+        ]
+
+    def _make_simulator(self, number: int) -> SequenceSimulator:
+        return SequenceSimulator(
+            self._source.make(number), self.grid, self._parameters, self._config.seed
+        )
+
+    def _frame(self, index: int, step: int, row: int):
+        """Radar input, boxes `[n, 7]` of the ego frame and classes of one frame."""
+        number, spec = self._specs[index]
+        with self._lock:  # one thread makes a scene, the others find it
+            simulator = self._simulator(number)
+        frame = simulator.sequence.frame(spec.scene_idx)
+        given = simulator.radar_input(spec.scene_idx, frame)
+        visible = simulator.is_radar_visible(frame, given)
+        boxes = frame.boxes[visible].copy()
+        boxes[:, 2] -= self._config.lidar_to_radar_m[2]  # z as readers of files have it
+        key = radar.frame_key(self._seed, step, row)
+        return index, given, key, boxes, frame.cls[visible]
+
+    def _assemble(self, frames: list) -> Batch:
+        count, capacity = self._max_objects, self._batch_size
+        boxes = np.zeros((capacity, count, 8), np.float32)
+        boxes[..., 7] = 1.0
+        classes = np.zeros((capacity, count), np.int32)
+        is_valid = np.zeros((capacity, count), bool)
+        for row, (_, _, _, own, cls) in enumerate(frames):
+            order = np.argsort(np.hypot(own[:, 0], own[:, 1]), kind="stable")[:count]
+            self.num_cut += len(own) - len(order)
+            boxes[row, : len(order)] = boxes8_from_7(own[order])
+            classes[row, : len(order)] = cls[order]
+            is_valid[row, : len(order)] = True
+        scatterers, noise = _stack([given for _, given, *_ in frames])
+        projection = _simulate_batch(
+            scatterers,
+            noise,
+            np.stack([key for _, _, key, *_ in frames]),
+            self.grid,
+            self._parameters,
+            self._rows_per_step,
+        )
+        return Batch(
+            projection=projection,
+            boxes=jnp.asarray(boxes),
+            classes=jnp.asarray(classes),
+            is_valid=jnp.asarray(is_valid),
+            frame=jnp.asarray([index for index, *_ in frames], jnp.int32),
+        )
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4, 5))
+def _simulate_batch(scatterers, noise, keys, grid, parameters, rows_per_step):
+    """`[B, R, A, D+E]` projections of a batch."""
+
+    def one(scatterers, noise, key):
+        return radar.simulate(
+            scatterers,
+            noise,
+            key,
+            grid=grid,
+            parameters=parameters,
+            rows_per_step=rows_per_step,
+        )
+
+    return jax.vmap(one)(scatterers, noise, keys)
+
+
+def _stack(inputs: list[RadarInput]) -> tuple[radar.Scatterers, np.ndarray]:
+    """Inputs of one batch, padded to the longest, in steps that bound recompiling."""
+    capacity = max(given.scatterers.range_m.shape[0] for given in inputs)
+    capacity = -(-capacity // 1024) * 1024
+
+    def pad(leaf: np.ndarray) -> np.ndarray:
+        return np.pad(leaf, [(0, capacity - len(leaf))] + [(0, 0)] * (leaf.ndim - 1))
+
+    scatterers = jax.tree.map(
+        lambda *leaves: np.stack([pad(leaf) for leaf in leaves]),
+        *[given.scatterers for given in inputs],
+    )
+    return scatterers, np.stack([given.noise_power for given in inputs])
