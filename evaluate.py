@@ -20,7 +20,7 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run of train.py.")
 _CHECKPOINT = flags.DEFINE_integer("checkpoint", None, "Step; the newest by default.")
 _PREDICTIONS = flags.DEFINE_string("predictions", None, "File or folder.")
 _COMPARE = flags.DEFINE_string(
-    "compare", None, "Run A; run B follows: --compare A B. Reports or predictions."
+    "compare", None, "Runs: --compare A B [C ...]. Folders of reports, or predictions."
 )
 _OUT = flags.DEFINE_string(
     "out",
@@ -39,7 +39,9 @@ _IOU = flags.DEFINE_list("iou", ["0.3", "0.5", "0.7"], "IoU thresholds.")
 _ROI = flags.DEFINE_string("roi", "narrow", "narrow, wide or none.")
 _SCORE = flags.DEFINE_float("score_threshold", 0.0, "Predictions need more than this.")
 _BOOTSTRAP = flags.DEFINE_integer(
-    "bootstrap", 0, "Resamples of sequences for intervals (2000 in --compare if 0)."
+    "bootstrap",
+    None,
+    "Resamples of sequences for intervals: 200 by default, 2000 in --compare; 0: none.",
 )
 _NAME = flags.DEFINE_string("name", None, "Name of the run in tables.")
 _SIZES = flags.DEFINE_enum(
@@ -59,16 +61,14 @@ def main(argv: list[str]) -> None:
         modes = [f for f in (_WORKDIR, _PREDICTIONS, _COMPARE) if f.value is not None]
         if len(modes) != 1:
             raise UserError("give one of --workdir, --predictions and --compare A B")
-        if len(argv) != (2 if _COMPARE.value is not None else 1):
-            raise UserError(
-                f"unexpected arguments: {' '.join(argv[1:]) or 'run B lacks'}"
-            )
+        if len(argv) > 1 and _COMPARE.value is None:
+            raise UserError(f"unexpected arguments: {' '.join(argv[1:])}")
         if _WORKDIR.value is not None:
             evaluate_workdir()
         elif _PREDICTIONS.value is not None:
             evaluate_files()
         else:
-            compare(argv[1])
+            compare([_COMPARE.value, *argv[1:]])
 
 
 def evaluate_workdir() -> None:
@@ -93,13 +93,12 @@ def evaluate_files() -> None:
     sys.stdout.write(f"{report.text}\nWritten to {out}\n")
 
 
-def compare(path_b: str) -> None:
-    """Compares two runs."""
+def compare(paths: list[str]) -> None:
+    """Compares runs with the first of them."""
     from radejax.evaluation import commands
 
     text, _ = commands.compare_files(
-        _COMPARE.value,
-        path_b,
+        paths,
         _OUT.value,
         _source(),
         _options("comparison"),
@@ -140,7 +139,7 @@ def _options(name: str) -> object:
         score_threshold=_SCORE.value,
         roi=None if _ROI.value == "none" else _ROI.value,
         label_version=_LABEL_VERSION.value,
-        bootstrap=_BOOTSTRAP.value,
+        bootstrap=200 if _BOOTSTRAP.value is None else _BOOTSTRAP.value,
         invalid_sizes=_SIZES.value,
         **changes,
     )

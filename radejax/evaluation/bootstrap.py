@@ -59,12 +59,13 @@ def resample(
     chosen = protocols.get_protocol(protocol)
     skip = chosen.skip_empty if skip_empty == PROTOCOL_DEFAULT else skip_empty
     num_classes = len(data.classes)
+    among = weights.any(axis=0)
     ap = np.full((len(weights), num_classes + 1), np.nan)
     for row, weight in enumerate(weights):
         by_class = data.frame_weights(skip, weight)
         for cls in range(num_classes):
             curve = data.curve(
-                chosen, space, iou, cls, by_class[:, cls], score_threshold
+                chosen, space, iou, cls, by_class[:, cls], score_threshold, among
             )
             if curve.num_gt:
                 ap[row, cls] = curve.ap

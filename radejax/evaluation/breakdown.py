@@ -14,8 +14,9 @@ import numpy as np
 from radejax.evaluation import matching, overlap, protocols
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.results import SPACES
+from radejax.visualize.curves import calibration_bins
 
-DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0)
+DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,8 +104,9 @@ def by_distance(
     result = {}
     for low, high in itertools.pairwise(edges_m):
         in_gt, in_pred = ((d >= low) & (d < high) for d in (far_gt, far))
+        band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
         for cls, name in enumerate(data.classes):
-            result[f"{low:g}-{high:g} m", name] = slice_numbers(
+            result[band, name] = slice_numbers(
                 data, cls, in_gt, in_pred, match, operating_score
             )
     return result
@@ -141,35 +143,26 @@ def calibration(
 
     Returns:
         Per class: "low" and "high" edges of the score bins, "count", mean "score" and
-        "precision" per bin (None where empty), and "error", the mean of
+        "precision" per bin (NaN where empty), and "error", the mean of
         |precision - score| weighted by count (expected calibration error).
     """
-    match = matched_objects(data, space, iou)
+    is_match = matched_objects(data, space, iou) >= 0
     edges = np.linspace(0, 1, num_bins + 1)
-    bins = np.clip(np.searchsorted(edges, data.pred.score, side="left") - 1, 0, None)
     result = {}
     for cls, name in [(None, "all"), *enumerate(data.classes)]:
         rows = np.ones(len(data.pred), bool) if cls is None else data.pred.cls == cls
-        count = np.bincount(bins[rows], minlength=num_bins)
-        score = np.bincount(bins[rows], data.pred.score[rows], num_bins)
-        right = np.bincount(bins[rows], match[rows] >= 0, num_bins)
-        filled = count > 0
-        mean_score = np.divide(score, count, out=np.zeros(num_bins), where=filled)
-        precision = np.divide(right, count, out=np.zeros(num_bins), where=filled)
-        gap = np.abs(precision - mean_score) * count
+        score, precision, count = calibration_bins(
+            data.pred.score[rows], is_match[rows], num_bins
+        )
+        total = int(count.sum())
+        error = float(np.nansum(np.abs(precision - score) * count))
         result[name] = {
             "low": edges[:-1].tolist(),
             "high": edges[1:].tolist(),
             "count": count.tolist(),
-            "score": [
-                v if f else None
-                for v, f in zip(mean_score.tolist(), filled, strict=True)
-            ],
-            "precision": [
-                v if f else None
-                for v, f in zip(precision.tolist(), filled, strict=True)
-            ],
-            "error": float(gap.sum() / count.sum()) if count.sum() else None,
+            "score": score.tolist(),
+            "precision": precision.tolist(),
+            "error": error / total if total else float("nan"),
         }
     return result
 

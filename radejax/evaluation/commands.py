@@ -5,15 +5,21 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from radejax import files
 from radejax.errors import UserError
-from radejax.evaluation import bootstrap, kitti, layouts, predictions_io
+from radejax.evaluation import (
+    bootstrap,
+    kitti,
+    layouts,
+    paper_tables,
+    predictions_io,
+)
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.measure import Options, repair_sizes
+from radejax.evaluation.measure import Options, measure, repair_sizes
 from radejax.evaluation.predictions_io import Columns
 from radejax.evaluation.report import Report, evaluate_predictions, plain
 
@@ -128,64 +134,90 @@ def evaluate_files(
 
 
 def compare_files(
-    path_a: PathLike,
-    path_b: PathLike,
+    paths: Sequence[PathLike],
     out_dir: PathLike | None,
     source: Source,
     options: Options,
     *,
     resamples: int = 2000,
 ) -> tuple[str, list[bootstrap.Comparison]]:
-    """Compares two runs on the same frames; returns the table and its rows.
+    """Compares runs on the same frames: each with the first, and all in Table III.
 
     Args:
-        path_a: Predictions or report folder of run A.
-        path_b: Of run B.
+        paths: Predictions or report folders, at least two; the first is run A.
         out_dir: Where to write comparison.txt and comparison.json, or None.
         source: Ground truth, unless the paths bring their own.
-        options: Classes, IoU thresholds, region, score cut, seed.
+        options: Classes, protocols, IoU thresholds, region, score cut, seed.
         resamples: Number of resamples of sequences.
+
+    Returns:
+        The tables as text, and all comparisons (B is the second run first).
+
+    Raises:
+        UserError: Fewer than two runs, or runs on different frames or ground truth.
     """
-    sets, sequence = [], None
-    for path in (path_a, path_b):
-        truth, found, frames, _ = load(path, source, options.classes)
-        if "sequence" not in frames:
-            raise UserError(
-                f"{path}: comparing runs resamples sequences, and the frames do not say"
-                " theirs: give --data or --labels"
-            )
-        found, _ = repair_sizes(found, options.invalid_sizes)
-        sets.append(
-            EvaluationSet(
-                truth, found, classes=options.classes, frames=frames, roi=options.roi
-            )
+    if len(paths) < 2:
+        raise UserError("a comparison needs at least two runs")
+    first, *others = [_load_run(path, source, options) for path in paths]
+    named = [p for p in ("exact", "kradar_r40") if p in options.protocols]
+    parts, rows = [], []
+    for path, (data, frames) in zip(paths[1:], others, strict=True):
+        found = bootstrap.compare(
+            first[0],
+            data,
+            frames["sequence"],
+            protocol_names=named or options.protocols[:1],
+            iou_thresholds=options.iou_thresholds[:1],
+            score_threshold=options.score_threshold,
+            resamples=resamples,
+            seed=options.seed,
         )
-        sequence = frames["sequence"]
-    protocol_names = [p for p in ("exact", "kradar_r40") if p in options.protocols]
-    rows = bootstrap.compare(
-        *sets,
-        sequence,
-        protocol_names=protocol_names or options.protocols[:1],
-        iou_thresholds=options.iou_thresholds[:1],
-        score_threshold=options.score_threshold,
-        resamples=resamples,
-        seed=options.seed,
-    )
-    text = layouts.comparison(rows, str(path_a), str(path_b)).render()
+        parts.append(layouts.comparison(found, str(paths[0]), str(path)).render())
+        rows += found
+    runs = dict(zip(map(str, paths), [first, *others], strict=True))
+    if "Sedan" in options.classes:
+        parts.append(_ablations(runs, options).render())
+    text = "\n".join(parts)
     if out_dir is not None:
+        content = {
+            "runs": list(runs),
+            "resamples": resamples,
+            "options": options.to_dict(),
+            "rows": [row.to_dict() for row in rows],
+        }
         out_dir = pathlib.Path(out_dir)
         out_dir.mkdir(parents=True, exist_ok=True)
         files.write_text(out_dir / "comparison.txt", text)
-        files.write_json(
-            out_dir / "comparison.json",
-            plain(
-                {
-                    "a": str(path_a),
-                    "b": str(path_b),
-                    "resamples": resamples,
-                    "options": options.to_dict(),
-                    "rows": [row.to_dict() for row in rows],
-                }
-            ),
-        )
+        files.write_json(out_dir / "comparison.json", plain(content))
     return text, rows
+
+
+def _load_run(
+    path: PathLike, source: Source, options: Options
+) -> tuple[EvaluationSet, Columns]:
+    """A run ready to be compared, and its frames."""
+    truth, found, frames, _ = load(path, source, options.classes)
+    if "sequence" not in frames:
+        raise UserError(
+            f"{path}: comparing runs resamples sequences, and the frames do not say"
+            " theirs: give --data or --labels"
+        )
+    found, _ = repair_sizes(found, options.invalid_sizes)
+    data = EvaluationSet(
+        truth, found, classes=options.classes, frames=frames, roi=options.roi
+    )
+    return data, frames
+
+
+def _ablations(
+    runs: Mapping[str, tuple[EvaluationSet, Columns]], options: Options
+) -> layouts.Table:
+    """Several runs in the layout of Table III."""
+    options = dataclasses.replace(
+        options, protocols=(options.paper_protocol,), iou_thresholds=(0.3, 0.5)
+    )
+    measured = {
+        name: layouts.index(measure(data, frames, options, kinds=()))
+        for name, (data, frames) in runs.items()
+    }
+    return paper_tables.table_3(measured, options.paper_protocol)

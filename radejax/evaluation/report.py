@@ -15,8 +15,10 @@ from radejax import files
 from radejax.evaluation import (
     bootstrap,
     breakdown,
+    details,
     layouts,
     measure,
+    paper_tables,
     predictions_io,
     protocols,
 )
@@ -86,9 +88,11 @@ def write_report(
         label_version=options.label_version,
     )
     rows = measure.measure(data, frames, options)
-    if options.bootstrap:
+    intervals = why_no_intervals(frames, options)
+    if intervals is None:
         rows = with_intervals(data, frames, rows, options)
     metrics = collect(data, frames, rows, options)
+    metrics["intervals"] = intervals or f"{options.bootstrap} resamples of sequences"
     metrics["left_out"]["predictions: size not positive, kept as false positives"] = (
         repaired
     )
@@ -106,7 +110,7 @@ def write_report(
         predictions_io.write_table(out_dir / f"{name}.npz", table, keys)
         written.append(out_dir / f"{name}.npz")
     written.append(_write(out_dir / "frames.json", files.write_json, _lists(frames)))
-    tables = paper_tables(rows, options)
+    tables = all_tables(rows, metrics, options)
     for style, name in (("markdown", "tables.md"), ("latex", "tables.tex")):
         content = "\n".join(table.render(style) for table in tables)
         written.append(_write(out_dir / name, files.write_text, content))
@@ -123,29 +127,46 @@ def _lists(frames: Mapping[str, np.ndarray]) -> dict[str, list]:
     return {name: np.asarray(column).tolist() for name, column in frames.items()}
 
 
+def why_no_intervals(frames: Mapping[str, np.ndarray], options: Options) -> str | None:
+    """The reason for not computing intervals, or None."""
+    if not options.bootstrap:
+        return "none asked for"
+    if "sequence" not in frames:
+        return "none: the frames do not say their sequence"
+    if np.unique(np.asarray(frames["sequence"])).size < 2:
+        return "none: all frames are of one sequence"
+    return None
+
+
 def with_intervals(
     data: EvaluationSet,
     frames: Mapping[str, np.ndarray],
     rows: list[Measured],
     options: Options,
 ) -> list[Measured]:
-    """The rows with 95 % intervals, for every metric over all frames and per weather."""
-    terms = [
-        (protocol, space, iou)
-        for protocol in options.protocols
-        for space in SPACES
-        for iou in options.iou_thresholds
-    ]
-    found = bootstrap.add_intervals(
-        data,
-        frames,
-        terms,
-        resamples=options.bootstrap,
-        seed=options.seed,
-        masks=measure.condition_masks(frames, "weather"),
-        skip_empty=options.skip_empty,
-        score_threshold=options.score_threshold,
-    )
+    """The rows with 95 % intervals: all over all frames, the main ones per weather."""
+    main = (protocols.RECOMMENDED, "kradar_r40", options.paper_protocol)
+    weathers = measure.condition_masks(frames, "weather")
+    found = {}
+    for names, masks in (
+        ([name for name in options.protocols if name in main], weathers),
+        ([name for name in options.protocols if name not in main], {}),
+    ):
+        found |= bootstrap.add_intervals(
+            data,
+            frames,
+            [
+                (name, space, iou)
+                for name in names
+                for space in SPACES
+                for iou in options.iou_thresholds
+            ],
+            resamples=options.bootstrap,
+            seed=options.seed,
+            masks=masks,
+            skip_empty=options.skip_empty,
+            score_threshold=options.score_threshold,
+        )
     result = []
     for row in rows:
         made = row.result
@@ -221,22 +242,19 @@ def _name_frames(worst: list[dict], frames: Mapping[str, np.ndarray]) -> list[di
     return worst
 
 
-def paper_tables(rows: list[Measured], options: Options) -> list[layouts.Table]:
-    """Tables beside the published ones, then one per protocol and IoU threshold."""
+def all_tables(
+    rows: list[Measured], metrics: Mapping[str, Any], options: Options
+) -> list[layouts.Table]:
+    """Beside the published ones, then every protocol and IoU threshold, then details."""
     table = layouts.index(rows)
-    iou = options.iou_thresholds[0]
-    result = []
-    if options.paper_protocol in options.protocols and 0.3 in options.iou_thresholds:
-        if "Sedan" in options.classes:
-            result.append(layouts.table_1(table, options))
-            result.append(layouts.table_3({options.run: table}, options.paper_protocol))
-        result.append(layouts.table_2(table, options))
+    result = paper_tables.beside_published(table, options)
     for space in ("3d", "bev"):
-        result.append(layouts.protocols_at_a_glance(table, options, space, iou))
+        for iou in options.iou_thresholds:
+            result.append(layouts.protocols_at_a_glance(table, options, space, iou))
     for protocol in options.protocols:
-        for threshold in options.iou_thresholds:
-            result.append(layouts.class_by_weather(table, options, protocol, threshold))
-    return result
+        for iou in options.iou_thresholds:
+            result.append(layouts.class_by_weather(table, options, protocol, iou))
+    return [*result, *details.detail_tables(metrics)]
 
 
 def console_text(
@@ -253,27 +271,17 @@ def console_text(
     for protocol in shown or options.protocols[:1]:
         parts.append(layouts.class_by_weather(table, options, protocol, iou).render())
     parts.append(layouts.protocols_at_a_glance(table, options, "3d", iou).render())
-    if options.bootstrap:
+    if any(row.low is not None for row in rows):
         parts.append(layouts.intervals(table, options, iou).render())
-    distance = metrics["slices"]["distance"]
-    parts.append(
-        layouts.Table(
-            "By distance, " + metrics["slices"]["protocol"],
-            ["Distance", "Class", "AP", "Precision", "Recall", "Objects"],
-            [
-                [
-                    entry["distance"],
-                    entry["cls"],
-                    layouts.number(entry["ap"]),
-                    layouts.number(entry["precision"]),
-                    layouts.number(entry["recall"]),
-                    str(entry["num_gt"]),
-                ]
-                for entry in distance
-                if entry["num_gt"] or entry["num_det"]
-            ],
-        ).render()
-    )
+    slices = metrics["slices"]
+    parts += [
+        details.slice_table(
+            slices["distance"], "distance", slices["protocol"]
+        ).render(),
+        details.error_table(metrics["box_errors"]).render(),
+        details.confusion_table(metrics["confusion"]).render(),
+    ]
+    parts.append(f"Intervals: {metrics['intervals']}\n")
     parts.append("Left out, or kept with a remark:")
     parts += [f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()]
     return "\n".join(parts) + "\n"

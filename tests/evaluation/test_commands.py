@@ -82,9 +82,25 @@ def test_comparison_of_two_reports(stored, scene):
     assert (folder / "out" / "comparison.txt").read_text() == text
     assert (folder / "out" / "comparison.json").is_file()
     again, _ = commands.compare_files(
-        folder / "few.json", folder / "found.json", None, source, OPTIONS, resamples=50
+        [folder / "few.json", folder / "found.json"],
+        None,
+        source,
+        OPTIONS,
+        resamples=50,
     )
-    assert again.splitlines()[3:] == text.splitlines()[3:]
+    assert again.splitlines()[3:20] == text.splitlines()[3:20]
+    three, rows = commands.compare_files(
+        [folder / "few", folder / "found", folder / "few"],
+        None,
+        Source(),
+        OPTIONS,
+        resamples=10,
+    )
+    assert three.count("B - A") == 2
+    assert "RADE-Net, Table III" in three
+    assert len(rows) % 2 == 0
+    with pytest.raises(UserError, match="at least two runs"):
+        commands.compare_files([folder / "few"], None, Source(), OPTIONS)
 
 
 def test_ground_truth_has_to_come_from_somewhere(stored, scene):
@@ -99,7 +115,7 @@ def test_ground_truth_has_to_come_from_somewhere(stored, scene):
     kitti.write_kitti(folder / "kitti", *scene)
     with pytest.raises(UserError, match="the frames do not say"):
         commands.compare_files(
-            folder / "kitti", folder / "kitti", None, Source(), OPTIONS
+            [folder / "kitti", folder / "kitti"], None, Source(), OPTIONS
         )
 
 
@@ -146,6 +162,7 @@ def test_command_line(stored):
         "--predictions", folder / "found.json", "--ground_truth", source.ground_truth,
         "--frames", source.frames, "--roi", "none", "--out", folder / "out",
         "--protocols", "exact,kradar_r40", "--iou", "0.3", "--classes", "Sedan",
+        "--bootstrap", "10",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "AP 3D / BEV at IoU 0.3, exact" in done.stdout
@@ -162,7 +179,7 @@ def test_command_line(stored):
     ("arguments", "message"),
     [
         ((), "give one of --workdir, --predictions and --compare"),
-        (("--compare", "a"), "run B lacks"),
+        (("--compare", "a"), "at least two runs"),
         (("--predictions", "a.json", "--iou", "x"), "--iou must be numbers"),
         (("--predictions", "none.csv", "--ground_truth", "none.csv"), "none.csv"),
     ],
