@@ -1,0 +1,331 @@
+import dataclasses
+import itertools
+import shutil
+
+import chex
+import grain
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+
+from radejax.data import frame_table, pipeline
+from radejax.data.augment import Augmentation
+from radejax.data.kradar import KRadar
+from radejax.data.pipeline import make_loader, steps_per_epoch
+from radejax.data.projection_job import project_dataset
+from radejax.data.records import RecordSource
+from radejax.errors import DataError, UserError
+from radejax.geometry.camera import CameraCalibration
+from radejax.structures import Batch
+
+OPTIONS = {
+    "batch_size": 3,
+    "max_objects": 5,
+    "seed": 1,
+    "process_index": 0,
+    "process_count": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def data(kradar_root):
+    return KRadar(kradar_root, visibility=None)
+
+
+@pytest.fixture(scope="module")
+def records(data, tmp_path_factory):
+    path = tmp_path_factory.mktemp("records")
+    project_dataset(data, path, num_workers=0, frames_per_file=5, progress=False)
+    return RecordSource(path)
+
+
+@pytest.fixture
+def loader(records, data):
+    def make(**options):
+        return make_loader(records, data, **{**OPTIONS, **options})
+
+    return make
+
+
+def frames_of(loader):
+    return [batch.frame.tolist() for batch in loader]
+
+
+# Content -----------------------------------------------------------------------------
+
+
+def test_batches_are_the_records_and_labels(loader, records, data):
+    for batch in loader(num_epochs=1):
+        assert isinstance(batch, Batch)
+        chex.assert_shape(batch.projection, (3, 16, 12, 11))
+        chex.assert_type(
+            [batch.projection, batch.boxes, batch.classes, batch.is_valid, batch.frame],
+            [np.float16, np.float32, np.int32, bool, np.int32],
+        )
+        for row, index in enumerate(batch.frame):
+            frame = data[index]
+            np.testing.assert_array_equal(
+                batch.projection[row], records[index]["projection"]
+            )
+            count = int(batch.is_valid[row].sum())
+            assert count == len(frame.boxes)
+            found = batch.boxes[row, :count]
+            np.testing.assert_allclose(found[:, :6], frame.boxes[:, :6], rtol=1e-6)
+            yaw = np.arctan2(found[:, 6], found[:, 7])
+            wanted = np.arctan2(np.sin(frame.boxes[:, 6]), np.cos(frame.boxes[:, 6]))
+            np.testing.assert_allclose(yaw, wanted, atol=1e-6)
+            assert [data.classes[i] for i in batch.classes[row, :count]] == list(
+                frame.classes
+            )
+            assert not batch.boxes[row, count:].any()
+            assert (batch.classes[row, count:] == -1).all()
+    assert batch.image is None
+    assert batch.camera is None
+
+
+def test_splits_point_to_the_right_records(records, kradar_root):
+    test = KRadar(kradar_root, split="test")
+    batch = next(make_loader(records, test, shuffle=False, **OPTIONS))
+    for row, index in enumerate(batch.frame):
+        record = records[records.frames.index(test[index].key)]
+        np.testing.assert_array_equal(batch.projection[row], record["projection"])
+
+
+# Order --------------------------------------------------------------------------------
+
+
+def test_every_epoch_has_every_frame_in_another_order(loader):
+    frames = frames_of(loader(num_epochs=3))
+    assert len(frames) == 12
+    epochs = [list(itertools.chain(*frames[i : i + 4])) for i in (0, 4, 8)]
+    assert all(sorted(epoch) == list(range(12)) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2] != epochs[0]
+    in_order = frames_of(loader(num_epochs=2, shuffle=False))
+    assert list(itertools.chain(*in_order)) == [*range(12), *range(12)]
+
+
+def test_order_depends_on_the_seed_alone(loader):
+    wanted = frames_of(loader(num_epochs=2))
+    for options in ({"num_threads": 0}, {"num_threads": 5}, {"prefetch": 7}):
+        assert frames_of(loader(num_epochs=2, **options)) == wanted
+    # grain shuffles epoch e of seed s as epoch e - 1 of seed s + 1; we must not.
+    others = [frames_of(loader(num_epochs=2, seed=s)) for s in (0, 2, 3)]
+    orders = [run[4 * e : 4 * e + 4] for run in [wanted, *others] for e in (0, 1)]
+    assert all(a != b for a, b in itertools.combinations(orders, 2))
+
+
+def test_without_num_epochs_it_never_ends(loader):
+    endless = loader()
+    assert len([next(endless) for _ in range(30)]) == 30
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_processes_share_every_epoch(loader, count):
+    options = {"num_epochs": 2, "process_count": count, "batch_size": 1}
+    shares = [frames_of(loader(process_index=i, **options)) for i in range(count)]
+    assert {len(share) for share in shares} == {2 * 12 // count}
+    for epoch in (0, 1):
+        half = slice(epoch * 12 // count, (epoch + 1) * 12 // count)
+        drawn = [frame for share in shares for (frame,) in share[half]]
+        assert sorted(drawn) == list(range(12))
+
+
+def test_processes_take_as_many_steps_when_frames_do_not_divide(loader):
+    for i in range(5):
+        share = frames_of(
+            loader(process_index=i, process_count=5, num_epochs=1, batch_size=2)
+        )
+        assert len(share) == 1 == steps_per_epoch(12, 2, process_count=5)
+    padded = [
+        frames_of(
+            loader(
+                process_index=i,
+                process_count=5,
+                num_epochs=1,
+                batch_size=2,
+                drop_remainder=False,
+                pad_remainder=True,
+                shuffle=False,
+            )
+        )
+        for i in range(5)
+    ]
+    assert {len(share) for share in padded} == {2}
+    drawn = sorted(frame for share in padded for batch in share for frame in batch)
+    assert drawn == [-1] * 8 + list(range(12))
+
+
+@pytest.mark.parametrize("batch_size", [5, 12])
+def test_remainders(loader, batch_size):
+    options = {"batch_size": batch_size, "num_epochs": 1, "shuffle": False}
+    dropped = frames_of(loader(**options))
+    kept = frames_of(loader(drop_remainder=False, **options))
+    padded = list(loader(pad_remainder=True, **options))
+    assert len(dropped) == 12 // batch_size == steps_per_epoch(12, batch_size)
+    assert list(itertools.chain(*kept)) == list(range(12))
+    assert len(padded) == len(kept)
+    assert len(kept) == steps_per_epoch(12, batch_size, drop_remainder=False)
+    empty = padded[-1].frame == -1
+    assert int(empty.sum()) == -12 % batch_size
+    assert not padded[-1].projection[empty].any()
+    assert not padded[-1].is_valid[empty].any()
+
+
+# State --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [0, 3, 6, 7])
+def test_restored_in_mid_epoch_continues_with_the_next_batch(loader, data, step):
+    options = {"num_epochs": 3, "augment": Augmentation(data.grid)}
+    first = loader(**options)
+    for _ in range(step):
+        next(first)
+    state = first.get_state()
+    wanted = list(first)
+    for changes in ({}, {"num_threads": 0}, {"prefetch": 5}):
+        second = loader(**options, **changes)
+        next(second)
+        second.set_state(state)
+        found = list(second)
+        assert len(found) == len(wanted) == 12 - step
+        for a, b in zip(found, wanted, strict=True):
+            chex.assert_trees_all_equal(a, b)
+
+
+def test_state_travels_with_an_orbax_checkpoint(loader, tmp_path):
+    first = loader(num_epochs=2)
+    for _ in range(5):
+        next(first)
+    with ocp.CheckpointManager(tmp_path) as manager:
+        manager.save(
+            5, args=ocp.args.Composite(data=grain.checkpoint.CheckpointSave(first))
+        )
+        manager.wait_until_finished()
+        second = loader(num_epochs=2)
+        manager.restore(
+            5, args=ocp.args.Composite(data=grain.checkpoint.CheckpointRestore(second))
+        )
+    assert frames_of(second) == frames_of(first)
+
+
+@pytest.mark.slow
+def test_worker_processes_give_the_same(loader, data):
+    options = {"num_epochs": 2, "augment": Augmentation(data.grid)}
+    wanted = list(loader(**options))
+    workers = loader(num_workers=2, **options)
+    found = [next(workers) for _ in range(3)]
+    state = workers.get_state()
+    found += list(workers)
+    for a, b in zip(found, wanted, strict=True):
+        chex.assert_trees_all_equal(
+            jax.tree.map(np.asarray, a), jax.tree.map(np.asarray, b)
+        )
+    again = loader(num_workers=2, **options)
+    again.set_state(state)
+    assert frames_of(again) == [batch.frame.tolist() for batch in wanted[3:]]
+
+
+# Options ------------------------------------------------------------------------------
+
+
+def test_augmentation_changes_per_epoch_and_stays_in_register(loader, data, records):
+    augment = Augmentation(data.grid, gain_db=0, gain_slope_db=0)
+    mirrored = {index: set() for index in range(12)}
+    for batch in loader(num_epochs=6, augment=augment):
+        for row, index in enumerate(batch.frame):
+            plain = records[index]["projection"]
+            is_mirrored = not np.array_equal(batch.projection[row], plain)
+            if is_mirrored:
+                np.testing.assert_array_equal(batch.projection[row], plain[:, ::-1])
+            mirrored[int(index)].add(is_mirrored)
+            count = len(data[index].boxes)
+            sign = -1 if is_mirrored else 1
+            np.testing.assert_allclose(
+                batch.boxes[row, :count, 1], sign * data[index].boxes[:, 1], rtol=1e-6
+            )
+    assert sum(len(seen) == 2 for seen in mirrored.values()) >= 9
+
+
+def test_on_device(loader):
+    wanted = list(loader(num_epochs=1))
+    found = list(loader(num_epochs=1, device=jax.devices()[0]))
+    assert all(isinstance(batch.projection, jax.Array) for batch in found)
+    for a, b in zip(found, wanted, strict=True):
+        chex.assert_trees_all_equal(a, b)
+
+
+def test_images_and_cameras(records, data, monkeypatch):
+    shape = (2, 4, 3)
+    monkeypatch.setattr(pipeline, "IMAGE_SHAPE", shape)
+    monkeypatch.setattr(
+        pipeline, "read_left_image", lambda path: np.full(shape, int(path), np.uint8)
+    )
+    camera = CameraCalibration.from_angles(
+        intrinsics=(2.0, 2.0, 2.0, 1.0),
+        yaw_deg=90,
+        pitch_deg=0,
+        roll_deg=90,
+        translation_m=(0, 0, 0),
+        width=4,
+        height=2,
+    ).camera()
+    frames = [
+        _with(frame, camera_path=None if i == 2 else str(10 + i))
+        for i, frame in enumerate(data)
+    ]
+    options = {**OPTIONS, "batch_size": 4, "shuffle": False, "images": True}
+    with pytest.raises(UserError, match="1 of 12 frames have no front image"):
+        make_loader(records, frames, **options)
+    batch = next(
+        make_loader(
+            records,
+            frames,
+            cameras=[camera] * 12,
+            allow_missing_images=True,
+            **options,
+        )
+    )
+    assert batch.image.dtype == np.uint8
+    assert batch.image[:, 0, 0, 0].tolist() == [10, 11, 0, 13]
+    assert batch.camera.is_valid.tolist() == [True, True, False, True]
+    chex.assert_shape(batch.camera.cam_from_ego, (4, 3, 4))
+    assert batch.camera.intrinsics.dtype == np.float32
+    assert frame_table.IMAGE_SHAPE == (720, 1280, 3)
+
+
+def _with(frame, **changes):
+    return dataclasses.replace(frame, **changes)
+
+
+# Errors -------------------------------------------------------------------------------
+
+
+def test_wrong_sizes(loader):
+    with pytest.raises(UserError, match="12 frames are fewer than one batch"):
+        loader(batch_size=13)
+    with pytest.raises(UserError, match="on each of 5 processes"):
+        loader(process_count=5)
+    with pytest.raises(UserError, match="must be at least 1, got 0"):
+        loader(batch_size=0)
+    with pytest.raises(UserError, match="would do"):
+        loader(max_objects=0)
+
+
+@pytest.mark.parametrize("num_threads", [0, 2])
+def test_a_damaged_record_is_named_when_it_is_read(
+    records, data, tmp_path, num_threads
+):
+    folder = shutil.copytree(records.folder, tmp_path / "copy")
+    path = folder / "projections-00000-of-00003.arrayrecord"
+    content = bytearray(path.read_bytes())
+    content[content.index(records[4]["projection"].tobytes()) + 10] ^= 1
+    path.write_bytes(content)
+    damaged = make_loader(
+        RecordSource(folder),
+        data,
+        **{**OPTIONS, "shuffle": False, "num_threads": num_threads},
+    )
+    next(damaged)
+    with pytest.raises(DataError, match=r"00000-of-00003\.arrayrecord: record 4"):
+        next(damaged)
