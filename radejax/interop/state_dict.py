@@ -34,6 +34,16 @@ class StateDictReader:
     def __contains__(self, name: str) -> bool:
         return name in self._tensors
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all tensors."""
+        return tuple(self._tensors)
+
+    def give_away(self, name: str) -> Any:
+        """The tensor as it is, for another reader to account for."""
+        self._taken.add(name)
+        return self._tensors[name]
+
     def take(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """The tensor as float32, or zeros of the shape after noting a problem."""
         self._taken.add(name)

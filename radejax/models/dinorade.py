@@ -1,0 +1,387 @@
+"""DinoRADE: a radar detector that looks up its queries in a camera image.
+
+References:
+    Leitgeb et al., DinoRADE, arXiv:2604.08074.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from radejax.errors import UserError
+from radejax.geometry.camera import Camera
+from radejax.models import radenet
+from radejax.models.backbone import Backbone
+from radejax.models.camera_neck import CameraNeck
+from radejax.models.fusion import Fusion
+from radejax.models.heads import Heads
+from radejax.models.image import normalize
+from radejax.models.lifting import LiftingAxes, ReferencePoints, reference_points
+from radejax.models.neck import Neck
+from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
+from radejax.models.vit import ViT
+from radejax.structures import DetectionMaps
+
+IMAGE_BACKBONE = "image_backbone"
+"""Key of the image backbone in the parameters: what is frozen, and what published
+checkpoints must leave out."""
+
+_SCOPE = f"{IMAGE_BACKBONE}/"
+
+
+class DinoRade(nn.Module):
+    """Radar-camera detector.
+
+    Attributes:
+        radar: The radar branch, neck and heads: a RADE-Net whose parts this module
+            has under the same names.
+        vit: Fields of the image transformer, or None for a ResNet-50.
+        fusion: Fields of `Fusion`.
+        axes: Centers of the radar queries.
+        image_size: Height and width of the images.
+        freeze: No gradients through the image backbone.
+        resnet_width: Channels of the ResNet's stem, where there is one.
+        standardize_image: ImageNet's mean and deviation; False scales to [0, 1].
+    """
+
+    radar: radenet.RadeNet
+    vit: ViT | None
+    fusion: Mapping[str, Any]
+    axes: LiftingAxes
+    image_size: tuple[int, int] = (720, 1280)
+    freeze: bool = True
+    resnet_width: int = 64
+    standardize_image: bool = True
+
+    def setup(self) -> None:
+        radar, dtype = self.radar, jnp.dtype(self.radar.dtype)
+        self.backbone = Backbone(
+            radar.doppler_bins,
+            radar.widths,
+            radar.decoder_width,
+            radar.num_groups,
+            radar.cbam,
+            radar.input_stem,
+            dtype=dtype,
+            remat=radar.remat,
+        )
+        self.neck = Neck(radar.neck, radar.num_groups, dtype, radar.remat)
+        self.heads = Heads(
+            radar.num_classes,
+            radar.heads,
+            radar.num_groups,
+            dtype,
+            radar.remat,
+            radar.heatmap_prior,
+        )
+        if self.vit is None:
+            self.image_backbone = ResNetTrunk(self.resnet_width, dtype=dtype)
+            self.image_neck = ResNetNeck(
+                radar.decoder_width, self.resnet_width, dtype=dtype
+            )
+        else:
+            self.image_backbone = self.vit.clone(dtype=dtype, parent=None)
+            self.image_neck = CameraNeck(radar.decoder_width, dtype)
+        self.image_fusion = Fusion(
+            **self.fusion,
+            num_groups=radar.num_groups,
+            dtype=dtype,
+            remat=radar.remat,
+        )
+
+    def __call__(
+        self,
+        projection: jax.Array,
+        image: jax.Array | None = None,
+        camera: Camera | ReferencePoints | None = None,
+        train: bool = False,
+    ) -> DetectionMaps:
+        """Predicts from projections and images.
+
+        Frames without an image (`camera.is_valid` or `has_image` False) and calls
+        without images or camera are predicted from the radar alone.
+
+        Args:
+            projection: `[B, R, A, D+E]`, Doppler channels first; any float dtype.
+            image: `[B, H, W, 3]` uint8 RGB (floats: normalised already), or what
+                `embed` made of it, `[B, h, w, C]`.
+            camera: Where the cameras look: a batch of `Camera`, or reference points
+                computed before, one for all frames or one per frame.
+            train: Batch statistics and dropout instead of the running ones.
+
+        Returns:
+            Maps on the padded bins, or on the projection's if `crop_output`.
+
+        Raises:
+            UserError: The image has another size than `image_size`, or image and
+                camera do not fit together.
+        """
+        radar = self.radar
+        _check_projection(projection, radar)
+        padded = radenet.pad_to_multiple(
+            projection.astype(jnp.dtype(radar.dtype)), radar.pad_multiple
+        )
+        x = self.backbone(padded)
+        camera_map = reference = None
+        if image is not None and camera is not None:
+            reference = self._reference(camera, padded.shape)
+            camera_map = self._camera_map(image, reference, train)
+        elif image is not None or camera is not None:
+            raise UserError(
+                f"{'camera' if image is None else 'image'} is given without "
+                f"{'image' if image is None else 'camera'}: give both or none"
+            )
+        elevation = padded[..., radar.doppler_bins :]
+        x = self.image_fusion(x, elevation, camera_map, reference, train=train)
+        maps = self.heads(self.neck(x))
+        if radar.crop_output:
+            r, a = projection.shape[1:3]
+            maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
+        return maps
+
+    def embed(self, image: jax.Array) -> jax.Array:
+        """What the image backbone makes of images: `__call__` takes it in their place.
+
+        Args:
+            image: `[B, H, W, 3]` uint8 RGB, or floats normalised already.
+
+        Returns:
+            `[B, h, w, C]` float32: patch tokens, or the ResNet's third stage.
+        """
+        if tuple(image.shape[1:]) != (*self.image_size, 3):
+            raise UserError(
+                f"image is {tuple(image.shape)}, expected "
+                f"{('B', *self.image_size, 3)} (config.model.image.size) or, if embedded"
+                f" before, {('B', *self.feature_shape)}"
+            )
+        image = normalize(image, standardize=self.standardize_image)
+        features = self.image_backbone(image)
+        if self.vit is not None:
+            features = features[:, self.vit.num_prefix :]
+            features = features.reshape(image.shape[0], *self.feature_shape)
+        return jax.lax.stop_gradient(features) if self.freeze else features
+
+    @property
+    def feature_shape(self) -> tuple[int, int, int]:
+        """Shape `(h, w, C)` of one image's features."""
+        stride = STRIDE if self.vit is None else self.vit.patch_size
+        channels = 16 * self.resnet_width if self.vit is None else self.vit.hidden_size
+        height, width = self.image_size
+        return height // stride, width // stride, channels
+
+    @nn.nowrap
+    def is_frozen(self, name: str) -> bool:
+        """Whether a parameter, "image_backbone/...", is not to be trained."""
+        return self.freeze and name.startswith(_SCOPE)
+
+    def _reference(
+        self, camera: Camera | ReferencePoints, shape: tuple[int, ...]
+    ) -> ReferencePoints:
+        b, r, a = shape[:3]
+        if isinstance(camera, Camera):
+            camera = jax.tree.map(jnp.asarray, camera)
+            invalid = self.fusion["invalid"]
+            camera = reference_points(camera, self.axes, r, a, invalid)
+        expected = (r, a, self.axes.num_elevation)
+        found = camera.is_valid.shape
+        if found[1:] != expected or found[0] not in (1, b):
+            raise UserError(
+                f"reference points are {tuple(found)}, expected [{b} or 1, "
+                f"{', '.join(map(str, expected))}]: frames, range, azimuth, elevation"
+            )
+        return camera
+
+    def _camera_map(
+        self, image: jax.Array, reference: ReferencePoints, train: bool
+    ) -> jax.Array:
+        b = image.shape[0]
+        is_embedded = tuple(image.shape[1:]) == self.feature_shape
+        features = image if is_embedded else self.embed(image)
+        has_image = reference.has_image
+        if has_image is None:
+            has_image = jnp.ones(b, bool)
+        return self.image_neck(features, jnp.asarray(has_image), train=train)
+
+
+def _check_projection(projection: jax.Array, radar: radenet.RadeNet) -> None:
+    channels = radar.doppler_bins + radar.elevation_bins
+    if projection.ndim != 4 or projection.shape[-1] != channels:
+        raise UserError(
+            f"projection must be [B, R, A, {channels}] with {radar.doppler_bins} "
+            f"Doppler and {radar.elevation_bins} elevation channels, got "
+            f"{projection.shape}"
+        )
+
+
+# Config ------------------------------------------------------------------------------
+
+FUSION_FIELDS = (
+    "num_heads",
+    "num_points",
+    "num_elevation",
+    "weighting",
+    "gate",
+    "invalid",
+    "necks",
+    "dropout",
+    "chunk_size",
+)
+"""Fields of `config.model.fusion`."""
+
+IMAGE_FIELDS = (
+    "kind",
+    "size",
+    "freeze",
+    "standardize",
+    "hidden_size",
+    "num_layers",
+    "num_heads",
+    "mlp_dim",
+    "patch_size",
+    "num_registers",
+    "gated_mlp",
+    "layer_scale",
+    "attention",
+    "resnet_width",
+)
+"""Fields of `config.model.image`."""
+
+AXES_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
+"""Fields of `config.model.axes`."""
+
+FIELDS = (*radenet.FIELDS, "image", "fusion", "axes")
+"""Fields of a model config beside `name`."""
+
+_CHOICES = {
+    "image.kind": ("vit", "resnet50"),
+    "image.attention": ("auto", "blocked", "xla", "cudnn"),
+    "fusion.weighting": ("mlp", "cnn", "off"),
+    "fusion.gate": ("channel", "bin"),
+    "fusion.invalid": ("drop", "official"),
+}
+
+
+def from_config(config: Mapping[str, Any]) -> DinoRade:
+    """DinoRADE as a config describes it.
+
+    Args:
+        config: Exactly the keys `name` and `FIELDS`; RADE-Net's keys describe the radar
+            branch, `image`, `fusion` and `axes` are mappings with exactly their fields.
+
+    Raises:
+        UserError: A key is missing or unknown, or a value is not possible.
+    """
+    fields = {key: config[key] for key in config if key != "name"}
+    radenet.check_keys(fields, FIELDS, "model")
+    sections = {"image": IMAGE_FIELDS, "fusion": FUSION_FIELDS, "axes": AXES_FIELDS}
+    image, fusion, axes = (
+        dict(_section(fields, name, keys)) for name, keys in sections.items()
+    )
+    for key, choices in _CHOICES.items():
+        section, name = key.split(".")
+        if fields[section][name] not in choices:
+            raise UserError(
+                f"config.model.{key} is {fields[section][name]!r}, expected one of "
+                f"{choices}"
+            )
+    radar = {k: fields[k] for k in radenet.FIELDS}
+    model = DinoRade(
+        radar=radenet.from_config({"name": "radenet"} | radar),
+        vit=_vit(image) if image["kind"] == "vit" else None,
+        fusion=fusion,
+        axes=LiftingAxes(
+            **{k: tuple(float(v) for v in axes[k]) for k in AXES_FIELDS},
+            num_elevation=fusion["num_elevation"],
+        ),
+        image_size=tuple(image["size"]),
+        freeze=image["freeze"],
+        resnet_width=image["resnet_width"],
+        standardize_image=image["standardize"],
+    )
+    _check_sizes(model)
+    return model
+
+
+def _section(
+    fields: Mapping[str, Any], name: str, keys: tuple[str, ...]
+) -> Mapping[str, Any]:
+    section = fields[name]
+    if not isinstance(section, Mapping) and not hasattr(section, "keys"):
+        raise UserError(f"config.model.{name} must be a mapping, got {section!r}")
+    radenet.check_keys(dict(section), keys, f"model.{name}")
+    return section
+
+
+def _vit(image: Mapping[str, Any]) -> ViT:
+    names = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
+    names += ("num_registers", "gated_mlp", "layer_scale", "attention")
+    activation = "silu" if image["gated_mlp"] else "gelu"
+    return ViT(**{n: image[n] for n in names}, activation=activation)
+
+
+def _check_sizes(model: DinoRade) -> None:
+    stride = STRIDE if model.vit is None else model.vit.patch_size
+    if any(n < stride or n % stride for n in model.image_size):
+        raise UserError(
+            f"config.model.image.size is {model.image_size}; height and width must be "
+            f"multiples of {stride}"
+        )
+    if model.vit is not None:
+        heads, hidden = model.vit.num_heads, model.vit.hidden_size
+        if hidden % heads or (hidden // heads) % 4:
+            raise UserError(
+                f"config.model.image: {hidden} channels in {heads} heads; each head "
+                "needs a multiple of 4"
+            )
+    width, heads = model.radar.decoder_width, model.fusion["num_heads"]
+    if width % heads:
+        raise UserError(
+            f"config.model: fusion.num_heads = {heads} does not divide decoder_width = "
+            f"{width}"
+        )
+
+
+def with_pretrained(
+    variables: Mapping[str, Any], part: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Variables with some of them replaced, such as a pretrained image backbone.
+
+    Args:
+        variables: Of a model: "params" and other collections.
+        part: The same tree or a part of it, e.g.
+            `{"params": {"image_backbone": params}}`. What `variables` lack is added.
+
+    Raises:
+        UserError: Shapes or structure differ.
+    """
+
+    def merge(old: Any, new: Any, path: str) -> Any:
+        if isinstance(new, Mapping) and isinstance(old, Mapping):
+            added = {
+                k: merge(old[k], v, f"{path}/{k}") if k in old else v
+                for k, v in new.items()
+            }
+            return {**old, **added}
+        shapes = [getattr(x, "shape", type(x).__name__) for x in (old, new)]
+        if shapes[0] != shapes[1]:
+            raise UserError(
+                f"pretrained {path.strip('/')} is {shapes[1]}, the model has {shapes[0]}"
+            )
+        return new
+
+    return merge(dict(variables), part, "")
+
+
+def num_parameters(variables: Mapping[str, Any]) -> tuple[int, int]:
+    """Numbers of parameters outside and inside the image backbone."""
+    sizes = [0, 0]
+    for name, tree in variables["params"].items():
+        leaves = jax.tree.leaves(tree)
+        sizes[name == IMAGE_BACKBONE] += sum(int(np.prod(x.shape)) for x in leaves)
+    return sizes[0], sizes[1]

@@ -1,0 +1,240 @@
+"""From radar bins to three-dimensional queries and their places in the image.
+
+A bin of the range-azimuth map becomes E queries, one per elevation segment. Each is a
+multiple of the bin's feature, by a weight learned from the elevation spectrum, and has
+a reference point: where its center appears in the camera image.
+
+References:
+    DinoRADE, sections 3.3 and 3.4, equations (1) and (2).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from radejax.errors import UserError
+from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, project
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.layers import Conv, Dense, GroupNorm
+
+InvalidRule = Literal["drop", "official"]
+WeightingKind = Literal["mlp", "cnn", "off"]
+
+OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
+"""Released offsets between radar and camera rig: the `ego_from_lidar_m` to project
+with, together with the "pinhole" image."""
+
+_OFFICIAL_MARGIN_PX = 280  # left and right: a leftover of square image crops
+_OFFICIAL_DEPTH_OFFSET_M = 1e-6
+
+
+@struct.dataclass
+class ReferencePoints:
+    """Where the queries of a radar map appear in the image.
+
+    Attributes:
+        points: `[B or 1, R, A, E, 2]` (x, y) in 0..1 from edge to edge of the image;
+            clipped to the border outside.
+        is_valid: `[B or 1, R, A, E]` bool, True where the query's center is in front
+            of the camera and in the image.
+        has_image: `[B]` bool, False for frames without a usable image; None for all.
+    """
+
+    points: Any
+    is_valid: Any
+    has_image: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class LiftingAxes:
+    """Centers of the queries: uniform axes in range, azimuth and elevation.
+
+    Hashable, so that it can be part of a module.
+
+    Attributes:
+        range_m: First bin center and step, metres.
+        azimuth_deg: First bin center and step; positive to the right.
+        elevation_deg: From and to of the span that `num_elevation` segments divide,
+            positive up. (18, -18) for a tensor whose elevation axis points down: code
+            bases disagree about K-Radar's.
+        num_elevation: Segments E.
+    """
+
+    range_m: tuple[float, float]
+    azimuth_deg: tuple[float, float]
+    elevation_deg: tuple[float, float]
+    num_elevation: int
+
+    @classmethod
+    def of_grid(cls, grid: RadarGrid, num_elevation: int = 10) -> LiftingAxes:
+        """Axes through the true bin centers; padding continues them."""
+        degrees = np.rad2deg
+        return cls(
+            range_m=(float(grid.range_m[0]), grid.range_step_m),
+            azimuth_deg=(
+                float(degrees(grid.azimuth_rad[0])),
+                float(degrees(grid.azimuth_step_rad)),
+            ),
+            elevation_deg=tuple(degrees(grid.elevation_rad[[0, -1]]).tolist()),
+            num_elevation=num_elevation,
+        )
+
+    @classmethod
+    def official(cls) -> LiftingAxes:
+        """Axes of the released code: 256 and 112 bins that divide the field of view."""
+        return cls(
+            range_m=(118 / 256 / 2, 118 / 256),
+            azimuth_deg=(-53 + 106 / 112 / 2, 106 / 112),
+            elevation_deg=(-18.0, 18.0),
+            num_elevation=10,
+        )
+
+    def centers_ego(self, num_range: int, num_azimuth: int) -> np.ndarray:
+        """Query centers `[R, A, E, 3]` in the ego frame, metres."""
+        range_m = self.range_m[0] + self.range_m[1] * np.arange(num_range)
+        azimuth = np.deg2rad(
+            self.azimuth_deg[0] + self.azimuth_deg[1] * np.arange(num_azimuth)
+        )
+        low, high = self.elevation_deg
+        part = (np.arange(self.num_elevation) + 0.5) / self.num_elevation
+        elevation = np.deg2rad(low + (high - low) * part)
+        flat = range_m[:, None, None] * np.cos(elevation)  # [R, 1, E]
+        x = flat * np.cos(azimuth)[:, None]
+        y = -flat * np.sin(azimuth)[:, None]
+        z = range_m[:, None, None] * np.sin(elevation)
+        return np.stack(np.broadcast_arrays(x, y, z), -1)
+
+
+def reference_points(
+    camera: Camera,
+    axes: LiftingAxes,
+    num_range: int,
+    num_azimuth: int,
+    invalid: InvalidRule = "drop",
+) -> ReferencePoints:
+    """Projects the centers of all queries of a map.
+
+    NumPy cameras are computed on the host in float64, JAX ones in the program in
+    float32, each sample with its own camera.
+
+    Args:
+        camera: One camera, or a batch of them.
+        axes: Centers of the queries.
+        num_range: Range bins R of the map, padding included.
+        num_azimuth: Azimuth bins A.
+        invalid: "official" counts only the middle of the image as valid, as released.
+
+    Returns:
+        Points and mask with a leading axis of 1 or B.
+    """
+    is_batch = np.ndim(camera.max_radius) > 0
+    on_host = isinstance(camera.intrinsics, np.ndarray)
+    xp = np if on_host else jnp
+    centers = axes.centers_ego(num_range, num_azimuth)
+    if not on_host:
+        # Small products in the program, no constant of millions of numbers.
+        centers = _centers_in_program(axes, num_range, num_azimuth)
+    centers = xp.broadcast_to(
+        centers[None], (np.shape(camera.max_radius) or (1,)) + centers.shape
+    )
+    if not is_batch:
+        camera = jax.tree.map(lambda x: xp.asarray(x)[None], camera)
+    offset = _OFFICIAL_DEPTH_OFFSET_M if invalid == "official" else 0.0
+    pixels, depth = project(centers, camera, depth_offset_m=offset)
+    width, height = (camera.size_px[:, i, None, None, None] for i in (0, 1))
+    margin = _OFFICIAL_MARGIN_PX if invalid == "official" else 0.0
+    u, v = pixels[..., 0], pixels[..., 1]
+    is_valid = (depth > 0) & (u >= margin) & (u < width - margin)
+    is_valid = is_valid & (v >= 0) & (v < height)
+    points = xp.stack([u / width, v / height], -1)
+    return ReferencePoints(
+        points=xp.clip(points, 0.0, 1.0).astype(np.float32),
+        is_valid=is_valid,
+        has_image=camera.is_valid if is_batch else None,
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def static_reference_points(
+    calibration: CameraCalibration,
+    axes: LiftingAxes,
+    num_range: int,
+    num_azimuth: int,
+    *,
+    image: ImageKind = "raw",
+    invalid: InvalidRule = "drop",
+) -> ReferencePoints:
+    """`reference_points` of one calibration, computed once on the host and kept.
+
+    Returns:
+        NumPy arrays with a leading axis of 1, for batches that share the calibration.
+    """
+    camera = calibration.camera(image)
+    return reference_points(camera, axes, num_range, num_azimuth, invalid)
+
+
+def query_weights(is_valid: jax.Array, invalid: InvalidRule) -> jax.Array:
+    """Weights `[..., E]` of the mean over a bin's queries.
+
+    "drop": equal over the valid ones, all zero where none is. "official": equal over
+    all, valid or not.
+
+    Raises:
+        UserError: The rule is neither.
+    """
+    if invalid == "official":
+        return jnp.full(is_valid.shape, 1.0 / is_valid.shape[-1], jnp.float32)
+    if invalid == "drop":
+        weights = is_valid.astype(jnp.float32)
+        return weights / jnp.maximum(weights.sum(-1, keepdims=True), 1.0)
+    raise UserError(f"invalid must be 'drop' or 'official', got {invalid!r}")
+
+
+class WeightingNetwork(nn.Module):
+    """Elevation channels `[B, R, A, D]` -> weights `[B, R, A, E]` that sum to one.
+
+    Attributes:
+        num_elevation: Segments E.
+        kind: "mlp" is two layers per bin, as the paper says (it prints no widths);
+            "cnn" three 3x3 convolutions and a 1x1 one, as released; "off" weighs all
+            segments alike, by 1: the plain copies of the ablation.
+        dtype: Dtype of the computation; the weights are float32.
+    """
+
+    num_elevation: int = 10
+    kind: WeightingKind = "mlp"
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, elevation: jax.Array) -> jax.Array:
+        if self.kind == "off":
+            return jnp.ones((*elevation.shape[:3], self.num_elevation))
+        if self.kind == "mlp":
+            x = nn.relu(Dense(64, dtype=self.dtype, name="hidden")(elevation))
+        elif self.kind == "cnn":
+            x = elevation
+            for i, features in enumerate((32, 64, 32), 1):
+                x = Conv(features, dtype=self.dtype, name=f"conv_{i}")(x)
+                x = nn.relu(GroupNorm(8, dtype=self.dtype, name=f"norm_{i}")(x))
+        else:
+            raise UserError(
+                f"weighting must be 'mlp', 'cnn' or 'off', got {self.kind!r}"
+            )
+        logits = Dense(self.num_elevation, dtype=self.dtype, name="out")(x)
+        return nn.softmax(logits.astype(jnp.float32), -1)
+
+
+def _centers_in_program(axes: LiftingAxes, num_range: int, num_azimuth: int) -> Any:
+    """`centers_ego` as outer products of small tables."""
+    unit = dataclasses.replace(axes, range_m=(1.0, 0.0)).centers_ego(1, num_azimuth)
+    range_m = axes.range_m[0] + axes.range_m[1] * np.arange(num_range)
+    range_m = jnp.asarray(range_m, jnp.float32).reshape(-1, 1, 1, 1)
+    return range_m * jnp.asarray(unit, jnp.float32)

@@ -1,0 +1,174 @@
+"""ResNet-50 as an image backbone: a frozen trunk and a last stage to fine-tune.
+
+The trunk (stem and the first three stages) and the last stage are modules of their own,
+because one is frozen and the other trained; `radejax.interop.resnet_torch` reads both
+from torchvision's file.
+
+References:
+    He et al., Deep residual learning, arXiv:1512.03385; strides as in torchvision.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from radejax.models.camera_neck import batch_norm
+from radejax.models.layers import Conv, uniform_fan_in
+
+STRIDE = 16
+"""Pixels per bin of the trunk's map."""
+
+
+class FrozenBatchNorm(nn.Module):
+    """Batch normalisation by fixed statistics, which are parameters here.
+
+    So a frozen backbone is all in one collection, and nothing updates it.
+
+    Attributes:
+        dtype: Dtype of the output.
+        epsilon: Added to the variance.
+    """
+
+    dtype: Any = jnp.float32
+    epsilon: float = 1e-5
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        ones, zeros = nn.initializers.ones, nn.initializers.zeros
+        shape = (x.shape[-1],)
+        scale, var = self.param("scale", ones, shape), self.param("var", ones, shape)
+        bias, mean = self.param("bias", zeros, shape), self.param("mean", zeros, shape)
+        factor = scale * jax.lax.rsqrt(var + self.epsilon)
+        shift = jnp.expand_dims(bias - mean * factor, (0, 1, 2))
+        return x * jnp.expand_dims(factor, (0, 1, 2)).astype(self.dtype) + shift.astype(
+            self.dtype
+        )
+
+
+class StridedConv(nn.Module):
+    """Convolution without bias, padded by half its size.
+
+    Attributes:
+        features: Output channels.
+        size: Taps per axis, odd.
+        stride: Step per axis.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int
+    size: int
+    stride: int = 1
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        shape = (self.size, self.size, x.shape[-1], self.features)
+        kernel = self.param("kernel", uniform_fan_in(self.size**2 * shape[2]), shape)
+        return jax.lax.conv_general_dilated(
+            x.astype(self.dtype),
+            kernel.astype(self.dtype),
+            window_strides=(self.stride, self.stride),
+            padding=((self.size // 2,) * 2,) * 2,
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 convolutions plus the input; the 3x3 one has the stride.
+
+    Attributes:
+        features: Channels inside; the output has four times as many.
+        stride: Step of the block.
+        is_first: The first block of a stage projects its input.
+        frozen: Fixed statistics, else batch normalisation.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int
+    stride: int
+    is_first: bool
+    frozen: bool
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: jax.Array, train: bool) -> jax.Array:
+        def block(x: jax.Array, features: int, size: int, stride: int, name: str):
+            x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
+            if self.frozen:
+                return FrozenBatchNorm(self.dtype, name=f"norm_{name}")(x)
+            return batch_norm(f"norm_{name}", self.dtype, train)(x)
+
+        y = nn.relu(block(x, self.features, 1, 1, "1"))
+        y = nn.relu(block(y, self.features, 3, self.stride, "2"))
+        y = block(y, 4 * self.features, 1, 1, "3")
+        if self.is_first:
+            x = block(x, 4 * self.features, 1, self.stride, "shortcut")
+        return nn.relu(x + y)
+
+
+class ResNetTrunk(nn.Module):
+    """Stem and first three stages, frozen: `[B, H, W, 3]` -> `[B, H/16, W/16, 1024]`.
+
+    Attributes:
+        width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
+        depths: Blocks of the three stages.
+        dtype: Dtype of the computation; the output is float32.
+    """
+
+    width: int = 64
+    depths: tuple[int, int, int] = (3, 4, 6)
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        x = StridedConv(self.width, 7, 2, self.dtype, name="stem_conv")(image)
+        x = nn.relu(FrozenBatchNorm(self.dtype, name="stem_norm")(x))
+        x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
+        for stage, depth in enumerate(self.depths, 1):
+            for i in range(depth):
+                x = Bottleneck(
+                    self.width * 2 ** (stage - 1),
+                    stride=2 if stage > 1 and i == 0 else 1,
+                    is_first=i == 0,
+                    frozen=True,
+                    dtype=self.dtype,
+                    name=f"stage_{stage}_block_{i + 1}",
+                )(x, False)
+        return x.astype(jnp.float32)
+
+
+class ResNetNeck(nn.Module):
+    """Last stage and a 1x1 convolution: `[B, h, w, C]` -> `[B, h/2, w/2, features]`.
+
+    Attributes:
+        features: Output channels.
+        width: Channels of the ResNet's stem, 64 in ResNet-50.
+        depth: Blocks of the stage.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int = 128
+    width: int = 64
+    depth: int = 3
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self, x: jax.Array, has_image: jax.Array, *, train: bool = False
+    ) -> jax.Array:
+        """As `CameraNeck`; `has_image` has no effect."""
+        del has_image
+        for i in range(self.depth):
+            x = Bottleneck(
+                8 * self.width,
+                stride=2 if i == 0 else 1,
+                is_first=i == 0,
+                frozen=False,
+                dtype=self.dtype,
+                name=f"block_{i + 1}",
+            )(x, train)
+        return Conv(self.features, 1, use_bias=False, dtype=self.dtype, name="proj")(x)
