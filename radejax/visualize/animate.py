@@ -126,8 +126,12 @@ def make_palette(first: Image.Image, num_colors: int) -> Image.Image:
     """
     lines = np.array([to_rgb(c) for c in _LINE_COLORS])
     lines = np.concatenate([lines, COLOR_MAP(np.linspace(0, 1, _MAP_COLORS))[:, :3]])
-    kept = max(2, min(num_colors, 256) - len(lines))
-    colors = first.quantize(kept, dither=Image.Dither.NONE).getpalette()[: 3 * kept]
+    # Half for smooth shades of large areas, half for rare but vivid colours.
+    kept = max(2, (min(num_colors, 256) - len(lines)) // 2)
+    colors = []
+    for method in (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE):
+        quantized = first.quantize(kept, method=method)
+        colors += quantized.getpalette()[: 3 * kept]
     palette = Image.new("P", (1, 1))
     palette.putpalette(colors + np.round(255 * lines).astype(int).ravel().tolist())
     return palette
