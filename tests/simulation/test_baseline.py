@@ -1,0 +1,79 @@
+"""The classical detector on maps with known answers."""
+
+import numpy as np
+import pytest
+
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation import baseline, radar
+from radejax.simulation.radar import RadarParameters
+
+GRID = RadarGrid.reduced(
+    num_doppler=8, num_range=64, num_elevation=5, num_azimuth=56, max_range_m=75.6
+)
+PARAMETERS = RadarParameters(azimuth_elements=40.0, elevation_elements=12.0)
+SETTINGS = baseline.CfarSettings()
+
+
+def projection_of(*targets):
+    """Projection of point targets (range, azimuth, dBsm) in noise."""
+    range_m, azimuth, rcs_db = np.array(targets, float).reshape(-1, 3).T
+    power_db = PARAMETERS.gain_db + rcs_db - 40.0 * np.log10(range_m)
+    amplitude = 10.0 ** (power_db / 20.0)
+    zero = np.zeros_like(range_m)
+    scatterers = radar.Scatterers(
+        *(v.astype(np.float32) for v in (range_m, azimuth, zero, zero)),
+        np.stack([amplitude, zero], 1).astype(np.float32),
+    )
+    noise = np.full((64, 8), 10 ** (PARAMETERS.noise_db / 10), np.float32)
+    return np.asarray(
+        radar.simulate(
+            scatterers, noise, radar.frame_key(3), grid=GRID, parameters=PARAMETERS
+        )
+    )
+
+
+def test_local_mean_by_hand():
+    settings = baseline.CfarSettings(guard_cells=1, training_cells=1)
+    power = np.full((7, 7), 1.0)
+    power[3, 3] = 1000.0  # in the guard: does not count
+    power[1, 3] = 17.0  # one of 16 training cells: mean (15 + 17) / 16 = 2
+    mean = baseline.local_mean_db(10 * np.log10(power), settings)
+    assert mean[3, 3] == pytest.approx(10 * np.log10(2.0))
+
+
+def test_finds_cars_where_they_are():
+    projection = projection_of((20.0, -0.2, 8.0), (40.0, 0.3, 8.0))
+    found = baseline.detect(projection, GRID, PARAMETERS)
+    cars = found["box"][found["cls"] == "Sedan"]
+    for distance, azimuth in ((20.0, -0.2), (40.0, 0.3)):
+        near_side = np.array([distance * np.cos(azimuth), -distance * np.sin(azimuth)])
+        rear = cars[:, :2] - cars[:, 3:4] / 2 * (1.0, 0.0)
+        assert np.hypot(*(rear - near_side).T).min() < 1.2
+
+
+@pytest.mark.parametrize(
+    ("rcs_db", "cls"),
+    [
+        (18.0, "Bus or Truck"),
+        (4.0, "Sedan"),
+        (-5.3, "Motorcycle"),
+        (-12.0, "Pedestrian"),
+    ],
+)
+def test_cross_section_chooses_the_class(rcs_db, cls):
+    found = baseline.detect(projection_of((15.6, 0.0, rcs_db)), GRID, PARAMETERS)
+    assert found["cls"][0] == cls
+
+
+def test_noise_alone_gives_next_to_nothing():
+    found = baseline.detect(projection_of((15.0, 0.0, -200.0)), GRID, PARAMETERS)
+    assert len(found["score"]) == 0
+    assert found["box"].shape == (0, 7)
+
+
+def test_near_peaks_become_one_and_scores_descend():
+    projection = projection_of((30.0, 0.0, 8.0), (32.0, 0.0, 5.0), (50.0, 0.4, 8.0))
+    found = baseline.detect(projection, GRID, PARAMETERS)
+    assert (np.diff(found["score"]) <= 0).all()
+    near = np.hypot(found["box"][:, 0] - 32.0, found["box"][:, 1]) < 6.0
+    assert near.sum() == 1
