@@ -75,8 +75,8 @@ def load(
     }
     reader = StateDictReader(_without_lora(rest), source)
     fusion = _fusion_fields(rest, model_overrides)
-    params["image_fusion"] = _read_fusion(reader, fusion)
-    vit, image_params, stats = _read_image(reader, rest)
+    params["image_fusion"] = read_fusion(reader, fusion)
+    vit, image_params, stats = read_image(reader, rest)
     params.update(image_params)
     try:
         reader.finish(ignored=_UNUSED)
@@ -145,7 +145,8 @@ def _fusion_fields(
     return fields | {k: v for k, v in overrides.items() if k in _FUSION_FIELDS}
 
 
-def _read_fusion(reader: StateDictReader, fields: Mapping[str, Any]) -> dict[str, Any]:
+def read_fusion(reader: StateDictReader, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of `Fusion` with the given fields."""
     width, samples = 128, fields["num_heads"] * fields["num_points"]
     sizes = {"sampling_offsets": 2 * samples, "attention_weights": samples}
     sizes |= {"value_proj": width, "output_proj": width}
@@ -196,7 +197,7 @@ def _read_neck(reader: StateDictReader, prefix: str, width: int) -> dict[str, An
 # Image -------------------------------------------------------------------------------
 
 
-def _read_image(
+def read_image(
     reader: StateDictReader, tensors: Mapping[str, Any]
 ) -> tuple[ViT | None, dict[str, Any], dict[str, Any]]:
     """Backbone's model (None: ResNet), parameters, statistics of the neck."""

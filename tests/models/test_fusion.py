@@ -1,0 +1,164 @@
+"""Tests of radejax.models.fusion."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.models.deformable_attention import DeformableAttention
+from radejax.models.fusion import Fusion
+from radejax.models.lifting import ReferencePoints
+
+B, R, A, C, E, D, H, W = 2, 4, 3, 8, 3, 5, 6, 7
+SMALL = {
+    "num_heads": 2,
+    "num_points": 3,
+    "num_elevation": E,
+    "num_groups": 4,
+    "necks": False,
+    "chunk_size": 5,
+}
+
+
+def inputs(seed=0, batch_geometry=True):
+    rng = np.random.default_rng(seed)
+    n = B if batch_geometry else 1
+    is_valid = rng.random((n, R, A, E)) > 0.4
+    is_valid[:, 1, 1] = False  # a bin that sees nothing
+    is_valid[:, 0, 0] = True
+    normal = lambda *s: rng.standard_normal(s).astype(np.float32)  # noqa: E731
+    reference = ReferencePoints(
+        points=rng.random((n, R, A, E, 2)).astype(np.float32), is_valid=is_valid
+    )
+    return normal(B, R, A, C), rng.random((B, R, A, D)), normal(B, H, W, C), reference
+
+
+def variables_of(module, args):
+    """Random parameters: the initial ones leave offsets and logits at zero."""
+    shapes = jax.eval_shape(module.init, jax.random.key(0), *args)
+    rng = np.random.default_rng(1)
+    return {
+        "params": jax.tree.map(
+            lambda x: 0.4 * rng.standard_normal(x.shape).astype(np.float32),
+            shapes["params"],
+        )
+    }
+
+
+def by_the_formulas(module, variables, radar, elevation, camera, reference):
+    """Query by query through the plain attention, then the paper's equations."""
+    params = jax.tree.map(np.asarray, variables["params"])
+    dense = lambda x, p: x @ p["kernel"] + p["bias"]  # noqa: E731
+    weights = np.ones((B, R, A, E))
+    if module.weighting == "mlp":
+        hidden = np.maximum(dense(elevation, params["weighting"]["hidden"]), 0)
+        weights = np.exp(dense(hidden, params["weighting"]["out"]))
+        weights /= weights.sum(-1, keepdims=True)
+    is_valid = np.broadcast_to(reference.is_valid, (B, R, A, E))
+    points = np.broadcast_to(reference.points, (B, R, A, E, 2))
+    query = (weights * is_valid)[..., None] * radar[:, :, :, None]
+    attention = DeformableAttention(C, module.num_heads, module.num_points)
+    attended = attention.apply(
+        {"params": params["attention"]},
+        jnp.asarray(query.reshape(B, -1, C), jnp.float32),
+        points.reshape(B, -1, 1, 2),
+        camera.reshape(B, H * W, C),
+        [(H, W)],
+    )
+    attended = np.asarray(attended).reshape(B, R, A, E, C)
+    if module.invalid == "official":
+        seen, has_camera = attended.mean(3), np.ones((B, R, A, 1), bool)
+    else:
+        count = is_valid.sum(-1)[..., None]
+        seen = (attended * is_valid[..., None]).sum(3) / np.maximum(count, 1)
+        has_camera = count > 0
+    joined = np.concatenate([radar, seen], -1)
+    hidden = np.maximum(dense(joined, params["gate_hidden"]), 0)
+    gate = 1 / (1 + np.exp(-dense(hidden, params["gate_out"])))
+    if module.gate == "channel":
+        fused = gate * radar + (1 - gate) * seen
+    else:
+        fused = gate * seen + (1 - gate) * radar
+    return np.where(has_camera, fused, radar)
+
+
+@pytest.mark.parametrize(
+    ("weighting", "gate", "invalid", "batch_geometry"),
+    [
+        ("mlp", "channel", "drop", True),
+        ("mlp", "bin", "official", False),
+        ("off", "channel", "drop", False),
+    ],
+)
+def test_fusion_follows_the_equations(weighting, gate, invalid, batch_geometry):
+    module = Fusion(**SMALL, weighting=weighting, gate=gate, invalid=invalid)
+    args = inputs(batch_geometry=batch_geometry)
+    variables = variables_of(module, args)
+    fused = jax.jit(module.apply)(variables, *args)
+    np.testing.assert_allclose(
+        fused, by_the_formulas(module, variables, *args), atol=2e-5
+    )
+    gate_width = C if gate == "channel" else 1
+    assert variables["params"]["gate_out"]["bias"].shape == (gate_width,)
+
+
+def test_bins_that_see_nothing_keep_their_radar_feature():
+    module = Fusion(**SMALL)
+    args = inputs()
+    fused = jax.jit(module.apply)(variables_of(module, args), *args)
+    np.testing.assert_array_equal(fused[:, 1, 1], args[0][:, 1, 1])
+    assert np.abs(fused[:, 0, 0] - args[0][:, 0, 0]).max() > 0.1
+
+
+@pytest.mark.parametrize("necks", [False, True])
+def test_a_missing_image_leaves_the_radar_alone(necks):
+    module = Fusion(**(SMALL | {"necks": necks}), invalid="official")
+    radar, elevation, camera, reference = inputs()
+    variables = variables_of(module, (radar, elevation, camera, reference))
+    reference = reference.replace(has_image=np.array([True, False]))
+    fused, state = module.apply(
+        variables, radar, elevation, camera, reference, mutable="intermediates"
+    )
+    alone = module.apply(variables, radar, elevation, None, None)
+    np.testing.assert_allclose(fused[1], alone[1], atol=1e-6)
+    assert np.abs(fused[0] - alone[0]).max() > 0.1
+    (share,) = state["intermediates"]["camera_share"]
+    chex.assert_shape(share, (B, R, A))
+    assert not share[1].any()
+    assert ((share[0] > 0) & (share[0] < 1)).all()
+    if not necks:
+        np.testing.assert_array_equal(alone, radar)
+
+
+def test_gradients_reach_every_parameter_and_are_finite():
+    module = Fusion(**SMALL)
+    args = inputs()
+    variables = variables_of(module, args)
+
+    def loss(variables):
+        return jnp.sum(module.apply(variables, *args) ** 2)
+
+    grads = jax.jit(jax.grad(loss))(variables)
+    chex.assert_tree_all_finite(grads)
+    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(grads))
+
+
+def test_dropout_drops_in_training_only():
+    module = Fusion(**SMALL, dropout=0.5)
+    args = inputs()
+    variables = variables_of(module, args)
+    plain = module.apply(variables, *args)
+    rngs = {"dropout": jax.random.key(3)}
+    dropped = module.apply(variables, *args, train=True, rngs=rngs)
+    share = np.mean(np.asarray(dropped) == 0)
+    assert 0.3 < share < 0.7
+    kept = np.asarray(dropped) != 0
+    np.testing.assert_allclose(dropped[kept], 2 * np.asarray(plain)[kept], rtol=1e-5)
+
+
+def test_unknown_gate():
+    module = Fusion(**SMALL, gate="pixel")
+    with pytest.raises(UserError, match="'channel' or 'bin', got 'pixel'"):
+        jax.eval_shape(module.init, jax.random.key(0), *inputs())

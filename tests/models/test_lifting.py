@@ -1,0 +1,195 @@
+"""Tests of radejax.models.lifting."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.geometry.camera import Camera, CameraCalibration, stack_cameras
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.models import lifting
+from radejax.models.lifting import LiftingAxes, WeightingNetwork
+
+AXES = LiftingAxes((1.0, 4.0), (-40.0, 20.0), (-10.0, 10.0), 2)
+
+
+def official_calibration(golden) -> CameraCalibration:
+    """Matrices of the golden geometry file."""
+    file = np.load(golden / "dinorade_geometry.npz")
+    matrix, extrinsics = file["intrinsics"], file["extrinsics"]
+    return CameraCalibration(
+        intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+        distortion=np.zeros(5),
+        rotation=extrinsics[:, :3],
+        translation_m=extrinsics[:, 3],
+        ego_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
+    )
+
+
+def ahead(**fields) -> CameraCalibration:
+    """A camera of 100 x 80 pixels in the radar's place, looking along x."""
+    settings = {
+        "intrinsics": (50.0, 50.0, 50.0, 40.0),
+        "yaw_deg": 90.0,
+        "pitch_deg": 0.0,
+        "roll_deg": 90.0,
+        "translation_m": (0.0, 0.0, 0.0),
+        "ego_from_lidar_m": (0.0, 0.0, 0.0),
+        "width": 100,
+        "height": 80,
+    }
+    return CameraCalibration.from_angles(**(settings | fields))
+
+
+def test_centers_by_hand():
+    centers = AXES.centers_ego(2, 3)
+    chex.assert_shape(centers, (2, 3, 2, 3))
+    # Range 5, azimuth 0, elevation -5 and +5 degrees.
+    low = [5 * np.cos(np.deg2rad(5)), 0, -5 * np.sin(np.deg2rad(5))]
+    np.testing.assert_allclose(centers[1, 2, 0], low, atol=1e-12)
+    np.testing.assert_allclose(centers[1, 2, 1], np.array(low) * [1, 1, -1], atol=1e-12)
+    # Negative azimuth is to the left: positive y.
+    assert centers[1, 0, 0, 1] > 3
+
+
+def test_axes_follow_the_grid_and_may_point_down():
+    grid = RadarGrid.kradar()
+    axes = LiftingAxes.of_grid(grid)
+    centers = axes.centers_ego(256, 112)
+    flat = np.hypot(centers[..., 0], centers[..., 1]) / np.cos(np.deg2rad(16.2))
+    np.testing.assert_allclose(flat[:, 5, 0], grid.range_m, atol=1e-9)
+    azimuth = -np.arctan2(centers[9, :107, 3, 1], centers[9, :107, 3, 0])
+    np.testing.assert_allclose(azimuth, grid.azimuth_rad, atol=1e-12)
+    down = LiftingAxes(axes.range_m, axes.azimuth_deg, (18.0, -18.0), 10)
+    np.testing.assert_allclose(
+        down.centers_ego(3, 4), axes.centers_ego(3, 4)[:, :, ::-1]
+    )
+
+
+def check_official(reference, index, points, is_valid):
+    np.testing.assert_allclose(
+        np.asarray(reference.points).reshape(-1, 2)[index], points, atol=2e-6
+    )
+    np.testing.assert_array_equal(
+        np.asarray(reference.is_valid).reshape(-1)[index], is_valid
+    )
+
+
+def test_released_reference_points(golden):
+    file = np.load(golden / "dinorade_geometry.npz")
+    calibration = official_calibration(golden)
+    axes = LiftingAxes.official()
+    settings = {"image": "pinhole", "invalid": "official"}
+    on_host = lifting.static_reference_points(calibration, axes, 256, 112, **settings)
+    chex.assert_shape(on_host.points, (1, 256, 112, 10, 2))
+    assert on_host.points.dtype == np.float32
+    check_official(on_host, file["index"], file["reference_points_f64"], file["valid"])
+    # In the program, in float32, for two cameras.
+    cameras = stack_cameras([calibration.camera("pinhole")] * 2)
+    in_program = jax.jit(
+        lambda c: lifting.reference_points(c, axes, 256, 112, "official")
+    )(jax.tree.map(jnp.asarray, cameras))
+    second = jax.tree.map(lambda x: x[1], in_program)
+    check_official(second, file["index"], file["reference_points_f64"], file["valid"])
+    # Computed once.
+    again = lifting.static_reference_points(calibration, axes, 256, 112, **settings)
+    assert again is on_host
+
+
+def test_released_mask_of_all_queries(shared):
+    folder = shared / "fixtures" / "dinorade"
+    file = np.load(folder / "geometry.npz")
+    calibration = CameraCalibration.from_kradar(
+        shared / "data/kradar/calib/common/cam_front0.yml",
+        ego_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
+    )
+    axes = LiftingAxes.official()
+    reference = lifting.static_reference_points(
+        calibration, axes, 256, 112, image="pinhole", invalid="official"
+    )
+    check_official(
+        reference, file["index"], file["reference_points_f64"], file["valid"]
+    )
+    expected = np.unpackbits(file["valid_packed"]).astype(bool)
+    is_clear = ~np.unpackbits(file["near_mask_border_packed"]).astype(bool)
+    is_valid = reference.is_valid.ravel()
+    np.testing.assert_array_equal(is_valid[is_clear], expected[is_clear])
+    # Without the released crop 95.3 % of the queries lie in the image.
+    whole = lifting.static_reference_points(
+        calibration, axes, 256, 112, image="pinhole"
+    )
+    assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
+
+
+def test_queries_outside_the_image_are_invalid_and_clipped():
+    axes = LiftingAxes((10.0, 10.0), (-60.0, 60.0), (-1.0, 1.0), 1)
+    reference = lifting.reference_points(ahead().camera(), axes, 2, 4)
+    # Azimuth -60, 0, 60, 120 degrees: left of the image, in it, right, behind.
+    np.testing.assert_array_equal(
+        reference.is_valid[0, :, :, 0], [[False, True, False, False]] * 2
+    )
+    np.testing.assert_allclose(reference.points[0, 0, :3, 0, 0], [0, 0.5, 1])
+    assert reference.has_image is None
+
+
+def test_each_sample_has_its_own_camera():
+    cameras = [ahead(yaw_deg=yaw).camera(is_valid=yaw > 85) for yaw in (81.3, 90.2, 95)]
+    batch = jax.tree.map(jnp.asarray, stack_cameras(cameras))
+    together = jax.jit(lambda c: lifting.reference_points(c, AXES, 5, 4))(batch)
+    chex.assert_shape(together.points, (3, 5, 4, 2, 2))
+    np.testing.assert_array_equal(together.has_image, [False, True, True])
+    for i, camera in enumerate(cameras):
+        alone = lifting.reference_points(camera, AXES, 5, 4)
+        np.testing.assert_allclose(together.points[i], alone.points[0], atol=1e-6)
+        np.testing.assert_array_equal(together.is_valid[i], alone.is_valid[0])
+    assert isinstance(batch, Camera)
+
+
+def test_weights_of_the_mean():
+    is_valid = jnp.asarray([[True, False, True, False], [False] * 4])
+    np.testing.assert_allclose(
+        lifting.query_weights(is_valid, "drop"), [[0.5, 0, 0.5, 0], [0] * 4]
+    )
+    np.testing.assert_allclose(lifting.query_weights(is_valid, "official"), 0.25)
+    with pytest.raises(UserError, match="'drop' or 'official', got 'zero'"):
+        lifting.query_weights(is_valid, "zero")
+
+
+@pytest.mark.parametrize("kind", ["mlp", "cnn"])
+def test_elevation_weights_sum_to_one(kind):
+    network = WeightingNetwork(6, kind)
+    elevation = np.random.default_rng(0).random((2, 5, 4, 9)).astype(np.float32)
+    variables = jax.jit(network.init)(jax.random.key(0), elevation)
+    weights = jax.jit(network.apply)(variables, elevation)
+    chex.assert_shape(weights, (2, 5, 4, 6))
+    np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-6)
+    # The MLP sees one bin alone, the CNN its neighbours.
+    moved = elevation.copy()
+    moved[:, 0, 0] += 1
+    changed = np.abs(jax.jit(network.apply)(variables, moved) - weights).max(-1) > 1e-7
+    assert changed[:, 0, 0].all()
+    assert changed[:, 1, 1].any() == (kind == "cnn")
+
+
+def test_mlp_weights_by_formula():
+    network = WeightingNetwork(3, "mlp")
+    elevation = np.random.default_rng(0).random((1, 2, 2, 5)).astype(np.float32)
+    variables = network.init(jax.random.key(0), elevation)
+    p = jax.tree.map(np.asarray, variables["params"])
+    hidden = np.maximum(elevation @ p["hidden"]["kernel"] + p["hidden"]["bias"], 0)
+    logits = np.exp(hidden @ p["out"]["kernel"] + p["out"]["bias"])
+    np.testing.assert_allclose(
+        network.apply(variables, elevation),
+        logits / logits.sum(-1, keepdims=True),
+        atol=1e-6,
+    )
+
+
+def test_without_weights_queries_are_copies():
+    network = WeightingNetwork(6, "off")
+    weights = network.apply({}, jnp.zeros((1, 2, 3, 9)))
+    np.testing.assert_array_equal(weights, np.ones((1, 2, 3, 6)))
+    with pytest.raises(UserError, match="'mlp', 'cnn' or 'off', got 'linear'"):
+        WeightingNetwork(6, "linear").init(jax.random.key(0), jnp.zeros((1, 2, 3, 9)))
