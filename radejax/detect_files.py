@@ -11,8 +11,7 @@ import numpy as np
 import tqdm
 
 from radejax import files
-from radejax.data import projection
-from radejax.detector import Detector
+from radejax.detector import Detector, read_frame
 from radejax.errors import UserError
 from radejax.structures import Detections
 
@@ -83,7 +82,7 @@ def detect_files(
 
     def batches() -> Iterator[np.ndarray]:
         for chunk in chunks:
-            yield np.stack([projection.load(path, detector.grid) for path in chunk])
+            yield np.stack([read_frame(path, detector.grid) for path in chunk])
 
     num_boxes = 0
     found: Iterator[Detections] = detector.stream(batches(), **settings)

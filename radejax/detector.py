@@ -14,6 +14,7 @@ import numpy as np
 
 from radejax.data import projection as projection_lib
 from radejax.data.encoding import to_float
+from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.detection.decode import decode
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
@@ -246,7 +247,7 @@ class Detector:
         if isinstance(frames, Sequence) and all(
             isinstance(f, str | pathlib.Path) for f in frames
         ):
-            frames = np.stack([projection_lib.load(f, self.grid) for f in frames])
+            frames = np.stack([read_frame(f, self.grid) for f in frames])
         shape = tuple(np.shape(frames))
         projection, tesseract = self.grid.projection_shape, self.grid.shape_drea
         for expected, is_tesseract in ((projection, False), (tesseract, True)):
@@ -259,6 +260,20 @@ class Detector:
             f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
             f"[B, {', '.join(map(str, tesseract))}]"
         )
+
+
+def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
+    """`[R, A, D+E]` float32 projection of a tesseract file or a released projection.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: It is damaged, or of another shape than the grid.
+    """
+    if pathlib.Path(path).suffix == ".npy":
+        shape = grid.projection_shape
+        projection = read_projection_npy(path, projection_shape=shape)
+        return projection.astype(np.float32)
+    return project_file(path, shape_drea=grid.shape_drea)
 
 
 def _detect(
@@ -281,7 +296,12 @@ def _detect(
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
     maps = model.apply(variables, *inputs, train=False)
     return decode(
-        maps, grid, score_threshold=score_threshold, nms_iou=nms_iou, roi=roi, **options
+        maps,
+        grid,
+        score_threshold=score_threshold,
+        nms_iou=nms_iou,
+        roi=jnp.concatenate([roi[::2], roi[1::2]]),
+        **options,
     )
 
 

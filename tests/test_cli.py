@@ -1,0 +1,75 @@
+"""The command line: help with examples, JSON, exit codes, no tracebacks."""
+
+import json
+import pathlib
+
+import click.testing
+import pytest
+
+from radejax import cli
+from radejax.data import kradar_write
+from radejax.data.labels import Label
+
+
+def _run(*arguments: object) -> click.testing.Result:
+    return click.testing.CliRunner().invoke(cli.main, [str(a) for a in arguments])
+
+
+def _commands() -> list[list[str]]:
+    found = []
+    for name, command in cli.main.commands.items():
+        if isinstance(command, click.Group):
+            found += [[name, sub] for sub in command.commands]
+        else:
+            found.append([name])
+    return found
+
+
+@pytest.mark.parametrize("command", _commands(), ids=" ".join)
+def test_help_shows_an_example(command: list[str]) -> None:
+    result = _run(*command, "--help")
+    assert result.exit_code == 0
+    assert "Example: radejax " + " ".join(command) in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["detect", "/nowhere", "--workdir", "/nowhere", "--out", "x"], "'/nowhere'"),
+        (["simulate", "--config", "nowhere.py", "--out", "x"], "nowhere.py"),
+        (["fly"], "No such command 'fly'"),
+        (["project", ".", "--out", "x", "--shard", "3/2"], "3/2"),
+    ],
+)
+def test_wrong_use_is_exit_code_2_and_a_clear_line(
+    arguments: list[str], message: str, tmp_path: pathlib.Path
+) -> None:
+    result = _run(*arguments)
+    assert result.exit_code == 2
+    assert message in result.output
+    assert "Traceback" not in result.output
+
+
+@pytest.fixture
+def root(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A K-Radar root with one label and nothing else."""
+    label = Label("Sedan", (10.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0), "R", 1)
+    path = tmp_path / "kradar" / "1" / "info_label_v2_1" / "00033_00001.txt"
+    kradar_write.write_labels(path, (33, 1, 2, 1, 4), 1.0, [label])
+    return tmp_path / "kradar"
+
+
+def test_check_reports_as_text_and_as_json(root: pathlib.Path) -> None:
+    text = _run("data", "check", root)
+    assert text.exit_code == 0, text.output
+    assert "tesseract" in text.output
+    values = _run("data", "check", root, "--json")
+    assert isinstance(json.loads(values.output), dict)
+
+
+def test_a_folder_without_frames_says_what_was_looked_for(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    result = _run("detect", root, "--workdir", tmp_path, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "tesseract_*.mat" in result.output

@@ -1,0 +1,100 @@
+"""A tiny detector on a tiny sensor, its data and its compiled steps, shared by tests."""
+
+import dataclasses
+import pathlib
+from typing import Any
+
+import grain
+import jax
+import numpy as np
+import pytest
+
+from radejax import models
+from radejax.config import base_config
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.structures import Batch
+from radejax.training.step import map_grid
+
+NUM_FRAMES = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Tiny:
+    """What a training needs."""
+
+    config: Any
+    model: Any
+    grid: RadarGrid
+    map_grid: RadarGrid
+    frames: Batch
+
+    def loader(self, batch_size: int = 4, seed: int = 0) -> Any:
+        """Endless, shuffled, checkpointable."""
+        dataset = grain.MapDataset.range(NUM_FRAMES).seed(seed).shuffle()
+        dataset = dataset.repeat(None).batch(batch_size)
+        dataset = dataset.map(lambda i: jax.tree.map(lambda x: x[i], self.frames))
+        return iter(dataset.to_iter_dataset(grain.ReadOptions(num_threads=0)))
+
+
+@pytest.fixture(scope="session")
+def tiny() -> Tiny:
+    """One bright bin an object, so that a few steps learn something."""
+    grid = RadarGrid.reduced(
+        num_doppler=2, num_range=16, num_elevation=2, num_azimuth=14, max_range_m=30.0
+    )
+    config = base_config()
+    config.model.update(
+        doppler_bins=2,
+        elevation_bins=2,
+        widths=(8, 8, 16),
+        decoder_width=8,
+        num_groups=4,
+        heatmap_prior=0.1,
+    )
+    config.loss.sigma_cells = 1.0
+    config.train.update(
+        batch_size=4,
+        num_epochs=2,
+        learning_rate=3e-3,
+        log_every_steps=1,
+        checkpoint_every_steps=3,
+        max_skipped_steps=2,
+    )
+    model = models.build(config.model)
+    return Tiny(
+        config=config,
+        model=model,
+        grid=grid,
+        map_grid=map_grid(grid, model, "true"),
+        frames=make_frames(grid, seed=0),
+    )
+
+
+def make_frames(grid: RadarGrid, seed: int) -> Batch:
+    """Two sedans a frame that each light up their own bin."""
+    rng = np.random.default_rng(seed)
+    n = NUM_FRAMES
+    cells = np.stack([rng.integers(4, 14, (n, 2)), rng.integers(2, 12, (n, 2))], -1)
+    xy = grid.cell_to_ego(
+        *np.moveaxis(cells + rng.uniform(-0.3, 0.3, cells.shape), -1, 0)
+    )
+    projection = 0.05 * rng.random((n, *grid.projection_shape))
+    for frame in range(n):
+        projection[frame, cells[frame, :, 0], cells[frame, :, 1]] += 0.6
+    boxes = np.zeros((n, 3, 8), np.float32)
+    boxes[:, :2, :2] = xy
+    boxes[:, :2, 3:] = (4.4, 1.9, 1.6, 0.0, 1.0)
+    return Batch(
+        projection=projection.astype(np.float16),
+        boxes=boxes,
+        classes=np.zeros((n, 3), np.int32),
+        is_valid=np.tile([True, True, False], (n, 1)),
+        frame=np.arange(n, dtype=np.int32),
+    )
+
+
+@pytest.fixture
+def workdir(tmp_path: pathlib.Path) -> pathlib.Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    return folder

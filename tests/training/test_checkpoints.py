@@ -1,0 +1,95 @@
+"""Checkpoints by themselves: what is kept, what is refused."""
+
+import pathlib
+from typing import Any
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import DataError
+from radejax.training import sharding
+from radejax.training.checkpoints import Checkpoints, abstract_state
+
+
+def _iterator() -> Any:
+    dataset = grain.MapDataset.range(10).repeat(None)
+    return iter(dataset.to_iter_dataset(grain.ReadOptions(num_threads=0)))
+
+
+def _state(value: float) -> dict[str, jax.Array]:
+    return {"w": jnp.full((4, 2), value), "step": jnp.int32(value)}
+
+
+def _abstract() -> Any:
+    mesh = sharding.make_mesh(1)
+    state = _state(0.0)
+    return abstract_state(
+        state, jax.tree.map(lambda _: sharding.replicated(mesh), state)
+    )
+
+
+def _save(folder: pathlib.Path, steps: int, **options: Any) -> None:
+    iterator = _iterator()
+    with Checkpoints(folder, **options) as checkpoints:
+        for step in range(1, steps + 1):
+            next(iterator)
+            checkpoints.save(step, _state(float(step)), iterator, info={"step": step})
+
+
+def test_state_position_and_info_come_back(tmp_path: pathlib.Path) -> None:
+    _save(tmp_path, 3)
+    iterator = _iterator()
+    with Checkpoints(tmp_path) as checkpoints:
+        state, step = checkpoints.restore(_abstract(), iterator)
+        assert checkpoints.steps() == [2, 3]
+    assert step == 3
+    np.testing.assert_array_equal(state["w"], 3.0)
+    assert next(iterator) == 3
+    with Checkpoints(tmp_path, read_only=True) as checkpoints:
+        state, info, step = checkpoints.restore_variables(2)
+    assert (info["step"], step, float(state["w"][0, 0])) == (2, 2, 2.0)
+
+
+def test_nothing_to_restore(tmp_path: pathlib.Path) -> None:
+    with Checkpoints(tmp_path / "new") as checkpoints:
+        assert checkpoints.restore(_abstract(), _iterator()) is None
+    with (
+        Checkpoints(tmp_path / "new", read_only=True) as checkpoints,
+        pytest.raises(FileNotFoundError, match="no checkpoint in"),
+    ):
+        checkpoints.restore_variables()
+
+
+def test_a_step_that_is_not_there_lists_those_that_are(tmp_path: pathlib.Path) -> None:
+    _save(tmp_path, 3)
+    with (
+        Checkpoints(tmp_path, read_only=True) as checkpoints,
+        pytest.raises(FileNotFoundError, match=r"step 7 .*there are \[2, 3\]"),
+    ):
+        checkpoints.restore_variables(7)
+
+
+def test_all_damaged_is_an_error_not_a_fresh_start(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "checkpoints"
+    _save(folder, 2)
+    for path in folder.rglob("*"):
+        if path.is_file() and "state" in path.parts:
+            path.write_bytes(b"")
+    with (
+        Checkpoints(folder) as checkpoints,
+        pytest.raises(DataError, match=r"none of the checkpoints \[1, 2\]"),
+    ):
+        checkpoints.restore(_abstract(), _iterator())
+
+
+def test_a_half_written_folder_is_not_a_checkpoint(tmp_path: pathlib.Path) -> None:
+    _save(tmp_path, 2)
+    half = tmp_path / "3.orbax-checkpoint-tmp-123" / "state"
+    half.mkdir(parents=True)
+    (half / "array").write_bytes(b"half")
+    with Checkpoints(tmp_path) as checkpoints:
+        assert checkpoints.steps() == [1, 2]
+        assert checkpoints.restore(_abstract(), _iterator())[1] == 2

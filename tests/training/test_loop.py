@@ -1,0 +1,180 @@
+"""Training from start to end, interrupted, damaged, stopped."""
+
+import functools
+import json
+import os
+import pathlib
+import signal
+from typing import Any
+
+import chex
+import numpy as np
+import pytest
+
+from radejax.errors import DataError
+from radejax.training import loop, sharding
+from radejax.training.checkpoints import Checkpoints
+
+Tiny = Any  # the fixture `tiny` of conftest.py
+STEPS_PER_EPOCH = 4
+
+
+@pytest.fixture(scope="module")
+def run(tiny: Tiny) -> Any:
+    """`train` on the tiny data, on one device unless told otherwise."""
+
+    def train(workdir: pathlib.Path, loader: Any = None, **options: Any) -> Any:
+        arguments = {
+            "config": tiny.config,
+            "info": {"config": {"seed": 0}},
+            "steps_per_epoch": STEPS_PER_EPOCH,
+            "mesh": sharding.make_mesh(1),
+        }
+        return loop.train(
+            tiny.model,
+            None,
+            tiny.loader() if loader is None else loader,
+            tiny.map_grid,
+            workdir,
+            **(arguments | options),
+        )
+
+    return train
+
+
+@pytest.fixture(scope="module")
+def undisturbed(run: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Result and folder of a run from start to end."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    return run(folder), folder
+
+
+class Stopping:
+    """A loader that has something happen at its n-th batch from the start."""
+
+    def __init__(self, loader: Any, at: int, what: Any) -> None:
+        self._loader, self._at, self._what = loader, at, what
+        self._count = 0
+
+    def __next__(self) -> Any:
+        self._count += 1
+        if self._count == self._at:
+            self._what()
+        return next(self._loader)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._loader, name)
+
+
+def _losses(folder: pathlib.Path) -> list[tuple[int, float]]:
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [(r["step"], r["focal"]) for r in map(json.loads, lines)]
+
+
+def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
+    result, folder = undisturbed
+    assert result.finished
+    assert result.step == int(result.state.step) == 8
+    losses = _losses(folder)
+    assert [step for step, _ in losses] == list(range(1, 9))
+    assert losses[-1][1] < losses[0][1]
+
+
+def test_two_runs_of_one_seed_are_equal_bit_for_bit(
+    run: Any, undisturbed: Any, workdir: pathlib.Path
+) -> None:
+    again = run(workdir)
+    chex.assert_trees_all_equal(again.state, undisturbed[0].state)
+    assert _losses(workdir) == _losses(undisturbed[1])
+
+
+@pytest.mark.parametrize("batch", [2, 6])
+def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
+    batch: int, run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
+) -> None:
+    def crash() -> None:
+        raise RuntimeError("power cut")
+
+    # One batch is looked at for its shapes before the first step.
+    with pytest.raises(RuntimeError, match="power cut"):
+        run(workdir, Stopping(_own(tiny), batch + 1, crash))
+    again = run(workdir)
+    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+    assert _losses(workdir) == _losses(undisturbed[1])
+
+
+def _own(tiny: Tiny) -> Any:
+    return tiny.loader()
+
+
+def test_sigterm_saves_and_stops(
+    run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
+) -> None:
+    terminate = functools.partial(os.kill, os.getpid(), signal.SIGTERM)
+    stopped = run(workdir, Stopping(tiny.loader(), 6, terminate))
+    assert not stopped.finished
+    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
+        assert checkpoints.steps()[-1] == stopped.step == 5
+    again = run(workdir)
+    assert again.finished
+    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+
+
+def test_a_damaged_newest_checkpoint_falls_back(
+    run: Any,
+    undisturbed: Any,
+    workdir: pathlib.Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    result = run(workdir)
+    newest = workdir / "checkpoints" / str(result.step)
+    for path in (newest / "state").rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    again = run(workdir)
+    assert "checkpoint 8 does not restore" in caplog.text
+    assert (workdir / "checkpoints_damaged" / "8").is_dir()
+    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+
+
+def test_a_run_on_four_devices_continues_on_one(
+    run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
+) -> None:
+    def stop() -> None:
+        raise RuntimeError("moved")
+
+    with pytest.raises(RuntimeError, match="moved"):
+        run(workdir, Stopping(tiny.loader(), 6, stop), mesh=sharding.make_mesh(4))
+    again = run(workdir)
+    assert again.finished
+    losses, expected = _losses(workdir), _losses(undisturbed[1])
+    np.testing.assert_allclose(
+        [v for _, v in losses], [v for _, v in expected], rtol=0.05
+    )
+
+
+def test_steps_without_finite_loss_end_the_run_and_name_the_frames(
+    run: Any, tiny: Tiny, workdir: pathlib.Path
+) -> None:
+    class Poisoned(Stopping):
+        def __next__(self) -> Any:
+            batch = super().__next__()
+            return batch.replace(projection=batch.projection * np.float16(np.nan))
+
+    with pytest.raises(DataError, match=r"3 steps in a row .*frames.*: \[\d+, "):
+        run(workdir, Poisoned(tiny.loader(), 99, None))
+
+
+def test_evaluation_on_the_way_is_logged(run: Any, tiny: Tiny, workdir: Any) -> None:
+    config = tiny.config.copy_and_resolve_references()
+    config.train.evaluate_every_epochs = 1
+    seen = []
+
+    def evaluate(state: Any, step: int) -> dict[str, float]:
+        seen.append((step, int(state.step)))
+        return {"ap_bev_iou30_exact": 1.5}
+
+    run(workdir, config=config, evaluate=evaluate)
+    assert seen == [(4, 4)]  # the end of the run has its own evaluation
+    lines = (workdir / "metrics.jsonl").read_text().splitlines()
+    assert any(json.loads(line).get("ap_bev_iou30_exact") == 1.5 for line in lines)

@@ -1,0 +1,154 @@
+"""One step: what it changes, what it leaves, and that devices do not matter."""
+
+import functools
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.training import sharding
+from radejax.training.state import create_state, make_optimizer
+from radejax.training.step import make_train_step, map_grid
+
+RNG = jax.random.key(7)
+Tiny = Any  # the fixture `tiny` of conftest.py
+
+
+@pytest.fixture(scope="module")
+def start(tiny: Tiny) -> tuple[Any, Any]:
+    """Optimizer and initial state."""
+    optimizer = make_optimizer(lambda _: 3e-3, weight_decay=0.01)
+    inputs = jnp.zeros((1, *tiny.grid.projection_shape))
+    variables = jax.jit(tiny.model.init)(jax.random.key(0), inputs)
+    return optimizer, create_state(variables, optimizer, batch_size=4, use_ema=True)
+
+
+@pytest.fixture(scope="module")
+def step(tiny: Tiny, start: tuple[Any, Any]) -> Any:
+    """Compiled step on one device."""
+    return jax.jit(_make(tiny, start[0]))
+
+
+def _make(tiny: Tiny, optimizer: Any, **options: Any) -> Any:
+    return make_train_step(
+        tiny.model,
+        optimizer,
+        tiny.map_grid,
+        loss=dict(tiny.config.loss),
+        ema_decay=0.9,
+        **options,
+    )
+
+
+def _batch(tiny: Tiny, count: int = 4) -> Any:
+    return jax.tree.map(lambda x: x[:count], tiny.frames)
+
+
+def test_steps_lower_the_loss(tiny: Tiny, start: Any, step: Any) -> None:
+    state, batch, focal = start[1], _batch(tiny), []
+    for _ in range(30):
+        state, metrics = step(state, batch, RNG)
+        focal.append(float(metrics["focal"]))
+    assert focal[-1] < 0.2 * focal[0]
+    assert int(state.step) == 30
+    assert int(state.num_skipped) == 0
+
+
+def test_moving_average_follows_the_parameters(
+    tiny: Tiny, start: Any, step: Any
+) -> None:
+    before = start[1]
+    after, _ = step(before, _batch(tiny), RNG)
+    expected = jax.tree.map(
+        lambda old, new: 0.9 * old + 0.1 * new, before.ema_params, after.params
+    )
+    chex.assert_trees_all_close(after.ema_params, expected, atol=1e-6)
+
+
+def test_a_step_without_finite_loss_changes_nothing_and_is_counted(
+    tiny: Tiny, start: Any, step: Any
+) -> None:
+    batch = _batch(tiny)
+    bad = batch.replace(projection=np.full_like(batch.projection, np.nan))
+    after, metrics = step(start[1], bad, RNG)
+    chex.assert_trees_all_equal(after.params, start[1].params)
+    chex.assert_trees_all_equal(after.opt_state, start[1].opt_state)
+    assert (int(after.step), int(after.num_skipped_in_row)) == (1, 1)
+    assert int(metrics["skipped"]) == 1
+    np.testing.assert_array_equal(after.skipped_frames, batch.frame)
+    again, _ = step(after, batch, RNG)
+    assert (int(again.num_skipped), int(again.num_skipped_in_row)) == (1, 0)
+
+
+def test_a_batch_without_objects_is_a_normal_step(
+    tiny: Tiny, start: Any, step: Any
+) -> None:
+    batch = _batch(tiny)
+    empty = batch.replace(is_valid=np.zeros_like(batch.is_valid))
+    after, metrics = step(start[1], empty, RNG)
+    chex.assert_tree_all_finite(after.params)
+    chex.assert_tree_all_finite(metrics)
+    assert int(metrics["skipped"]) == 0
+
+
+@pytest.mark.parametrize("parameters", ["replicated", "fsdp"])
+def test_four_devices_equal_one(
+    tiny: Tiny, start: Any, step: Any, parameters: str
+) -> None:
+    optimizer, state = start
+    expected, expected_metrics = step(state, _batch(tiny), RNG)
+    mesh = sharding.make_mesh(4)
+    placement = sharding.state_sharding(state, mesh, parameters, min_size=64)
+    sharded = jax.jit(
+        _make(tiny, optimizer), out_shardings=(placement, sharding.replicated(mesh))
+    )
+    with jax.transfer_guard("disallow"):
+        on_mesh = jax.device_put((state, RNG), (placement, sharding.replicated(mesh)))
+        batch = sharding.put_batch(_batch(tiny), mesh)
+        actual, metrics = sharded(on_mesh[0], batch, on_mesh[1])
+    chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-4, atol=1e-5)
+    # Adam divides by the gradient's size: rounding of a tiny gradient shows up to lr.
+    chex.assert_trees_all_close(actual.params, expected.params, atol=2e-3)
+    assert _share_that_differs(actual.params, expected.params, 1e-5) < 0.02
+
+
+def _share_that_differs(a: Any, b: Any, tolerance: float) -> float:
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    differs = [np.abs(np.asarray(x) - np.asarray(y)) > tolerance for x, y in pairs]
+    return float(np.concatenate([d.ravel() for d in differs]).mean())
+
+
+def test_accumulation_averages_the_gradients_of_the_parts(
+    tiny: Tiny, start: Any, step: Any
+) -> None:
+    optimizer, state = start
+    accumulate = jax.jit(_make(tiny, optimizer, num_accumulate=2))
+    batch = _batch(tiny)
+    _, whole = accumulate(state, batch, RNG)
+    halves = [
+        jax.jit(functools.partial(_metrics_of, _make(tiny, optimizer)))(
+            state, jax.tree.map(lambda x, s=s: x[s], batch), RNG
+        )
+        for s in (slice(0, 2), slice(2, 4))
+    ]
+    for name in ("focal", "gwd", "smooth_l1"):
+        mean = np.mean([float(h[name]) for h in halves])
+        np.testing.assert_allclose(float(whole[name]), mean, rtol=1e-5)
+
+
+def _metrics_of(step: Any, state: Any, batch: Any, rng: Any) -> Any:
+    state = state.replace(skipped_frames=state.skipped_frames[:2])
+    return step(state, batch, rng)[1]
+
+
+def test_map_grid_follows_padding_and_cropping(tiny: Tiny) -> None:
+    padded = map_grid(tiny.grid, tiny.model.clone(crop_output=False), "true")
+    assert (padded.num_range, padded.num_azimuth) == (16, 16)
+    cropped = map_grid(tiny.grid, tiny.model.clone(crop_output=True), "true")
+    assert cropped == tiny.grid
+    stretched = map_grid(tiny.grid, tiny.model.clone(crop_output=True), "stretched")
+    assert stretched.num_azimuth == 14
+    assert stretched.azimuth_step_rad < tiny.grid.azimuth_step_rad
