@@ -17,7 +17,7 @@ import os
 import pathlib
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
@@ -248,35 +248,50 @@ def _run(
 def _run_in_processes(tasks: list[_Task], num_workers: int, bar: tqdm) -> Iterator:
     """Results in the order in which they come; the bar moves with every frame."""
     context = multiprocessing.get_context("spawn")
-    done = context.Value("q", 0)
+    # Without locks: a killed worker could hold one for ever. Each slot has one writer.
+    done, stop = context.RawArray("q", max(len(tasks), 1)), context.RawValue("b", 0)
     pool = concurrent.futures.ProcessPoolExecutor(
         min(num_workers, max(len(tasks), 1)),
         mp_context=context,
         initializer=_start_worker,
-        initargs=(done,),
+        initargs=(done, stop),
     )
     with pool:
-        pending = {pool.submit(_project_task, task) for task in tasks}
+        pending = {
+            pool.submit(_project_in_worker, task, slot)
+            for slot, task in enumerate(tasks)
+        }
         try:
             while pending:
                 finished, pending = concurrent.futures.wait(
                     pending, 0.2, concurrent.futures.FIRST_COMPLETED
                 )
-                bar.update(done.value - bar.n)
+                bar.update(sum(done) - bar.n)
                 for future in finished:
                     yield future.result()
+        except concurrent.futures.process.BrokenProcessPool:
+            raise UserError(
+                "a worker process was killed, perhaps for want of memory; run the same "
+                "command again to continue, with fewer workers"
+            ) from None
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            stop.value = 1  # the others need not finish their files first
+            pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
+class _StoppedError(Exception):
+    """Another worker failed: this one's file is given up."""
+
+
 _done: Any = None
+_stop: Any = None
 
 
-def _start_worker(done: Any) -> None:
-    """Shares the counter of frames, and ends this process when its parent dies."""
-    global _done
-    _done = done
+def _start_worker(done: Any, stop: Any) -> None:
+    """Shares the counters of frames, and ends this process when its parent dies."""
+    global _done, _stop
+    _done, _stop = done, stop
     parent = multiprocessing.parent_process()
 
     def watch() -> None:
@@ -286,13 +301,19 @@ def _start_worker(done: Any) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _count_frame(number: int) -> None:
-    with _done.get_lock():
-        _done.value += number
+def _project_in_worker(task: _Task, slot: int) -> tuple:
+    """`_project_task` that moves the parent's progress bar and can be stopped by it."""
+
+    def count_frame(number: int) -> None:
+        if _stop.value:
+            raise _StoppedError
+        _done[slot] += number
+
+    return _project_task(task, count_frame)
 
 
 def _project_task(
-    task: _Task, count_frame: Any = _count_frame
+    task: _Task, count_frame: Callable[[int], Any]
 ) -> tuple[record_files.RecordFile, float, float]:
     """Projects one file of records; returns its manifest, reading and working time."""
     began = time.perf_counter()

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -67,6 +68,7 @@ def test_second_run_does_what_is_missing(kradar_root, tmp_path):
 
 KILLED = """
 import sys
+import threading
 from radejax.data.kradar import KRadar
 from radejax.data.projection_job import project_dataset
 if __name__ == "__main__":
@@ -110,7 +112,7 @@ def test_resumes_after_a_kill(root, tmp_path):
         np.testing.assert_array_equal(records[i]["projection"], wanted)
 
 
-def wait_until(condition, seconds=60.0):
+def wait_until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
@@ -139,10 +141,10 @@ def test_bad_frames_are_named_or_left_out(root, tmp_path, num_workers):
         DataError, match=r"frame 1/00005_00002: .*_00005\.mat: truncated"
     ):
         run(data, out, num_workers=num_workers)
-    assert not list(out.glob("*.arrayrecord"))
+    assert not list(out.glob("*-00000-of-*.arrayrecord"))
     assert not list(out.glob(".*.tmp"))
     report = run(data, out, num_workers=num_workers, skip_bad=True)
-    assert report.num_projected == 10
+    assert report.num_projected + report.num_found == 10
     assert sorted(report.skipped) == ["1/00005_00002", "2/00009_00006"]
     assert "left out: 2/00009_00006: no tesseract in any root" in report.to_text()
     records = RecordSource(out)
@@ -231,3 +233,21 @@ def test_a_full_disk_keeps_nothing_half_written(kradar_root, tmp_path, monkeypat
     with pytest.raises(UserError, match="no space left on the disk of"):
         run(KRadar(kradar_root), tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["plan.json"]
+
+
+def test_a_killed_worker_is_one_line(root, tmp_path):
+    blocked = root / "1/radar_tesseract/tesseract_00005.mat"
+    blocked.unlink()
+    os.mkfifo(blocked)
+    out = tmp_path / "out"
+
+    def kill_worker() -> None:
+        wait_until(lambda: list(out.glob(".projections*.tmp")))
+        (temporary,) = out.glob(".projections*.tmp")
+        os.kill(int(temporary.name.split(".")[-2]), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_worker)
+    killer.start()
+    with pytest.raises(UserError, match=r"a worker process was killed.*run the same"):
+        run(KRadar(root), out, num_workers=1)
+    killer.join()
