@@ -21,6 +21,12 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config = base_config()
     config.simulation = ConfigDict(default_config())
     grid = config.simulation.grid
+    # Many short sequences: a network learns more from another scene than from the next
+    # tenth of a second.
+    config.simulation.update(
+        train_sequences=32, test_sequences=12, frames_per_sequence=14
+    )
+    config.data.mirror_probability = 0.5
     config.model.update(
         doppler_bins=grid.num_doppler,
         elevation_bins=grid.num_elevation,
@@ -33,12 +39,13 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.loss.sigma_cells = 1.0
     config.train.update(
         batch_size=4,
-        num_epochs=10,
+        num_epochs=9,
         warmup_steps=20,
         log_every_steps=10,
         checkpoint_every_steps=100,
     )
     config.evaluation.score_threshold = 0.05
+    config.evaluation.protocols = ("kradar_r40", "exact", "coco101")
     if length == "short":
         config.simulation.update(
             train_sequences=2, test_sequences=1, frames_per_sequence=12

@@ -125,7 +125,6 @@ def _train() -> ConfigDict:
         {
             "batch_size": 10,
             "num_epochs": 10,
-            "optimizer": "adamw",
             "learning_rate": 1e-3,
             "final_learning_rate": 1e-4,  # cosine, per step
             "weight_decay": 0.01,
@@ -152,6 +151,11 @@ def _data() -> ConfigDict:
             "azimuth_mapping": "true",  # "stretched": released checkpoints
             "num_threads": 2,  # that prepare batches
             "num_workers": 0,  # processes; slower than threads for large frames
+            # Augmentation, off as in the papers: share of frames mirrored left to right,
+            # standard deviations of a gain at all ranges and of one that grows with range.
+            "mirror_probability": 0.0,
+            "gain_db": 0.0,
+            "gain_slope_db": 0.0,
             # Exchanges the labels of training frames: what is learnt then is no skill.
             "label_permutation_seed": placeholder(int),
         }

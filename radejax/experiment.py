@@ -29,6 +29,7 @@ from ml_collections import ConfigDict
 import radejax
 from radejax import files, models
 from radejax.data import pipeline, projection_job
+from radejax.data.augment import Augmentation
 from radejax.data.kradar import KRadar
 from radejax.data.records import RecordSource
 from radejax.errors import UserError
@@ -274,6 +275,7 @@ def train(
         max_objects=config.data.max_objects,
         classes=config.classes,
         seed=config.seed,
+        augment=make_augmentation(config.data, records.grid),
         num_threads=config.data.num_threads,
         num_workers=config.data.num_workers,
         label_permutation_seed=config.data.label_permutation_seed,
@@ -295,6 +297,18 @@ def train(
         },
         steps_per_epoch=len(frames) // config.train.batch_size,
     )
+
+
+def make_augmentation(data: ConfigDict, grid: RadarGrid) -> Augmentation | None:
+    """Random changes of training frames as `config.data` says; None for none."""
+    augmentation = Augmentation(
+        grid=grid,
+        mirror_probability=data.mirror_probability,
+        gain_db=data.gain_db,
+        gain_slope_db=data.gain_slope_db,
+    )
+    is_on = data.mirror_probability or data.gain_db or data.gain_slope_db
+    return augmentation if is_on else None
 
 
 def initial_variables(path: str, config: ConfigDict) -> Mapping[str, Any]:

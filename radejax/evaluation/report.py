@@ -268,8 +268,12 @@ def console_text(
         f" objects, {metrics['num_predictions']} predictions\n"
     ]
     shown = [p for p in ("exact", "kradar_r40", "coco101") if p in options.protocols]
-    for protocol in shown or options.protocols[:1]:
-        parts.append(layouts.class_by_weather(table, options, protocol, iou).render())
+    shown = shown or list(options.protocols[:1])
+    for protocol in shown:
+        # The usual two thresholds for the first protocol; the others stay short.
+        for level in options.iou_thresholds[:2] if protocol == shown[0] else (iou,):
+            grid = layouts.class_by_weather(table, options, protocol, level)
+            parts.append(grid.render())
     parts.append(layouts.protocols_at_a_glance(table, options, "3d", iou).render())
     if any(row.low is not None for row in rows):
         parts.append(layouts.intervals(table, options, iou).render())
