@@ -44,7 +44,7 @@ def test_without_data_and_simulation_the_flag_is_named(tmp_path: pathlib.Path) -
 
 
 def test_a_missing_data_folder_is_named(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such folder: .*nowhere"):
+    with pytest.raises(FileNotFoundError, match=r"no such folder: .*nowhere"):
         experiment.prepare_data(
             base_config(), data=[str(tmp_path / "nowhere")], labels=None, records=None
         )

@@ -1,0 +1,157 @@
+"""The quickstart as a user types it, in small: from nothing to metrics, and killed."""
+
+import csv
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import pytest
+
+REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
+OVERRIDES = [
+    "--config=configs/quickstart.py:short",
+    "--config.simulation.train_sequences=2",
+    "--config.simulation.frames_per_sequence=6",
+    "--config.model.widths=(8,8,16)",
+    "--config.model.decoder_width=8",
+    "--config.model.num_groups=4",
+    "--config.train.num_epochs=4",
+    "--config.train.checkpoint_every_steps=1",
+    "--config.evaluation.num_pictures=1",
+]
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+
+
+def _start(folder: pathlib.Path, *more: str) -> subprocess.Popen:
+    command = [sys.executable, "train.py", *OVERRIDES, *more]
+    command += [f"--workdir={folder / 'run'}", f"--data={folder / 'data'}"]
+    return subprocess.Popen(
+        command,
+        cwd=REPOSITORY,
+        env=_environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def _finish(process: subprocess.Popen) -> str:
+    output, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, output
+    return output
+
+
+def _metrics(folder: pathlib.Path) -> dict:
+    return json.loads((folder / "run" / "evaluation" / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Path, str]:
+    """A run from start to end: its folder and what it printed."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    return folder, _finish(_start(folder))
+
+
+@pytest.mark.timeout(900)
+def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
+    folder, output = undisturbed
+    for line in ("simulate", "project", "train", "detect", "Done in", "evaluate.py"):
+        assert line in output
+    run = folder / "run"
+    assert _metrics(folder)
+    rows = list(csv.DictReader((run / "evaluation" / "metrics.csv").open()))
+    assert {row["space"] for row in rows} == {"bev", "3d"}
+    assert {float(row["iou"]) for row in rows} == {0.3, 0.5}
+    assert list((run / "evaluation" / "pictures").glob("*.png"))
+    assert list((run / "tensorboard").iterdir())
+    assert len((run / "metrics.jsonl").read_text().splitlines()) > 0
+    for name in ("radar_tesseract", "info_label_v2_1", "cam-front", "info_calib"):
+        assert any((folder / "data" / "1" / name).iterdir())
+    assert not list(folder.rglob("*.tmp"))
+
+
+@pytest.mark.timeout(900)
+def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
+    undisturbed: tuple,
+) -> None:
+    folder, _ = undisturbed
+    first = _metrics(folder)
+    subprocess.run(
+        [sys.executable, "evaluate.py", f"--workdir={folder / 'run'}"],
+        cwd=REPOSITORY,
+        env=_environment(),
+        check=True,
+        capture_output=True,
+        timeout=600,
+    )
+    assert _metrics(folder) == first
+    command = [sys.executable, "-c", "from radejax.cli import main; main()", "detect"]
+    command += [str(folder / "data" / "3"), "--workdir", str(folder / "run")]
+    command += ["--out", str(folder / "boxes"), "--score-threshold", "0", "--json"]
+    done = subprocess.run(
+        command, env=_environment(), check=True, capture_output=True, timeout=600
+    )
+    assert json.loads(done.stdout)["frames"] == 6
+    assert len(list((folder / "boxes").glob("3_tesseract_*.json"))) == 6
+
+
+@pytest.mark.timeout(900)
+def test_wrong_use_is_one_line_and_exit_code_2(undisturbed: tuple) -> None:
+    folder, _ = undisturbed
+    for flag, message in (
+        ("--config.train.batchsize=3", "batchsize"),
+        ("--config.seed=5", "config.seed is 0 there and 5 here"),
+        ("--labels=/nowhere", "/nowhere"),
+    ):
+        process = _start(folder, flag)
+        output, _ = process.communicate(timeout=300)
+        assert process.returncode == 2, output
+        errors = [line for line in output.splitlines() if line.startswith("error:")]
+        assert len(errors) == 1
+        assert message in errors[0]
+        assert "Traceback" not in output
+
+
+def _simulating(folder: pathlib.Path) -> bool:
+    return any((folder / "data").glob("2/info_label_v2_1/*.txt"))
+
+
+def _projecting(folder: pathlib.Path) -> bool:
+    records = folder / "data" / "records"
+    return records.is_dir() and not (records / "manifest.json").exists()
+
+
+def _training(folder: pathlib.Path) -> bool:
+    checkpoints = folder / "run" / "checkpoints"
+    steps = checkpoints.glob("[0-9]*")
+    return any(path.name.isdigit() and int(path.name) >= 2 for path in steps)
+
+
+def _evaluating(folder: pathlib.Path) -> bool:
+    return (folder / "run" / "evaluation").is_dir()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("stage", [_simulating, _projecting, _training, _evaluating])
+def test_killed_at_any_stage_it_ends_in_the_same_digits(
+    stage: Callable[[pathlib.Path], bool], undisturbed: tuple, tmp_path: pathlib.Path
+) -> None:
+    process = _start(tmp_path)
+    while not stage(tmp_path):
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    evaluation = tmp_path / "run" / "evaluation" / "metrics.json"
+    assert not evaluation.exists(), "killed too late to show anything"
+    _finish(_start(tmp_path))
+    assert _metrics(tmp_path) == _metrics(undisturbed[0])
