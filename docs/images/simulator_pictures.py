@@ -13,6 +13,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
+
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.camera import CameraRenderer, stereo_calibration
 from radejax.simulation.radar import RadarParameters
@@ -41,6 +42,7 @@ def outline(box):
 
 
 def draw(weather, environment, time, seed, path):
+    """Camera image, range-azimuth, azimuth-elevation and range-Doppler maps in a row."""
     sequence = make_sequence(
         seed, environment=environment, time=time, weather=weather, num_frames=60,
         rng=np.random.default_rng(seed),
@@ -59,7 +61,7 @@ def draw(weather, environment, time, seed, path):
     axes[0].imshow(renderer.render(frame)[:, :640])
     axes[0].axis("off")
     axes[0].set_title(f"{weather}, {environment}, {time}", fontsize=9)
-    colors = {"cmap": "viridis", "vmin": 98, "vmax": 145}
+    colors = {"cmap": "viridis", "vmin": 99, "vmax": 132}
     centers = GRID.cell_centers_ego()
     axes[1].pcolormesh(
         -centers[..., 1], centers[..., 0], power_db.max((0, 2)), shading="nearest",
@@ -72,7 +74,12 @@ def draw(weather, environment, time, seed, path):
             axes[1].plot(-y, x, color=color, lw=0.7)
             if is_visible:
                 axes[1].text(
-                    -box[1] + 1.5, box[0], CLASSES[cls][:3], color="white", fontsize=4.5
+                    -box[1] + 1.5,
+                    box[0],
+                    CLASSES[cls][:3],
+                    color="white",
+                    fontsize=4.5,
+                    clip_on=True,
                 )
     axes[1].set(xlim=(-45, 45), ylim=(0, 90), xlabel="right [m]", ylabel="forward [m]")
     axes[1].set_aspect("equal")

@@ -239,23 +239,34 @@ def _power_with_noise(
     """
     shape = (field.shape[0], field.shape[1], field.shape[3])
     counter = lax.iota(jnp.uint32, int(np.prod(shape))).reshape(shape)
-    row_key = _hash(_hash(row_idx * jnp.uint32(0x9E3779B9) + key[0]) ^ key[1])
-    bits = _hash(_hash(counter + row_key) + key[0])
+    row_key = _hash(row_idx * jnp.uint32(0x9E3779B9) + key[0], key[1])
+    bits = _hash(counter + row_key, _hash(row_key, key[1]))
     uniform = ((bits >> 12).astype(jnp.float32) + 0.5) * np.float32(2.0**-20)
-    phase = (bits & 0xFFF).astype(jnp.float32) * np.float32(2.0 * np.pi / 4096.0)
     radius = jnp.sqrt(-jnp.log(uniform) * noise[:, None, None])
-    real = field[:, :, 0] + radius * jnp.cos(phase)
-    imaginary = field[:, :, 1] + radius * jnp.sin(phase)
+    real = field[:, :, 0] + radius * _sine_of_turn(bits + jnp.uint32(1024))
+    imaginary = field[:, :, 1] + radius * _sine_of_turn(bits)
     return real * real + imaginary * imaginary
 
 
-def _hash(x: jax.Array) -> jax.Array:
-    """A 32-bit integer hash (two rounds of multiply and xor-shift).
+def _sine_of_turn(bits: jax.Array) -> jax.Array:
+    """Sine of the angle whose 4096th parts of a turn are the 12 lowest bits.
 
-    Half the time of the noise goes here; threefry would take four times as long, and
-    this one gives the same bits on every platform.
+    Two parabolas, wrong by 0.1 % at most: ample for noise, and the library's sine would
+    take most of the simulator's time.
+    """
+    half_turns = (bits & 0xFFF).astype(jnp.float32) * np.float32(2.0**-11) - 1.0
+    rough = 4.0 * half_turns * (jnp.abs(half_turns) - 1.0)
+    return rough * (0.775 + 0.225 * jnp.abs(rough))
+
+
+def _hash(x: jax.Array, key: jax.Array) -> jax.Array:
+    """A 32-bit integer hash of a number under a key (multiply and xor-shift).
+
+    Cheaper than threefry by far, and the same bits on every platform. The key enters
+    between the rounds, so that counters under two keys are not shifted copies.
     """
     x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
+    x = x ^ key
     x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
     return x ^ (x >> 16)
 

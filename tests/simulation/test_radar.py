@@ -267,7 +267,53 @@ class TestNoise:
         assert np.std(cells) == pytest.approx(20.0 * np.sqrt(0.5), rel=0.2)
 
 
+def direct_tesseract(scatterers, grid, parameters):
+    """The tensor from first principles: sums over samples and antennas, float64."""
+    s = [np.asarray(v, np.float64) for v in jax.tree.leaves(scatterers)]
+    by_name = dict(
+        zip([f.name for f in dataclasses.fields(scatterers)], s, strict=True)
+    )
+
+    def transform(offset, num, pedestal):  # [bins, S] in bins of num samples
+        n = np.arange(num) - (num - 1) / 2
+        window = pedestal + (1 - pedestal) * np.cos(np.pi * n / num) ** 2
+        phase = np.exp(2j * np.pi * offset[..., None] * n / num)
+        return ((phase * window).sum(-1) / window.sum()).real
+
+    def angle(axis, angles, num):
+        sines = np.sin(axis)[:, None] - np.sin(angles)[None]
+        return transform(sines * num / 2, int(num), parameters.array_pedestal)
+
+    step = grid.doppler_mps[1] - grid.doppler_mps[0]
+    wrapped = (grid.doppler_mps[:, None] - by_name["velocity_mps"]) / step
+    wrapped = (wrapped + 8) % 16 - 8
+    doppler = transform(wrapped, 16, 0.0)
+    many = 4096  # a long chirp: the crop of its spectrum that the axis shows
+    ranges = transform(
+        (grid.range_m[:, None] - by_name["range_m"]) / grid.range_step_m, many, 0.0
+    )
+    azimuth = angle(grid.azimuth_rad, by_name["azimuth_rad"], 20)
+    elevation = angle(grid.elevation_rad, by_name["elevation_rad"], 12)
+    amplitude = by_name["amplitude"] @ [1.0, 1j]
+    field = np.einsum(
+        "s,ds,rs,es,as->drea", amplitude, doppler, ranges, elevation, azimuth
+    )
+    return np.abs(field) ** 2
+
+
 class TestOutputs:
+    def test_equals_the_sum_over_samples_and_antennas(self):
+        rng = np.random.default_rng(1)
+        scene = points(
+            rng.uniform(3, 28, 12), rng.uniform(-0.8, 0.8, 12),
+            rng.uniform(-0.2, 0.2, 12), rng.normal(0, 5, 12),
+            rng.normal(size=12) + 1j * rng.normal(size=12),
+        )  # fmt: skip
+        expected = direct_tesseract(scene, GRID, PARAMETERS)
+        np.testing.assert_allclose(
+            tesseract(scene), expected, atol=1e-4 * expected.max()
+        )
+
     def scene(self):
         rng = np.random.default_rng(0)
         return points(
