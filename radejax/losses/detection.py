@@ -31,12 +31,12 @@ def detection_loss(
     matching: Matching = "center",
     weights: tuple[float, float, float] = (2.0, 1.0, 1.0),
     normalize: bool = True,
-    z0_m: float = 0.0,
+    z0_m: float | jax.Array = 0.0,
     is_frame_valid: jax.Array | None = None,
     max_peaks: int = 128,
-    score_threshold: float = 0.3,
-    nms_iou: float = 0.3,
-    match_iou: float = 0.0,
+    score_threshold: float | jax.Array = 0.3,
+    nms_iou: float | jax.Array = 0.3,
+    match_iou: float | jax.Array = 0.0,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Weighted sum of the three losses over a batch, and its parts.
 
@@ -139,7 +139,7 @@ def _pairs_at_centers(
     boxes: jax.Array,
     is_valid: jax.Array,
     grid: RadarGrid,
-    z0_m: float,
+    z0_m: float | jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Predictions at the objects' bins and the objects: `[B, N, 8]` each, `[B, N]`."""
     cell = grid.nearest_cell(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
@@ -152,12 +152,12 @@ def _pairs_after_nms(
     boxes: jax.Array,
     is_valid: jax.Array,
     grid: RadarGrid,
-    z0_m: float,
+    z0_m: float | jax.Array,
     *,
     max_peaks: int,
-    score_threshold: float,
-    nms_iou: float,
-    match_iou: float,
+    score_threshold: float | jax.Array,
+    nms_iou: float | jax.Array,
+    match_iou: float | jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Predictions that survive NMS and their objects: `[B, P, 8]` each, `[B, P]`."""
     # Which boxes are compared is a choice, not a function to differentiate.

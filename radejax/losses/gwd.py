@@ -115,12 +115,19 @@ def gwd_loss(
 
 def gaussian_root(boxes: jax.Array) -> jax.Array:
     """Square root S of the covariance of boxes: `[..., 8]` -> `[..., 2, 2]`."""
+    xx, xy, yy = _root_entries(boxes)
+    return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
+
+
+def _root_entries(boxes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """xx, xy and yy of the symmetric S."""
     length, width = boxes[..., 3] / 2, boxes[..., 4] / 2
     sin, cos = boxes[..., 6], boxes[..., 7]
-    xx = length * cos * cos + width * sin * sin
-    yy = length * sin * sin + width * cos * cos
-    xy = (length - width) * sin * cos
-    return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
+    return (
+        length * cos * cos + width * sin * sin,
+        (length - width) * sin * cos,
+        length * sin * sin + width * cos * cos,
+    )
 
 
 def _shape_distance(a: jax.Array, b: jax.Array, root: Root) -> jax.Array:
@@ -140,7 +147,7 @@ def _shape_distance(a: jax.Array, b: jax.Array, root: Root) -> jax.Array:
     numerator = 4 * (norm_gap**2 + 4 * _dot(cross, cross)) + 16 * jnp.minimum(dets, 0)
     numerator = jnp.maximum(numerator, 0)
     if root == "eigh":
-        trace = _trace_of_root(gaussian_root(a), gaussian_root(b))
+        trace = _trace_of_root(a, b)
     else:
         overlap = 2 * norm_a * norm_b + 8 * mean_a * mean_b * _dot(skew_a, skew_b)
         trace = _safe_sqrt(overlap + 2 * jnp.abs(dets))
@@ -186,78 +193,61 @@ def _safe_sqrt(value: jax.Array) -> jax.Array:
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, value, 1)), 0)
 
 
-def _trace_of_root(s1: jax.Array, s2: jax.Array) -> jax.Array:
-    """tr (S1 S2^2 S1)^(1/2) of symmetric `[..., 2, 2]`."""
-    product = _matmul(s1, s2)
-    return jnp.trace(
-        sqrtm_2x2(_matmul(product, _transposed(product))), axis1=-2, axis2=-1
-    )
+def _trace_of_root(a: jax.Array, b: jax.Array) -> jax.Array:
+    """tr (S1 S2^2 S1)^(1/2) of the boxes' roots: `[...]`."""
+    (a_xx, a_xy, a_yy), (b_xx, b_xy, b_yy) = _root_entries(a), _root_entries(b)
+    # P = S1 S2, and M = P P^T; as scalars, never in an accelerator's low precision.
+    p_xx, p_xy = a_xx * b_xx + a_xy * b_xy, a_xx * b_xy + a_xy * b_yy
+    p_yx, p_yy = a_xy * b_xx + a_yy * b_xy, a_xy * b_xy + a_yy * b_yy
+    xx, yy = p_xx * p_xx + p_xy * p_xy, p_yx * p_yx + p_yy * p_yy
+    return trace_of_root_2x2(xx, p_xx * p_yx + p_xy * p_yy, yy)
 
 
 @jax.custom_jvp
-def sqrtm_2x2(matrix: jax.Array) -> jax.Array:
-    """Symmetric root of symmetric positive semi-definite matrices.
+def trace_of_root_2x2(xx: jax.Array, xy: jax.Array, yy: jax.Array) -> jax.Array:
+    """Trace of the symmetric root of [[xx, xy], [xy, yy]], elementwise.
 
-    By eigendecomposition, with eigenvalues clamped at 1e-12. The derivative solves
-    S dS + dS S = dM in the eigenbasis, dS_ij = dM_ij / (sqrt(l_i) + sqrt(l_j)), which
-    is finite and right for equal eigenvalues, where differentiating eigenvectors
-    divides by their difference.
+    By eigendecomposition, with eigenvalues l clamped at 1e-12. The derivative of the
+    root S of M solves S dS + dS S = dM; in the eigenbasis dS_ij = dM_ij / (sqrt(l_i) +
+    sqrt(l_j)). Its trace needs the diagonal alone and is finite and right for equal
+    eigenvalues, where differentiating eigenvectors divides by their difference.
 
     Args:
-        matrix: `[..., 2, 2]` symmetric.
+        xx: `[...]` entry of a positive semi-definite matrix, as are the others.
+        xy: `[...]`.
+        yy: `[...]`.
 
     Returns:
-        `[..., 2, 2]`.
+        `[...]` sum of the roots of the eigenvalues.
     """
-    values, vectors = _eigh_2x2(matrix)
-    return _from_eigenbasis(_diagonal(_clamped_root(values)), vectors)
+    roots, _, _ = _roots_and_axes(xx, xy, yy)
+    return roots[0] + roots[1]
 
 
-@sqrtm_2x2.defjvp
-def _sqrtm_2x2_jvp(primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
-    values, vectors = _eigh_2x2(primals[0])
-    roots = _clamped_root(values)
-    turned = _matmul(_transposed(vectors), _matmul(tangents[0], vectors))
-    turned = turned / (roots[..., :, None] + roots[..., None, :])
-    return (
-        _from_eigenbasis(_diagonal(roots), vectors),
-        _from_eigenbasis(turned, vectors),
-    )
+@trace_of_root_2x2.defjvp
+def _trace_of_root_2x2_jvp(primals: tuple, tangents: tuple) -> tuple:
+    roots, cos, sin = _roots_and_axes(*primals)
+    first, second = _diagonal_in_basis(*tangents, cos, sin)
+    return roots[0] + roots[1], first / (2 * roots[0]) + second / (2 * roots[1])
 
 
-def _eigh_2x2(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Eigenvalues `[..., 2]` and eigenvectors (columns) of symmetric 2x2 matrices.
+def _roots_and_axes(xx: jax.Array, xy: jax.Array, yy: jax.Array) -> tuple:
+    """Roots of the two eigenvalues, and the first eigenvector (cos, sin).
 
-    One Jacobi rotation diagonalises exactly; elementwise, unlike a LAPACK call per
-    matrix. A multiple of the identity gets the unit vectors.
+    One Jacobi rotation diagonalises a 2x2 matrix exactly, elementwise and without a
+    LAPACK call per matrix; a multiple of the identity keeps its axes.
     """
-    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    angle = jnp.arctan2(2 * b, a - d) / 2
+    angle = jnp.arctan2(2 * xy, xx - yy) / 2
     cos, sin = jnp.cos(angle), jnp.sin(angle)
-    first = a * cos * cos + 2 * b * sin * cos + d * sin * sin
-    second = a * sin * sin - 2 * b * sin * cos + d * cos * cos
-    vectors = jnp.stack([jnp.stack([cos, -sin], -1), jnp.stack([sin, cos], -1)], -2)
-    return jnp.stack([first, second], -1), vectors
+    values = _diagonal_in_basis(xx, xy, yy, cos, sin)
+    roots = [jnp.sqrt(jnp.maximum(v, _SMALLEST_EIGENVALUE)) for v in values]
+    return roots, cos, sin
 
 
-def _clamped_root(values: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.maximum(values, _SMALLEST_EIGENVALUE))
-
-
-def _from_eigenbasis(matrix: jax.Array, vectors: jax.Array) -> jax.Array:
-    return _matmul(vectors, _matmul(matrix, _transposed(vectors)))
-
-
-def _diagonal(values: jax.Array) -> jax.Array:
-    return values[..., :, None] * jnp.eye(2, dtype=values.dtype).reshape(
-        (1,) * (values.ndim - 1) + (2, 2)
-    )
-
-
-def _transposed(matrix: jax.Array) -> jax.Array:
-    return jnp.swapaxes(matrix, -1, -2)
-
-
-def _matmul(p: jax.Array, q: jax.Array) -> jax.Array:
-    """Product of 2x2 matrices, elementwise: never in an accelerator's low precision."""
-    return jnp.sum(p[..., :, :, None] * q[..., None, :, :], axis=-2)
+def _diagonal_in_basis(
+    xx: jax.Array, xy: jax.Array, yy: jax.Array, cos: jax.Array, sin: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Diagonal of a symmetric matrix seen from axes turned by an angle."""
+    mixed = 2 * sin * cos * xy
+    first = cos * cos * xx + mixed + sin * sin * yy
+    return first, sin * sin * xx - mixed + cos * cos * yy

@@ -1,0 +1,388 @@
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.detection import decode as D
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.structures import DetectionMaps
+
+KRADAR = RadarGrid.kradar()
+OFFICIAL = {112: KRADAR.padded(8, "stretched"), 107: KRADAR.padded(1, "stretched")}
+CASES = ("padded_wide_roi", "padded_no_roi", "unpadded_wide_roi", "unpadded_no_roi")
+GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimuth=12)
+C = 3
+SIZES = ("grid", "max_detections", "pre_nms", "per_class_nms")
+FLAGS = ("threshold_inclusive", "normalize_yaw")
+
+decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
+find_peaks = jax.jit(
+    D.find_peaks, static_argnames=("grid", "max_peaks", "threshold_inclusive")
+)
+
+
+def logit(p):
+    with np.errstate(divide="ignore"):
+        p = np.asarray(p, np.float64)
+        return (np.log(p) - np.log1p(-p)).astype(np.float32)
+
+
+def make_maps(heatmap, params):
+    """Maps from probabilities and box parameters, channels first as the reference."""
+    return DetectionMaps(
+        jnp.asarray(np.moveaxis(logit(heatmap), 1, -1)),
+        jnp.asarray(np.moveaxis(params, 1, -1), jnp.float32),
+    )
+
+
+# The released code ----------------------------------------------------------------
+
+
+def reference_maps(stream, blobs, width):
+    """Full-size maps that the reference was computed on."""
+    rng = np.random.default_rng([1234, stream])
+    shape = (3, 256, width)
+    heatmap = 0.05 * rng.random((3, 5, 256, width))
+    rows, columns = np.arange(256)[:, None], np.arange(width)
+    for frame, cls, i, j, peak, sigma in blobs:
+        distance = (rows - i) ** 2 + (columns - j) ** 2
+        one = heatmap[int(frame), int(cls)]
+        np.maximum(one, peak * np.exp(-distance / (2 * sigma**2)), out=one)
+    params = np.empty((3, 8, 256, width))
+    params[:, :2] = 0.3 * rng.standard_normal((3, 2, 256, width))
+    params[:, 2] = 0.5 * rng.standard_normal(shape)
+    for channel, low, spread in ((3, 4.0, 1.5), (4, 1.8, 0.6), (5, 1.3, 0.8)):
+        params[:, channel] = low + spread * rng.random(shape)
+    yaw = 0.3 * np.arange(3)[:, None, None] + 0.2 * rng.standard_normal(shape)
+    norm = 0.9 + 0.2 * rng.random(shape)
+    params[:, 6], params[:, 7] = norm * np.sin(yaw), norm * np.cos(yaw)
+    return make_maps(heatmap.astype(np.float32), params)
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request, golden):
+    arrays = np.load(golden / "detection_postproc.npz")
+    name = request.param
+    want = {k.split("/")[1]: v for k, v in arrays.items() if k.startswith(f"{name}/")}
+    maps = reference_maps(int(want["stream"]), want["blobs"], int(want["width"]))
+    return name, want, maps, OFFICIAL[int(want["width"])]
+
+
+def roi_of(want):
+    whole = np.array([-1e9] * 3 + [1e9] * 3)
+    return D.WIDE_ROI if want["wide_roi"] else whole
+
+
+def test_boxes_before_nms_of_the_released_code(case):
+    _, want, maps, grid = case
+    peaks = find_peaks(maps, grid, max_peaks=96, score_threshold=0.3, roi=roi_of(want))
+    for frame in range(3):
+        boxes = want[f"boxes_before_nms_{frame}"]
+        boxes = boxes[np.argsort(-boxes[:, 8])]
+        count = len(boxes)
+        assert peaks.num_found[frame] == count
+        assert peaks.is_valid[frame].tolist() == [True] * count + [False] * (96 - count)
+        np.testing.assert_allclose(peaks.boxes[frame, :count], boxes[:, :8], atol=2e-5)
+        np.testing.assert_allclose(peaks.scores[frame, :count], boxes[:, 8], atol=1e-6)
+        np.testing.assert_array_equal(peaks.classes[frame, :count], boxes[:, 9])
+        np.testing.assert_array_equal(peaks.cell[frame, :count], boxes[:, [11, 10]])
+
+
+def test_detections_of_the_released_code(case):
+    _, want, maps, grid = case
+    found = decode(maps, grid, max_detections=48, score_threshold=0.3, roi=roi_of(want))
+    for frame in range(3):
+        before = want[f"boxes_before_nms_{frame}"]
+        kept = before[want[f"kept_{frame}"]]
+        count = len(kept)
+        assert int(found.is_valid[frame].sum()) == count
+        np.testing.assert_allclose(
+            found.boxes[frame, :count, :6], kept[:, :6], atol=2e-5
+        )
+        yaw = np.arctan2(kept[:, 6], kept[:, 7])
+        np.testing.assert_allclose(found.boxes[frame, :count, 6], yaw, atol=2e-5)
+        np.testing.assert_allclose(found.scores[frame, :count], kept[:, 8], atol=1e-6)
+        np.testing.assert_array_equal(found.classes[frame, :count], kept[:, 9])
+    np.testing.assert_array_equal(found.num_cut, 0)
+
+
+def test_golden_boxes_are_the_reference(case, shared):
+    name, want, _, _ = case
+    reference = np.load(shared / f"fixtures/postproc/{name}.npz")
+    for key in reference:
+        np.testing.assert_array_equal(want[key], reference[key])
+
+
+def test_ties_of_the_released_code(golden):
+    want = np.load(golden / "detection_ties.npz")
+    heatmap = np.zeros((1, 5, 256, 112), np.float32)
+    heatmap[tuple(want["heat_index"].T)] = want["heat_value"]
+    params = np.zeros((1, 8, 256, 112))
+    params[:, 3:5], params[:, [5, 7]] = 0.2, 1
+    maps = make_maps(heatmap, params)
+    peaks = find_peaks(maps, OFFICIAL[112], max_peaks=8, score_threshold=0.3)
+    boxes = want["boxes_before_nms"]
+    order = np.lexsort((boxes[:, 10], boxes[:, 11], -boxes[:, 8]))
+    np.testing.assert_allclose(peaks.boxes[0, :4], boxes[order, :8], atol=2e-5)
+    np.testing.assert_array_equal(peaks.classes[0, :4], boxes[order, 9])
+    assert int(peaks.num_found[0]) == 4
+
+
+# Against the definition -----------------------------------------------------------
+
+
+def naive_peaks(scores, threshold, inclusive=False):
+    """(score, class, range, azimuth) of one frame `[R, A, C]`, by loops."""
+    found = []
+    for i in range(scores.shape[0]):
+        for j in range(scores.shape[1]):
+            best = None
+            for cls in range(scores.shape[2]):
+                value = scores[i, j, cls]
+                around = scores[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2, cls]
+                above = value >= threshold if inclusive else value > threshold
+                if above and value >= around.max() and (not best or value > best[0]):
+                    best = (value, cls, i, j)
+            found += [best] if best else []
+    return sorted(found, key=lambda p: (-p[0], p[2], p[3]))
+
+
+def sigmoid(x):
+    return np.asarray(jax.nn.sigmoid(x))
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_peaks_equal_the_definition(seed, inclusive):
+    rng = np.random.default_rng(seed)
+    # Few levels: many equal neighbours, equal classes and scores on the threshold.
+    logits = rng.integers(-3, 2, (1, 20, 12, C)).astype(np.float32)
+    maps = DetectionMaps(jnp.asarray(logits), jnp.zeros((1, 20, 12, 8)))
+    threshold = sigmoid(np.float32(0))
+    expected = naive_peaks(sigmoid(logits[0]), threshold, inclusive)
+    peaks = find_peaks(
+        maps,
+        GRID,
+        max_peaks=240,
+        score_threshold=threshold,
+        threshold_inclusive=inclusive,
+    )
+    count = int(peaks.num_found[0])
+    assert count == len(expected)
+    found = zip(
+        peaks.scores[0, :count].tolist(),
+        peaks.classes[0, :count].tolist(),
+        *peaks.cell[0, :count].T.tolist(),
+        strict=True,
+    )
+    assert list(found) == [(float(s), c, i, j) for s, c, i, j in expected]
+    assert not np.asarray(peaks.is_valid[0, count:]).any()
+
+
+def scattered(num=6, spacing=3, seed=0):
+    """Peaks of falling score, apart from each other, with 1 m boxes."""
+    rng = np.random.default_rng(seed)
+    logits = np.full((1, 20, 12, C), -8.0, np.float32)
+    cells = [(i, j) for i in range(4, 20, spacing) for j in range(0, 12, spacing)]
+    cells = [cells[k] for k in rng.permutation(len(cells))[:num]]
+    classes = rng.integers(0, C, num)
+    for rank, ((i, j), cls) in enumerate(zip(cells, classes, strict=True)):
+        logits[0, i, j, cls] = 3 - 0.25 * rank
+    params = np.zeros((1, 20, 12, 8), np.float32)
+    params[..., 3:6], params[..., 7] = 1, 1
+    return logits, params, np.array(cells), classes
+
+
+def maps_of(logits, params):
+    return DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
+
+
+def test_encoded_boxes_come_back():
+    logits, params, cells, classes = scattered()
+    rng = np.random.default_rng(1)
+    boxes = np.zeros((len(cells), 7))
+    boxes[:, :2] = GRID.cell_to_ego(*cells.T) + rng.uniform(-1, 1, (len(cells), 2))
+    boxes[:, 2:6] = rng.uniform(0.5, 3, (len(cells), 4))
+    boxes[:, 6] = rng.uniform(-3, 3, len(cells))
+    for (i, j), box in zip(cells, boxes, strict=True):
+        offset = box[:2] - GRID.cell_to_ego(i, j)
+        heading = [np.sin(box[6]), np.cos(box[6])]
+        params[0, i, j] = [*offset, box[2] - 0.7, *box[3:6], *heading]
+    found = decode(
+        maps_of(logits, params), GRID, max_detections=12, score_threshold=0.3, z0_m=0.7
+    )
+    np.testing.assert_allclose(found.boxes[0, :6], boxes, atol=2e-5)
+    np.testing.assert_array_equal(found.classes[0], [*classes] + [-1] * 6)
+    np.testing.assert_array_equal(found.scores[0, 6:], 0)
+    np.testing.assert_array_equal(found.boxes[0, 6:], 0)
+    assert found.is_valid[0].tolist() == [True] * 6 + [False] * 6
+
+
+def test_what_k_cuts_off_is_counted():
+    logits, params, _, _ = scattered(num=10)
+    maps = maps_of(logits, params)
+    counts = {}
+    for k, pre_nms in ((16, None), (6, None), (4, None), (6, 6), (6, 10)):
+        found = decode(
+            maps, GRID, max_detections=k, score_threshold=0.3, pre_nms=pre_nms
+        )
+        counts[k, pre_nms] = int(found.num_cut[0])
+        assert int(found.is_valid[0].sum()) == min(k, 10)
+        assert found.boxes.shape == (1, k, 7)
+        assert (np.diff(found.scores[0]) <= 0).all()
+    assert counts == {
+        (16, None): 0, (6, None): 4, (4, None): 6, (6, 6): 4, (6, 10): 4
+    }  # fmt: skip
+
+
+def test_boxes_dropped_by_nms_are_not_counted_as_cut():
+    logits, params, _, _ = scattered(num=10)
+    params[..., 3:5] = 500  # everything overlaps
+    found = decode(maps_of(logits, params), GRID, max_detections=5, score_threshold=0.3)
+    assert int(found.is_valid[0].sum()) == 1
+    assert int(found.num_cut[0]) == 0
+    few = decode(
+        maps_of(logits, params),
+        GRID,
+        max_detections=5,
+        score_threshold=0.3,
+        pre_nms=7,
+    )
+    assert int(few.num_cut[0]) == 3
+
+
+def test_more_rows_than_bins():
+    logits, params, _, _ = scattered()
+    found = decode(
+        maps_of(logits, params), GRID, max_detections=300, score_threshold=0.3
+    )
+    assert found.boxes.shape == (1, 300, 7)
+    assert found.classes[0, -1] == -1
+    assert int(found.is_valid.sum()) == 6
+
+
+def test_region_bounds_are_inclusive_and_leave_room_for_others():
+    logits, params, cells, _ = scattered(num=10)
+    x, y = GRID.cell_to_ego(*cells.T).T
+    inside = (np.abs(y) <= 30) & (x <= 90)
+    assert 3 < inside.sum() < 10
+    roi = np.array([0, -30, 0, 90, 30, 0.0])
+    found = decode(
+        maps_of(logits, params), GRID, max_detections=12, score_threshold=0.3, roi=roi
+    )
+    np.testing.assert_allclose(found.boxes[0, : inside.sum(), 0], x[inside], rtol=1e-6)
+    # Peaks outside do not take the place of peaks inside.
+    tight = find_peaks(
+        maps_of(logits, params),
+        GRID,
+        max_peaks=int(inside.sum()),
+        score_threshold=0.3,
+        roi=roi,
+    )
+    assert np.asarray(tight.is_valid).all()
+    # The sensor height counts towards z.
+    above = decode(
+        maps_of(logits, params),
+        GRID,
+        max_detections=12,
+        score_threshold=0.3,
+        roi=roi,
+        z0_m=0.1,
+    )
+    assert not np.asarray(above.is_valid).any()
+
+
+def overlapping_classes():
+    """Two classes that overlap, in bins that are not neighbours."""
+    logits = np.full((1, 20, 12, C), -8.0, np.float32)
+    logits[0, 10, 5, 0], logits[0, 10, 7, 1] = 2, 1
+    params = np.zeros((1, 20, 12, 8), np.float32)
+    params[..., 3:5], params[..., 5], params[..., 7] = 60, 2, 1
+    return maps_of(logits, params)
+
+
+def test_nms_across_classes_or_per_class():
+    run = partial(
+        decode, overlapping_classes(), GRID, max_detections=4, score_threshold=0.3
+    )
+    assert run().is_valid[0].tolist() == [True, False, False, False]
+    assert run(per_class_nms=True).classes[0].tolist() == [0, 1, -1, -1]
+
+
+def test_length_of_the_yaw_vector_scales_boxes_in_nms_only_as_released():
+    maps = overlapping_classes()
+    maps = maps.replace(box_params=maps.box_params.at[..., 7].set(0.1))
+    run = partial(decode, maps, GRID, max_detections=4, score_threshold=0.3)
+    released, plain = run(), run(normalize_yaw=True)
+    assert int(released.is_valid.sum()) == 2
+    assert int(plain.is_valid.sum()) == 1
+    np.testing.assert_allclose(released.boxes[0, 0, 3:5], 60)
+
+
+def test_thresholds_and_region_are_traced_values():
+    logits, params, _, _ = scattered(num=10)
+    count = decode._cache_size()
+    for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5), (0.5, 0.1)):
+        roi = np.array([0.0, -50, -1, 100 * threshold, 50, 1])
+        found = decode(
+            maps_of(logits, params),
+            GRID,
+            max_detections=9,
+            score_threshold=threshold,
+            nms_iou=nms_iou,
+            roi=roi,
+        )
+        valid = np.asarray(found.is_valid[0])
+        assert (np.asarray(found.scores[0])[valid] > threshold).all()
+        assert (np.asarray(found.boxes[0])[valid, 0] <= 100 * threshold).all()
+    assert decode._cache_size() == count + 1
+
+
+def test_frames_of_a_batch_do_not_mix():
+    scenes = [scattered(num=n, seed=n)[:2] for n in (0, 3, 9)]
+    batch = maps_of(*(np.concatenate(x) for x in zip(*scenes, strict=True)))
+    together = decode(batch, GRID, max_detections=12, score_threshold=0.3)
+    for i, scene in enumerate(scenes):
+        alone = decode(maps_of(*scene), GRID, max_detections=12, score_threshold=0.3)
+        for found, wanted in zip(
+            jax.tree.leaves(together), jax.tree.leaves(alone), strict=True
+        ):
+            np.testing.assert_allclose(found[i], wanted[0], rtol=1e-6)
+    assert together.is_valid.sum(1).tolist() == [0, 3, 9]
+
+
+def test_bfloat16_maps_and_saturated_or_missing_numbers():
+    logits, params, _, _ = scattered()
+    low = jax.tree.map(lambda x: x.astype(jnp.bfloat16), maps_of(logits, params))
+    found = decode(low, GRID, max_detections=8, score_threshold=0.3)
+    assert found.boxes.dtype == found.scores.dtype == jnp.float32
+    assert int(found.is_valid.sum()) == 6
+    for value in (np.inf, 100.0, np.nan, -np.inf):
+        flat = decode(
+            maps_of(np.full_like(logits, value), params),
+            GRID,
+            max_detections=8,
+            score_threshold=0.3,
+        )
+        assert np.isfinite(flat.boxes).all()
+        assert np.isfinite(flat.scores).all()
+        assert np.asarray(flat.is_valid).any() == (value > 0)
+
+
+def test_wrong_shapes_are_refused():
+    logits, params, _, _ = scattered()
+    run = partial(D.decode, max_detections=4, score_threshold=0.3)
+    with pytest.raises(ValueError, match=r"maps have 20 x 12 .* the grid 256 x 107"):
+        run(maps_of(logits, params), KRADAR)
+    with pytest.raises(ValueError, match=r"\[B, R, A, C\] and \[B, R, A, 8\], got"):
+        run(maps_of(logits, params[..., :7]), GRID)
+    with pytest.raises(ValueError, match="max_detections must be at least 1, got 0"):
+        D.decode(maps_of(logits, params), GRID, max_detections=0, score_threshold=0.3)
+    with pytest.raises(ValueError, match="1 peak must enter NMS, got 0"):
+        run(maps_of(logits, params), GRID, pre_nms=0)
+    with pytest.raises(ValueError, match=r"roi must be \[6\]"):
+        run(maps_of(logits, params), GRID, roi=np.zeros(4))

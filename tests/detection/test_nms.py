@@ -1,0 +1,135 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.detection.nms import greedy_suppression, rotated_nms
+from radejax.geometry.rotated_iou import bev_iou_np
+
+K = 24
+nms = jax.jit(rotated_nms)
+suppression = jax.jit(greedy_suppression)
+
+
+def python_greedy(overlaps, is_valid):
+    keep = np.zeros(len(is_valid), bool)
+    for j in range(len(is_valid)):
+        keep[j] = is_valid[j] and not any(keep[i] and overlaps[i, j] for i in range(j))
+    return keep
+
+
+def random_boxes(rng, spread=6.0):
+    boxes = np.zeros((K, 7), np.float32)
+    boxes[:, :2] = rng.uniform(-spread, spread, (K, 2))
+    boxes[:, 3:6] = rng.uniform(1, 6, (K, 3))
+    boxes[:, 6] = rng.uniform(-np.pi, np.pi, K)
+    return boxes
+
+
+def overlap_matrix(boxes, threshold):
+    rows, columns = np.repeat(boxes, K, 0), np.tile(boxes, (K, 1))
+    return bev_iou_np(rows, columns).reshape(K, K) >= threshold
+
+
+def test_chain_by_hand():
+    # Each box overlaps the next: the first suppresses the second, which then cannot
+    # suppress the third.
+    boxes = np.zeros((4, 7), np.float32)
+    boxes[:, 0] = [0, 2, 4, 30]
+    boxes[:, 3:6] = 4
+    keep = rotated_nms(boxes, jnp.array([True, True, True, False]), 0.3)
+    assert keep.tolist() == [True, False, True, False]
+
+
+def test_threshold_is_inclusive():
+    boxes = np.zeros((2, 7), np.float32)
+    boxes[:, 3:6] = [3.0, 2, 1]
+    boxes[1, 0] = 1.5  # half of each: IoU 1/3, exact in these numbers up to rounding
+    valid = jnp.ones(2, bool)
+    iou = np.float32(jax.jit(lambda b: rotated_nms(b, valid, 0.0))(boxes)[1])
+    assert iou == 0  # suppressed at threshold 0, even
+    assert rotated_nms(boxes, valid, 1 / 3 - 1e-5).tolist() == [True, False]
+    assert rotated_nms(boxes, valid, 1 / 3 + 1e-5).tolist() == [True, True]
+    same = boxes.copy()
+    same[1] = same[0]
+    assert rotated_nms(same, valid, 1.0).tolist() == [True, False]
+
+
+def test_only_boxes_of_one_class_where_classes_are_given():
+    boxes = np.zeros((3, 7), np.float32)
+    boxes[:, 3:6] = 4
+    valid, classes = jnp.ones(3, bool), jnp.array([0, 1, 0])
+    assert rotated_nms(boxes, valid, 0.3).tolist() == [True, False, False]
+    keep = rotated_nms(boxes, valid, 0.3, classes=classes)
+    assert keep.tolist() == [True, True, False]
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(0, K), st.floats(0.05, 0.9))
+def test_equals_the_python_loop(seed, num_valid, threshold):
+    boxes = random_boxes(np.random.default_rng(seed))
+    is_valid = np.arange(K) < num_valid
+    expected = python_greedy(overlap_matrix(boxes, threshold), is_valid)
+    np.testing.assert_array_equal(nms(boxes, is_valid, threshold), expected)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_any_overlap_relation(seed, density):
+    rng = np.random.default_rng(seed)
+    overlaps = rng.random((K, K)) < density
+    overlaps |= overlaps.T
+    is_valid = rng.random(K) < 0.8
+    expected = python_greedy(overlaps, is_valid)
+    np.testing.assert_array_equal(suppression(overlaps, is_valid), expected)
+
+
+def test_longest_possible_chain():
+    overlaps = np.eye(K, k=1, dtype=bool) | np.eye(K, k=-1, dtype=bool)
+    keep = suppression(overlaps, np.ones(K, bool))
+    np.testing.assert_array_equal(keep, np.arange(K) % 2 == 0)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_kept_boxes_are_all_kept_again(seed):
+    boxes = random_boxes(np.random.default_rng(seed), spread=4)
+    keep = np.asarray(nms(boxes, np.ones(K, bool), 0.3))
+    np.testing.assert_array_equal(nms(boxes, keep, 0.3), keep)
+    overlaps = overlap_matrix(boxes, 0.3) & ~np.eye(K, dtype=bool)
+    assert not overlaps[np.ix_(keep, keep)].any()
+    assert overlaps[np.ix_(keep, ~keep)].any(0).all()
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**32 - 1))
+def test_order_of_rows_does_not_matter_once_sorted_by_score(seed):
+    rng = np.random.default_rng(seed)
+    boxes, scores = random_boxes(rng), rng.permutation(K)
+    shuffle = rng.permutation(K)
+    kept = []
+    for order in (np.arange(K), shuffle):
+        by_score = order[np.argsort(-scores[order])]
+        kept.append(by_score[np.asarray(nms(boxes[by_score], np.ones(K, bool), 0.3))])
+    np.testing.assert_array_equal(*kept)
+
+
+def test_batched_by_vmap_with_rows_in_different_states():
+    rng = np.random.default_rng(0)
+    boxes = np.stack([random_boxes(rng) for _ in range(3)])
+    is_valid = np.arange(K) < np.array([[0], [10], [K]])
+    batch = jax.jit(jax.vmap(lambda b, v: rotated_nms(b, v, 0.3)))(boxes, is_valid)
+    for i in range(3):
+        np.testing.assert_array_equal(batch[i], nms(boxes[i], is_valid[i], 0.3))
+    assert not np.asarray(batch[0]).any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_bad_boxes_in_padding_rows_disturb_nothing(bad):
+    boxes = random_boxes(np.random.default_rng(1))
+    is_valid = np.arange(K) < 12
+    clean = nms(boxes, is_valid, 0.3)
+    boxes[12:] = bad
+    np.testing.assert_array_equal(nms(boxes, is_valid, 0.3), clean)

@@ -1,0 +1,424 @@
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.losses.detection import detection_loss, smooth_l1
+from radejax.losses.focal import gaussian_heatmap
+from radejax.losses.gwd import gwd_loss
+from radejax.structures import Batch, DetectionMaps
+
+STRETCHED = RadarGrid.kradar().padded(8, "stretched")
+CASES = (
+    "batch4_sigma3",
+    "batch4_sigma0p75",
+    "single_frame_sigma0p75",
+    "one_object_sigma3",
+    "batch2_adaptive",
+    "batch2_anisotropic",
+    "no_objects",
+)
+PARTS = ("focal", "gwd", "smooth_l1")
+GRID = RadarGrid.reduced(num_doppler=4, num_range=24, num_elevation=4, num_azimuth=16)
+
+
+# The released code ----------------------------------------------------------------
+
+
+def reference_maps(stream, batch):
+    """Full-size maps that the reference was computed on, channels last."""
+    rng = np.random.default_rng([1234, stream])
+    logits = 1.5 * rng.standard_normal((batch, 5, 256, 112)) - 2
+    heatmap = (1 / (1 + np.exp(-logits))).astype(np.float32)
+    params = np.empty((batch, 8, 256, 112))
+    params[:, :3] = 0.5 * rng.standard_normal((batch, 3, 256, 112))
+    for channel, low, width in ((3, 3.0, 2.0), (4, 1.5, 1.0), (5, 1.2, 1.0)):
+        params[:, channel] = low + width * rng.random((batch, 256, 112))
+    params[:, 6:] = 0.7 * rng.standard_normal((batch, 2, 256, 112))
+    p = heatmap.astype(np.float64)
+    logits = np.moveaxis(np.log(p) - np.log1p(-p), 1, -1)
+    maps = DetectionMaps(
+        jnp.asarray(logits, jnp.float32),
+        jnp.asarray(np.moveaxis(params, 1, -1), jnp.float32),
+    )
+    return maps, heatmap
+
+
+def batch_of(boxes, classes, is_valid):
+    arrays = (jnp.asarray(x) for x in (boxes, classes, is_valid))
+    return Batch(None, *arrays, frame=None)
+
+
+@pytest.fixture(scope="module")
+def cases(golden):
+    return np.load(golden / "losses_cases.npz")
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request, cases):
+    """Everything the reference says about a case, and what we compute for it."""
+    name = request.param
+    want = {k.split("/")[1]: v for k, v in cases.items() if k.startswith(f"{name}/")}
+    batch = batch_of(want["boxes"], want["classes"], want["is_valid"])
+    maps, heatmap = reference_maps(int(want["stream"]), len(want["boxes"]))
+    sigma = {"sigma": str(want["sigma_mode"])}
+    sigma["sigma_cells"] = float(want["sigma_cells"])
+
+    def loss(maps):
+        return detection_loss(maps, batch, STRETCHED, gwd_transform="none", **sigma)
+
+    (total, parts), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(maps)
+    target = gaussian_heatmap(
+        batch.boxes, batch.classes, batch.is_valid, STRETCHED, num_classes=5, **sigma
+    )
+    # The reference differentiates with respect to probabilities.
+    slope = np.moveaxis(heatmap.astype(np.float64) * (1 - heatmap), 1, -1)
+    return {
+        "name": name,
+        "want": want,
+        "total": float(total),
+        "parts": {k: float(v) for k, v in parts.items()},
+        "target": np.moveaxis(np.asarray(target), -1, 1),
+        "grad_heatmap": np.moveaxis(np.asarray(grads.heatmap_logits) / slope, -1, 1),
+        "grad_params": np.asarray(grads.box_params),
+    }
+
+
+def windows(maps, case, fill):
+    """13 x 13 bins around each object in its class: `[P, 13, 13]`."""
+    want = case["want"]
+    padded = np.pad(
+        maps, [(0, 0), (0, 0), (6, 6), (6, 6)], mode="constant", constant_values=fill
+    )
+    found = []
+    for frame, row in want["patch_frame_object"].astype(int):
+        x, y = want["boxes"][frame, row, :2].astype(np.float64)
+        i, j = STRETCHED.nearest_cell(x, y)
+        cls = want["classes"][frame, row]
+        found.append(padded[frame, cls, i : i + 13, j : j + 13])
+    return np.stack(found)
+
+
+def relative(found, wanted):
+    return np.abs(found - wanted).max() / np.abs(wanted).max()
+
+
+def test_losses_of_the_released_code(case):
+    for part in PARTS:
+        np.testing.assert_allclose(case["parts"][part], case["want"][part], rtol=2e-6)
+    has_objects = case["want"]["is_valid"].any()
+    assert case["total"] == pytest.approx(4.0 if has_objects else 2.0)
+    assert case["parts"]["num_objects"] == case["want"]["is_valid"].sum()
+
+
+def test_targets_of_the_released_code(case):
+    want, target = case["want"], case["target"]
+    ones = (target == 1).sum((2, 3))
+    np.testing.assert_array_equal(ones, want["target_num_ones"])
+    assert case["parts"]["num_positive"] == ones.sum()
+    sums = target.sum((2, 3), dtype=np.float64)
+    np.testing.assert_allclose(sums, want["target_channel_sum"], rtol=1e-6, atol=1e-6)
+    if len(want["patch_frame_object"]):
+        found = windows(target, case, -1)
+        np.testing.assert_allclose(found, want["target_patches"], atol=1e-6)
+
+
+def test_gradients_of_the_released_code(case):
+    want = case["want"]
+    stats = want["grad_total_heatmap_channel_stats"]  # mean, std, min, max
+    for column, function in enumerate((np.mean, np.std, np.min, np.max)):
+        found = function(case["grad_heatmap"].astype(np.float64), (2, 3))
+        np.testing.assert_allclose(
+            found, stats[..., column], rtol=1e-4, atol=1e-5 * np.abs(stats).max()
+        )
+    if not len(want["patch_frame_object"]):
+        np.testing.assert_array_equal(case["grad_params"], 0)
+        return
+    # Total = 2 focal / constant + ...
+    found = windows(case["grad_heatmap"], case, 0) * case["parts"]["focal"] / 2
+    assert relative(found, want["grad_focal_heatmap_patches"]) < 2e-6
+    at = tuple(want["grad_cells"].T)
+    found = case["grad_params"][at]
+    assert relative(found, want["grad_total_regression_at_cells"]) < 5e-6
+    elsewhere = case["grad_params"].copy()
+    elsewhere[at] = 0
+    np.testing.assert_array_equal(elsewhere, 0)
+
+
+def test_all_reference_arrays(case, shared):
+    reference = np.load(shared / "fixtures/losses" / f"{case['name']}.npz")
+    sub = np.s_[:, :, np.r_[0:256:4, 255][:, None], np.r_[0:112:2, 111]]
+    np.testing.assert_allclose(
+        case["target"][sub], reference["target_sub"], atol=1e-6, rtol=0
+    )
+    found = case["grad_heatmap"][sub]
+    assert relative(found, reference["grad_total_heatmap_sub"]) < 2e-6
+    focal = case["parts"]["focal"]
+    assert relative(found * focal / 2, reference["grad_focal_heatmap_sub"]) < 2e-6
+
+
+# Small scenes ---------------------------------------------------------------------
+
+
+def small_scene(rng, counts=(0, 1, 3), rows=4):
+    """Random maps and objects in the field of view of the small grid."""
+    b = len(counts)
+    maps = DetectionMaps(
+        jnp.asarray(rng.normal(-2, 1, (b, 24, 16, 2)), jnp.float32),
+        jnp.asarray(rng.normal(1, 0.5, (b, 24, 16, 8)), jnp.float32),
+    )
+    boxes = np.full((b, rows, 8), np.nan, np.float32)
+    classes = np.full((b, rows), -1, np.int32)
+    is_valid = np.arange(rows) < np.array(counts)[:, None]
+    cells = rng.uniform([2, 0], [23, 15], (b, rows, 2))
+    boxes[..., :2] = GRID.cell_to_ego(cells[..., 0], cells[..., 1])
+    boxes[..., 2:6] = rng.uniform(0.5, 5, (b, rows, 4))
+    yaw = rng.uniform(-3, 3, (b, rows))
+    boxes[..., 6], boxes[..., 7] = np.sin(yaw), np.cos(yaw)
+    boxes[~is_valid] = np.nan
+    classes[is_valid] = rng.integers(0, 2, is_valid.sum())
+    return maps, batch_of(boxes, classes, is_valid)
+
+
+@partial(jax.jit, static_argnames="options")
+def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
+    def loss(maps):
+        return detection_loss(
+            maps, batch, GRID, is_frame_valid=is_frame_valid, **numbers, **dict(options)
+        )
+
+    return jax.value_and_grad(loss, has_aux=True)(maps)
+
+
+def loss_and_grad(maps, batch, is_frame_valid=None, **options):
+    """Compiled once per shape and set of options, not once per test."""
+    numbers = {"z0_m": 0.0, "score_threshold": 0.3, "nms_iou": 0.3}
+    numbers = {name: options.pop(name, value) for name, value in numbers.items()}
+    if is_frame_valid is None:
+        is_frame_valid = jnp.ones(len(batch.boxes), bool)
+    return _loss_and_grad(
+        maps, batch, is_frame_valid, numbers, tuple(sorted(options.items()))
+    )
+
+
+def naive_regression(maps, batch, transform="sqrt", z0_m=0.0):
+    """GWD and smooth L1 object by object, frame by frame."""
+    totals = np.zeros(2)
+    for b in range(len(batch.boxes)):
+        frame = []
+        for n in np.flatnonzero(batch.is_valid[b]):
+            wanted = np.asarray(batch.boxes[b, n])
+            i, j = GRID.nearest_cell(*wanted[:2])
+            predicted = np.array(maps.box_params[b, i, j])
+            predicted[:2] += GRID.cell_to_ego(i, j)
+            predicted[2] += z0_m
+            gap = np.abs(predicted - wanted)
+            l1 = np.where(gap < 1, gap**2 / 2, gap - 0.5).mean()
+            frame.append([float(gwd_loss(predicted, wanted, transform=transform)), l1])
+        totals += np.mean(frame, 0) if frame else 0
+    return totals / len(batch.boxes)
+
+
+def test_regression_losses_object_by_object():
+    maps, batch = small_scene(np.random.default_rng(0))
+    (_, parts), _ = loss_and_grad(maps, batch, z0_m=0.7)
+    expected = naive_regression(maps, batch, z0_m=0.7)
+    np.testing.assert_allclose([parts["gwd"], parts["smooth_l1"]], expected, rtol=1e-5)
+    assert int(parts["num_matched"]) == int(parts["num_objects"]) == 4
+
+
+def test_smooth_l1_by_hand():
+    found = smooth_l1(jnp.array([-3.0, -0.5, 0.0, 1.0, 2.0]))
+    np.testing.assert_allclose(found, [2.5, 0.125, 0, 0.5, 1.5])
+
+
+def test_parts_weigh_as_asked_whatever_their_size():
+    maps, batch = small_scene(np.random.default_rng(1))
+    (total, parts), grad = loss_and_grad(maps, batch)
+    assert float(total) == pytest.approx(4)
+    sizes = [float(parts[p]) for p in PARTS]
+    weights = tuple(np.array([2, 1, 1]) / sizes)
+    (plain, parts), plain_grad = loss_and_grad(
+        maps, batch, weights=weights, normalize=False
+    )
+    assert float(plain) == pytest.approx(4)
+    assert float(parts["weighted_sum"]) == pytest.approx(4)
+    for found, wanted in zip(
+        jax.tree.leaves(grad), jax.tree.leaves(plain_grad), strict=True
+    ):
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("matching", ["center", "nms"])
+def test_without_objects_everything_is_finite(matching):
+    maps, batch = small_scene(np.random.default_rng(2), counts=(0, 0, 0))
+    (total, parts), grad = loss_and_grad(maps, batch, matching=matching)
+    assert float(total) == pytest.approx(2)
+    assert all(np.isfinite(v) for v in parts.values())
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
+    assert np.abs(grad.heatmap_logits).max() > 0
+    np.testing.assert_array_equal(grad.box_params, 0)
+
+
+def test_perfect_boxes_give_finite_gradients():
+    maps, batch = small_scene(np.random.default_rng(3), counts=(3, 0, 0))
+    params = np.array(maps.box_params)
+    for box in np.asarray(batch.boxes[0, :3]):
+        i, j = GRID.nearest_cell(*box[:2])
+        params[0, i, j] = box
+        params[0, i, j, :2] -= GRID.cell_to_ego(i, j)
+    maps = maps.replace(box_params=jnp.asarray(params))
+    (_, parts), grad = loss_and_grad(maps, batch)
+    assert float(parts["gwd"]) * 3 == pytest.approx(1 - 1 / 1.65, abs=1e-5)
+    assert float(parts["smooth_l1"]) == pytest.approx(0, abs=1e-10)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
+
+
+def test_frames_that_fill_up_a_batch_do_not_count():
+    maps, batch = small_scene(np.random.default_rng(4), counts=(2, 3, 4))
+    is_frame_valid = jnp.array([True, True, False])
+    (_, parts), grad = loss_and_grad(maps, batch, is_frame_valid)
+    first = jax.tree.map(lambda x: x[:2], (maps, batch))
+    (_, alone), alone_grad = loss_and_grad(*first)
+    for name in alone:
+        np.testing.assert_allclose(parts[name], alone[name], rtol=1e-6, err_msg=name)
+    for found, wanted in zip(
+        jax.tree.leaves(grad), jax.tree.leaves(alone_grad), strict=True
+    ):
+        np.testing.assert_allclose(found[:2], wanted, rtol=1e-5, atol=1e-8)
+        np.testing.assert_array_equal(found[2], 0)
+
+
+def test_what_fills_up_a_batch_does_not_matter_to_nms_matching():
+    is_frame_valid = jnp.array([True, True, False])
+    maps, batch = scene_with_peaks()
+    others = small_scene(np.random.default_rng(4), counts=(2, 3, 4))
+
+    def with_last_of_others(x, y):
+        return x.at[2].set(y[2])
+
+    results = [
+        loss_and_grad(*scene, is_frame_valid, matching="nms")
+        for scene in (
+            (maps, batch),
+            jax.tree.map(with_last_of_others, (maps, batch), others),
+        )
+    ]
+    assert int(results[0][0][1]["num_matched"]) > 0
+    jax.tree.map(np.testing.assert_array_equal, *results)
+    assert not np.asarray(results[0][1].box_params[2]).any()
+
+
+def test_bfloat16_maps_are_compared_in_float32():
+    maps, batch = small_scene(np.random.default_rng(5))
+    low = jax.tree.map(lambda x: x.astype(jnp.bfloat16), maps)
+    same = jax.tree.map(lambda x: x.astype(jnp.float32), low)
+    (_, parts), grad = loss_and_grad(low, batch)
+    (_, wanted), _ = loss_and_grad(same, batch)
+    for name in wanted:
+        np.testing.assert_allclose(parts[name], wanted[name], rtol=1e-6)
+        assert parts[name].dtype != jnp.bfloat16
+    assert grad.box_params.dtype == jnp.bfloat16
+
+
+def test_normalised_yaw_ignores_the_length_of_the_vector():
+    maps, batch = small_scene(np.random.default_rng(6))
+    longer = maps.replace(box_params=maps.box_params.at[..., 6:].multiply(2.5))
+    gwd = [
+        float(loss_and_grad(m, batch, normalize_yaw=True)[0][1]["gwd"])
+        for m in (maps, longer)
+    ]
+    raw = [float(loss_and_grad(m, batch)[0][1]["gwd"]) for m in (maps, longer)]
+    assert gwd[0] == pytest.approx(gwd[1], rel=1e-5)
+    assert abs(raw[0] - raw[1]) > 1e-3
+    zero = maps.replace(box_params=maps.box_params.at[..., 6:].set(0))
+    _, grad = loss_and_grad(zero, batch, normalize_yaw=True)
+    assert np.isfinite(grad.box_params).all()
+
+
+def scene_with_peaks():
+    """Two objects in the first of three frames; peaks on one, behind it, and far off.
+
+    All boxes are squares of 8 m; bins are 5.1 m and 7 degrees apart.
+    """
+    logits = np.full((3, 24, 16, 2), -6.0, np.float32)
+    for (i, j), logit in {(10, 8): 3.0, (12, 8): 2.0, (18, 3): 1.0}.items():
+        logits[0, i, j, 0] = logit
+    params = np.zeros((3, 24, 16, 8), np.float32)
+    boxes = np.zeros((3, 4, 8), np.float32)
+    for array in (params, boxes):
+        array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
+    boxes[0, 0, :2] = GRID.cell_to_ego(10, 8) + np.array([1.0, 0.5])
+    boxes[0, 1, :2] = GRID.cell_to_ego(5, 2)
+    is_valid = np.zeros((3, 4), bool)
+    is_valid[0, :2] = True
+    maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
+    return maps, batch_of(boxes, np.zeros((3, 4), np.int32), is_valid)
+
+
+def test_nms_matching_by_hand():
+    # (12, 8) is 10 m behind (10, 8): it overlaps neither it nor the object.
+    maps, batch = scene_with_peaks()
+    (_, parts), grad = loss_and_grad(maps, batch, matching="nms")
+    assert int(parts["num_matched"]) == 1
+    assert int(parts["num_objects"]) == 2
+    # Off by (1, 0.5) in 2 of 8 numbers, sqrt(1.25) m apart, in one of three frames.
+    np.testing.assert_allclose(parts["smooth_l1"], (0.5 + 0.125) / 8 / 3, rtol=1e-5)
+    gwd = 1 - 1 / (1.65 + np.sqrt(1.25))
+    np.testing.assert_allclose(parts["gwd"], gwd / 3, rtol=1e-5)
+    touched = np.argwhere(np.abs(grad.box_params).sum(-1) > 0)
+    assert touched.tolist() == [[0, 10, 8]]
+
+
+def test_nms_matching_without_a_peak_has_no_regression_loss():
+    maps, batch = scene_with_peaks()
+    (_, parts), _ = loss_and_grad(maps, batch, matching="nms", score_threshold=0.99)
+    assert parts["gwd"] == parts["smooth_l1"] == parts["num_matched"] == 0
+
+
+def test_suppressed_peaks_are_not_matched():
+    maps, batch = scene_with_peaks()
+    wide = maps.replace(box_params=maps.box_params.at[..., 3:5].set(30.0))
+    (_, parts), _ = loss_and_grad(wide, batch, matching="nms", nms_iou=0.3)
+    (_, every), _ = loss_and_grad(wide, batch, matching="nms", nms_iou=1.1)
+    assert int(parts["num_matched"]) < int(every["num_matched"])
+
+
+def test_gradient_descent_finds_the_objects():
+    maps, batch = small_scene(np.random.default_rng(7))
+    optimizer = optax.adam(0.1)
+    state = optimizer.init(maps)
+    for _ in range(150):
+        (_, parts), grad = loss_and_grad(maps, batch)
+        updates, state = optimizer.update(grad, state)
+        maps = optax.apply_updates(maps, updates)
+    # Two of three frames have objects; a perfect box costs 0.394.
+    assert float(parts["gwd"]) * 3 / 2 < 0.42
+    assert float(parts["smooth_l1"]) < 1e-3
+    assert float(parts["focal"]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"matching": "nearest"}, "'center' or 'nms', got 'nearest'"),
+        ({"sigma": "round"}, "sigma must be"),
+        ({"gwd_transform": "cube"}, "transform must be"),
+    ],
+)
+def test_unknown_options_are_refused(changes, message):
+    maps, batch = small_scene(np.random.default_rng(8))
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(lambda m: detection_loss(m, batch, GRID, **changes), maps)
+
+
+def test_wrong_shapes_are_refused():
+    maps, batch = small_scene(np.random.default_rng(9))
+    with pytest.raises(ValueError, match="24 x 16 range x azimuth bins, the grid 256"):
+        detection_loss(maps, batch, STRETCHED)
+    with pytest.raises(ValueError, match=r"must be \[3, N, 8\] .* got \(3, 4, 7\)"):
+        detection_loss(maps, batch.replace(boxes=batch.boxes[..., :7]), GRID)
