@@ -12,6 +12,7 @@ import concurrent.futures
 import dataclasses
 import hashlib
 import json
+import math
 import multiprocessing
 import os
 import pathlib
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from radejax.geometry.radar_grid import RadarGrid
 
 PLAN = "plan.json"
+
+_SMALL_JOB_CELLS = 3e9  # some 50 of K-Radar's tesseracts, a few seconds
 
 
 @dataclasses.dataclass
@@ -110,7 +113,8 @@ def project_dataset(
         grid: Sensor axes; None takes those of `frames`.
         dtype: Type of the records: "float16", "uint8" or "float32".
         shard: `(i, n)` or `"i/n"`, i from 0: this run does every n-th file.
-        num_workers: Processes; None: one a core; 0: this process.
+        num_workers: Processes; 0: this one; None: one a core, or for a job that is done
+            before they have started, this one.
         frames_per_file: Frames of one file of records (64 of K-Radar: 350 MB).
         skip_bad: Leave out frames whose tesseract is missing or damaged, and report
             them. Otherwise the first one raises.
@@ -231,7 +235,8 @@ def _run(
     total = sum(len(task.frames) for task in tasks)
     bar = tqdm(total=total, unit="frame", desc="project", disable=not progress)
     if num_workers is None:
-        num_workers = os.cpu_count() or 1
+        cells = sum(len(task.frames) * math.prod(task.shape_drea) for task in tasks)
+        num_workers = (os.cpu_count() or 1) if cells > _SMALL_JOB_CELLS else 0
     reading = working = 0.0
     with bar:
         if num_workers == 0:

@@ -93,12 +93,16 @@ def _read_slabs(
     file: BinaryIO, slab: np.ndarray, count: int, timings: dict[str, float]
 ) -> Iterator[np.ndarray]:
     """The next `count` slabs of a file, all in the same buffer."""
+    view = memoryview(slab).cast("B")
     for i in range(count):
         began = time.perf_counter()
-        num_bytes = file.readinto(slab)
+        filled = 0
+        while filled < len(view):  # network file systems return parts
+            num_bytes = file.readinto(view[filled:])
+            if not num_bytes:
+                raise EOFError(f"the file ends in column {i} of {count}")
+            filled += num_bytes
         timings["reading"] += time.perf_counter() - began
-        if num_bytes != slab.nbytes:
-            raise EOFError(f"the file ends in column {i} of {count}")
         yield slab
 
 

@@ -132,11 +132,11 @@ def test_processes_share_every_epoch(loader, count):
 
 
 def test_processes_take_as_many_steps_when_frames_do_not_divide(loader):
-    for i in range(5):
-        share = frames_of(
-            loader(process_index=i, process_count=5, num_epochs=1, batch_size=2)
-        )
-        assert len(share) == 1 == steps_per_epoch(12, 2, process_count=5)
+    for batch_size, steps in ((1, 2), (2, 1)):
+        options = {"process_count": 5, "num_epochs": 1, "batch_size": batch_size}
+        shares = [frames_of(loader(process_index=i, **options)) for i in range(5)]
+        assert {len(share) for share in shares} == {steps}
+        assert steps == steps_per_epoch(12, batch_size, process_count=5)
     padded = [
         frames_of(
             loader(

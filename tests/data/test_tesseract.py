@@ -1,3 +1,5 @@
+import io
+
 import h5py
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ import scipy.io
 from radejax.data.kradar_write import write_tesseract
 from radejax.data.projection import project
 from radejax.data.tesseract import (
+    _read_slabs,
     check_tesseract,
     project_file,
     read_projection_npy,
@@ -145,3 +148,21 @@ def test_bad_released_projections(tmp_path):
     np.save(path, np.array([{}], object))
     with pytest.raises(DataError, match=r"p\.npy: damaged"):
         read_projection_npy(path)
+
+
+class Dribble(io.BytesIO):
+    """A file that returns a few bytes at a time, as network file systems may."""
+
+    def readinto(self, buffer):
+        return super().readinto(memoryview(buffer)[:7])
+
+
+def test_slabs_of_a_file_that_returns_parts(tesseract):
+    content = np.asfortranarray(tesseract).tobytes(order="F")
+    slab = np.empty(SHAPE[2::-1], np.float32)
+    slabs = _read_slabs(Dribble(content), slab, SHAPE[3], {"reading": 0.0})
+    found = np.stack([column.copy() for column in slabs])  # [A, E, R, D]
+    np.testing.assert_array_equal(found.T, tesseract)
+    short = _read_slabs(Dribble(content[:-3]), slab, SHAPE[3], {"reading": 0.0})
+    with pytest.raises(EOFError, match="the file ends in column 4 of 5"):
+        list(short)
