@@ -73,8 +73,8 @@ def load(
         for name, value in tensors.items()
         if not name.startswith(tuple(_RADAR_PARTS))
     }
-    reader = StateDictReader(_without_lora(rest), source)
-    fusion = _fusion_fields(rest, model_overrides)
+    reader = StateDictReader(without_lora(rest), source)
+    fusion = fusion_fields(rest, model_overrides)
     params["image_fusion"] = read_fusion(reader, fusion)
     vit, image_params, stats = read_image(reader, rest)
     params.update(image_params)
@@ -123,7 +123,7 @@ def _load_radar(
 # Fusion ------------------------------------------------------------------------------
 
 
-def _fusion_fields(
+def fusion_fields(
     tensors: Mapping[str, Any], overrides: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Settings that names and shapes show; the rest as released."""
@@ -265,7 +265,7 @@ def _read_resnet(reader: StateDictReader) -> tuple[dict[str, Any], dict[str, Any
 _LORA = re.compile(r"(.*)\.lora_([AB])\.[^.]+\.weight$")
 
 
-def _without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
+def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
     """Adds low-rank adapters (PEFT) to the weights they adapt.
 
     The released settings have rank and alpha 16, hence a factor of 1; they also never

@@ -267,10 +267,10 @@ def _corners(
                 y_part if step_y else 1 - y_part
             )
             share.append(jnp.where(is_inside, part, 0.0))
-            # Outside the share is zero and any index will do.
-            column = jnp.clip(column, 0, width - 1)
-            row = jnp.clip(row, 0, height - 1)
-            index.append((row * width + column).astype(jnp.int32))
+            # Outside the share is zero and any index will do. NaN is outside, too:
+            # no index may ever lie beyond the map, see `_rows`.
+            place = jnp.where(is_inside, row * width + column, 0.0)
+            index.append(place.astype(jnp.int32))
     return jnp.stack(index, -1), jnp.stack(share, -1)
 
 
@@ -280,7 +280,7 @@ def wide_dtype(dtype: Any) -> Any:
 
 
 def _rows(pixels: jax.Array, index: jax.Array) -> jax.Array:
-    # Indices were clipped when made; not checking them again is faster.
+    # Indices are in the map by construction; not checking them again is faster.
     return pixels.at[index.reshape(-1)].get(mode="promise_in_bounds")
 
 

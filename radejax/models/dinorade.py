@@ -127,7 +127,6 @@ class DinoRade(nn.Module):
         padded = radenet.pad_to_multiple(
             projection.astype(jnp.dtype(radar.dtype)), radar.pad_multiple
         )
-        x = self.backbone(padded)
         camera_map = reference = None
         if image is not None and camera is not None:
             reference = self._reference(camera, padded.shape)
@@ -137,6 +136,7 @@ class DinoRade(nn.Module):
                 f"{'camera' if image is None else 'image'} is given without "
                 f"{'image' if image is None else 'camera'}: give both or none"
             )
+        x = self.backbone(padded)
         elevation = padded[..., radar.doppler_bins :]
         x = self.image_fusion(x, elevation, camera_map, reference, train=train)
         maps = self.heads(self.neck(x))

@@ -155,6 +155,8 @@ def reference_points(
     is_valid = (depth > 0) & (u >= margin) & (u < width - margin)
     is_valid = is_valid & (v >= 0) & (v < height)
     points = xp.stack([u / width, v / height], -1)
+    # Frames without an image may have a camera of zeros: keep their gradients finite.
+    points = xp.nan_to_num(points, nan=0.0, posinf=1.0, neginf=0.0)
     return ReferencePoints(
         points=xp.clip(points, 0.0, 1.0).astype(np.float32),
         is_valid=is_valid,

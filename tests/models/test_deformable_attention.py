@@ -64,6 +64,8 @@ def test_samples_by_hand():
         (1.0, 0.75): 2.5,  # right edge: half of pixel 5
         (1.5, 0.5): 0.0,  # outside
         (-1e9, 1e9): 0.0,  # far outside
+        (np.inf, 0.5): 0.0,
+        (np.nan, np.nan): 0.0,
     }
     locations = jnp.asarray(list(places)).reshape(1, -1, 1, 1, 1, 2)
     weights = jnp.full(locations.shape[:-1], 2.0)

@@ -147,6 +147,15 @@ def test_each_sample_has_its_own_camera():
     assert isinstance(batch, Camera)
 
 
+def test_a_camera_of_zeros_sees_nothing():
+    zeros = stack_cameras([jax.tree.map(lambda x: 0 * x, ahead().camera())] * 2)
+    for camera in (zeros, jax.tree.map(jnp.asarray, zeros)):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            reference = lifting.reference_points(camera, AXES, 3, 4)
+        chex.assert_tree_all_finite(reference.points)
+        assert not np.any(reference.is_valid)
+
+
 def test_weights_of_the_mean():
     is_valid = jnp.asarray([[True, False, True, False], [False] * 4])
     np.testing.assert_allclose(

@@ -1,0 +1,366 @@
+"""Tests of radejax.models.dinorade."""
+
+import functools
+import importlib.util
+import pathlib
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.models import build, dinorade, lifting
+from radejax.models.lifting import ReferencePoints
+from radejax.models.radenet import RadeNet
+
+B, R, A, SIZE = 2, 6, 7, (32, 48)
+
+
+def small_config(**changes):
+    """A model of a few thousand parameters; `changes` by dotted name."""
+    config = {
+        "name": "dinorade",
+        "num_classes": 2,
+        "doppler_bins": 5,
+        "elevation_bins": 4,
+        "widths": (8, 8),
+        "decoder_width": 8,
+        "num_groups": 4,
+        "cbam": "official",
+        "input_stem": True,
+        "neck": "plain",
+        "heads": "default",
+        "pad_multiple": 4,
+        "crop_output": True,
+        "dtype": "float32",
+        "remat": False,
+        "heatmap_prior": 0.5,
+        "image": {
+            "kind": "vit",
+            "size": SIZE,
+            "freeze": True,
+            "standardize": True,
+            "hidden_size": 16,
+            "num_layers": 1,
+            "num_heads": 2,
+            "mlp_dim": 16,
+            "patch_size": 16,
+            "num_registers": 1,
+            "gated_mlp": False,
+            "layer_scale": 1.0,
+            "attention": "auto",
+            "resnet_width": 4,
+        },
+        "fusion": {
+            "num_heads": 2,
+            "num_points": 2,
+            "num_elevation": 3,
+            "weighting": "mlp",
+            "gate": "channel",
+            "invalid": "drop",
+            "necks": True,
+            "dropout": 0.1,
+            "chunk_size": 16,
+        },
+        "axes": {
+            "range_m": (2.0, 5.0),
+            "azimuth_deg": (-45.0, 15.0),
+            "elevation_deg": (-10.0, 10.0),
+        },
+    }
+    for name, value in changes.items():
+        *path, last = name.split(".")
+        functools.reduce(lambda node, key: node[key], path, config)[last] = value
+    return config
+
+
+def small(**changes):
+    return build(small_config(**changes))
+
+
+def calibration(**fields) -> CameraCalibration:
+    settings = {
+        "intrinsics": (24.0, 24.0, 24.0, 16.0),
+        "yaw_deg": 90.0,
+        "pitch_deg": 0.0,
+        "roll_deg": 90.0,
+        "translation_m": (0.0, 0.0, 0.0),
+        "width": SIZE[1],
+        "height": SIZE[0],
+    }
+    return CameraCalibration.from_angles(**(settings | fields))
+
+
+def batch(*, valid=(True, True), yaws=(90.0, 80.0)):
+    rng = np.random.default_rng(0)
+    cameras = [
+        calibration(yaw_deg=yaw).camera(is_valid=ok)
+        for yaw, ok in zip(yaws, valid, strict=True)
+    ]
+    return (
+        rng.random((B, R, A, 9)).astype(np.float32),
+        rng.integers(0, 256, (B, *SIZE, 3)).astype(np.uint8),
+        stack_cameras(cameras),
+    )
+
+
+@functools.cache
+def model_and_variables():
+    model = small()
+    variables = jax.jit(model.init)(jax.random.key(0), *batch())
+    # Away from the initial values, at which attention does not depend on the query.
+    rng = np.random.default_rng(1)
+    params = jax.tree.map(
+        lambda x: x + 0.1 * rng.standard_normal(x.shape).astype(np.float32),
+        variables["params"],
+    )
+    return model, variables | {"params": params}
+
+
+@functools.cache
+def applied():
+    model, _ = model_and_variables()
+    return jax.jit(model.apply)
+
+
+def test_shapes_and_parts():
+    _, variables = model_and_variables()
+    maps = applied()(variables, *batch())
+    chex.assert_shape(maps.heatmap_logits, (B, R, A, 2))
+    chex.assert_shape(maps.box_params, (B, R, A, 8))
+    chex.assert_tree_all_finite(maps)
+    assert set(variables["params"]) == {
+        "backbone",
+        "neck",
+        "heads",
+        "image_backbone",
+        "image_neck",
+        "image_fusion",
+    }
+
+
+def test_radar_parts_have_the_names_of_radenet():
+    model, variables = model_and_variables()
+    assert isinstance(model.radar, RadeNet)
+    shapes = jax.eval_shape(model.radar.init, jax.random.key(0), batch()[0])["params"]
+    ours = {k: variables["params"][k] for k in ("backbone", "neck", "heads")}
+    chex.assert_trees_all_equal_shapes(ours, shapes)
+
+
+def test_the_camera_changes_the_prediction_and_each_frame_uses_its_own():
+    _, variables = model_and_variables()
+    projection, image, camera = batch()
+    first = applied()(variables, projection, image, camera).heatmap_logits
+    other_image = image.copy()
+    other_image[1] = 255 - other_image[1]
+    second = applied()(variables, projection, other_image, camera).heatmap_logits
+    np.testing.assert_allclose(second[0], first[0], atol=1e-5)
+    assert np.abs(second[1] - first[1]).max() > 1e-3
+    turned = batch(yaws=(90.0, 95.0))[2]
+    third = applied()(variables, projection, image, turned).heatmap_logits
+    np.testing.assert_allclose(third[0], first[0], atol=1e-5)
+    assert np.abs(third[1] - first[1]).max() > 1e-4
+
+
+def test_embedded_images_give_the_same_prediction():
+    model, variables = model_and_variables()
+    projection, image, camera = batch()
+    backbone = {"params": {"image_backbone": variables["params"]["image_backbone"]}}
+    features = jax.jit(functools.partial(model.apply, method="embed"))(backbone, image)
+    chex.assert_shape(features, (B, *model.feature_shape))
+    assert model.feature_shape == (2, 3, 16)
+    rest = {k: v for k, v in variables["params"].items() if k != "image_backbone"}
+    from_features = applied()(
+        variables | {"params": rest}, projection, features, camera
+    )
+    from_images = applied()(variables, projection, image, camera)
+    chex.assert_trees_all_close(from_features, from_images, atol=1e-6)
+
+
+def test_reference_points_computed_before_give_the_same_prediction():
+    model, variables = model_and_variables()
+    projection, image, camera = batch(yaws=(90.0, 90.0))
+    reference = lifting.static_reference_points(calibration(), model.axes, 8, 8)
+    assert 0.05 < reference.is_valid.mean() < 0.95
+    chex.assert_trees_all_close(
+        applied()(variables, projection, image, reference),
+        applied()(variables, projection, image, camera),
+        atol=1e-5,
+    )
+
+
+def test_frames_without_an_image_fall_back_to_the_radar():
+    _, variables = model_and_variables()
+    projection, image, camera = batch(valid=(True, False))
+    image[1] = 0
+    maps = applied()(variables, projection, image, camera).heatmap_logits
+    whole = applied()(variables, *batch()).heatmap_logits
+    alone = applied()(variables, projection).heatmap_logits
+    np.testing.assert_allclose(maps[0], whole[0], atol=1e-5)
+    np.testing.assert_allclose(maps[1], alone[1], atol=1e-5)
+    assert np.abs(whole[1] - alone[1]).max() > 1e-3
+
+
+def test_a_frozen_backbone_has_no_gradient():
+    model, variables = model_and_variables()
+
+    @jax.jit
+    @jax.grad
+    def gradient(params):
+        maps, _ = model.apply(
+            variables | {"params": params},
+            *batch(),
+            train=True,
+            rngs={"dropout": jax.random.key(0)},
+            mutable=["batch_stats"],
+        )
+        return jnp.sum(maps.heatmap_logits**2) + jnp.sum(maps.box_params**2)
+
+    grads = gradient(variables["params"])
+    chex.assert_tree_all_finite(grads)
+    sizes = jax.tree.map(lambda g: float(np.abs(g).max()), grads)
+    assert not any(jax.tree.leaves(sizes.pop("image_backbone")))
+    assert np.mean(np.array(jax.tree.leaves(sizes)) > 0) > 0.9
+    assert model.is_frozen("image_backbone/norm/scale")
+    assert not model.is_frozen("image_neck/proj/kernel")
+    assert not model.is_frozen("backbone/stem/mix/conv/kernel")
+
+
+def test_a_backbone_that_is_trained_has_gradients():
+    model = small(**{"image.freeze": False})
+    _, variables = model_and_variables()
+    params = {"image_backbone": variables["params"]["image_backbone"]}
+
+    @jax.jit
+    @jax.grad
+    def gradient(params):
+        features = model.apply({"params": params}, batch()[1], method="embed")
+        return jnp.sum(features**3)
+
+    grads = gradient(params)
+    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(grads))
+    assert not model.is_frozen("image_backbone/norm/scale")
+
+
+def test_resnet_in_place_of_the_transformer():
+    model = small(**{"image.kind": "resnet50"})
+    variables = jax.eval_shape(model.init, jax.random.key(0), *batch())
+    assert model.feature_shape == (2, 3, 64)
+    maps = jax.eval_shape(model.apply, variables, *batch())
+    chex.assert_shape(maps.heatmap_logits, (B, R, A, 2))
+    # The last stage is trained and lies outside what is frozen.
+    assert "block_3" in variables["params"]["image_neck"]
+    assert "image_backbone" not in variables["batch_stats"]
+
+
+def test_half_precision():
+    model = small(dtype="bfloat16")
+    _, variables = model_and_variables()
+    maps = jax.jit(model.apply)(variables, *batch())
+    assert maps.heatmap_logits.dtype == jnp.float32
+    exact = applied()(variables, *batch())
+    assert np.abs(maps.heatmap_logits - exact.heatmap_logits).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("variant", "trained", "frozen"),
+    [
+        ("rcw", (30e6, 32e6), (20e6, 22e6)),  # the paper: 31 M and 21 M
+        ("rc", (30e6, 32e6), (20e6, 22e6)),
+        ("r", (28452782, 28452782), (0, 0)),
+        ("official", (31059193, 31059193), (21596160, 21596160)),
+        ("rcw_resnet50", (45545448, 45545448), (8573888, 8573888)),
+    ],
+)
+def test_parameters_at_full_size(variant, trained, frozen):
+    model = build(config_module().get_config(variant).model)
+    inputs = [jnp.zeros((1, 256, 107, 101))]
+    if variant != "r":
+        inputs.append(jnp.zeros((1, 720, 1280, 3), jnp.uint8))
+        reference = ReferencePoints(
+            jnp.zeros((1, 256, 112, 10, 2)), jnp.zeros((1, 256, 112, 10), bool)
+        )
+        inputs.append(reference)
+    variables = jax.eval_shape(model.init, jax.random.key(0), *inputs)
+    outside, inside = dinorade.num_parameters(variables)
+    assert trained[0] <= outside <= trained[1]
+    assert frozen[0] <= inside <= frozen[1]
+
+
+def config_module():
+    path = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
+    spec = importlib.util.spec_from_file_location("dinorade_config", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_configs_differ_where_paper_and_code_do():
+    get_config = config_module().get_config
+    default, official = get_config(), get_config("official")
+    assert default.loss.sigma_cells == 0.75
+    assert (default.train.batch_size, default.train.num_epochs) == (6, 11)
+    assert default.model.fusion.invalid == "drop"
+    assert official.model.fusion.invalid == "official"
+    assert official.data.azimuth_mapping == "stretched"
+    assert build(official.model).axes == lifting.LiftingAxes.official()
+    assert get_config("paper").model.cbam == "paper"
+    assert get_config("rc").model.fusion.weighting == "off"
+    assert get_config("r").model.name == "radenet"
+    assert not get_config("official,rcw_resnet50").model.image.standardize
+    assert get_config("rcw,sedan").model.num_classes == 1
+    with pytest.raises(UserError, match="unknown config argument 'rcx'"):
+        get_config("rcx")
+
+
+def test_images_of_another_size_are_refused():
+    model, variables = model_and_variables()
+    projection, image, camera = batch()
+    with pytest.raises(
+        UserError, match=r"image is \(2, 32, 32, 3\), expected \('B', 32, 48, 3\)"
+    ):
+        model.apply(variables, projection, image[:, :, :32], camera)
+    with pytest.raises(UserError, match="camera is given without image"):
+        model.apply(variables, projection, None, camera)
+    with pytest.raises(UserError, match="image is given without camera"):
+        model.apply(variables, projection, image)
+    reference = lifting.static_reference_points(calibration(), model.axes, 4, 8)
+    with pytest.raises(
+        UserError, match=r"reference points are \(1, 4, 8, 3\), expected"
+    ):
+        model.apply(variables, projection, image, reference)
+    with pytest.raises(UserError, match=r"projection must be \[B, R, A, 9\]"):
+        model.apply(variables, projection[..., :8], image, camera)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"image.kind": "vgg"}, r"config.model.image.kind is 'vgg', expected one of"),
+        ({"fusion.gate": "pixel"}, r"fusion.gate is 'pixel'"),
+        ({"fusion.depth": 3}, r"config.model.fusion has unknown \['depth'\]"),
+        ({"axes": {}}, r"config.model.axes has missing"),
+        ({"image.size": (30, 48)}, r"image.size is \(30, 48\); .* multiples of 16"),
+        ({"image.hidden_size": 20}, r"20 channels in 2 heads; .* multiple of 4"),
+        ({"fusion.num_heads": 3}, r"fusion.num_heads = 3 does not divide"),
+        ({"image": 3}, r"config.model.image must be a mapping, got 3"),
+    ],
+)
+def test_impossible_configs_are_refused(changes, message):
+    with pytest.raises(UserError, match=message):
+        small(**changes)
+
+
+def test_pretrained_parts_replace_their_like():
+    _, variables = model_and_variables()
+    part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}}}}
+    merged = dinorade.with_pretrained(variables, part)
+    assert (merged["params"]["image_neck"]["proj"]["bias"] == 7).all()
+    kept = variables["params"]["image_neck"]["proj"]["kernel"]
+    assert merged["params"]["image_neck"]["proj"]["kernel"] is kept
+    wrong = {"params": {"image_neck": {"proj": {"bias": np.zeros(9)}}}}
+    with pytest.raises(UserError, match=r"params/image_neck/proj/bias is \(9,\)"):
+        dinorade.with_pretrained(variables, wrong)
