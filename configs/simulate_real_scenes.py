@@ -24,7 +24,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         frame_stride=30,
         frames_per_sequence=0,
         image_width=0,
-        image_height=0,
+        image_height=180,
         output="projection",
     )
     grid = config.simulation.grid

@@ -90,7 +90,8 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
         changed = _changed_fields(found["config"], json.loads(config.to_json()))
         raise UserError(
             f"{root} holds a data set of another simulation config (differs in:"
-            f" {', '.join(changed) or 'version of the simulator'}); choose another folder or delete it"
+            f" {', '.join(changed) or 'version of the simulator'});"
+            " choose another folder or delete it"
         )
     return bool(found["finished"])
 
