@@ -42,7 +42,8 @@ class ViewerFrame:
         projection: `[R, A, D+E]` normalised log power.
         ground_truth: Boxes with classes, see `canvas.as_objects`, or None.
         predictions: Boxes with scores and classes, or None.
-        track_ids: One id per ground truth box, for its trail; or None.
+        track_ids: One hashable id per ground truth box, None for a box without trail; or
+            None.
         image: `[H, W, 3]` uint8 camera image, or None.
         calibration: Of the image, to draw boxes on it, or None.
         time_s: Seconds since the Unix epoch, or None.
@@ -314,7 +315,9 @@ def _log_trails(
             f"{len(truth.boxes)} boxes but {len(frame.track_ids)} track_ids"
         )
     seen = {
-        int(i): box[:3] for i, box in zip(frame.track_ids, truth.boxes, strict=True)
+        track: box[:3]
+        for track, box in zip(frame.track_ids, truth.boxes, strict=True)
+        if track is not None
     }
     for track in [t for t in trails if t not in seen]:
         del trails[track]

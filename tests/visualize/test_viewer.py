@@ -1,4 +1,5 @@
 import builtins
+import dataclasses
 
 import numpy as np
 import pytest
@@ -91,6 +92,26 @@ def test_opening_needs_recording_and_program(tmp_path, monkeypatch):
 def test_recording_needs_its_suffix(tmp_path):
     with pytest.raises(UserError, match=r"\.rrd"):
         viewer.write_recording([frame(0)], GRID, tmp_path / "a.mp4")
+
+
+def test_trails_follow_tracks_and_end_with_them():
+    class Stream:
+        strips = None
+
+        def log(self, path, entity):
+            assert path == "world/tracks"
+            self.strips = entity
+
+    rr = pytest.importorskip("rerun")
+    del rr
+    stream, trails = Stream(), {}
+    for i in range(4):
+        viewer._log_trails(stream, frame(i), trails, 3)
+    (trail,) = trails.values()
+    np.testing.assert_allclose(np.array(trail)[:, 0], [21.0, 22.0, 23.0])
+    gone = dataclasses.replace(frame(4), track_ids=[None])
+    viewer._log_trails(stream, gone, trails, 3)
+    assert not trails
 
 
 def test_recording_is_whole(tmp_path):

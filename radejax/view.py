@@ -1,0 +1,115 @@
+"""A rerun recording of sequences: radar, labels with tracks, camera, detections."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+import tqdm
+
+from radejax.data.frame import Frame
+from radejax.data.kradar import KRadar
+from radejax.data.tesseract import project_file
+from radejax.errors import UserError
+from radejax.evaluate_run import read_left_image
+from radejax.geometry.camera import CameraCalibration
+from radejax.visualize.viewer import ViewerFrame, write_recording
+
+
+def write_view(
+    roots: Sequence[str | os.PathLike],
+    out: str | os.PathLike,
+    *,
+    sequence: int | None = None,
+    labels: str | os.PathLike | None = None,
+    version: str = "v2.1",
+    workdir: str | os.PathLike | None = None,
+    max_frames: int | None = None,
+    elevation_sign: int = 1,
+) -> dict[str, Any]:
+    """Records frames for the rerun viewer.
+
+    Args:
+        roots: K-Radar folders.
+        out: Recording to write, `.rrd`.
+        sequence: The only one to record; all by default.
+        labels: Label revision, see `KRadar`.
+        version: Of the labels.
+        workdir: Run whose detections are shown as well, or None.
+        max_frames: Record only the first so many.
+        elevation_sign: See `visualize.viewer.echo_points`.
+
+    Returns:
+        "frames" recorded, "without_tesseract" left out, "out".
+
+    Raises:
+        UserError: rerun is not installed, or there is no frame with a tesseract.
+    """
+    numbers = None if sequence is None else [sequence]
+    frames = KRadar(
+        roots, labels, version=version, sequence_numbers=numbers, visibility=None
+    )
+    complete = [frame for frame in frames if frame.tesseract_path is not None]
+    if not complete:
+        raise UserError(f"no tesseract for any of {len(frames)} labelled frames")
+    shown = complete[:max_frames]
+    detector = None
+    if workdir is not None:
+        from radejax.detector import Detector
+
+        detector = Detector.from_workdir(pathlib.Path(workdir))
+    entries = viewer_frames(
+        tqdm.tqdm(shown, desc="record", unit="frame"), frames.grid, detector
+    )
+    write_recording(entries, frames.grid, out, elevation_sign=elevation_sign)
+    return {
+        "frames": len(shown),
+        "without_tesseract": len(frames) - len(complete),
+        "out": str(out),
+    }
+
+
+def viewer_frames(
+    frames: Any, grid: Any, detector: Any = None
+) -> Iterator[ViewerFrame]:
+    """What the viewer shows of each frame, read as it is needed."""
+    for frame in frames:
+        projection = project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
+        found = None
+        if detector is not None:
+            found = jax.tree.map(lambda x: np.asarray(x[0]), detector(projection))
+        calibration = None
+        if frame.camera_calibration_path is not None:
+            calibration = CameraCalibration.from_kradar(
+                frame.camera_calibration_path,
+                ego_from_lidar_m=frame.radar_from_lidar_m,
+            )
+        yield ViewerFrame(
+            projection,
+            ground_truth=frame,
+            predictions=found,
+            track_ids=track_ids(frame),
+            image=read_left_image(frame.camera_path),
+            calibration=calibration,
+            time_s=frame.header.timestamp_s,
+            name=f"sequence {frame.sequence}, {frame.name}, {frame.weather}",
+        )
+
+
+def track_ids(frame: Frame) -> list[tuple[int, int] | None]:
+    """Sequence and track id of each box that the data set keeps: `[N]`.
+
+    Boxes are those of some labels, moved to the radar's frame. None where the label
+    has no id.
+    """
+    if not len(frame.boxes):
+        return []
+    centers = np.array([label.box[:3] for label in frame.labels])
+    centers = centers + np.asarray(frame.radar_from_lidar_m)
+    gaps = np.linalg.norm(frame.boxes[:, None, :3] - centers[None], axis=-1)  # [N, L]
+    ids = [frame.labels[i].track_id for i in gaps.argmin(1)]
+    return [(frame.sequence, i) if i >= 0 else None for i in ids]
