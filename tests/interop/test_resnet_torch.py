@@ -1,0 +1,145 @@
+"""Tests of radejax.interop.resnet_torch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import DataError
+from radejax.interop import resnet_torch, torch_file
+from radejax.models.resnet import ResNetNeck, ResNetTrunk
+
+
+def torchvision_shapes():
+    """Names and shapes of torchvision's ResNet-50, written down layer by layer."""
+    shapes = {"conv1.weight": (64, 3, 7, 7)}
+
+    def norm(name, width):
+        for kind in ("weight", "bias", "running_mean", "running_var"):
+            shapes[f"{name}.{kind}"] = (width,)
+        shapes[f"{name}.num_batches_tracked"] = ()
+
+    norm("bn1", 64)
+    before = 64
+    for stage, (depth, inside) in enumerate(
+        zip((3, 4, 6, 3), (64, 128, 256, 512), strict=True), 1
+    ):
+        for i in range(depth):
+            name = f"layer{stage}.{i}"
+            shapes[f"{name}.conv1.weight"] = (inside, before, 1, 1)
+            shapes[f"{name}.conv2.weight"] = (inside, inside, 3, 3)
+            shapes[f"{name}.conv3.weight"] = (4 * inside, inside, 1, 1)
+            for j, width in enumerate((inside, inside, 4 * inside), 1):
+                norm(f"{name}.bn{j}", width)
+            if i == 0:
+                shapes[f"{name}.downsample.0.weight"] = (4 * inside, before, 1, 1)
+                norm(f"{name}.downsample.1", 4 * inside)
+            before = 4 * inside
+    return shapes | {"fc.weight": (1000, 2048), "fc.bias": (1000,)}
+
+
+@pytest.fixture(scope="module")
+def tensors():
+    rng = np.random.default_rng(0)
+    out = {}
+    for name, shape in torchvision_shapes().items():
+        value = 0.1 * rng.standard_normal(shape)
+        if len(shape) == 1:
+            value = 1 + value
+        elif len(shape) == 4:
+            value = value * 10 / np.sqrt(np.prod(shape[1:]))
+        out[name] = np.asarray(value, np.float32)
+    return out
+
+
+def test_every_tensor_finds_its_place(tensors):
+    loaded = resnet_torch.load(tensors)
+    trunk, neck = ResNetTrunk(), ResNetNeck()
+    image = jnp.zeros((1, 32, 32, 3))
+    expected = jax.eval_shape(trunk.init, jax.random.key(0), image)["params"]
+    shapes = lambda tree: jax.tree.map(lambda x: x.shape, tree)  # noqa: E731
+    assert shapes(loaded["params"]["image_backbone"]) == shapes(expected)
+    expected = jax.eval_shape(
+        neck.init, jax.random.key(0), jnp.zeros((1, 2, 2, 1024)), jnp.ones(1, bool)
+    )
+    del expected["params"]["proj"]
+    assert shapes(loaded["params"]["image_neck"]) == shapes(expected["params"])
+    assert shapes(loaded["batch_stats"]["image_neck"]) == shapes(
+        expected["batch_stats"]
+    )
+    block = loaded["params"]["image_backbone"]["stage_2_block_1"]
+    np.testing.assert_array_equal(
+        block["conv_2"]["kernel"][0, 2, 5, 7],
+        tensors["layer2.0.conv2.weight"][7, 5, 0, 2],
+    )
+    np.testing.assert_array_equal(
+        block["norm_shortcut"]["var"], tensors["layer2.0.downsample.1.running_var"]
+    )
+
+
+def test_features_equal_torch(tensors):
+    torch = pytest.importorskip("torch")
+    functional = torch.nn.functional
+    t = {k: torch.from_numpy(v) for k, v in tensors.items() if v.ndim}
+
+    def norm(x, name):
+        kinds = ("running_mean", "running_var", "weight", "bias")
+        return functional.batch_norm(x, *(t[f"{name}.{k}"] for k in kinds))
+
+    def block(x, name, stride):
+        y = functional.conv2d(x, t[f"{name}.conv1.weight"])
+        y = functional.relu(norm(y, f"{name}.bn1"))
+        y = functional.conv2d(y, t[f"{name}.conv2.weight"], stride=stride, padding=1)
+        y = functional.relu(norm(y, f"{name}.bn2"))
+        y = norm(functional.conv2d(y, t[f"{name}.conv3.weight"]), f"{name}.bn3")
+        if f"{name}.downsample.0.weight" in t:
+            weight = t[f"{name}.downsample.0.weight"]
+            x = functional.conv2d(x, weight, stride=stride)
+            x = norm(x, f"{name}.downsample.1")
+        return functional.relu(x + y)
+
+    image = np.random.default_rng(1).standard_normal((1, 3, 48, 64)).astype(np.float32)
+    x = functional.conv2d(
+        torch.from_numpy(image), t["conv1.weight"], stride=2, padding=3
+    )
+    x = functional.max_pool2d(functional.relu(norm(x, "bn1")), 3, 2, 1)
+    for stage, depth in enumerate((3, 4, 6, 3), 1):
+        for i in range(depth):
+            x = block(x, f"layer{stage}.{i}", 2 if stage > 1 and i == 0 else 1)
+        if stage == 3:
+            third = x
+    loaded = resnet_torch.load(tensors)
+    image = image.transpose(0, 2, 3, 1)
+    features = jax.jit(ResNetTrunk().apply)(
+        {"params": loaded["params"]["image_backbone"]}, image
+    )
+    expected = third.numpy().transpose(0, 2, 3, 1)
+    np.testing.assert_allclose(features, expected, atol=2e-4 * np.abs(expected).max())
+    # The projection that follows is the model's own: pass everything through.
+    kernel = np.eye(2048, dtype=np.float32)[None, None]
+    params = loaded["params"]["image_neck"] | {"proj": {"kernel": kernel}}
+    out = jax.jit(ResNetNeck(2048).apply)(
+        {"params": params, "batch_stats": loaded["batch_stats"]["image_neck"]},
+        features,
+        jnp.ones(1, bool),
+    )
+    expected = x.numpy().transpose(0, 2, 3, 1)
+    np.testing.assert_allclose(out, expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_files_and_their_problems(tensors, tmp_path):
+    path = tmp_path / "resnet50.pth"
+    broken = dict(tensors)
+    del broken["layer3.5.bn2.weight"]
+    broken["avgpool.weight"] = np.zeros(2, np.float32)
+    torch_file.write(path, broken)
+    with pytest.raises(
+        DataError, match=r"resnet50.pth.*1 missing: layer3.5.bn2.weight"
+    ):
+        resnet_torch.load(path)
+    with pytest.raises(DataError, match=r"1 unexpected: avgpool.weight"):
+        resnet_torch.load(path)
+    torch_file.write(path, tensors)
+    assert set(resnet_torch.load(path)) == {"params", "batch_stats"}
+    with pytest.raises(FileNotFoundError):
+        resnet_torch.load(tmp_path / "nothing.pth")
