@@ -24,7 +24,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
     # Many short sequences: a network learns more from another scene than from the next
     # tenth of a second.
     config.simulation.update(
-        train_sequences=32, test_sequences=12, frames_per_sequence=14
+        train_sequences=56, test_sequences=14, frames_per_sequence=10
     )
     config.data.mirror_probability = 0.5
     config.model.update(
@@ -39,7 +39,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.loss.sigma_cells = 1.0
     config.train.update(
         batch_size=4,
-        num_epochs=9,
+        num_epochs=8,
         warmup_steps=20,
         log_every_steps=10,
         checkpoint_every_steps=100,
