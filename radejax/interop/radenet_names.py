@@ -123,7 +123,7 @@ def param_shapes(model: RadeNet) -> dict[Path, tuple[int, ...]]:
 def to_torch_layout(name: str, value: np.ndarray) -> np.ndarray:
     """Our parameter in the layout of the official tensor of that name."""
     if value.ndim == 4:
-        is_transposed = name.endswith(".upsample.weight")
+        is_transposed = name.endswith("upsample.weight")
         return value.transpose((2, 3, 0, 1) if is_transposed else (3, 2, 0, 1))
     return value.T if value.ndim == 2 else value
 
@@ -131,7 +131,7 @@ def to_torch_layout(name: str, value: np.ndarray) -> np.ndarray:
 def from_torch_layout(name: str, value: np.ndarray) -> np.ndarray:
     """Inverse of `to_torch_layout`."""
     if value.ndim == 4:
-        is_transposed = name.endswith(".upsample.weight")
+        is_transposed = name.endswith("upsample.weight")
         return value.transpose((2, 3, 0, 1) if is_transposed else (2, 3, 1, 0))
     return value.T if value.ndim == 2 else value
 

@@ -1,0 +1,123 @@
+"""Makes `models_radenet.npz`: RADE-Net at small widths, computed by PyTorch.
+
+    python tests/golden/models_radenet.py
+
+Needs torch (2.13.0 made the file) and `benchmarks/torch_radenet.py`, whose network was
+checked against the released one's outputs. Weights and inputs follow from names and
+shapes (`seeded_tensor`), so the file holds outputs and gradients only. Reached by
+radejax in float32 on a CPU: 5e-6 on maps, 1e-5 of the largest value on gradients.
+"""
+
+import pathlib
+import sys
+import zlib
+
+import numpy as np
+
+SEED = 1234
+
+SMALL = {
+    "name": "radenet",
+    "num_classes": 3,
+    "doppler_bins": 8,
+    "elevation_bins": 5,
+    "widths": (16, 32, 64),
+    "decoder_width": 16,
+    "num_groups": 8,
+    "cbam": "official",
+    "input_stem": False,
+    "neck": "dilated",
+    "heads": "expanded",
+    "pad_multiple": 8,
+    "crop_output": False,
+    "dtype": "float32",
+    "remat": False,
+    "heatmap_prior": 0.5,
+}
+"""A model config with every part, small enough for a test."""
+
+VARIANTS = {
+    "model": {},
+    "base": {"cbam": None, "neck": "plain", "heads": "default"},
+    "stem": {"input_stem": True},
+    "expand": {"decoder_width": 32},
+    "paper": {"cbam": "paper"},
+}
+
+# Multiples of 8 on no axis: the model pads.
+INPUT_SHAPE = (2, 21, 14, 13)
+
+GRADIENTS = (
+    "backbone.start_conv.weight",
+    "backbone.upsample_2.upsample.weight",
+    "backbone.cbam_1.channel_attention.fc1.weight",
+    "backbone.cbam_3.spatial_attention.convolution.weight",
+    "neck.neck.2.conv1.conv.weight",
+    "head.reg_head.head.1.weight",
+)
+
+
+def seeded_tensor(name, shape):
+    """A weight that depends on its name and shape only; float32, torch's layout."""
+    rng = np.random.default_rng([SEED, zlib.crc32(name.encode())])
+    if len(shape) == 1 and name.endswith("bias"):
+        value = 0.05 * rng.standard_normal(shape)
+    elif len(shape) == 1:
+        value = 1.0 + 0.1 * rng.standard_normal(shape)
+    else:
+        value = rng.standard_normal(shape) * np.sqrt(2.0 / np.prod(shape[1:]))
+    return value.astype(np.float32)
+
+
+def seeded_state(shapes):
+    """State dict for a mapping from names to shapes."""
+    return {name: seeded_tensor(name, shape) for name, shape in shapes.items()}
+
+
+def small_input():
+    """`INPUT_SHAPE`, channels last."""
+    return np.random.default_rng(SEED).random(INPUT_SHAPE, np.float32)
+
+
+def cotangents(shapes):
+    """What outputs of these shapes are multiplied with before they are summed."""
+    rng = np.random.default_rng(SEED + 1)
+    return [rng.standard_normal(shape).astype(np.float32) for shape in shapes]
+
+
+def _channels_last(tensor):
+    return tensor.detach().permute(0, 2, 3, 1).numpy()
+
+
+def main():
+    root = pathlib.Path(__file__).resolve().parents[2]
+    sys.path.insert(0, str(root / "benchmarks"))
+    import torch
+    import torch_radenet
+
+    x = small_input()
+    x = np.pad(x, ((0, 0), (0, -x.shape[1] % 8), (0, -x.shape[2] % 8), (0, 0)))
+    x = torch.tensor(x.transpose(0, 3, 1, 2).copy())
+    arrays = {}
+    for variant, changes in VARIANTS.items():
+        model = torch_radenet.RadeNet(SMALL | changes)
+        shapes = {n: tuple(v.shape) for n, v in model.state_dict().items()}
+        state = {n: torch.tensor(v) for n, v in seeded_state(shapes).items()}
+        model.load_state_dict(state)
+        outputs = model(x)
+        maps = [_channels_last(output) for output in outputs]
+        arrays[f"{variant}/heatmap_logits"], arrays[f"{variant}/box_params"] = maps
+        weights = [
+            torch.tensor(c.transpose(0, 3, 1, 2).copy())
+            for c in cotangents([m.shape for m in maps])
+        ]
+        sum((o * w).sum() for o, w in zip(outputs, weights, strict=True)).backward()
+        parameters = dict(model.named_parameters())
+        for name in GRADIENTS:
+            if variant == "model":
+                arrays[f"{variant}/grad/{name}"] = parameters[name].grad.numpy()
+    np.savez_compressed(pathlib.Path(__file__).with_suffix(".npz"), **arrays)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""Tests of `radejax.interop.radenet_torch` against PyTorch's numbers.
+
+`tests/golden/models_radenet.npz` has them at small widths; with ../shared the official
+network's outputs at full size are compared too.
+"""
+
+import json
+import runpy
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.errors import DataError, UserError
+from radejax.interop import radenet_torch
+from radejax.interop.radenet_names import torch_names, torch_shapes
+from radejax.models.radenet import from_config
+
+
+@pytest.fixture(scope="module")
+def recipe(golden):
+    return runpy.run_path(golden / "models_radenet.py")
+
+
+@pytest.fixture(scope="module")
+def small_state(recipe):
+    """Seeded state dict of the small model in official names."""
+    model = from_config(recipe["SMALL"])
+    return recipe["seeded_state"](torch_shapes(model))
+
+
+OVERRIDES = {"num_groups": 8, "doppler_bins": 8, "elevation_bins": 5}
+
+
+def load_variant(recipe, variant):
+    config = recipe["SMALL"] | recipe["VARIANTS"][variant]
+    model = from_config(config)
+    state = recipe["seeded_state"](torch_shapes(model))
+    overrides = OVERRIDES | ({"cbam": "paper"} if variant == "paper" else {})
+    return model, *radenet_torch.load(state, **overrides)
+
+
+@pytest.mark.parametrize("variant", ["model", "base", "stem", "expand", "paper"])
+def test_small_outputs_equal_torchs(variant, recipe, golden):
+    expected_model, model, variables = load_variant(recipe, variant)
+    assert model == expected_model  # worked out from names and shapes
+    maps = jax.jit(model.apply)(variables, recipe["small_input"]())
+    with np.load(golden / "models_radenet.npz") as arrays:
+        for name in ("heatmap_logits", "box_params"):
+            expected = arrays[f"{variant}/{name}"]
+            np.testing.assert_allclose(getattr(maps, name), expected, atol=2e-5)
+
+
+def test_small_gradients_equal_torchs(recipe, golden):
+    _, model, variables = load_variant(recipe, "model")
+    x = recipe["small_input"]()
+
+    def loss(variables):
+        maps = model.apply(variables, x, train=True)
+        maps = (maps.heatmap_logits, maps.box_params)
+        weights = recipe["cotangents"]([m.shape for m in maps])
+        return sum((m * w).sum() for m, w in zip(maps, weights, strict=True))
+
+    gradient = jax.jit(jax.grad(loss))(variables)
+    # Written like a checkpoint, a gradient has torch's names and layout.
+    gradient = radenet_torch.save(model, gradient)
+    with np.load(golden / "models_radenet.npz") as arrays:
+        for name in recipe["GRADIENTS"]:
+            expected = arrays[f"model/grad/{name}"]
+            tolerance = 1e-4 * np.abs(expected).max()
+            np.testing.assert_allclose(gradient[name], expected, atol=tolerance)
+
+
+def test_save_is_the_inverse_of_load(small_state):
+    model, variables = radenet_torch.load(small_state, **OVERRIDES)
+    saved = radenet_torch.save(model, variables)
+    assert saved.keys() == small_state.keys()
+    chex.assert_trees_all_equal(saved, small_state)
+
+
+@pytest.mark.parametrize("ending", [".pth", ".pt", ".npz", ".safetensors"])
+def test_files_of_every_kind_come_back(small_state, tmp_path, ending):
+    model, variables = radenet_torch.load(small_state, **OVERRIDES)
+    path = tmp_path / f"weights{ending}"
+    radenet_torch.save(model, variables, path)
+    again, loaded = radenet_torch.load(path, **OVERRIDES)
+    assert again == model
+    chex.assert_trees_all_equal(loaded, variables)
+
+
+def test_torch_loads_what_was_saved(small_state, tmp_path):
+    torch = pytest.importorskip("torch")
+    model, variables = radenet_torch.load(small_state, **OVERRIDES)
+    radenet_torch.save(model, variables, tmp_path / "weights.pth")
+    loaded = torch.load(tmp_path / "weights.pth", weights_only=True)
+    assert list(loaded) == list(radenet_torch.save(model, variables))
+    for name, tensor in loaded.items():
+        np.testing.assert_array_equal(tensor.numpy(), small_state[name])
+
+
+def test_torch_tensors_are_taken_as_they_are(small_state):
+    torch = pytest.importorskip("torch")
+    tensors = {n: torch.tensor(v, requires_grad=True) for n, v in small_state.items()}
+    _, variables = radenet_torch.load(tensors, **OVERRIDES)
+    _, expected = radenet_torch.load(small_state, **OVERRIDES)
+    chex.assert_trees_all_equal(variables, expected)
+
+
+@pytest.mark.parametrize("prefix", ["", "module.", "_orig_mod.", "module._orig_mod."])
+@pytest.mark.parametrize("key", [None, "model_state_dict", "model"])
+def test_nested_and_prefixed_checkpoints(small_state, prefix, key):
+    state = {prefix + name: value for name, value in small_state.items()}
+    checkpoint = state if key is None else {"epoch": 3, key: state, "optimizer": {}}
+    _, variables = radenet_torch.load(checkpoint, **OVERRIDES)
+    _, expected = radenet_torch.load(small_state, **OVERRIDES)
+    chex.assert_trees_all_equal(variables, expected)
+
+
+def test_several_state_dicts_are_not_guessed_at(small_state):
+    with pytest.raises(UserError, match=r"several state dicts, \['model', 'ema'\]"):
+        radenet_torch.load({"model": small_state, "ema": small_state})
+
+
+def test_all_problems_are_listed(small_state):
+    state = dict(small_state)
+    del state["neck.neck.1.gn.bias"], state["head.reg_head.head.9.weight"]
+    state["neck.neck.7.gn.bias"] = np.zeros(3, np.float32)
+    name = "backbone.encoder_block_2.double_conv.0.single_conv.0.weight"
+    state[name] = np.zeros((31, 16, 3, 3), np.float32)
+    with pytest.raises(DataError) as error:
+        radenet_torch.load(state, **OVERRIDES)
+    message = str(error.value)
+    assert "4 problems" in message
+    assert "missing neck.neck.1.gn.bias (16,)" in message
+    assert "missing head.reg_head.head.9.weight (8, 16, 1, 1)" in message
+    assert "unexpected neck.neck.7.gn.bias (3,)" in message
+    assert f"mis-shaped {name}: (31, 16, 3, 3), expected (32, 16, 3, 3)" in message
+
+
+def test_released_models_without_cbam_still_have_its_tensors(small_state, recipe):
+    model, variables = radenet_torch.load(small_state, cbam=None, **OVERRIDES)
+    assert model.cbam is None
+    assert not any("cbam" in name for name in variables["params"]["backbone"])
+    saved = radenet_torch.save(model, variables)
+    assert saved.keys() == small_state.keys()
+    assert {n: v.shape for n, v in saved.items()} == {
+        n: v.shape for n, v in small_state.items()
+    }
+    for name in torch_names(model).values():
+        np.testing.assert_array_equal(saved[name], small_state[name])
+
+
+def test_paper_cbam_has_no_official_form(recipe):
+    _, model, variables = load_variant(recipe, "paper")
+    with pytest.raises(UserError, match=r'no cbam="paper"'):
+        radenet_torch.save(model, variables)
+
+
+@pytest.mark.parametrize(
+    ("content", "error", "message"),
+    [
+        ({"a": 1}, DataError, r"no RADE-Net state dict; it holds \['a'\]"),
+        (
+            {"backbone.fc.weight": np.zeros(3)},
+            DataError,
+            r"not a state dict of RADE-Net",
+        ),
+    ],
+)
+def test_something_else_is_refused(content, error, message):
+    with pytest.raises(error, match=message):
+        radenet_torch.load(content)
+
+
+def test_overrides_are_checked(small_state):
+    with pytest.raises(UserError, match=r"unknown model fields \['width'\]"):
+        radenet_torch.load(small_state, width=3)
+    with pytest.raises(UserError, match=r"give doppler_bins and elevation_bins"):
+        radenet_torch.load(small_state, num_groups=8)
+
+
+def test_unknown_ending_and_missing_file(small_state, tmp_path):
+    model, variables = radenet_torch.load(small_state, **OVERRIDES)
+    with pytest.raises(UserError, match=r"weights.h5: unknown ending"):
+        radenet_torch.save(model, variables, tmp_path / "weights.h5")
+    with pytest.raises(FileNotFoundError):
+        radenet_torch.load(tmp_path / "none.pth")
+
+
+# The official network at full size ---------------------------------------------------
+
+
+def load_official(shared, recipe, variant):
+    listing = json.loads(
+        (shared / f"fixtures/radenet/{variant}_params.json").read_text()
+    )
+    shapes = {e["name"]: tuple(e["shape"]) for e in listing["tensors"]}
+    overrides = {"cbam": None} if variant in ("base", "no_cbam") else {}
+    return radenet_torch.load(recipe["seeded_state"](shapes), **overrides)
+
+
+def official_input():
+    cube = np.random.default_rng([1234, 7]).random((1, 101, 256, 107), np.float32)
+    return (cube * np.float32(0.6)).transpose(0, 2, 3, 1)
+
+
+def check_maps(shared, variant, maps):
+    with np.load(shared / f"fixtures/radenet/{variant}.npz") as expected:
+        rows, columns = expected["rows"][:, None], expected["cols"]
+        heatmap = np.asarray(jax.nn.sigmoid(maps.heatmap_logits[0]))
+        boxes = np.asarray(maps.box_params[0])
+        for name, actual, atol in (
+            ("heatmap", heatmap, 2e-5),
+            ("regression", boxes, 1e-4),
+        ):
+            assert actual.shape[:2] == (256, 112)
+            subset = actual[rows, columns].transpose(2, 0, 1)
+            np.testing.assert_allclose(subset, expected[name], atol=atol)
+            stats = [actual.mean((0, 1)), actual.std((0, 1))]
+            stats += [actual.min((0, 1)), actual.max((0, 1))]
+            np.testing.assert_allclose(
+                np.stack(stats, -1), expected[f"{name}_stats"], atol=1e-4
+            )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "variant", ["stem", "no_cbam", "expand256", "default_heads", "default_neck", "base"]
+)
+def test_official_variants(shared, recipe, variant):
+    model, variables = load_official(shared, recipe, variant)
+    check_maps(shared, variant, jax.jit(model.apply)(variables, official_input()))
+
+
+INTERMEDIATES = {
+    "start": "start_conv",
+    **{f"encoder_{i}": f"encoder_block_{i}" for i in (1, 2, 3)},
+    "bottleneck_2": "bottleneck",
+    **{f"upsample_{i}": f"upsample_{i}" for i in (1, 2, 3)},
+    **{f"cbam_{i}": f"cbam_{i}" for i in (1, 2, 3)},
+    **{f"decoder_{i}": f"decoder_block_{i}" for i in (1, 2, 3)},
+}
+
+
+def test_official_default_with_intermediates(shared, recipe):
+    model, variables = load_official(shared, recipe, "default")
+    assert sum(v.size for v in jax.tree.leaves(variables)) == 28_336_878
+
+    @jax.jit
+    def run(variables, x):
+        return model.apply(
+            variables,
+            x,
+            capture_intermediates=lambda module, _: (
+                module.name in (*INTERMEDIATES, "neck")
+            ),
+        )
+
+    maps, captured = run(variables, jnp.asarray(official_input()))
+    check_maps(shared, "default", maps)
+    captured = captured["intermediates"]
+    with np.load(shared / "fixtures/radenet/default_intermediates.npz") as expected:
+        outputs = {INTERMEDIATES[n]: captured["backbone"][n] for n in INTERMEDIATES}
+        outputs["neck"] = captured["neck"]
+        for name, output in outputs.items():
+            rows, columns = expected[f"{name}__rows"], expected[f"{name}__cols"]
+            actual = np.asarray(output["__call__"][0][0])[rows[:, None], columns]
+            np.testing.assert_allclose(
+                actual.transpose(2, 0, 1), expected[name], atol=1e-4, err_msg=name
+            )

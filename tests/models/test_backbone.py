@@ -1,0 +1,51 @@
+"""Tests of `radejax.models.backbone`; the whole is checked in test_radenet."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.models.backbone import Backbone, InputStem
+
+
+def test_input_stem_equals_official(module_case, run_like_torch):
+    x, expected = module_case("input_stem")
+    names = {
+        f"{part}/{ours}": f"{part}_conv.{theirs}"
+        for part in ("doppler", "elevation", "mix")
+        for ours, theirs in (("conv", "0"), ("norm", "1"))
+    }
+    actual = run_like_torch(InputStem(128, 64, 32), names, x)
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("widths", [(16,), (16, 32), (16, 32, 48, 64)])
+def test_any_number_of_levels(widths):
+    backbone = Backbone(8, widths, decoder_width=24, num_groups=8)
+    x = jnp.zeros((1, 32, 16, 13))
+    variables = jax.eval_shape(backbone.init, jax.random.key(0), x)
+    assert jax.eval_shape(backbone.apply, variables, x).shape == (1, 32, 16, 24)
+    names = [
+        f"{part}_{i + 1}"
+        for part in ("encoder", "decoder", "cbam")
+        for i in range(len(widths))
+    ]
+    assert set(names) <= set(variables["params"])
+
+
+def test_skips_are_joined_after_the_upsampled_map():
+    # decoder_1 reads [upsampled 32, skip 32]: zeroing its first 32 input channels must
+    # hide the bottleneck and leave the skip.
+    backbone = Backbone(8, (16, 32), decoder_width=16, num_groups=8, cbam=None)
+    x = jax.random.normal(jax.random.key(1), (1, 8, 8, 13))
+    variables = backbone.init(jax.random.key(0), x)
+    decoder = variables["params"]["decoder_1"]
+    cut = jnp.arange(64) >= 32
+    for conv in (decoder["conv_1"]["conv"], decoder["shortcut"]):
+        conv["kernel"] = conv["kernel"] * cut[None, None, :, None]
+    y = backbone.apply(variables, x)
+    variables["params"]["bottleneck_2"] = jax.tree.map(
+        jnp.zeros_like, variables["params"]["bottleneck_2"]
+    )
+    variables["params"]["upsample_1"]["bias"] += 5.0
+    np.testing.assert_array_equal(backbone.apply(variables, x), y)

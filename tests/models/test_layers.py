@@ -1,0 +1,151 @@
+"""Tests of `radejax.models.layers`; torch's numbers are in the shared fixtures."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.interop.radenet_names import _double_conv
+from radejax.models.layers import (
+    Conv,
+    ConvGNSiLU,
+    Dense,
+    DoubleConvResidual,
+    GroupNorm,
+    Upsample,
+    max_pool,
+    uniform_fan_in,
+)
+
+
+def strip(names, ours, theirs):
+    """Names below a module instead of from the top."""
+    return {
+        k.removeprefix(f"{ours}/"): v.removeprefix(f"{theirs}.")
+        for k, v in names.items()
+    }
+
+
+def test_double_conv_residual_equals_official(module_case, run_like_torch):
+    x, expected = module_case("double_conv_residual")
+    names = strip(_double_conv("m", "m"), "m", "m")
+    actual = run_like_torch(DoubleConvResidual(64, 32), names, x)
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+def test_upsample_equals_official(module_case, run_like_torch):
+    x, expected = module_case("upsample")
+    actual = run_like_torch(Upsample(16), {"": "upsample"}, x)
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
+
+
+def test_upsample_places_each_tap_at_its_corner():
+    x = jnp.array([[[[1.0], [10.0]]]])  # 1 x 2 bins
+    kernel = jnp.array([[1.0, 2.0], [3.0, 4.0]]).reshape(2, 2, 1, 1)
+    variables = {"params": {"kernel": kernel, "bias": jnp.array([0.5])}}
+    y = Upsample(1).apply(variables, x)[0, ..., 0]
+    expected = [[1.5, 2.5, 10.5, 20.5], [3.5, 4.5, 30.5, 40.5]]
+    np.testing.assert_array_equal(y, expected)
+
+
+def test_max_pool_by_hand():
+    x = jnp.array([[1.0, 2.0, 5.0, 0.0], [3.0, -1.0, -7.0, 4.0]]).reshape(1, 2, 4, 1)
+    np.testing.assert_array_equal(max_pool(x)[0, ..., 0], [[3.0, 5.0]])
+
+
+def test_max_pool_gradient_goes_to_the_maximum():
+    x = jnp.array([[1.0, 2.0], [4.0, 3.0]]).reshape(1, 2, 2, 1)
+    gradient = jax.grad(lambda x: max_pool(x).sum())(x)
+    np.testing.assert_array_equal(gradient[0, ..., 0], [[0, 0], [1, 0]])
+
+
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
+def test_group_norm_equals_its_definition(offset):
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((2, 5, 3, 8)) * 3.0 + offset
+    scale, bias = rng.standard_normal((2, 8))
+    groups = x.reshape(2, 5, 3, 4, 2)
+    mean = groups.mean((1, 2, 4), keepdims=True)
+    variance = groups.var((1, 2, 4), keepdims=True)
+    expected = ((groups - mean) / np.sqrt(variance + 1e-5)).reshape(x.shape)
+    expected = expected * scale + bias
+    params = {"scale": jnp.asarray(scale, jnp.float32), "bias": bias}
+    actual = GroupNorm(4).apply({"params": params}, jnp.asarray(x, jnp.float32))
+    # The input itself is only good to 1e-4 at an offset of 1000.
+    np.testing.assert_allclose(actual, expected, atol=3e-4 if offset else 1e-5)
+
+
+def test_group_norm_of_constant_map_is_the_bias():
+    x = jnp.full((1, 4, 4, 8), 7.0)
+    variables = GroupNorm(4).init(jax.random.key(0), x)
+
+    def apply(x):
+        return GroupNorm(4).apply(variables, x)
+
+    np.testing.assert_allclose(apply(x), 0.0, atol=1e-6)
+    chex.assert_tree_all_finite(jax.grad(lambda x: jnp.square(apply(x)).sum())(x))
+
+
+def test_group_norm_names_the_mismatch():
+    with pytest.raises(ValueError, match=r"num_groups=3 does not divide 8 channels"):
+        GroupNorm(3).init(jax.random.key(0), jnp.zeros((1, 2, 2, 8)))
+
+
+def test_group_norm_statistics_are_float32_in_bfloat16():
+    # 100 + small noise: bfloat16 sums of squares would lose the variance.
+    x = 100.0 + jnp.asarray(
+        np.random.default_rng(0).integers(-2, 3, (1, 16, 16, 8)), jnp.float32
+    )
+    variables = GroupNorm(4).init(jax.random.key(0), x)
+    expected = GroupNorm(4).apply(variables, x)
+    actual = GroupNorm(4, dtype=jnp.bfloat16).apply(variables, x.astype(jnp.bfloat16))
+    assert actual.dtype == jnp.bfloat16
+    np.testing.assert_allclose(actual.astype(jnp.float32), expected, atol=2e-2)
+
+
+def gradient_by_differences(f, x, direction, step=1e-3):
+    return (f(x + step * direction) - f(x - step * direction)) / (2 * step)
+
+
+def test_conv_gn_silu_gradient_against_finite_differences():
+    with jax.enable_x64(True):
+        module = ConvGNSiLU(8, 4, dtype=jnp.float64)
+        rng = np.random.default_rng(0)
+        x, direction, weight = rng.standard_normal((3, 1, 6, 5, 8))
+        variables = module.init(jax.random.key(0), jnp.asarray(x))
+        variables = jax.tree.map(lambda v: v.astype(jnp.float64), variables)
+
+        def f(x):
+            return (module.apply(variables, x) * weight).sum()
+
+        actual = (jax.grad(f)(jnp.asarray(x)) * direction).sum()
+        expected = gradient_by_differences(f, jnp.asarray(x), direction)
+        np.testing.assert_allclose(actual, expected, rtol=1e-3)
+
+
+def test_initialiser_is_uniform_within_torchs_bound():
+    values = uniform_fan_in(25)(jax.random.key(0), (20_000,))
+    assert np.abs(values).max() <= 0.2
+    # Variance of a uniform distribution: bound squared over 3.
+    np.testing.assert_allclose(np.var(values), 0.04 / 3, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("module", "fan_in"),
+    [(Conv(64, 3), 9 * 16), (Dense(64), 16), (Upsample(64), 4 * 64)],
+)
+def test_initial_weights_and_biases_fill_torchs_interval(module, fan_in):
+    params = module.init(jax.random.key(0), jnp.zeros((1, 2, 2, 16)))["params"]
+    bound = fan_in**-0.5
+    for leaf in params.values():
+        assert bound * 0.9 < np.abs(leaf).max() <= bound
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_parameters_stay_float32_and_output_has_the_dtype(dtype):
+    module = DoubleConvResidual(16, 8, dtype=dtype)
+    x = jnp.ones((1, 4, 4, 8))
+    variables = module.init(jax.random.key(0), x)
+    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
+    assert module.apply(variables, x).dtype == dtype

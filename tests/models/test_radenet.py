@@ -1,0 +1,176 @@
+"""Tests of `radejax.models.radenet` and of `radejax.models.build`."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ml_collections import ConfigDict
+
+from radejax import models
+from radejax.config import base_config
+from radejax.errors import UserError
+from radejax.models.radenet import FIELDS, pad_to_multiple
+
+
+@pytest.fixture(scope="module")
+def small(radenet_golden):
+    return radenet_golden["SMALL"]
+
+
+def num_parameters(model):
+    x = jnp.zeros((1, 16, 16, model.doppler_bins + model.elevation_bins))
+    shapes = jax.eval_shape(model.init, jax.random.key(0), x)["params"]
+    return {k: sum(v.size for v in jax.tree.leaves(t)) for k, t in shapes.items()}
+
+
+def test_parameters_of_the_released_model():
+    counts = num_parameters(models.build(base_config().model))
+    expected = {"backbone": 26_561_121, "neck": 887_040, "heads": 888_717}
+    assert counts == expected
+    assert sum(counts.values()) == 28_336_878
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"input_stem": True}, 28_452_782),
+        ({"decoder_width": 256}, 34_356_718),
+        ({"heads": "default"}, 27_596_846),
+        ({"neck": "plain"}, 27_893_358),
+    ],
+)
+def test_parameters_of_released_variants(changes, expected):
+    config = base_config().model
+    config.update(changes)
+    assert sum(num_parameters(models.build(config)).values()) == expected
+
+
+def test_pads_at_the_far_and_right_end():
+    padded = pad_to_multiple(jnp.ones((1, 5, 7, 2)), 4)
+    assert padded.shape == (1, 8, 8, 2)
+    np.testing.assert_array_equal(padded[:, :5, :7], 1.0)
+    assert padded.sum() == 5 * 7 * 2
+
+
+def test_padding_inside_equals_padding_outside(small):
+    model = models.build(small)
+    x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
+    variables = model.init(jax.random.key(1), x)
+    maps = jax.jit(model.apply)(variables, x)
+    assert maps.heatmap_logits.shape == (1, 24, 16, 3)
+    assert maps.box_params.shape == (1, 24, 16, 8)
+    outside = jax.jit(model.apply)(variables, pad_to_multiple(x, 8))
+    chex.assert_trees_all_close(maps, outside, atol=1e-5)
+
+
+def test_cropped_maps_are_the_padded_ones_cut(small):
+    x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
+    model = models.build(small)
+    variables = model.init(jax.random.key(1), x)
+    maps = jax.jit(model.apply)(variables, x)
+    cropped = jax.jit(models.build(small | {"crop_output": True}).apply)(variables, x)
+    assert cropped.heatmap_logits.shape == (1, 21, 14, 3)
+    expected = jax.tree.map(lambda m: m[:, :21, :14], maps)
+    chex.assert_trees_all_close(cropped, expected, atol=1e-5)
+
+
+def test_frames_do_not_touch_each_other(small):
+    model = models.build(small)
+    x = jax.random.uniform(jax.random.key(0), (3, 16, 16, 13))
+    variables = model.init(jax.random.key(1), x[:1])
+    together = jax.jit(model.apply)(variables, x)
+    alone = jax.jit(model.apply)(variables, x[1:2])
+    middle = jax.tree.map(lambda m: m[1:2], together)
+    chex.assert_trees_all_close(middle, alone, atol=2e-5)
+
+
+def test_remat_changes_neither_parameters_nor_gradients(small):
+    x = jax.random.uniform(jax.random.key(0), (1, 16, 8, 13))
+    model = models.build(small)
+    variables = model.init(jax.random.key(1), x)
+
+    def gradient(model):
+        def loss(v):
+            maps = model.apply(v, x, train=True)
+            return jnp.square(maps.heatmap_logits).sum() + maps.box_params.sum()
+
+        return jax.jit(jax.grad(loss))(variables)
+
+    remat = gradient(models.build(small | {"remat": True}))
+    chex.assert_trees_all_close(remat, gradient(model), rtol=1e-3, atol=1e-3)
+
+
+def test_bfloat16_is_near_float32(small):
+    x = jax.random.uniform(jax.random.key(0), (1, 16, 16, 13))
+    model = models.build(small)
+    variables = model.init(jax.random.key(1), x)
+    narrow = models.build(small | {"dtype": "bfloat16"})
+    maps = jax.jit(narrow.apply)(variables, x)
+    expected = jax.jit(model.apply)(variables, x)
+    assert maps.heatmap_logits.dtype == jnp.float32
+    for actual, wide in zip(
+        jax.tree.leaves(maps), jax.tree.leaves(expected), strict=True
+    ):
+        assert np.abs(actual - wide).max() > 0  # it did compute in bfloat16
+        assert np.abs(actual - wide).max() < 0.1 * np.abs(wide).max()
+
+
+def test_cbam_kinds_give_their_parameters(small):
+    kinds = {"official": True, "paper": True, "off": False, None: False}
+    for kind, has_cbam in kinds.items():
+        model = models.build(small | {"cbam": kind})
+        x = jnp.zeros((1, 8, 8, 13))
+        params = jax.eval_shape(model.init, jax.random.key(0), x)["params"]
+        assert ("cbam_1" in params["backbone"]) == has_cbam
+
+
+def test_wrong_channels_are_named(small):
+    with pytest.raises(ValueError, match=r"\[B, R, A, 13\].*got \(1, 8, 8, 12\)"):
+        models.build(small).init(jax.random.key(0), jnp.zeros((1, 8, 8, 12)))
+
+
+def test_build_takes_a_config_dict(small):
+    model = models.build(ConfigDict(small))
+    assert model.widths == (16, 32, 64)
+    assert model == models.build(small)
+
+
+def test_build_names_unknown_and_missing_keys(small):
+    broken = {k: v for k, v in small.items() if k != "neck"} | {"width": 3}
+    with pytest.raises(UserError, match=r"unknown \['width'\] and missing \['neck'\]"):
+        models.build(broken)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_field_is_required(small, field):
+    with pytest.raises(UserError, match=rf"missing \['{field}'\]"):
+        models.build({k: v for k, v in small.items() if k != field})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"name": "radarnet"},
+            r"'radarnet'; available models: \['dinorade', 'radenet'\]",
+        ),
+        ({"cbam": "on"}, r"cbam is 'on', expected one of"),
+        ({"neck": "flat"}, r"neck is 'flat'"),
+        ({"heads": "small"}, r"heads is 'small'"),
+        ({"dtype": "float16"}, r"dtype is 'float16'"),
+        ({"pad_multiple": 4}, r"pad_multiple is 4; 3 levels need a multiple of 8"),
+        ({"num_groups": 32}, r"widths\[0\] = 16 is not a multiple of num_groups = 32"),
+        ({"num_groups": 16, "heads": "default"}, r"decoder_width / 2 .* = 8"),
+        ({"num_groups": 16, "input_stem": True}, r"widths\[0\] / 2 .* = 8"),
+        ({"heatmap_prior": 1.0}, r"heatmap_prior is 1.0"),
+    ],
+)
+def test_impossible_values_are_named(small, changes, message):
+    with pytest.raises(UserError, match=message):
+        models.build(small | changes)
+
+
+def test_name_is_required(small):
+    with pytest.raises(UserError, match=r"config.model.name is missing"):
+        models.build({k: v for k, v in small.items() if k != "name"})
