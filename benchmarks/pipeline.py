@@ -9,9 +9,11 @@ frame into batches of the same size.
 """
 
 import argparse
+import functools
 import itertools
 import os
 import pathlib
+import statistics
 import tempfile
 import time
 import types
@@ -120,7 +122,8 @@ def main() -> None:
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read one
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=128, help="Frames in the files.")
-    parser.add_argument("--timed_frames", type=int, default=320)
+    parser.add_argument("--timed_frames", type=int, default=160, help="A round.")
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--batch_size", type=int, default=8)
     parser.add_argument("--memory_frames", type=int, default=0)
     parser.add_argument("--folder", type=pathlib.Path, help="Where to put test files.")
@@ -150,15 +153,21 @@ def main() -> None:
             "float16, 2 worker processes": (records, {"num_workers": 2}),
             "uint8, 2 threads": (bytes_, {}),
         }
-        print(f"frames of {grid.projection_shape}, batches of {size}\n{'':32}frames/s")
-        # The reference is timed before and after: machines are shared.
-        rates = [time_npy(paths, size, timed // 2)]
-        for title, (source, how) in variants.items():
-            print(
-                f"{title:32}{time_loader(source, size, timed, **how):8.0f}", flush=True
-            )
-        rates.append(time_npy(paths, size, timed // 2))
-        print(f"{'released float64 .npy':32}{min(rates):8.0f} to {max(rates):.0f}")
+        functions = {
+            title: functools.partial(time_loader, source, size, timed, **how)
+            for title, (source, how) in variants.items()
+        }
+        functions["released float64 .npy"] = functools.partial(
+            time_npy, paths, size, timed
+        )
+        rates = {title: [] for title in functions}
+        for _ in range(arguments.rounds):  # in turns: machines are shared
+            for title, function in functions.items():
+                rates[title].append(function())
+        print(f"frames of {grid.projection_shape}, batches of {size}; frames/s")
+        print(f"{'':32}{'median':>8}{'best':>8}")
+        for title, values in rates.items():
+            print(f"{title:32}{statistics.median(values):8.0f}{max(values):8.0f}")
 
 
 if __name__ == "__main__":
