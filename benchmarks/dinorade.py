@@ -231,6 +231,7 @@ def row(name, batch, times, memory):
         torch_wall, torch_processor = times["torch"]
         cells += [1e3 * torch_wall / batch, torch_processor, torch_wall / wall]
         cells.append(torch_processor / processor)
+    print(*(x if isinstance(x, str | int) else f"{x:.2f}" for x in cells), flush=True)
     return cells
 
 

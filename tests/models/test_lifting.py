@@ -135,7 +135,9 @@ def test_queries_outside_the_image_are_invalid_and_clipped():
 
 
 def test_each_sample_has_its_own_camera():
-    cameras = [ahead(yaw_deg=yaw).camera(is_valid=yaw > 85) for yaw in (81.3, 90.2, 94.1)]
+    cameras = [
+        ahead(yaw_deg=yaw).camera(is_valid=yaw > 85) for yaw in (81.3, 90.2, 94.1)
+    ]
     batch = jax.tree.map(jnp.asarray, stack_cameras(cameras))
     together = jax.jit(lambda c: lifting.reference_points(c, AXES, 5, 4))(batch)
     chex.assert_shape(together.points, (3, 5, 4, 2, 2))
