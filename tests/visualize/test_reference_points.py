@@ -1,0 +1,36 @@
+"""Tests of radejax.visualize.reference_points."""
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from radejax.geometry.camera import CameraCalibration
+from radejax.visualize.reference_points import draw_reference_points
+
+matplotlib.use("agg")
+
+
+def test_valid_points_and_the_radar_are_drawn_in_pixels():
+    # The radar lies 2 m ahead of the camera and 1 m below its axis.
+    calibration = CameraCalibration.from_angles(
+        intrinsics=(50.0, 50.0, 50.0, 40.0),
+        yaw_deg=90.0,
+        pitch_deg=0.0,
+        roll_deg=90.0,
+        translation_m=(0.0, 0.0, 0.0),
+        ego_from_lidar_m=(-2.0, 0.0, 1.0),
+        width=100,
+        height=80,
+    )
+    points = np.zeros((2, 2, 1, 2), np.float32)
+    points[0, 0, 0] = 0.25, 0.5
+    points[1, 1, 0] = 0.5, 0.75
+    is_valid = np.array([[[True], [False]], [[False], [True]]])
+    ax = Figure().add_subplot()
+    args = (ax, points, is_valid, calibration)
+    assert draw_reference_points(*args, every=(1, 1, 1)) == 2
+    dots, radar = ax.collections
+    np.testing.assert_allclose(dots.get_offsets(), [[24.5, 39.5], [49.5, 59.5]])
+    np.testing.assert_allclose(radar.get_offsets(), [[49.5, 40 + 25 - 0.5]])
+    # Every second range bin: the first point alone.
+    assert draw_reference_points(*args, every=(2, 1, 1)) == 1
