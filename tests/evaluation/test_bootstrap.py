@@ -47,6 +47,18 @@ def test_weight_one_is_the_result_itself(scene):
         assert ap[2] == pytest.approx(ap[:2].mean())
 
 
+def test_weights_of_a_condition_give_the_condition(scene):
+    data, mask = make(*scene), scene[2]["weather"] == "fog"
+    weights = np.stack([mask, 2 * mask]).astype(int)
+    for protocol in ("exact", "kradar_r40", "kradar_r11", "voc11"):
+        ap = bootstrap.resample(data, weights[:1], protocol, "3d", 0.3)[0]
+        results = data.results(protocol, iou_thresholds=0.3, spaces="3d", weights=mask)
+        np.testing.assert_allclose(ap[:2], [r.ap for r in results], rtol=0, atol=1e-12)
+    # Doubling every frame changes nothing but the rounding of recall steps.
+    ap = bootstrap.resample(data, weights, "exact", "3d", 0.3)
+    np.testing.assert_allclose(ap[0], ap[1], atol=1e-9)
+
+
 def test_interval_covers_the_number_and_grows_with_the_level(scene):
     data = make(*scene)
     found = bootstrap.add_intervals(
