@@ -122,8 +122,9 @@ def project(
     Example: radejax project /disk1/kradar --out /fast/records --shard 3/16
     """
     from radejax.data.kradar import KRadar
-    from radejax.data.projection_job import project_dataset
+    from radejax.data.projection_job import parse_shard, project_dataset
 
+    parse_shard(shard)  # before the labels are read
     frames = KRadar(roots, labels, version=label_version)
     summary = project_dataset(
         frames, out, dtype=dtype, num_workers=workers, shard=shard, skip_bad=skip_bad

@@ -1,11 +1,20 @@
 """Settings shared by all tests."""
 
+import os
 import pathlib
+import tempfile
 
 import jax
 import pytest
 from absl import flags
 
+# Programs that several tests or processes compile are compiled once in a session; the
+# workers of pytest-xdist inherit the folder.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _cache = tempfile.TemporaryDirectory(prefix="radejax-test-cache-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 8)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -49,6 +49,9 @@ def tiny() -> Tiny:
         widths=(8, 8, 16),
         decoder_width=8,
         num_groups=4,
+        cbam="off",  # the loop does not care, and the compiler is done sooner
+        neck="plain",
+        heads="default",
         heatmap_prior=0.1,
     )
     config.loss.sigma_cells = 1.0
