@@ -1,0 +1,78 @@
+"""The notebooks: whole, clean and running from start to end."""
+
+import ast
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+SECONDS = 900
+
+by_name = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+@pytest.fixture(scope="session")
+def work(tmp_path_factory) -> pathlib.Path:
+    """Runs and data of the notebooks; the first one trains for all."""
+    return tmp_path_factory.mktemp("notebooks")
+
+
+def code_cells(path: pathlib.Path) -> list[dict]:
+    notebook = json.loads(path.read_text(encoding="utf-8"))
+    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)
+    return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@by_name
+def test_notebook_is_clean(path):
+    """Code parses; stored outputs are complete, without errors or private paths."""
+    for cell in code_cells(path):
+        ast.parse("".join(cell["source"]))
+        assert cell["execution_count"] is not None
+        assert not [o for o in cell["outputs"] if o["output_type"] == "error"]
+    text = path.read_text(encoding="utf-8")
+    assert len(text) < 2_000_000
+    for private in (f"{ROOT.parent}/", f"{pathlib.Path.home()}/", "/tmp/", "/home/"):
+        assert private not in text
+    pictures = text.count('"image/png"') + text.count('"image/gif"')
+    assert pictures >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(SECONDS)
+@by_name
+def test_notebook_runs(path, work):
+    """In a fresh process without a display, on the short quickstart.
+
+    Cells are fed as one program through standard input: worker processes that the
+    notebook starts must not find a main file to import, as in Jupyter.
+    """
+    program = "\n\n".join("".join(cell["source"]) for cell in code_cells(path))
+    settings = {
+        "RADEJAX_WORK": str(work),
+        "RADEJAX_SHORT": "1",
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": str(ROOT),
+    }
+    unset = ("DISPLAY", "MPLBACKEND", "KRADAR", "KRADAR_LABELS", "RADENET_PTH")
+    inherited = {k: v for k, v in os.environ.items() if k not in unset}
+    done = subprocess.run(
+        [sys.executable, "-W", "error::FutureWarning", "-"],
+        input=program,
+        cwd=ROOT / "notebooks",
+        env={**inherited, **settings},
+        capture_output=True,
+        text=True,
+        timeout=SECONDS,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
