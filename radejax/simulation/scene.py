@@ -204,7 +204,10 @@ def class_index(name: str) -> int:
     Raises:
         ValueError: There is no such class.
     """
-    return CLASSES.index(name.removesuffix(" Group"))
+    single = name.removesuffix(" Group")
+    if single not in CLASSES:
+        raise ValueError(f"class {name!r} is none of {', '.join(CLASSES)}")
+    return CLASSES.index(single)
 
 
 def wrap_angle(angle_rad: Any) -> Any:
