@@ -85,7 +85,7 @@ def evaluate_files() -> None:
     """Evaluates predictions in files."""
     import pathlib
 
-    from radejax.evaluation import commands
+    from radejax import evaluate_files as commands
 
     path = pathlib.Path(_PREDICTIONS.value)
     out = _OUT.value or path.with_name(f"{path.stem}_evaluation")
@@ -95,7 +95,7 @@ def evaluate_files() -> None:
 
 def compare(paths: list[str]) -> None:
     """Compares runs with the first of them."""
-    from radejax.evaluation import commands
+    from radejax import evaluate_files as commands
 
     text, _ = commands.compare_files(
         paths,
@@ -108,7 +108,7 @@ def compare(paths: list[str]) -> None:
 
 
 def _source() -> object:
-    from radejax.evaluation.commands import Source
+    from radejax.evaluate_files import Source
 
     return Source(
         data=tuple(_DATA.value),

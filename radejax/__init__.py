@@ -1,11 +1,20 @@
 """RADE-Net and DinoRADE in JAX: 3D object detection in 4D radar tensors."""
 
+import importlib
 from typing import Any
 
 from radejax.errors import DataError, UserError
-from radejax.structures import CLASSES, Batch, DetectionMaps, Detections
 
 __version__ = "0.1.0"
+
+# On first use: reading labels or evaluating files should not load the models.
+_LAZY = {
+    "Batch": "radejax.structures",
+    "CLASSES": "radejax.structures",
+    "DetectionMaps": "radejax.structures",
+    "Detections": "radejax.structures",
+    "Detector": "radejax.detector",
+}
 
 __all__ = [
     "CLASSES",
@@ -19,9 +28,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """`radejax.Detector` on first use: reading labels should not load the models."""
-    if name == "Detector":
-        from radejax.detector import Detector
-
-        return Detector
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'radejax' has no attribute {name!r}")

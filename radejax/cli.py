@@ -75,21 +75,29 @@ def data() -> None:
 @click.argument("roots", nargs=-1, required=True, type=EXISTING)
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
+@click.option("--deep", is_flag=True, help="Read every tesseract whole.")
 @_json_option
 def check(
     roots: tuple[pathlib.Path, ...],
     labels: pathlib.Path | None,
     label_version: str,
+    deep: bool,
     as_json: bool,
 ) -> None:
     """Report what is there, what is missing and what is damaged.
+
+    Exit code 1 if anything is missing or damaged.
 
     Example: radejax data check /disk1/kradar /disk2/kradar
     """
     from radejax.data.check import check_dataset
 
-    report = check_dataset(roots, labels=labels, version=label_version)
+    report = check_dataset(
+        roots, labels=labels, version=label_version, deep=deep, progress=not as_json
+    )
     _report(as_json, report.to_dict(), report.to_text())
+    if report.num_problems:
+        raise SystemExit(entry.FAILED)
 
 
 @main.command()
@@ -97,7 +105,9 @@ def check(
 @click.option("--out", required=True, type=PATH, help="Folder of the records.")
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
-@click.option("--dtype", type=click.Choice(["float16", "uint8"]), default="float16")
+@click.option(
+    "--dtype", type=click.Choice(["float16", "uint8", "float32"]), default="float16"
+)
 @click.option("--workers", type=int, help="Processes; one per core by default.")
 @click.option(
     "--shard", default="0/1", show_default=True, help="Part i of n, i from 0."
@@ -126,6 +136,7 @@ def project(
 
     parse_shard(shard)  # before the labels are read
     frames = KRadar(roots, labels, version=label_version)
+    click.echo(frames.summary().to_text(), err=True)
     summary = project_dataset(
         frames, out, dtype=dtype, num_workers=workers, shard=shard, skip_bad=skip_bad
     )

@@ -170,6 +170,7 @@ def _evaluation() -> ConfigDict:
             "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
             "score_threshold": 0.3,
+            "bootstrap": 0,  # resamples of sequences for intervals; 1000 is plenty
             "batch_size": 8,
             "num_pictures": 8,
         }

@@ -300,7 +300,7 @@ def _detect(
         grid,
         score_threshold=score_threshold,
         nms_iou=nms_iou,
-        roi=jnp.concatenate([roi[::2], roi[1::2]]),
+        roi=roi,
         **options,
     )
 

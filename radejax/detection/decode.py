@@ -73,7 +73,7 @@ def decode(
         score_threshold: Peaks must score above it.
         nms_iou: Of two boxes overlapping this much or more the weaker is dropped.
         pre_nms: Peaks that enter NMS at most, the strongest; default 2 K.
-        roi: `[6]` x, y, z minima and maxima in metres, bounds included, or None.
+        roi: `[6]` (x0, x1, y0, y1, z0, z1) in metres, bounds included, or None.
         per_class_nms: Only boxes of the same class suppress each other.
         threshold_inclusive: Peaks that score exactly the threshold count (the paper's
             reading; the released code's is exclusive).
@@ -224,16 +224,14 @@ def _in_roi(
     """`[B, R, A]` bool: the box of a bin has its center in the region."""
     roi = jnp.asarray(roi, jnp.float32)
     if roi.shape != (6,):
-        raise ValueError(
-            f"roi must be [6]: x, y, z minima, then maxima; got {roi.shape}"
-        )
+        raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
     center = params[..., :3].astype(jnp.float32)
     ground = jnp.asarray(grid.cell_centers_ego(), jnp.float32)[None]  # [1, R, A, 2]
     inside = jnp.ones(params.shape[:3], bool)
     offsets = (ground[..., 0], ground[..., 1], z0_m)
     for axis, offset in enumerate(offsets):
         position = center[..., axis] + offset
-        inside &= (position >= roi[axis]) & (position <= roi[axis + 3])
+        inside &= (position >= roi[2 * axis]) & (position <= roi[2 * axis + 1])
     return inside
 
 

@@ -73,7 +73,7 @@ def case(request, golden):
 
 
 def roi_of(want):
-    whole = np.array([-1e9] * 3 + [1e9] * 3)
+    whole = np.array([-1e9, 1e9] * 3)
     return D.WIDE_ROI if want["wide_roi"] else whole
 
 
@@ -270,7 +270,7 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     x, y = GRID.cell_to_ego(*cells.T).T
     inside = (np.abs(y) <= 30) & (x <= 90)
     assert 3 < inside.sum() < 10
-    roi = np.array([0, -30, 0, 90, 30, 0.0])
+    roi = np.array([0, 90, -30, 30, 0, 0.0])
     found = decode(
         maps_of(logits, params), GRID, max_detections=12, score_threshold=0.3, roi=roi
     )
@@ -327,7 +327,7 @@ def test_thresholds_and_region_are_traced_values():
     logits, params, _, _ = scattered(num=10)
     count = decode._cache_size()
     for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5), (0.5, 0.1)):
-        roi = np.array([0.0, -50, -1, 100 * threshold, 50, 1])
+        roi = np.array([0.0, 100 * threshold, -50, 50, -1, 1])
         found = decode(
             maps_of(logits, params),
             GRID,

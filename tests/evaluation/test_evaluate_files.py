@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
+from radejax import evaluate_files as commands
 from radejax.errors import UserError
-from radejax.evaluation import commands, kitti, predictions_io
-from radejax.evaluation.commands import Source
+from radejax.evaluate_files import Source
+from radejax.evaluation import kitti, predictions_io
 from radejax.evaluation.measure import Options
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
