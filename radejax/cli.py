@@ -48,11 +48,22 @@ def _report(as_json: bool, values: dict[str, Any], text: str) -> None:
 @click.option("--config", default="configs/quickstart.py", show_default=True, type=str)
 @click.option("--out", required=True, type=PATH, help="Root of the new data set.")
 @click.option("--seed", type=int, help="Instead of the config's.")
+@click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
+@click.option("--sequences", help="Of the labels, such as 1,5,58; all by default.")
+@click.option("--frames", type=int, help="A sequence; 0 for all of the labels.")
 @_json_option
-def simulate(config: str, out: pathlib.Path, seed: int | None, as_json: bool) -> None:
+def simulate(
+    config: str,
+    out: pathlib.Path,
+    seed: int | None,
+    scenes: str | None,
+    sequences: str | None,
+    frames: int | None,
+    as_json: bool,
+) -> None:
     """Simulate a data set in K-Radar's folders and file formats.
 
-    Example: radejax simulate --config configs/quickstart.py --out data/sim
+    Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
     """
     from radejax.errors import UserError
     from radejax.simulation.dataset import simulate_dataset
@@ -62,6 +73,15 @@ def simulate(config: str, out: pathlib.Path, seed: int | None, as_json: bool) ->
         raise UserError(f"{config} has no `simulation` section")
     if seed is not None:
         simulation.seed = seed
+    if scenes is not None:
+        simulation.scenes = scenes
+    if frames is not None:
+        simulation.frames_per_sequence = frames
+    if sequences is not None:
+        try:
+            simulation.sequences = [int(number) for number in sequences.split(",")]
+        except ValueError:
+            raise UserError(f"--sequences {sequences!r}, expected 1,5,58") from None
     simulate_dataset(simulation, out)
     _report(as_json, {"root": str(out)}, f"simulated data set in {out}")
 
@@ -211,6 +231,48 @@ def overlay(
 
     draw_overlay(name, roots, out, labels=labels, version=label_version)
     _report(as_json, {"picture": str(out)}, f"drew {out}")
+
+
+@main.command()
+@click.argument("roots", nargs=-1, required=True, type=EXISTING)
+@click.option("--out", type=PATH, default="recording.rrd", show_default=True)
+@click.option("--sequence", type=int, help="All by default.")
+@click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
+@click.option("--label-version", default="v2.1", show_default=True)
+@click.option("--workdir", type=EXISTING, help="Run whose detections are shown too.")
+@click.option("--max-frames", type=int, help="All by default.")
+@click.option("--open", "open_it", is_flag=True, help="Open it in the viewer.")
+@_json_option
+def view(
+    roots: tuple[pathlib.Path, ...],
+    out: pathlib.Path,
+    sequence: int | None,
+    labels: pathlib.Path | None,
+    label_version: str,
+    workdir: pathlib.Path | None,
+    max_frames: int | None,
+    open_it: bool,
+    as_json: bool,
+) -> None:
+    """Record a sequence for the rerun viewer (extra "viewer").
+
+    Example: radejax view data/kradar --sequence 5 --out five.rrd --open
+    """
+    from radejax.view import write_view
+    from radejax.visualize.viewer import open_viewer
+
+    write_view(
+        roots,
+        out,
+        sequence=sequence,
+        labels=labels,
+        version=label_version,
+        workdir=workdir,
+        max_frames=max_frames,
+    )
+    if open_it:
+        open_viewer(out)
+    _report(as_json, {"recording": str(out)}, f"wrote {out}")
 
 
 def _load_config(path_and_words: str) -> Any:
