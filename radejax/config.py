@@ -12,13 +12,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from radejax.errors import UserError
-from radejax.structures import CLASSES
-
-NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
-"""K-Radar's benchmark region: x, y, z from and to, metres, ego frame."""
-
-WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
-"""K-Radar's wide region: x, y, z from and to, metres, ego frame."""
+from radejax.structures import CLASSES, NARROW_ROI
 
 
 def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:

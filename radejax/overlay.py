@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from radejax.config import WIDE_ROI
 from radejax.data.kradar import KRadar
 from radejax.data.tesseract import project_file
 from radejax.errors import UserError
 from radejax.evaluate_run import read_camera, read_left_image
+from radejax.structures import WIDE_ROI
 from radejax.visualize import bev
 
 

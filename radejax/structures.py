@@ -20,6 +20,12 @@ CLASSES = ("Sedan", "Bus or Truck", "Pedestrian", "Motorcycle", "Bicycle")
 BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
 """Names of the numbers of a box, metres and radians."""
 
+NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
+"""K-Radar's benchmark region: x, y, z from and to, metres, ego frame."""
+
+WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
+"""K-Radar's wide region: x, y, z from and to, metres, ego frame."""
+
 
 @struct.dataclass
 class Batch:

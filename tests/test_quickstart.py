@@ -67,7 +67,8 @@ def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
         assert line in output
     run = folder / "run"
     assert _metrics(folder)
-    rows = list(csv.DictReader((run / "evaluation" / "metrics.csv").open()))
+    with (run / "evaluation" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
     assert {row["space"] for row in rows} == {"bev", "3d"}
     assert {float(row["iou"]) for row in rows} == {0.3, 0.5}
     assert list((run / "evaluation" / "pictures").glob("*.png"))

@@ -16,11 +16,6 @@ from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.structures import DetectionMaps, Detections
 
-NARROW_ROI = np.array([0.0, -6.4, -2.0, 72.0, 6.4, 6.0])
-"""K-Radar's benchmark region: x, y, z minima, then maxima, in metres."""
-WIDE_ROI = np.array([0.0, -16.0, -2.0, 72.0, 16.0, 7.6])
-"""K-Radar's wide region: x, y, z minima, then maxima, in metres."""
-
 
 @struct.dataclass
 class Peaks:

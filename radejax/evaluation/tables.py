@@ -13,15 +13,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from radejax.errors import DataError, UserError
-from radejax.structures import CLASSES
+from radejax.structures import CLASSES, NARROW_ROI, WIDE_ROI
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not asked for are ignored."""
 
-ROIS = {
-    "narrow": (0.0, 72.0, -6.4, 6.4, -2.0, 6.0),
-    "wide": (0.0, 72.0, -16.0, 16.0, -2.0, 7.6),
-}
+ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
 """Regions of interest: x, y, z bounds in metres, inclusive, for box centers (ego)."""
 
 BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")

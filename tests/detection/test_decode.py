@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from radejax.detection import decode as D
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import DetectionMaps
+from radejax.structures import WIDE_ROI, DetectionMaps
 
 KRADAR = RadarGrid.kradar()
 OFFICIAL = {112: KRADAR.padded(8, "stretched"), 107: KRADAR.padded(1, "stretched")}
@@ -74,7 +74,7 @@ def case(request, golden):
 
 def roi_of(want):
     whole = np.array([-1e9, 1e9] * 3)
-    return D.WIDE_ROI if want["wide_roi"] else whole
+    return WIDE_ROI if want["wide_roi"] else whole
 
 
 def test_boxes_before_nms_of_the_released_code(case):
