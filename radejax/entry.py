@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import logging
 import os
 import pathlib
@@ -15,6 +14,7 @@ from absl import flags
 from absl import logging as absl_logging
 
 from radejax.errors import DataError, UserError
+from radejax.files import is_no_space
 
 FAILED = 1
 WRONG_USE = 2
@@ -36,7 +36,7 @@ def exit_codes(*, debug: bool = False) -> Iterator[None]:
     except DataError as error:
         _fail(error, FAILED, debug)
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if not is_no_space(error):
             raise
         _fail(error, WRONG_USE, debug)
 

@@ -21,7 +21,7 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: pathlib.Path) -
 
 def test_full_disk_is_one_clear_error(tmp_path: pathlib.Path) -> None:
     with (
-        pytest.raises(UserError, match=r"no space left to write .*a\.json"),
+        pytest.raises(UserError, match="no space left on the disk of"),
         files.atomic_path(tmp_path / "a.json"),
     ):
         raise OSError(errno.ENOSPC, "No space left on device")

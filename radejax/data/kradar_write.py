@@ -6,51 +6,24 @@ when it is complete: writers write beside it and rename.
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import json
 import math
 import os
 import pathlib
-from collections.abc import Iterable, Iterator, Sequence
-from typing import IO, TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from radejax.data.labels import Label, normalise_version
 from radejax.errors import UserError
+from radejax.files import atomic_write
 
 if TYPE_CHECKING:
     from radejax.geometry.radar_grid import RadarGrid
 
 _SENSORS = "tesseract_os2-64_cam-front_os1-128_cam-lrr"
 _MAT_TEXT = b"MATLAB 5.0 MAT-file, written by radejax"
-
-
-@contextlib.contextmanager
-def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
-    """An open binary file that becomes `path` when the block ends without an error.
-
-    Missing parent folders are made. After an error or a kill `path` is what it was;
-    the error also removes the temporary file.
-
-    Raises:
-        UserError: No space is left on the disk.
-    """
-    path = pathlib.Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if is_no_space(error):
-            raise no_space_error(path) from error
-        raise
 
 
 def write_labels(
@@ -149,25 +122,6 @@ def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
     """Writes `radar_grid.json` at the root of a data set of another sensor grid."""
     with atomic_write(pathlib.Path(root) / "radar_grid.json") as file:
         file.write(json.dumps(grid.to_dict()).encode("ascii"))
-
-
-def is_no_space(error: BaseException) -> bool:
-    """True if an error says that the disk is full or a quota is used up.
-
-    Libraries in C++ keep the system's message but not its number.
-    """
-    numbers = (errno.ENOSPC, errno.EDQUOT)
-    if isinstance(error, OSError) and error.errno in numbers:
-        return True
-    return any(os.strerror(number) in str(error) for number in numbers)
-
-
-def no_space_error(path: str | os.PathLike) -> UserError:
-    """The one-line error for a full disk or an exhausted quota."""
-    return UserError(
-        f"no space left on the disk of {pathlib.Path(path).parent}; nothing half-"
-        "written was kept, run the same command again with space to continue"
-    )
 
 
 def _object_line(label: Label, version: str) -> str:

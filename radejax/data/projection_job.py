@@ -25,9 +25,9 @@ from tqdm import tqdm
 
 from radejax.data import record_files
 from radejax.data.encoding import check_encoding, encode, num_clipped
-from radejax.data.kradar_write import atomic_write
 from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.errors import DataError, UserError
+from radejax.files import atomic_write
 
 if TYPE_CHECKING:
     from radejax.data.kradar import Frame, KRadar

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from radejax.data.kradar_write import atomic_write, is_no_space, no_space_error
 from radejax.errors import DataError
+from radejax.files import atomic_write, is_no_space, no_space_error
 
 # One record a group: random access then reads one frame, not its neighbours.
 WRITER_OPTIONS = "group_size:1,uncompressed"

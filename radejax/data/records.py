@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from radejax.data.encoding import MAX_ERROR_DB, check_encoding
-from radejax.data.kradar_write import atomic_write
 from radejax.data.record_files import READER_OPTIONS, RecordFile, sha256
 from radejax.errors import DataError, UserError
+from radejax.files import atomic_write
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"

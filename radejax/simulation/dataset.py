@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from radejax import files
 from radejax.data import kradar_write
 from radejax.errors import UserError
 from radejax.simulation.camera import CameraRenderer, stereo_calibration
@@ -68,7 +69,7 @@ def simulate_dataset(
         _write_marker(root, checked, finished=True)
     except OSError as error:
         if error.errno in (28, 122):  # no space left, quota exceeded
-            raise kradar_write.no_space_error(root / MARKER) from error
+            raise files.no_space_error(root / MARKER) from error
         raise
     return root
 
@@ -108,7 +109,7 @@ def _write_marker(
         "finished": finished,
         "config": json.loads(config.to_json()),
     }
-    with kradar_write.atomic_write(root / MARKER) as file:
+    with files.atomic_write(root / MARKER) as file:
         file.write(json.dumps(content, indent=1, sort_keys=True).encode())
 
 
@@ -132,7 +133,7 @@ def _write_common(
         )
         for name, calibration in zip(("cam_front0", "cam_front1"), pair, strict=True):
             path = root / "calib" / "common" / f"{name}.yml"
-            with kradar_write.atomic_write(path) as file:
+            with files.atomic_write(path) as file:
                 file.write(calibration.to_kradar_text().encode("ascii"))
 
 
@@ -220,13 +221,11 @@ class _SequenceWriter:
             kradar_write.write_tesseract(path, output)
         else:
             name = f"DERA_tesseract_{radar_idx:05d}.npy"
-            with kradar_write.atomic_write(
-                self.folder / "DERA_tesseract" / name
-            ) as file:
+            with files.atomic_write(self.folder / "DERA_tesseract" / name) as file:
                 np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
         if config.image_width:
             path = self.folder / "cam-front" / f"cam-front_{camera_idx:05d}.png"
-            with kradar_write.atomic_write(path) as file:
+            with files.atomic_write(path) as file:
                 file.write(encode_png(self.renderer.render(frame)))
         kradar_write.write_labels(
             self.folder / "info_label_v2_1" / f"{spec.name}.txt",

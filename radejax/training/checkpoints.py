@@ -7,7 +7,6 @@ the one before is used.
 
 from __future__ import annotations
 
-import errno
 import logging
 import pathlib
 import shutil
@@ -19,6 +18,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from radejax.errors import DataError, UserError
+from radejax.files import is_no_space
 
 _log = logging.getLogger(__name__)
 
@@ -56,7 +56,8 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """Steps of the finished checkpoints, oldest first."""
-        return sorted(self._manager.all_steps(read=True))
+        self._manager.reload()
+        return sorted(self._manager.all_steps())
 
     def save(
         self,
@@ -201,7 +202,7 @@ def abstract_state(state: Any, sharding: Any) -> Any:
 
 
 def _disk_full(error: OSError, folder: pathlib.Path) -> Exception:
-    if error.errno == errno.ENOSPC or "No space left" in str(error):
+    if is_no_space(error):
         free = shutil.disk_usage(folder).free
         return UserError(
             f"no space left for a checkpoint in {folder} ({free / 2**20:.0f} MiB free); "

@@ -8,6 +8,7 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from radejax import files
 from radejax.data import kradar_write, sequences
 from radejax.data.labels import (
     LABEL_CLASSES,
@@ -97,7 +98,7 @@ def test_failed_write_leaves_nothing(tmp_path):
     path.write_text("old")
 
     def fail() -> None:
-        with kradar_write.atomic_write(path) as file:
+        with files.atomic_write(path) as file:
             file.write(b"half")
             raise RuntimeError("in between")
 
@@ -111,12 +112,12 @@ def test_full_disk_is_the_users_to_mend(tmp_path):
     full = OSError(errno.ENOSPC, "No space left on device")
     with (
         pytest.raises(UserError, match="no space left on the disk of"),
-        kradar_write.atomic_write(tmp_path / "a.txt"),
+        files.atomic_write(tmp_path / "a.txt"),
     ):
         raise full
     assert not list(tmp_path.iterdir())
-    assert kradar_write.is_no_space(RuntimeError("write(): No space left on device"))
-    assert not kradar_write.is_no_space(OSError(errno.EIO, "Input/output error"))
+    assert files.is_no_space(RuntimeError("write(): No space left on device"))
+    assert not files.is_no_space(OSError(errno.EIO, "Input/output error"))
 
 
 def test_wrong_arguments(tmp_path):
