@@ -58,13 +58,29 @@ def parse_flags(argv: Sequence[str]) -> list[str]:
     """
     try:
         with exit_codes():
-            return flags.FLAGS(argv)
+            rest = flags.FLAGS(argv)
+            if "config" in flags.FLAGS:
+                _check_config_file(flags.FLAGS["config"])
+            return rest
     except (flags.Error, AttributeError, KeyError, ValueError, TypeError) as error:
         # ml_collections reports unknown fields by AttributeError or KeyError, whose
         # text names the nearest field, and values of a wrong type by the other two.
-        text = error.args[0] if error.args else error
-        sys.stderr.write("error: " + " ".join(str(text).split()) + "\n")
+        text = str(error.args[0] if error.args else error)
+        # An error inside get_config comes as the text of its traceback.
+        text = text.rsplit(f"{UserError.__name__}: ", 1)[-1]
+        text = text.replace("\\n", " ").replace("\\'", "'")
+        if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"":
+            text = text[1:-1]
+        sys.stderr.write("error: " + " ".join(text.split()) + "\n")
         raise SystemExit(WRONG_USE) from None
+
+
+def _check_config_file(flag: flags.Flag) -> None:
+    """`UserError` for a config file that is not there, which absl reports too late."""
+    name = getattr(flag, "config_filename", None)
+    path = (name or "").partition(":")[0]
+    if path and not pathlib.Path(path).is_file():
+        raise UserError(f"no such config file: {path}")
 
 
 def set_up_jax(*, cache: bool = True) -> None:

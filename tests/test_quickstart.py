@@ -108,7 +108,9 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
 def test_wrong_use_is_one_line_and_exit_code_2(undisturbed: tuple) -> None:
     folder, _ = undisturbed
     for flag, message in (
-        ("--config.train.batchsize=3", "batchsize"),
+        ("--config.train.batchsize=3", 'Did you mean "batch_size"'),
+        ("--config=configs/nope.py", "no such config file: configs/nope.py"),
+        ("--config=configs/radenet.py:big", "unknown config argument 'big'; available:"),
         ("--config.seed=5", "config.seed is 0 there and 5 here"),
         ("--labels=/nowhere", "/nowhere"),
     ):
