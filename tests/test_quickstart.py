@@ -110,7 +110,10 @@ def test_wrong_use_is_one_line_and_exit_code_2(undisturbed: tuple) -> None:
     for flag, message in (
         ("--config.train.batchsize=3", 'Did you mean "batch_size"'),
         ("--config=configs/nope.py", "no such config file: configs/nope.py"),
-        ("--config=configs/radenet.py:big", "unknown config argument 'big'; available:"),
+        (
+            "--config=configs/radenet.py:big",
+            "unknown config argument 'big'; available:",
+        ),
         ("--config.seed=5", "config.seed is 0 there and 5 here"),
         ("--labels=/nowhere", "/nowhere"),
     ):
