@@ -58,10 +58,8 @@ def parse_flags(argv: Sequence[str]) -> list[str]:
     """
     try:
         with exit_codes():
-            rest = flags.FLAGS(argv)
-            if "config" in flags.FLAGS:
-                _check_config_file(flags.FLAGS["config"])
-            return rest
+            _check_config_file(argv)
+            return flags.FLAGS(argv)
     except (flags.Error, AttributeError, KeyError, ValueError, TypeError) as error:
         # ml_collections reports unknown fields by AttributeError or KeyError, whose
         # text names the nearest field, and values of a wrong type by the other two.
@@ -75,12 +73,14 @@ def parse_flags(argv: Sequence[str]) -> list[str]:
         raise SystemExit(WRONG_USE) from None
 
 
-def _check_config_file(flag: flags.Flag) -> None:
+def _check_config_file(argv: Sequence[str]) -> None:
     """`UserError` for a config file that is not there, which absl reports too late."""
-    name = getattr(flag, "config_filename", None)
-    path = (name or "").partition(":")[0]
-    if path and not pathlib.Path(path).is_file():
-        raise UserError(f"no such config file: {path}")
+    for flag, following in zip(argv, [*argv[1:], ""], strict=True):
+        name, _, value = flag.partition("=")
+        if name.lstrip("-") == "config" and name.startswith("-"):
+            path = (value or following).partition(":")[0]
+            if not pathlib.Path(path).is_file():
+                raise UserError(f"no such config file: {path}")
 
 
 def set_up_jax(*, cache: bool = True) -> None:
