@@ -50,6 +50,12 @@ _SIZES = flags.DEFINE_enum(
     ["error", "false_positive"],
     "Predicted sizes that are not positive.",
 )
+_BACKBONE = flags.DEFINE_string(
+    "image_backbone",
+    None,
+    "With --workdir: weights of a frozen image backbone, where they are not at the "
+    "place any more that the run was trained from.",
+)
 _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 
 
@@ -77,7 +83,11 @@ def evaluate_workdir() -> None:
     from radejax.evaluate_run import evaluate_run
 
     evaluate_run(
-        _WORKDIR.value, step=_CHECKPOINT.value, split=_SPLIT.value, out=_OUT.value
+        _WORKDIR.value,
+        step=_CHECKPOINT.value,
+        split=_SPLIT.value,
+        out=_OUT.value,
+        image_backbone=_BACKBONE.value,
     )
 
 

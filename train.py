@@ -31,6 +31,15 @@ _RECORDS = flags.DEFINE_string(
 _INIT = flags.DEFINE_string(
     "init_from", None, "Start from these weights: official .pth, or another workdir."
 )
+_EMBEDDINGS = flags.DEFINE_string(
+    "embeddings", None, "Folder of `radejax embed`, to train from in place of images."
+)
+_BACKBONE = flags.DEFINE_string(
+    "image_backbone",
+    None,
+    "Weights of the image backbone: a DINOv3 folder from Hugging Face, or torchvision's "
+    "ResNet-50 file.",
+)
 _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 flags.mark_flag_as_required("config")
 
@@ -49,6 +58,8 @@ def main(_: list[str]) -> None:
             labels=_LABELS.value,
             records=_RECORDS.value,
             init_from=_INIT.value,
+            embeddings=_EMBEDDINGS.value,
+            image_backbone=_BACKBONE.value,
         )
 
 

@@ -27,9 +27,9 @@ import pathlib
 import types
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder
 
 from radejax.config import base_config, parse_words
-from radejax.geometry.camera import EGO_FROM_LIDAR_M
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 
@@ -61,7 +61,6 @@ PRESETS = {
         "model.fusion.invalid": "drop",
         "model.image.standardize": True,
         "data.camera.projection": "raw",
-        "data.camera.ego_from_lidar_m": EGO_FROM_LIDAR_M,
     },
     "official": {
         "loss.sigma_cells": 3.0,
@@ -159,9 +158,11 @@ def _camera() -> ConfigDict:
             # "raw": the image as recorded, with lens distortion; "rectified",
             # "pinhole" (no distortion, as released).
             "projection": "raw",
-            # Shift from LiDAR to radar. Open in the field: dz is 0.7 in K-Radar's
-            # code, 0 in RADE-Net's and DPFT's.
-            "ego_from_lidar_m": EGO_FROM_LIDAR_M,
+            # Shift from LiDAR to radar; None: each sequence's own, by which its boxes
+            # are moved too.
+            "ego_from_lidar_m": placeholder(tuple),
+            # Images of another size than model.image.size: resized, or an error.
+            "resize": False,
             # Frames without an image: radar alone, counted; False is an error.
             "allow_missing": True,
         }

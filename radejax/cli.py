@@ -65,10 +65,11 @@ def simulate(
 
     Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
     """
+    from radejax.config import load_config
     from radejax.errors import UserError
     from radejax.simulation.dataset import simulate_dataset
 
-    simulation = _load_config(config).get("simulation")
+    simulation = load_config(config).get("simulation")
     if simulation is None:
         raise UserError(f"{config} has no `simulation` section")
     if seed is not None:
@@ -275,14 +276,59 @@ def view(
     _report(as_json, {"recording": str(out)}, f"wrote {out}")
 
 
-def _load_config(path_and_words: str) -> Any:
-    """The config of a file such as "configs/radenet.py:stem"."""
-    import importlib.util
+@main.command()
+@click.argument("roots", nargs=-1, required=True, type=EXISTING)
+@click.option("--config", required=True, type=str, help="As of train.py, :words too.")
+@click.option(
+    "--image-backbone",
+    "--image_backbone",
+    required=True,
+    type=EXISTING,
+    help="DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.",
+)
+@click.option("--out", required=True, type=PATH, help="Folder of the embeddings.")
+@click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
+@click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32")
+@click.option("--batch-size", "--batch_size", type=click.IntRange(1), default=8)
+@_json_option
+def embed(
+    roots: tuple[pathlib.Path, ...],
+    config: str,
+    image_backbone: pathlib.Path,
+    out: pathlib.Path,
+    labels: pathlib.Path | None,
+    dtype: str,
+    batch_size: int,
+    as_json: bool,
+) -> None:
+    """Run the front images through the frozen backbone once, to train from.
 
-    path, _, words = path_and_words.partition(":")
-    if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(f"no such config file: {path}")
-    spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.get_config(words) if words else module.get_config()
+    Resumes where it stopped. Training then takes --embeddings OUT in place of images.
+
+    Example: radejax embed /disk1/kradar --config configs/dinorade.py
+    --image-backbone dinov3-vits16 --out /fast/embeddings
+    """
+    entry.set_up_jax()
+    from radejax import camera_inputs
+    from radejax.config import load_config
+    from radejax.data.kradar import KRadar
+    from radejax.embed import embed_dataset
+    from radejax.models import build
+
+    settings = load_config(config)
+    camera_inputs.require_camera(settings)
+    model = build(settings.model)
+    variables = camera_inputs.load_image_backbone(image_backbone, settings)
+    frames = KRadar(roots, labels, version=settings.data.label_version)
+    counts = embed_dataset(
+        model,
+        variables,
+        settings.model.image,
+        frames,
+        out,
+        dtype=dtype,
+        resize=settings.data.camera.resize,
+        batch_size=batch_size,
+    )
+    text = ", ".join(f"{number:,} {name}" for name, number in counts.items())
+    _report(as_json, counts, text)

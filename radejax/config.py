@@ -6,6 +6,8 @@ same fields. Values are plain and resolved: no paths, no devices, nothing comput
 
 from __future__ import annotations
 
+import importlib.util
+import pathlib
 from collections.abc import Collection
 
 from ml_collections import ConfigDict
@@ -41,6 +43,22 @@ def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:
             )
         chosen[group] = word
     return chosen
+
+
+def load_config(path_and_words: str) -> ConfigDict:
+    """The config of a file such as "configs/radenet.py:stem".
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        UserError: A word is unknown.
+    """
+    path, _, words = path_and_words.partition(":")
+    if not pathlib.Path(path).is_file():
+        raise FileNotFoundError(f"no such config file: {path}")
+    spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.get_config(words) if words else module.get_config()
 
 
 def base_config() -> ConfigDict:

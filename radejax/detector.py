@@ -227,12 +227,14 @@ class Detector:
         Reading and projecting the next item overlap with the device's work on this.
 
         Args:
-            frames: Items as `__call__` takes them.
+            frames: Items as `__call__` takes them; tuples of frames, image and camera
+                for radar-camera models.
             **settings: Keyword arguments of `__call__`.
         """
         pending = None
         for item in frames:
-            started = self(item, **settings)
+            item = item if isinstance(item, tuple) else (item,)
+            started = self(*item, **settings)
             if pending is not None:
                 yield pending
             pending = started

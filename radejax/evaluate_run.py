@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import tqdm
 
+from radejax import camera_inputs
+from radejax.camera_share import camera_share, write_camera_share
 from radejax.data.encoding import decode as decode_array
 from radejax.data.frame import Frame
 from radejax.data.kradar import KRadar
@@ -34,6 +36,7 @@ def evaluate_run(
     split: str = "test",
     out: str | os.PathLike | None = None,
     num_pictures: int | None = None,
+    image_backbone: str | os.PathLike | None = None,
 ) -> Report:
     """Evaluates a run's checkpoint as its config says.
 
@@ -43,11 +46,12 @@ def evaluate_run(
         split: "test", "train", "all" or a split file.
         out: Folder of the results; `evaluation` in the work folder if None.
         num_pictures: Frames drawn; as the config says if None.
+        image_backbone: Weights of a frozen backbone, see `load_run`.
 
     Returns:
         The report that was written.
     """
-    run = load_run(workdir, step)
+    run = load_run(workdir, step, image_backbone)
     config = run.config
     out = pathlib.Path(out or run.workdir / "evaluation")
     out.mkdir(parents=True, exist_ok=True)
@@ -57,7 +61,13 @@ def evaluate_run(
     detector = Detector.from_config(
         config, run.variables, run.grid, score_threshold=options.score_threshold
     )
-    predictions = predict_dataset(detector, records, frames, options.batch_size)
+    predictions = predict_dataset(
+        detector,
+        records,
+        frames,
+        options.batch_size,
+        inputs=camera_inputs.loader_arguments(config, frames, run.paths.embeddings),
+    )
     drawer = FrameDrawer(records, frames, predictions, config)
     ground_truth, table = tables_from_frames(frames)
     protocols = tuple(options.protocols)
@@ -82,6 +92,11 @@ def evaluate_run(
         draw_frame=drawer,
     )
     _log.info("step %d, split %s\n%s", run.step, split, report.text)
+    if camera_inputs.has_camera(config):
+        shares = camera_share(
+            config, run.variables, records, frames, embeddings=run.paths.embeddings
+        )
+        write_camera_share(out, *shares, run.grid)
     count = options.num_pictures if num_pictures is None else num_pictures
     pictures = drawer.draw_spread(out / "pictures", count)
     _log.info("drew %d frames in %s", len(pictures), out / "pictures")
@@ -93,6 +108,8 @@ def predict_dataset(
     records: RecordSource,
     frames: KRadar,
     batch_size: int = 8,
+    *,
+    inputs: Mapping[str, Any] | None = None,
     **settings: Any,
 ) -> dict[str, np.ndarray]:
     """Detections on every frame of a data set.
@@ -102,6 +119,7 @@ def predict_dataset(
         records: Projections of the frames.
         frames: Which frames, in which order.
         batch_size: Frames at once.
+        inputs: Further arguments of `make_loader`, see `camera_inputs`.
         **settings: Further keyword arguments of a `Detector` call.
 
     Returns:
@@ -116,13 +134,19 @@ def predict_dataset(
         shuffle=False,
         num_epochs=1,
         pad_remainder=True,
+        **(inputs or {}),
     )
     taken: collections.deque[np.ndarray] = collections.deque()
 
     def batches() -> Any:
         for batch in loader:
             taken.append(batch.frame)
-            yield batch.projection
+            has_image = batch.image is not None
+            yield (
+                (batch.projection, batch.image, batch.camera)
+                if has_image
+                else batch.projection
+            )
 
     parts = []
     with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:

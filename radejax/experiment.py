@@ -27,13 +27,14 @@ import jax
 from ml_collections import ConfigDict
 
 import radejax
-from radejax import files, models
+from radejax import camera_inputs, files, models
 from radejax.data import pipeline, projection_job
 from radejax.data.augment import Augmentation
 from radejax.data.kradar import KRadar
 from radejax.data.records import RecordSource
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.training import loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.step import map_grid
@@ -52,11 +53,15 @@ class DataPaths:
         roots: K-Radar folders.
         labels: Folder or zip of a label revision, or None for the sequences' own.
         records: Folder of projected frames.
+        embeddings: Folder of embedded images, or None for the images themselves.
+        image_backbone: Weights of the image backbone, or None.
     """
 
     roots: tuple[str, ...]
     labels: str | None
     records: str
+    embeddings: str | None = None
+    image_backbone: str | None = None
 
     def open(self, config: ConfigDict, split: str | None) -> KRadar:
         """The frames of a split with the labels that the config asks for."""
@@ -106,6 +111,8 @@ def run(
     labels: str | None = None,
     records: str | None = None,
     init_from: str | None = None,
+    embeddings: str | None = None,
+    image_backbone: str | None = None,
 ) -> pathlib.Path:
     """Everything from nothing to metrics; run again, it continues where it stopped.
 
@@ -117,6 +124,8 @@ def run(
         labels: Label revision, see `KRadar`.
         records: Folder of projected frames, beside the data if None.
         init_from: Weights to start from: official .pth file or another work folder.
+        embeddings: Folder of `radejax embed`, in place of images.
+        image_backbone: Weights of the image backbone, see `load_image_backbone`.
 
     Returns:
         The work folder.
@@ -129,7 +138,11 @@ def run(
     workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
     models.build(config.model)  # a config that cannot be built should fail first
     claim_workdir(workdir, config)
-    paths = prepare_data(config, data=data, labels=labels, records=records)
+    paths = dataclasses.replace(
+        prepare_data(config, data=data, labels=labels, records=records),
+        embeddings=camera_inputs.saved_path(embeddings),
+        image_backbone=camera_inputs.saved_path(image_backbone),
+    )
     info = run_info(paths)
     files.write_json(workdir / "run.json", info)
     result = train(config, workdir, paths, info=info, init_from=init_from)
@@ -279,10 +292,14 @@ def train(
         num_threads=config.data.num_threads,
         num_workers=config.data.num_workers,
         label_permutation_seed=config.data.label_permutation_seed,
+        **camera_inputs.loader_arguments(config, frames, paths.embeddings),
     )
     model, variables = models.build(config.model), None
     if init_from is not None:
         variables = initial_variables(init_from, config)
+    pretrained = None
+    if paths.embeddings is None and not _has_backbone(variables):
+        pretrained = camera_inputs.load_image_backbone(paths.image_backbone, config)
     return loop.train(
         model,
         variables,
@@ -300,7 +317,12 @@ def train(
             config.train.batch_size // jax.process_count(),
             process_count=jax.process_count(),
         ),
+        pretrained=pretrained,
     )
+
+
+def _has_backbone(variables: Mapping[str, Any] | None) -> bool:
+    return variables is not None and IMAGE_BACKBONE in variables["params"]
 
 
 def make_augmentation(data: ConfigDict, grid: RadarGrid) -> Augmentation | None:
@@ -330,6 +352,12 @@ def initial_variables(path: str, config: ConfigDict) -> Mapping[str, Any]:
                 + "; ".join(_differences(found, wanted, "config.model"))
             )
         return other.variables
+    if camera_inputs.has_camera(config):
+        from radejax.interop import dinorade_torch
+
+        _, variables = dinorade_torch.load(path)
+        camera_inputs.check_fits(models.build(config.model), variables, path)
+        return variables
     from radejax.interop import radenet_torch
 
     _, variables = radenet_torch.load(path, **_structure(config.model))
@@ -355,12 +383,19 @@ def run_info(paths: DataPaths) -> dict[str, Any]:
     }
 
 
-def load_run(workdir: PathLike, step: int | None = None) -> Run:
+def load_run(
+    workdir: PathLike, step: int | None = None, image_backbone: PathLike | None = None
+) -> Run:
     """The model of a work folder.
+
+    A run that trained from embeddings, or whose backbone weights are not where they
+    were, is loaded without its image backbone, for embedded images alone.
 
     Args:
         workdir: Of `train.py`.
         step: Of the checkpoint; the newest if None.
+        image_backbone: Weights of a frozen backbone, in place of those that the run
+            was trained with.
 
     Raises:
         FileNotFoundError: No run there, or no such checkpoint.
@@ -375,11 +410,18 @@ def load_run(workdir: PathLike, step: int | None = None) -> Run:
         state, info, step = checkpoints.restore_variables(step)
     params = state["ema_params"] if state.get("ema_params") else state["params"]
     data = info["run"]["data"]
+    paths = DataPaths(**{**data, "roots": tuple(data["roots"])})
+    variables = {"params": params, **(state.get("model_state") or {})}
+    image_backbone = image_backbone or paths.image_backbone
+    if image_backbone and camera_inputs.missing_backbone(params, config):
+        part = camera_inputs.load_image_backbone(image_backbone, config)
+        frozen = {IMAGE_BACKBONE: part["params"][IMAGE_BACKBONE]}
+        variables["params"] = {**params, **frozen}
     return Run(
         workdir=workdir,
         config=config,
-        paths=DataPaths(tuple(data["roots"]), data["labels"], data["records"]),
+        paths=paths,
         grid=RadarGrid.from_dict(info["grid"]),
-        variables={"params": params, **(state.get("model_state") or {})},
+        variables=variables,
         step=step,
     )

@@ -1,8 +1,10 @@
 """Settings shared by all tests."""
 
+import importlib.util
 import os
 import pathlib
 import tempfile
+import types
 
 import jax
 import pytest
@@ -31,6 +33,16 @@ def shared() -> pathlib.Path:
     if not SHARED.is_dir():
         pytest.skip("reference data (../shared) not at hand")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def make() -> types.ModuleType:
+    """Recipes of the radar-camera golden files: seeded weights and inputs."""
+    path = GOLDEN / "dinorade_make.py"
+    spec = importlib.util.spec_from_file_location("dinorade_make", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="session")

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from radejax.data.array_records import ArrayRecords
 from radejax.data.frame import Frame
 from radejax.data.records import RecordSource
 from radejax.errors import DataError, UserError
 from radejax.structures import CLASSES
 
-IMAGE_SHAPE = (720, 1280, 3)
-"""Left half of K-Radar's 2560 x 720 stereo images."""
+IMAGE_SIZE = (720, 1280)
+"""Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +31,10 @@ class FrameTable:
         image_paths: Front image of every frame (None: missing), or None when images
             are not loaded.
         cameras: `geometry.camera.Camera` of every frame, or None.
+        image_size: Height and width of the images.
+        resize: Images of another size are resized.
+        features: What an image backbone made of the images, in their place, or None.
+        feature_record: `[F]` index of each frame's features; -1: it has no image.
     """
 
     record: np.ndarray
@@ -38,9 +43,48 @@ class FrameTable:
     is_valid: np.ndarray
     image_paths: tuple[pathlib.Path | None, ...] | None = None
     cameras: tuple[Any, ...] | None = None
+    image_size: tuple[int, int] = IMAGE_SIZE
+    resize: bool = False
+    features: ArrayRecords | None = None
+    feature_record: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.record)
+
+    def empty_images(self, count: int) -> np.ndarray | None:
+        """Black images (or zero features) of a batch; None without images."""
+        if self.features is not None:
+            return np.zeros((count, *self.features.shape), self.features.dtype)
+        if self.image_paths is not None:
+            return np.zeros((count, *self.image_size, 3), np.uint8)
+        return None
+
+    def image(self, index: int) -> np.ndarray | None:
+        """Image (or features) of a frame, black where missing; None without images."""
+        if not self.has_image(index):
+            empty = self.empty_images(1)
+            return None if empty is None else empty[0]
+        if self.features is not None:
+            return self.features.read(int(self.feature_record[index]))
+        return read_left_image(
+            self.image_paths[index], self.image_size, resize=self.resize
+        )
+
+    def camera(self, index: int, is_valid: bool = True) -> Any:
+        """Camera of a frame, not valid where its image is missing."""
+        if self.cameras is None:
+            return None
+        camera = self.cameras[index]
+        with_images = self.features is not None or self.image_paths is not None
+        if not is_valid or (with_images and not self.has_image(index)):
+            camera = camera.replace(is_valid=np.bool_(False))
+        return camera
+
+    def has_image(self, index: int) -> bool:
+        """Whether there is an image or its features."""
+        if self.features is not None:
+            return bool(self.feature_record[index] >= 0)
+        return self.image_paths is not None and self.image_paths[index] is not None
 
 
 def make_table(
@@ -53,6 +97,9 @@ def make_table(
     cameras: Sequence[Any] | None = None,
     allow_missing_images: bool = False,
     label_permutation_seed: int | None = None,
+    image_size: tuple[int, int] = IMAGE_SIZE,
+    resize: bool = False,
+    features: ArrayRecords | None = None,
 ) -> FrameTable:
     """Labels of the frames, padded, next to the indices of their records.
 
@@ -68,6 +115,9 @@ def make_table(
             camera whose `is_valid` is False. Otherwise it raises.
         label_permutation_seed: Exchange the labels of the frames at random. Training
             on such labels must fail: a check that a result is not an accident.
+        image_size: Height and width of the images.
+        resize: Resize images of another size; otherwise one is an error when read.
+        features: Of the frames that have an image; see `FrameTable`.
 
     Raises:
         UserError: A frame has more than `max_objects` objects (the message says how
@@ -102,26 +152,55 @@ def make_table(
     if cameras is not None and len(cameras) != len(frames):
         raise UserError(f"{len(cameras)} cameras for {len(frames)} frames")
     cameras = None if cameras is None else tuple(cameras)
-    return FrameTable(record, boxes, indices, indices >= 0, paths, cameras)
+    feature_record = None
+    if features is not None:
+        position = features.index_of()
+        feature_record = np.array([position.get(f.key, -1) for f in frames], np.int64)
+        _check_images(frames, feature_record < 0, allow_missing_images)
+    return FrameTable(
+        record,
+        boxes,
+        indices,
+        indices >= 0,
+        paths,
+        cameras,
+        tuple(image_size),
+        resize,
+        features,
+        feature_record,
+    )
 
 
-def read_left_image(path: pathlib.Path) -> np.ndarray:
-    """`[720, 1280, 3]` uint8 left half of a front image (a stereo pair, or left only).
+def read_left_image(
+    path: pathlib.Path, size: tuple[int, int] = IMAGE_SIZE, *, resize: bool = False
+) -> np.ndarray:
+    """`[H, W, 3]` uint8 left half of a front image (a stereo pair, or left only).
+
+    Args:
+        path: Of the picture file. More than twice as wide as high: a stereo pair.
+        size: Height and width of the result.
+        resize: Bring other sizes to `size`, averaging where they are larger.
 
     Raises:
-        DataError: The file is damaged or of another size.
+        DataError: The file is damaged, or of another size and not `resize`.
     """
     from PIL import Image, UnidentifiedImageError
 
-    height, width, _ = IMAGE_SHAPE
+    height, width = size
     try:
         with Image.open(path) as file:
-            if file.size not in ((2 * width, height), (width, height)):
+            found = file.size
+            if not resize and found not in ((2 * width, height), (width, height)):
                 raise DataError(
-                    f"{path}: {file.size[0]} x {file.size[1]} pixels, expected "
+                    f"{path}: {found[0]} x {found[1]} pixels, expected "
                     f"{2 * width} x {height} (stereo) or {width} x {height}"
                 )
-            return np.asarray(file.convert("RGB").crop((0, 0, width, height)))
+            is_pair = found[0] > 2 * found[1] if resize else found[0] == 2 * width
+            left = (0, 0, found[0] // 2 if is_pair else found[0], found[1])
+            image = file.convert("RGB").crop(left)
+            if image.size != (width, height):
+                image = image.resize((width, height), Image.Resampling.BOX)
+            return np.asarray(image)
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise DataError(f"{path}: damaged image ({error})") from None
 
@@ -154,11 +233,18 @@ def _image_paths(
     frames: Sequence[Frame], allow_missing: bool
 ) -> tuple[pathlib.Path | None, ...]:
     """Front images; `UserError` for a missing one unless that is allowed."""
-    missing = [frame.key for frame in frames if frame.camera_path is None]
+    paths = tuple(frame.camera_path for frame in frames)
+    _check_images(frames, [path is None for path in paths], allow_missing)
+    return paths
+
+
+def _check_images(
+    frames: Sequence[Frame], is_missing: Sequence[bool], allow_missing: bool
+) -> None:
+    missing = [f.key for f, gone in zip(frames, is_missing, strict=True) if gone]
     if missing and not allow_missing:
         raise UserError(
             f"{len(missing)} of {len(frames)} frames have no front image "
             f"(cam-front_*.png), the first is {missing[0]}; allow_missing_images takes "
             "black ones instead"
         )
-    return tuple(frame.camera_path for frame in frames)

@@ -12,9 +12,10 @@ from typing import Any
 import grain
 import numpy as np
 
+from radejax.data.array_records import ArrayRecords
 from radejax.data.frame import Frame
 from radejax.data.frame_table import (
-    IMAGE_SHAPE,
+    IMAGE_SIZE,
     FrameTable,
     frames_with_records,
     make_table,
@@ -55,6 +56,9 @@ def make_loader(
     images: bool = False,
     cameras: Sequence[Any] | None = None,
     allow_missing_images: bool = False,
+    image_size: tuple[int, int] = IMAGE_SIZE,
+    resize_images: bool = False,
+    features: ArrayRecords | None = None,
     device: Any = None,
     label_permutation_seed: int | None = None,
 ) -> grain.DatasetIterator[Batch]:
@@ -88,6 +92,10 @@ def make_loader(
         images: Fill `Batch.image` with left front images, uint8.
         cameras: Fill `Batch.camera` from one `geometry.camera.Camera` a frame.
         allow_missing_images: As in `make_table`.
+        image_size: Height and width of the images.
+        resize_images: Resize images of another size instead of raising.
+        features: What `radejax embed` made of the images, to fill `Batch.image` with
+            in their place.
         device: Device or sharding to put batches on ahead of use; None: host arrays.
         label_permutation_seed: As in `make_table`.
 
@@ -108,6 +116,9 @@ def make_loader(
         cameras=cameras,
         allow_missing_images=allow_missing_images,
         label_permutation_seed=label_permutation_seed,
+        image_size=image_size,
+        resize=resize_images,
+        features=features,
     )
     if process_count is None or process_index is None:
         import jax
@@ -212,7 +223,7 @@ class _LoadBatch(grain.transforms.Map):
         cameras = []
         for row, (index, seed) in enumerate(element):
             if index >= len(self._table):
-                cameras.append(self._camera(0, is_valid=False))
+                cameras.append(self._table.camera(0, is_valid=False))
                 continue
             sample = self._sample(index)
             if self._augment is not None:
@@ -232,29 +243,16 @@ class _LoadBatch(grain.transforms.Map):
     def _sample(self, index: int) -> dict[str, Any]:
         """One frame; images and cameras None where they are not asked for."""
         record = self._records[int(self._table.record[index])]
-        image = self._image(index)
         return {
             "projection": record["projection"],
             "boxes": self._table.boxes[index],
-            "image": image,
-            "camera": self._camera(index),
+            "image": self._table.image(index),
+            "camera": self._table.camera(index),
         }
-
-    def _camera(self, index: int, is_valid: bool = True) -> Any:
-        if self._table.cameras is None:
-            return None
-        camera = self._table.cameras[index]
-        paths = self._table.image_paths
-        if not is_valid or (paths is not None and paths[index] is None):
-            camera = camera.replace(is_valid=np.bool_(False))
-        return camera
 
     def _empty(self, size: int) -> Batch:
         """Nothing but padding."""
         shape, dtype = self._records.grid.projection_shape, self._records.dtype
-        image = None
-        if self._table.image_paths is not None:
-            image = np.zeros((size, *IMAGE_SHAPE), np.uint8)
         rows = (size, self._table.boxes.shape[1])
         return Batch(
             projection=np.zeros((size, *shape), dtype),
@@ -262,15 +260,7 @@ class _LoadBatch(grain.transforms.Map):
             classes=np.full(rows, -1, np.int32),
             is_valid=np.zeros(rows, bool),
             frame=np.full(size, -1, np.int32),
-            image=image,
-        )
-
-    def _image(self, index: int) -> np.ndarray | None:
-        if self._table.image_paths is None:
-            return None
-        path = self._table.image_paths[index]
-        return (
-            np.zeros(IMAGE_SHAPE, np.uint8) if path is None else read_left_image(path)
+            image=self._table.empty_images(size),
         )
 
 

@@ -54,9 +54,9 @@ class RecordFile:
         return cls(**{f.name: fields[f.name] for f in dataclasses.fields(cls)})
 
 
-def file_name(index: int, count: int) -> str:
+def file_name(index: int, count: int, what: str = "projections") -> str:
     """Name of file `index` of `count`."""
-    return f"projections-{index:05d}-of-{count:05d}.arrayrecord"
+    return f"{what}-{index:05d}-of-{count:05d}.arrayrecord"
 
 
 def manifest_path(folder: pathlib.Path, name: str) -> pathlib.Path:

@@ -7,27 +7,24 @@ that a label revision can be swapped without projecting again.
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
 import itertools
 import json
 import os
 import pathlib
-import threading
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from radejax.data.array_records import MANIFEST, ArrayRecords
 from radejax.data.encoding import MAX_ERROR_DB, check_encoding
-from radejax.data.record_files import READER_OPTIONS, RecordFile, sha256
+from radejax.data.record_files import RecordFile
 from radejax.errors import DataError, UserError
 from radejax.files import atomic_write
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"
 FORMAT_VERSION = 1
-MANIFEST = "manifest.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +118,7 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         raise DataError(f"{path}: damaged manifest ({error!r})") from None
 
 
-class RecordSource(Sequence[dict[str, Any]]):
+class RecordSource(ArrayRecords):
     """Random access to the projections of a folder; a source for grain.
 
     Element i is `{"projection": [R, A, D+E] array, "frame": i}`: the array in the type
@@ -146,109 +143,23 @@ class RecordSource(Sequence[dict[str, Any]]):
         grid: RadarGrid | None = None,
         verify: bool = False,
     ) -> None:
-        self.folder = pathlib.Path(folder)
-        self.manifest = read_manifest(self.folder)
+        self.manifest = read_manifest(folder)
         self.grid = self.manifest.grid
         if grid is not None and grid != self.grid:
             raise UserError(
-                f"{self.folder}: records of a grid of {_describe(self.grid)}, expected "
+                f"{folder}: records of a grid of {_describe(self.grid)}, expected "
                 f"{_describe(grid)}"
             )
-        self.frames = self.manifest.frames
-        self.dtype = np.dtype(self.manifest.encoding)
-        self._ends = list(
-            itertools.accumulate(len(f.frames) for f in self.manifest.files)
+        super().__init__(
+            folder,
+            self.manifest.files,
+            self.grid.projection_shape,
+            np.dtype(self.manifest.encoding),
+            verify=verify,
         )
-        self._open()
-        for index in range(len(self.manifest.files)):
-            self._check_file(index, verify)
-
-    def __len__(self) -> int:
-        return len(self.frames)
 
     def __getitem__(self, index: Any) -> dict[str, Any]:
-        index = int(index)
-        if not 0 <= index < len(self):
-            raise IndexError(f"record {index} of {len(self)}")
-        number = bisect.bisect_right(self._ends, index)
-        entry = self.manifest.files[number]
-        position = index - (self._ends[number] - len(entry.frames))
-        shape = self.grid.projection_shape
-        try:
-            content = self._reader(number).read([position])[0]
-        except Exception as error:  # the reader raises several types
-            raise self._damaged(number, position, str(error)) from None
-        if len(content) != self.dtype.itemsize * int(np.prod(shape)):
-            raise self._damaged(number, position, f"{len(content)} bytes")
-        projection = np.frombuffer(content, self.dtype).reshape(shape)
-        return {"projection": projection, "frame": index}
-
-    def index_of(self) -> dict[str, int]:
-        """Record index by frame key."""
-        return {key: index for index, key in enumerate(self.frames)}
-
-    # Readers are opened on first use and stay behind when the source is pickled.
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {
-            k: v for k, v in self.__dict__.items() if k not in ("_readers", "_lock")
-        }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._open()
-
-    def __repr__(self) -> str:
-        # grain names sources by it, also in checkpoints: no addresses, no paths.
-        return f"RecordSource({len(self)} frames, {self.dtype})"
-
-    def _open(self) -> None:
-        self._readers: dict[int, Any] = {}
-        self._lock = threading.Lock()
-
-    def _reader(self, number: int) -> Any:
-        """The reader of a file; readers may be shared by threads."""
-        with self._lock:
-            if number not in self._readers:
-                from array_record.python.array_record_module import ArrayRecordReader
-
-                path = str(self.folder / self.manifest.files[number].name)
-                self._readers[number] = ArrayRecordReader(path, READER_OPTIONS)
-            return self._readers[number]
-
-    def _check_file(self, number: int, verify: bool) -> None:
-        """`DataError` unless a file is there, whole, and (with `verify`) unchanged."""
-        entry = self.manifest.files[number]
-        path = self.folder / entry.name
-        if not path.is_file():
-            raise DataError(f"{path}: missing, but named in {MANIFEST}")
-        if (size := path.stat().st_size) != entry.num_bytes:
-            raise DataError(
-                f"{path}: {size} bytes, {MANIFEST} says {entry.num_bytes}: damaged; "
-                "delete it and run the projection again"
-            )
-        if verify and sha256(path) != entry.sha256:
-            raise DataError(
-                f"{path}: checksum differs from {MANIFEST}: damaged; delete it and run "
-                "the projection again"
-            )
-        if not entry.frames:
-            return
-        try:
-            count = self._reader(number).num_records()
-        except Exception as error:
-            raise DataError(f"{path}: damaged: {error}") from None
-        if count != len(entry.frames):
-            raise DataError(
-                f"{path}: {count} records, {MANIFEST} says {len(entry.frames)}: damaged"
-            )
-
-    def _damaged(self, number: int, position: int, reason: str) -> DataError:
-        entry = self.manifest.files[number]
-        return DataError(
-            f"{self.folder / entry.name}: record {position} (frame "
-            f"{entry.frames[position]}) is damaged: {reason}"
-        )
+        return {"projection": self.read(int(index)), "frame": int(index)}
 
 
 def _describe(grid: RadarGrid) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import pathlib
 import signal
@@ -62,6 +63,7 @@ def train(
     steps_per_epoch: int,
     mesh: jax.sharding.Mesh | None = None,
     evaluate: Evaluate | None = None,
+    pretrained: Mapping[str, Any] | None = None,
 ) -> TrainResult:
     """Trains until the configured epochs are done, from where an earlier start ended.
 
@@ -78,6 +80,8 @@ def train(
         mesh: Devices to use; all by default.
         evaluate: Called every `train.evaluate_every_epochs` epochs; what it returns is
             logged and kept with the checkpoint.
+        pretrained: Part of the variables that takes the place of drawn ones, an image
+            backbone's weights for example.
 
     Raises:
         DataError: More than `train.max_skipped_steps` steps in a row without a finite
@@ -98,11 +102,10 @@ def train(
         ),
         weight_decay=options.weight_decay,
         gradient_clip_norm=options.gradient_clip_norm,
-        is_frozen=getattr(model, "is_frozen", None),
     )
-    init = _make_init(model, variables, optimizer, config)
-    inputs = _first_inputs(loader)
-    abstract = jax.eval_shape(init, inputs)
+    init = functools.partial(_init_state, model, optimizer, config)
+    given = _first_inputs(loader), variables, pretrained
+    abstract = jax.eval_shape(init, *given)
     placement = sharding.state_sharding(abstract, mesh, options.parameter_sharding)
     step_fn = jax.jit(
         make_train_step(
@@ -121,11 +124,14 @@ def train(
         workdir / "checkpoints", max_to_keep=options.checkpoints_to_keep
     )
     with checkpoints:
-        restored = checkpoints.restore(abstract_state(abstract, placement), loader)
-        if restored is None:
-            state, start = jax.jit(init, out_shardings=placement)(inputs), 0
-        else:
-            state, start = restored
+        # Frozen parameters are not in a checkpoint: they come from where they came from.
+        saved = abstract_state(abstract, placement).replace(frozen={})
+        restored = checkpoints.restore(saved, loader)
+        if restored is None or abstract.frozen:
+            state, start = jax.jit(init, out_shardings=placement)(*given), 0
+        if restored is not None:
+            found, start = restored
+            state = found.replace(frozen=state.frozen) if abstract.frozen else found
             _log.info("continuing from step %d of %d", start, num_steps)
         run = _Run(step_fn, loader, mesh, rng, checkpoints, info, options, evaluate)
         with Watch(
@@ -201,29 +207,39 @@ class _Run:
         self, step: int, state: TrainState, metrics: Mapping[str, float] | None
     ) -> None:
         _check_skipped(state, self.options.max_skipped_steps)
-        self.checkpoints.save(step, state, self.loader, info=self.info, metrics=metrics)
-
-
-def _make_init(
-    model: nn.Module,
-    variables: Mapping[str, Any] | None,
-    optimizer: Any,
-    config: Any,
-) -> Callable[[Any], TrainState]:
-    def init(inputs: Any) -> TrainState:
-        start = variables
-        if start is None:
-            keys = jax.random.split(jax.random.key(config.seed))
-            rngs = {"params": keys[0], "dropout": keys[1]}
-            start = model.init(rngs, *inputs, train=False)
-        return create_state(
-            start,
-            optimizer,
-            batch_size=config.train.batch_size,
-            use_ema=config.train.ema_decay is not None,
+        self.checkpoints.save(
+            step,
+            state.replace(frozen={}),
+            self.loader,
+            info=self.info,
+            metrics=metrics,
         )
 
-    return init
+
+def _init_state(
+    model: nn.Module,
+    optimizer: Any,
+    config: Any,
+    inputs: Any,
+    variables: Mapping[str, Any] | None,
+    pretrained: Mapping[str, Any] | None,
+) -> TrainState:
+    """State before the first step; what is given need not be drawn."""
+    if variables is None:
+        keys = jax.random.split(jax.random.key(config.seed))
+        rngs = {"params": keys[0], "dropout": keys[1]}
+        variables = model.init(rngs, *inputs, train=False)
+    if pretrained is not None:
+        from radejax.models.dinorade import with_pretrained
+
+        variables = with_pretrained(variables, pretrained)
+    return create_state(
+        variables,
+        optimizer,
+        batch_size=config.train.batch_size,
+        use_ema=config.train.ema_decay is not None,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
 
 
 def _first_inputs(loader: Any) -> Any:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import optax
@@ -19,13 +21,15 @@ class TrainState:
 
     Attributes:
         step: Number of steps taken, skipped ones included; int32.
-        params: Trainable and frozen parameters, float32.
+        params: Parameters that are trained, float32.
         model_state: Other variable collections, such as running batch statistics.
         opt_state: The optimizer's.
         ema_params: Moving average of `params`, or None.
         num_skipped: Steps skipped in all because loss or gradient was not finite.
         num_skipped_in_row: The same, since the last step that was taken.
         skipped_frames: `[B]` int32 frames of the last skipped batch; -1 at first.
+        frozen: Parameters that are not trained: in no gradient, optimizer or average,
+            and in no checkpoint, as they are known from where they came.
     """
 
     step: jax.Array
@@ -36,12 +40,13 @@ class TrainState:
     num_skipped: jax.Array
     num_skipped_in_row: jax.Array
     skipped_frames: jax.Array
+    frozen: Any = dataclasses.field(default_factory=dict)
 
     @property
     def eval_variables(self) -> dict[str, Any]:
         """Variables to run the model with: averaged parameters where there are any."""
         params = self.params if self.ema_params is None else self.ema_params
-        return {"params": params, **self.model_state}
+        return {"params": merge_parameters(params, self.frozen), **self.model_state}
 
 
 def make_schedule(
@@ -77,7 +82,6 @@ def make_optimizer(
     *,
     weight_decay: float,
     gradient_clip_norm: float | None = None,
-    is_frozen: Callable[[str], bool] | None = None,
 ) -> optax.GradientTransformation:
     """AdamW with torch's defaults, decaying every parameter as the papers' runs do.
 
@@ -85,30 +89,11 @@ def make_optimizer(
         schedule: Learning rate by step.
         weight_decay: Decoupled weight decay.
         gradient_clip_norm: Global norm to clip to, or None.
-        is_frozen: Told a parameter's path such as "backbone/stem/kernel", True where
-            it stays as it is: it gets no update and no optimizer state.
     """
     parts = [optax.adamw(schedule, weight_decay=weight_decay)]
     if gradient_clip_norm is not None:
         parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
-    optimizer = optax.chain(*parts)
-    if is_frozen is None:
-        return optimizer
-
-    def labels(params: Any) -> Any:
-        return jax.tree_util.tree_map_with_path(
-            lambda path, _: "frozen" if is_frozen(parameter_name(path)) else "trained",
-            params,
-        )
-
-    return optax.partition(
-        {"trained": optimizer, "frozen": optax.set_to_zero()}, labels
-    )
-
-
-def parameter_name(path: tuple[Any, ...]) -> str:
-    """Path of a parameter in its tree as "outer/inner/kernel"."""
-    return "/".join(str(getattr(key, "key", key)) for key in path)
+    return optax.chain(*parts)
 
 
 def create_state(
@@ -117,6 +102,7 @@ def create_state(
     *,
     batch_size: int,
     use_ema: bool,
+    is_frozen: Callable[[str], bool] | None = None,
 ) -> TrainState:
     """State before the first step.
 
@@ -125,8 +111,9 @@ def create_state(
         optimizer: From `make_optimizer`.
         batch_size: Global; the shape of `skipped_frames`.
         use_ema: Keep a moving average of the parameters.
+        is_frozen: Told a parameter's path, True where it is not to be trained.
     """
-    params = variables["params"]
+    params, frozen = split_parameters(variables["params"], is_frozen)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
@@ -136,4 +123,28 @@ def create_state(
         num_skipped=jnp.zeros((), jnp.int32),
         num_skipped_in_row=jnp.zeros((), jnp.int32),
         skipped_frames=jnp.full((batch_size,), -1, jnp.int32),
+        frozen=frozen,
     )
+
+
+def split_parameters(
+    params: Mapping[str, Any], is_frozen: Callable[[str], bool] | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parameters that are trained, and those that are not, as two trees."""
+    if is_frozen is None:
+        return dict(params), {}
+    flat = flax.traverse_util.flatten_dict(params, sep="/")
+    parts: tuple[dict, dict] = ({}, {})
+    for name, leaf in flat.items():
+        parts[is_frozen(name)][name] = leaf
+    return tuple(flax.traverse_util.unflatten_dict(part, sep="/") for part in parts)
+
+
+def merge_parameters(
+    params: Mapping[str, Any], frozen: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Inverse of `split_parameters`."""
+    if not frozen:
+        return dict(params)
+    trees = [flax.traverse_util.flatten_dict(t, sep="/") for t in (params, frozen)]
+    return flax.traverse_util.unflatten_dict({**trees[0], **trees[1]}, sep="/")

@@ -15,7 +15,7 @@ from radejax.data.encoding import to_float
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
 from radejax.structures import Batch
-from radejax.training.state import TrainState
+from radejax.training.state import TrainState, merge_parameters
 
 Metrics = dict[str, jax.Array]
 
@@ -57,10 +57,10 @@ def make_train_step(
     """
 
     def loss_of_part(
-        params: Any, model_state: Any, part: Batch, rng: jax.Array
+        params: Any, frozen: Any, model_state: Any, part: Batch, rng: jax.Array
     ) -> tuple[jax.Array, tuple[Any, Metrics]]:
         maps, updates = model.apply(
-            {"params": params, **model_state},
+            {"params": merge_parameters(params, frozen), **model_state},
             *model_inputs(part),
             train=True,
             rngs={"dropout": rng},
@@ -73,14 +73,16 @@ def make_train_step(
 
     def accumulate(state: TrainState, batch: Batch, rng: jax.Array) -> Any:
         if num_accumulate == 1:
-            (_, aux), grads = gradient(state.params, state.model_state, batch, rng)
+            (_, aux), grads = gradient(
+                state.params, state.frozen, state.model_state, batch, rng
+            )
             return grads, *aux
 
         def body(carry: Any, part_and_rng: Any) -> Any:
             model_state, total = carry
             part, part_rng = part_and_rng
             (_, (model_state, parts)), grads = gradient(
-                state.params, model_state, part, part_rng
+                state.params, state.frozen, model_state, part, part_rng
             )
             return (model_state, jax.tree.map(jnp.add, total, grads)), parts
 
@@ -112,7 +114,7 @@ def make_train_step(
             lambda new, old: jnp.where(is_finite, new, old), taken, kept
         )
         is_skipped = (~is_finite).astype(jnp.int32)
-        state = TrainState(
+        state = state.replace(
             step=state.step + 1,
             params=params,
             model_state=model_state,
@@ -132,9 +134,11 @@ def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: str) -> RadarGrid:
 
     Args:
         grid: Of the sensor.
-        model: Pads to `model.pad_multiple` and, if `model.crop_output`, crops again.
+        model: Pads to `pad_multiple` and, if `crop_output`, crops again; a
+            radar-camera model does so in its `radar` part.
         azimuth_mapping: See `RadarGrid.padded`.
     """
+    model = getattr(model, "radar", model)
     padded = grid.padded(model.pad_multiple, azimuth_mapping)
     if not model.crop_output:
         return padded

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from radejax.data.frame_table import (
-    IMAGE_SHAPE,
+    IMAGE_SIZE,
     frames_with_records,
     make_table,
     read_left_image,
@@ -111,7 +111,7 @@ def test_missing_images_and_cameras():
 
 
 def test_left_half_of_the_stereo_pair(tmp_path):
-    height, width, _ = IMAGE_SHAPE
+    height, width = IMAGE_SIZE
     pixels = np.random.default_rng(0).integers(
         0, 255, (height, 2 * width, 3), dtype=np.uint8
     )

@@ -8,8 +8,9 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from PIL import Image
 
-from radejax.data import frame_table, pipeline
+from radejax.data import frame_table
 from radejax.data.augment import Augmentation
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import make_loader, steps_per_epoch
@@ -255,12 +256,10 @@ def test_on_device(loader):
         chex.assert_trees_all_equal(a, b)
 
 
-def test_images_and_cameras(records, data, monkeypatch):
-    shape = (2, 4, 3)
-    monkeypatch.setattr(pipeline, "IMAGE_SHAPE", shape)
-    monkeypatch.setattr(
-        pipeline, "read_left_image", lambda path: np.full(shape, int(path), np.uint8)
-    )
+def test_images_and_cameras(records, data, tmp_path):
+    paths = [tmp_path / f"{10 + i}.png" for i in range(len(data))]
+    for i, path in enumerate(paths):
+        Image.fromarray(np.full((2, 4, 3), 10 + i, np.uint8)).save(path)
     camera = CameraCalibration.from_angles(
         intrinsics=(2.0, 2.0, 2.0, 1.0),
         yaw_deg=90,
@@ -271,10 +270,11 @@ def test_images_and_cameras(records, data, monkeypatch):
         height=2,
     ).camera()
     frames = [
-        _with(frame, camera_path=None if i == 2 else str(10 + i))
+        _with(frame, camera_path=None if i == 2 else paths[i])
         for i, frame in enumerate(data)
     ]
     options = {**OPTIONS, "batch_size": 4, "shuffle": False, "images": True}
+    options["image_size"] = (2, 4)
     with pytest.raises(UserError, match="1 of 12 frames have no front image"):
         make_loader(records, frames, **options)
     batch = next(
@@ -291,7 +291,7 @@ def test_images_and_cameras(records, data, monkeypatch):
     assert batch.camera.is_valid.tolist() == [True, True, False, True]
     chex.assert_shape(batch.camera.cam_from_ego, (4, 3, 4))
     assert batch.camera.intrinsics.dtype == np.float32
-    assert frame_table.IMAGE_SHAPE == (720, 1280, 3)
+    assert frame_table.IMAGE_SIZE == (720, 1280)
 
 
 def _with(frame, **changes):

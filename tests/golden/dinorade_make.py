@@ -56,6 +56,70 @@ def uniform_input(stream: int, shape: tuple[int, ...], scale: float) -> np.ndarr
     return rng.random(shape, dtype=np.float32) * np.float32(scale)
 
 
+TINY_CONFIG = {
+    "model_type": "dinov3_vit",
+    "hidden_size": 96,
+    "num_hidden_layers": 3,
+    "num_attention_heads": 4,
+    "intermediate_size": 192,
+    "patch_size": 16,
+    "num_register_tokens": 4,
+    "rope_theta": 100.0,
+    "layer_norm_eps": 1e-5,
+    "layerscale_value": 1.0,
+    "use_gated_mlp": False,
+    "hidden_act": "gelu",
+    "query_bias": True,
+    "key_bias": False,
+    "value_bias": True,
+    "proj_bias": True,
+    "mlp_bias": True,
+}
+_LAYER = {
+    "norm1.weight": (96,),
+    "norm1.bias": (96,),
+    "attention.q_proj.weight": (96, 96),
+    "attention.q_proj.bias": (96,),
+    "attention.k_proj.weight": (96, 96),
+    "attention.v_proj.weight": (96, 96),
+    "attention.v_proj.bias": (96,),
+    "attention.o_proj.weight": (96, 96),
+    "attention.o_proj.bias": (96,),
+    "layer_scale1.lambda1": (96,),
+    "norm2.weight": (96,),
+    "norm2.bias": (96,),
+    "mlp.up_proj.weight": (192, 96),
+    "mlp.up_proj.bias": (192,),
+    "mlp.down_proj.weight": (96, 192),
+    "mlp.down_proj.bias": (96,),
+    "layer_scale2.lambda1": (96,),
+}
+TINY_SHAPES = {
+    "embeddings.cls_token": (1, 1, 96),
+    "embeddings.mask_token": (1, 1, 96),
+    "embeddings.register_tokens": (1, 4, 96),
+    "embeddings.patch_embeddings.weight": (96, 3, 16, 16),
+    "embeddings.patch_embeddings.bias": (96,),
+    **{f"layer.{i}.{k}": s for i in range(3) for k, s in _LAYER.items()},
+    "norm.weight": (96,),
+    "norm.bias": (96,),
+}
+
+
+def tiny_tensors() -> dict[str, np.ndarray]:
+    """Weights of a tiny DINOv3 under Hugging Face's names."""
+    return {name: seeded_tensor(name, shape) for name, shape in TINY_SHAPES.items()}
+
+
+def write_tiny_folder(folder: pathlib.Path) -> pathlib.Path:
+    """A tiny DINOv3 as Hugging Face lays it out."""
+    import safetensors.numpy
+
+    (folder / "config.json").write_text(json.dumps(TINY_CONFIG))
+    safetensors.numpy.save_file(tiny_tensors(), folder / "model.safetensors")
+    return folder
+
+
 def main(fixtures: pathlib.Path, out: pathlib.Path) -> None:
     with np.load(fixtures / "dinov3" / "tiny.npz") as tiny:
         keys = [f"64x96__{k}" for k in ("last_hidden_state", "embeddings")]

@@ -1,6 +1,5 @@
 """Tests of radejax.interop.dinov3_hf."""
 
-import importlib.util
 import json
 import shutil
 
@@ -15,78 +14,16 @@ from radejax.interop import dinov3_hf
 
 TOLERANCE = 5e-5
 
-TINY_CONFIG = {
-    "model_type": "dinov3_vit",
-    "hidden_size": 96,
-    "num_hidden_layers": 3,
-    "num_attention_heads": 4,
-    "intermediate_size": 192,
-    "patch_size": 16,
-    "num_register_tokens": 4,
-    "rope_theta": 100.0,
-    "layer_norm_eps": 1e-5,
-    "layerscale_value": 1.0,
-    "use_gated_mlp": False,
-    "hidden_act": "gelu",
-    "query_bias": True,
-    "key_bias": False,
-    "value_bias": True,
-    "proj_bias": True,
-    "mlp_bias": True,
-}
-_LAYER = {
-    "norm1.weight": (96,),
-    "norm1.bias": (96,),
-    "attention.q_proj.weight": (96, 96),
-    "attention.q_proj.bias": (96,),
-    "attention.k_proj.weight": (96, 96),
-    "attention.v_proj.weight": (96, 96),
-    "attention.v_proj.bias": (96,),
-    "attention.o_proj.weight": (96, 96),
-    "attention.o_proj.bias": (96,),
-    "layer_scale1.lambda1": (96,),
-    "norm2.weight": (96,),
-    "norm2.bias": (96,),
-    "mlp.up_proj.weight": (192, 96),
-    "mlp.up_proj.bias": (192,),
-    "mlp.down_proj.weight": (96, 192),
-    "mlp.down_proj.bias": (96,),
-    "layer_scale2.lambda1": (96,),
-}
-TINY_SHAPES = {
-    "embeddings.cls_token": (1, 1, 96),
-    "embeddings.mask_token": (1, 1, 96),
-    "embeddings.register_tokens": (1, 4, 96),
-    "embeddings.patch_embeddings.weight": (96, 3, 16, 16),
-    "embeddings.patch_embeddings.bias": (96,),
-    **{f"layer.{i}.{k}": s for i in range(3) for k, s in _LAYER.items()},
-    "norm.weight": (96,),
-    "norm.bias": (96,),
-}
-
-
-@pytest.fixture(scope="module")
-def make(golden):
-    """The recipes beside the golden files."""
-    spec = importlib.util.spec_from_file_location(
-        "dinorade_make", golden / "dinorade_make.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
 
 @pytest.fixture(scope="module")
 def tensors(make):
-    return {name: make.seeded_tensor(name, s) for name, s in TINY_SHAPES.items()}
+    return make.tiny_tensors()
 
 
 @pytest.fixture
-def folder(tmp_path, tensors):
+def folder(tmp_path, make):
     """A model folder as Hugging Face lays it out."""
-    (tmp_path / "config.json").write_text(json.dumps(TINY_CONFIG))
-    safetensors.numpy.save_file(tensors, tmp_path / "model.safetensors")
-    return tmp_path
+    return make.write_tiny_folder(tmp_path)
 
 
 def image_of(make, stream, height, width):
@@ -106,7 +43,7 @@ def test_tokens_of_the_tiny_model(folder, golden, make):
 def test_the_first_layers_alone(golden, make, tensors):
     # Without the final normalisation's statistics, to see where an error starts.
     expected = np.load(golden / "dinorade_vit.npz")
-    config = TINY_CONFIG | {"num_hidden_layers": 1}
+    config = make.TINY_CONFIG | {"num_hidden_layers": 1}
     kept = {
         k: v for k, v in tensors.items() if not k.startswith(("layer.1", "layer.2"))
     }
@@ -155,16 +92,16 @@ def check_tokens(shared, name, model, variables, make, size, stream):
     np.testing.assert_allclose(norms, file[f"{size}__token_norms"], atol=TOLERANCE)
 
 
-def test_names_of_transformers_5_in_memory(tensors):
-    model = dinov3_hf.model_from_config(TINY_CONFIG)
+def test_names_of_transformers_5_in_memory(tensors, make):
+    model = dinov3_hf.model_from_config(make.TINY_CONFIG)
     plain = dinov3_hf.to_params(model, tensors)
     prefixed = {f"model.{k}": v for k, v in tensors.items()}
     chex.assert_trees_all_equal(dinov3_hf.to_params(model, prefixed), plain)
 
 
 def test_larger_models_have_a_gated_mlp(make):
-    config = TINY_CONFIG | {"use_gated_mlp": True, "hidden_act": "silu"}
-    shapes = dict(TINY_SHAPES)
+    config = make.TINY_CONFIG | {"use_gated_mlp": True, "hidden_act": "silu"}
+    shapes = dict(make.TINY_SHAPES)
     for i in range(3):
         shapes[f"layer.{i}.mlp.gate_proj.weight"] = (192, 96)
         shapes[f"layer.{i}.mlp.gate_proj.bias"] = (192,)
@@ -225,8 +162,8 @@ def test_incomplete_or_damaged_folders(folder, tmp_path):
         ({"rope_theta": None}, "lacks rope_theta"),
     ],
 )
-def test_other_models_are_refused(change, message):
-    config = TINY_CONFIG | change
+def test_other_models_are_refused(change, message, make):
+    config = make.TINY_CONFIG | change
     config = {k: v for k, v in config.items() if v is not None}
     with pytest.raises(UserError, match=message):
         dinov3_hf.model_from_config(config)

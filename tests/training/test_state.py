@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from radejax.errors import UserError
-from radejax.training.state import create_state, make_optimizer, make_schedule
+from radejax.training.state import (
+    create_state,
+    make_optimizer,
+    make_schedule,
+    merge_parameters,
+    split_parameters,
+)
 
 
 def test_cosine_at_start_middle_and_end() -> None:
@@ -49,15 +55,25 @@ def test_first_step_is_adamw_with_torch_defaults() -> None:
 
 
 def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
-    optimizer = make_optimizer(
-        lambda _: 1e-3, weight_decay=0.1, is_frozen=lambda name: name.startswith("vit/")
+    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.1)
+    params = {
+        "vit": {"kernel": jnp.ones((7, 5))},
+        "head": {"kernel": jnp.ones((3,)), "fixed": jnp.ones((2,))},
+    }
+    state = create_state(
+        {"params": params},
+        optimizer,
+        batch_size=1,
+        use_ema=True,
+        is_frozen=lambda name: name.startswith("vit/") or name == "head/fixed",
     )
-    params = {"vit": {"kernel": jnp.ones((7, 5))}, "head": {"kernel": jnp.ones((3,))}}
-    state = optimizer.init(params)
-    updates, _ = optimizer.update(params, state, params)
-    assert not updates["vit"]["kernel"].any()
-    assert updates["head"]["kernel"].all()
-    assert (7, 5) not in {x.shape for x in jax.tree.leaves(state)}
+    assert jax.tree.leaves(jax.tree.map(jnp.shape, state.params)) == [3]
+    for part in (state.opt_state, state.ema_params):
+        assert {x.shape for x in jax.tree.leaves(part)} <= {(3,), ()}
+    chex.assert_trees_all_equal(state.eval_variables["params"], params)
+    chex.assert_trees_all_equal(
+        merge_parameters(*split_parameters(params, None)), params
+    )
 
 
 def test_eval_variables_are_the_averaged_ones_where_there_are_any() -> None:

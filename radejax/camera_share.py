@@ -1,0 +1,99 @@
+"""What a fusion model takes from the camera, by weather: the gate's map averaged."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from ml_collections import ConfigDict
+
+from radejax import camera_inputs, files, models
+from radejax.data.frame import Frame
+from radejax.data.pipeline import make_loader
+from radejax.data.records import RecordSource
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.training.step import model_inputs
+
+
+def camera_share(
+    config: ConfigDict,
+    variables: Mapping[str, Any],
+    records: RecordSource,
+    frames: Sequence[Frame],
+    *,
+    embeddings: str | None = None,
+    group: Callable[[Frame], str] = lambda frame: frame.weather,
+    max_frames: int = 256,
+    batch_size: int = 8,
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Mean share of the camera in the fused map by group of frames, "all" first.
+
+    Args:
+        config: Of a radar-camera run.
+        variables: Of its model.
+        records: Projections.
+        frames: Of a data set; evenly spread ones where there are more than `max_frames`.
+        embeddings: Folder of embeddings in place of images.
+        group: Names the group of a frame.
+        max_frames: Limit of frames.
+        batch_size: Frames at once.
+
+    Returns:
+        `[R, A]` means by group, and how many frames each is of.
+    """
+    spread = np.linspace(0, len(frames) - 1, min(max_frames, len(frames)))
+    frames = [frames[int(i)] for i in np.round(spread)]
+    loader = make_loader(
+        records,
+        frames,
+        batch_size=batch_size,
+        max_objects=max(len(frame.boxes) for frame in frames) or 1,
+        classes=config.classes,
+        shuffle=False,
+        num_epochs=1,
+        pad_remainder=True,
+        **camera_inputs.loader_arguments(config, frames, embeddings),
+    )
+    model = models.build(config.model)
+
+    @jax.jit
+    def share_of(variables: Any, inputs: Any) -> jax.Array:
+        _, sown = model.apply(variables, *inputs, mutable=["intermediates"])
+        return sown["intermediates"]["image_fusion"]["camera_share"][0]
+
+    variables = jax.device_put(dict(variables))
+    sums: dict[str, Any] = {}
+    counts: dict[str, int] = {}
+    for batch in loader:
+        shares = np.asarray(share_of(variables, model_inputs(batch)), np.float64)
+        for index, share in zip(batch.frame, shares, strict=True):
+            if index < 0:
+                continue
+            for name in ("all", group(frames[index])):
+                sums[name] = sums.get(name, 0.0) + share
+                counts[name] = counts.get(name, 0) + 1
+    return {name: sums[name] / counts[name] for name in sums}, counts
+
+
+def write_camera_share(
+    out: pathlib.Path,
+    maps: Mapping[str, np.ndarray],
+    counts: Mapping[str, int],
+    grid: RadarGrid,
+) -> None:
+    """Writes `camera_share.json` (means and counts) and `camera_share.png`."""
+    from radejax.visualize import bev
+    from radejax.visualize.camera_share import draw_camera_share
+
+    rows, columns = grid.num_range, grid.num_azimuth
+    summary = {
+        name: {"mean": float(m[:rows, :columns].mean()), "frames": counts[name]}
+        for name, m in maps.items()
+    }
+    files.write_json(out / "camera_share.json", summary)
+    bev.save_figure(
+        draw_camera_share(maps, grid, counts=counts), out / "camera_share.png"
+    )

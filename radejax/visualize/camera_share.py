@@ -1,0 +1,70 @@
+"""How much a fusion model takes from the camera, over the field of view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from radejax.geometry.radar_grid import RadarGrid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw_camera_share(
+    maps: Mapping[str, np.ndarray],
+    grid: RadarGrid,
+    *,
+    counts: Mapping[str, int] | None = None,
+    columns: int = 4,
+) -> Figure:
+    """One range-azimuth panel per condition, all on one scale.
+
+    Args:
+        maps: `[R, A]` mean share of the camera by condition, 0 (radar alone) to 1.
+        grid: Axes of the maps; more bins than the grid has are padding and cut.
+        counts: Frames per condition, for the titles.
+        columns: Panels side by side.
+    """
+    import matplotlib.pyplot as plt
+
+    columns = min(columns, len(maps))
+    rows = -(-len(maps) // columns)
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(2.6 * columns + 1.2, 2.9 * rows + 0.4),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    maps = {
+        k: np.asarray(m)[: grid.num_range, : grid.num_azimuth] for k, m in maps.items()
+    }
+    low = min(float(m.min()) for m in maps.values())
+    high = max(float(m.max()) for m in maps.values())
+    azimuth = np.rad2deg(grid.azimuth_rad)
+    extent = (azimuth[0], azimuth[-1], grid.range_m[0], grid.range_m[-1])
+    for ax, (name, share) in zip(axes.flat, maps.items(), strict=False):
+        picture = ax.imshow(
+            share,
+            origin="lower",
+            aspect="auto",
+            extent=extent,
+            vmin=low,
+            vmax=max(high, low + 1e-3),
+            cmap="cividis",
+            interpolation="nearest",
+        )
+        number = "" if counts is None else f", {counts[name]} frames"
+        ax.set_title(f"{name}: mean {share.mean():.2f}{number}", fontsize=9)
+    for ax in axes.flat[len(maps) :]:
+        ax.set_visible(False)
+    figure.supxlabel("azimuth (degrees, positive to the right)", fontsize=9)
+    figure.supylabel("range (m)", fontsize=9)
+    bar = figure.colorbar(picture, ax=axes.ravel().tolist(), shrink=0.8)
+    bar.set_label("share of the camera in the fused map")
+    return figure

@@ -1,0 +1,69 @@
+"""Tests of radejax.data.cameras."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from radejax.data.cameras import frame_cameras
+from radejax.errors import UserError
+from radejax.geometry.camera import CameraCalibration
+
+CALIBRATION = CameraCalibration.from_angles(
+    intrinsics=(60.0, 58.0, 32.0, 16.0),
+    distortion=(-0.03, 0.001, 0.0, 0.0, 0.0),
+    yaw_deg=90,
+    pitch_deg=0,
+    roll_deg=90,
+    translation_m=(0.2, -0.1, 0.0),
+    width=64,
+    height=32,
+)
+
+
+@dataclasses.dataclass
+class _Frame:
+    key: str
+    camera_path: str | None
+    camera_calibration_path: str | None
+    radar_from_lidar_m: tuple = (-2.54, 0.3, 0.0)
+
+
+@pytest.fixture
+def frames(tmp_path):
+    path = tmp_path / "cam_front0.yml"
+    path.write_text(CALIBRATION.to_kradar_text())
+    return [_Frame(f"1/{i}", "x.png", str(path)) for i in range(3)]
+
+
+def test_cameras_project_as_their_calibration(frames):
+    frames[1].radar_from_lidar_m = (1.0, 2.0, 3.0)
+    cameras = frame_cameras(frames, (32, 64))
+    for frame, camera in zip(frames, cameras, strict=True):
+        wanted = dataclasses.replace(
+            CALIBRATION, ego_from_lidar_m=frame.radar_from_lidar_m
+        ).camera()
+        np.testing.assert_allclose(camera.cam_from_ego, wanted.cam_from_ego)
+        np.testing.assert_allclose(camera.distortion, wanted.distortion)
+        assert camera.is_valid
+    fixed = frame_cameras(frames, (32, 64), ego_from_lidar_m=(1.0, 2.0, 3.0))
+    np.testing.assert_allclose(fixed[0].cam_from_ego, cameras[1].cam_from_ego)
+
+
+def test_another_size_is_an_error_or_resized(frames):
+    with pytest.raises(UserError, match=r"calibration of 64 x 32 images.* 128 x 64"):
+        frame_cameras(frames, (64, 128))
+    camera = frame_cameras(frames, (64, 128), resize=True)[0]
+    np.testing.assert_allclose(camera.intrinsics, 2 * CALIBRATION.intrinsics)
+    assert camera.size_px.tolist() == [128, 64]
+
+
+@pytest.mark.parametrize("field", ["camera_path", "camera_calibration_path"])
+def test_missing_ones_are_an_error_or_counted(frames, field, caplog):
+    setattr(frames[2], field, None)
+    with pytest.raises(UserError, match=r"1 of 3 frames .* the first is 1/2"):
+        frame_cameras(frames, (32, 64))
+    cameras = frame_cameras(frames, (32, 64), allow_missing=True)
+    assert [bool(c.is_valid) for c in cameras] == [True, True, False]
+    assert "1 of 3 frames" in caplog.text
+    assert np.isfinite(cameras[2].cam_from_ego).all()

@@ -1,0 +1,211 @@
+"""Radar-camera runs from images and from embeddings, with a frozen backbone from files."""
+
+import dataclasses
+import json
+import logging
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from radejax import camera_inputs, embed, experiment
+from radejax.cli import main
+from radejax.config import load_config
+from radejax.data.records import RecordSource
+from radejax.detector import Detector
+from radejax.errors import DataError, UserError
+from radejax.evaluate_run import evaluate_run, predict_dataset
+from radejax.models import build
+
+CONFIG = pathlib.Path(__file__).parents[1] / "configs" / "quickstart_fusion.py"
+
+
+def small_config():
+    """A few bins, small images, and the tiny DINOv3's sizes, frozen."""
+    config = load_config(f"{CONFIG}:short")
+    config.simulation.update(
+        train_sequences=2, test_sequences=1, image_width=96, image_height=32
+    )
+    config.simulation.grid.update(
+        num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
+    )
+    config.model.update(doppler_bins=4, elevation_bins=3, widths=(8, 8), num_groups=4)
+    config.model.update(decoder_width=8, neck="plain", heads="default", pad_multiple=4)
+    config.model.image.update(
+        size=(32, 96), freeze=True, hidden_size=96, num_registers=4, mlp_dim=192
+    )
+    config.model.fusion.update(num_heads=2, num_elevation=3, necks=False)
+    config.data.mirror_probability = 0.0
+    config.train.update(batch_size=8, num_epochs=2, log_every_steps=1)
+    config.evaluation.num_pictures = 1
+    return config
+
+
+@dataclasses.dataclass
+class _Data:
+    folder: pathlib.Path
+    backbone: pathlib.Path
+    runs: pathlib.Path
+
+    def train(self, name, config=None, **options):
+        config = small_config() if config is None else config
+        workdir = self.runs / name
+        experiment.run(
+            config, name=name, workdir=workdir, data=[str(self.folder)], **options
+        )
+        return workdir
+
+    def losses(self, workdir):
+        rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
+        return [[row[k] for k in ("focal", "gwd", "smooth_l1")] for row in rows]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, make):
+    root = tmp_path_factory.mktemp("fusion")
+    (root / "dinov3").mkdir()
+    return _Data(root / "data", make.write_tiny_folder(root / "dinov3"), root)
+
+
+@pytest.fixture(scope="module")
+def from_images(data):
+    return data.train("images", image_backbone=str(data.backbone))
+
+
+@pytest.fixture(scope="module")
+def embeddings(data, from_images, tmp_path_factory):
+    out = tmp_path_factory.mktemp("embeddings")
+    config = small_config()
+    model = build(config.model)
+    variables = camera_inputs.load_image_backbone(data.backbone, config)
+    frames = experiment.load_run(from_images).paths.open(config, None)
+    arguments = (model, variables, config.model.image, frames, out)
+    counts = embed.embed_dataset(*arguments, frames_per_file=5, progress=False)
+    assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
+    counts = embed.embed_dataset(*arguments, frames_per_file=5, progress=False)
+    assert counts == {"frames": 12, "embedded": 0, "found": 12, "missing": 0}
+    return out
+
+
+def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
+    config = small_config()
+    run = experiment.load_run(from_images)
+    given = camera_inputs.load_image_backbone(data.backbone, config)
+    backbone = run.variables["params"]["image_backbone"]
+    for found, wanted in zip(
+        jax.tree.leaves(backbone),
+        jax.tree.leaves(given["params"]["image_backbone"]),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(found, wanted)
+    stored = json.dumps(
+        [str(p) for p in (from_images / "checkpoints").rglob("*")]
+    ) + "".join(p.read_text() for p in (from_images / "checkpoints").rglob("_METADATA"))
+    assert "image_neck" in stored
+    assert "image_backbone" not in stored
+
+
+def test_training_from_embeddings_is_the_same(data, from_images, embeddings):
+    workdir = data.train("embedded", embeddings=str(embeddings))
+    found, wanted = data.losses(workdir), data.losses(from_images)
+    assert len(found) == len(wanted) > 0
+    np.testing.assert_allclose(found, wanted, rtol=2e-5)
+    # Evaluated from the embeddings too: the backbone is nowhere.
+    assert "image_backbone" not in experiment.load_run(workdir).variables["params"]
+    reports = [
+        json.loads((w / "evaluation" / "metrics.json").read_text())
+        for w in (workdir, from_images)
+    ]
+    assert reports[0]["rows"] == reports[1]["rows"]
+
+
+def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path):
+    config = small_config()
+    config.model.image.standardize = False
+    with pytest.raises(UserError, match=r"standardize = True, .* is False"):
+        embed.open_embeddings(embeddings, config.model)
+    config = small_config()
+    config.data.mirror_probability = 0.5
+    with pytest.raises(UserError, match="cannot be mirrored"):
+        camera_inputs.loader_arguments(config, [], embeddings)
+    config = small_config()
+    config.model.image.freeze = False
+    with pytest.raises(UserError, match="freeze is False"):
+        camera_inputs.loader_arguments(config, [], embeddings)
+    with pytest.raises(FileNotFoundError, match="radejax embed"):
+        embed.open_embeddings(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
+    with pytest.raises(DataError, match="other 1"):
+        embed.open_embeddings(tmp_path)
+
+
+def test_weights_that_do_not_fit_are_refused(data, tmp_path):
+    config = small_config()
+    with pytest.raises(UserError, match="--image_backbone FOLDER"):
+        camera_inputs.load_image_backbone(None, config)
+    with pytest.raises(FileNotFoundError, match=r"lacks config.json"):
+        camera_inputs.load_image_backbone(tmp_path, config)
+    config.model.image.num_layers = 12
+    with pytest.raises(UserError, match=r"num_layers = 3, .* is 12"):
+        camera_inputs.load_image_backbone(data.backbone, config)
+    radar = load_config(f"{CONFIG}:radar")
+    with pytest.raises(UserError, match="has no camera"):
+        camera_inputs.load_image_backbone(data.backbone, radar)
+    assert camera_inputs.load_image_backbone(None, radar) is None
+
+
+def test_frames_without_image_are_counted_and_predicted_by_radar(
+    data, from_images, caplog
+):
+    run = experiment.load_run(from_images)
+    frames = list(run.paths.open(run.config, "test"))
+    records = RecordSource(run.paths.records)
+    detector = Detector.from_config(
+        run.config, run.variables, run.grid, score_threshold=0.0
+    )
+
+    def boxes(frames):
+        inputs = camera_inputs.loader_arguments(run.config, frames)
+        found = predict_dataset(detector, records, frames, 4, inputs=inputs)
+        return {i: found["box"][found["frame"] == i] for i in range(len(frames))}
+
+    seen = boxes(frames)
+    blind = [dataclasses.replace(frames[0], camera_path=None), *frames[1:]]
+    with caplog.at_level(logging.WARNING):
+        half = boxes(blind)
+    assert "1 of 4 frames have no front image" in caplog.text
+    assert not np.array_equal(half[0], seen[0])
+    np.testing.assert_allclose(half[1], seen[1], rtol=1e-4, atol=1e-4)
+    radar = predict_dataset(detector, records, frames[:1], 4)
+    np.testing.assert_allclose(radar["box"], half[0], rtol=1e-4, atol=1e-4)
+
+    run.config.data.camera.allow_missing = False
+    with pytest.raises(UserError, match="1 of 4 frames"):
+        camera_inputs.loader_arguments(run.config, blind)
+
+
+def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
+    evaluate_run(from_images, out=tmp_path, num_pictures=0)
+    shares = json.loads((tmp_path / "camera_share.json").read_text())
+    assert shares["all"]["frames"] == 4
+    assert 0 < shares["all"]["mean"] < 1
+    assert (tmp_path / "camera_share.png").stat().st_size > 10_000
+
+
+def test_embed_command(data, from_images, tmp_path):
+    config = tmp_path / "config.py"
+    fields = json.loads(small_config().to_json())
+    config.write_text(
+        "from ml_collections import ConfigDict\n"
+        f"def get_config():\n    return ConfigDict({fields!r})\n"
+    )
+    command = ["embed", str(data.folder), "--config", str(config), "--json"]
+    command += ["--image-backbone", str(data.backbone), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout.splitlines()[-1])["embedded"] == 12
+    half = embed.open_embeddings(tmp_path / "out")
+    assert half.dtype == np.float32
+    assert half.shape == (2, 6, 96)
