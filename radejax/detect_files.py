@@ -11,7 +11,8 @@ import numpy as np
 import tqdm
 
 from radejax import files
-from radejax.detector import Detector, read_frame
+from radejax.data.tesseract import read_frame
+from radejax.detector import Detector
 from radejax.errors import UserError
 from radejax.structures import Detections
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -12,13 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from radejax import checkpoint_files, detector_inputs, models
 from radejax.data import projection as projection_lib
 from radejax.data.encoding import to_float
-from radejax.data.tesseract import project_file, read_projection_npy
+from radejax.data.tesseract import read_frame
 from radejax.detection.decode import decode
+from radejax.detector_inputs import CameraOptions
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import CLASSES, Detections
+from radejax.structures import CLASSES, Batch, Detections
 from radejax.training.step import map_grid
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
@@ -44,10 +47,17 @@ class Detector:
         roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, or None.
         batch_sizes: Sizes that are compiled.
         device: Where to run; JAX's default device if None.
+        dtype: Of the computation, "float32" or "bfloat16"; the model's own if None.
+        camera_options: How calibrations are used by a radar-camera model.
+
+    Attributes:
+        num_radar_alone: Frames that a radar-camera model has so far predicted without
+            an image.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
         >>> detector(projection).to_list()  # doctest: +SKIP
+        >>> fusion(projection, images, calibration)  # doctest: +SKIP
     """
 
     def __init__(
@@ -64,8 +74,14 @@ class Detector:
         roi: Sequence[float] | None = None,
         batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
         device: jax.Device | None = None,
+        dtype: str | None = None,
+        camera_options: CameraOptions = CameraOptions(),  # noqa: B008, frozen
     ) -> None:
-        self.model = model
+        self.model = model = model if dtype is None else models.with_dtype(model, dtype)
+        self.takes_camera = hasattr(model, "image_size")
+        self.camera_options = camera_options
+        self.num_radar_alone = 0
+        self._lock = threading.Lock()
         self.grid = grid
         self.classes = tuple(classes)
         self.score_threshold = score_threshold
@@ -74,16 +90,9 @@ class Detector:
         self._device = device if device is not None else jax.devices()[0]
         self.variables = jax.device_put(variables, self._device)
         self._batch_sizes = tuple(sorted(batch_sizes))
-        options = {"max_detections": 100, **(decode_options or {})}
-        self._run = jax.jit(
-            functools.partial(
-                _detect,
-                model,
-                map_grid(grid, model, azimuth_mapping),
-                options,
-            ),
-            static_argnames="is_tesseract",
-        )
+        self.azimuth_mapping = azimuth_mapping
+        self.decode_options = {"max_detections": 100, **(decode_options or {})}
+        self._run = jax.jit(self.detect_function(), static_argnames="is_tesseract")
 
     # Construction --------------------------------------------------------------------
 
@@ -115,18 +124,35 @@ class Detector:
         **overrides: Any,
     ) -> Detector:
         """Detector with the model, thresholds and mapping that a config states."""
-        from radejax import models
-
-        decode_options = dict(config.decode)
-        arguments = {
-            "classes": tuple(config.classes),
-            "azimuth_mapping": config.data.azimuth_mapping,
-            "score_threshold": decode_options.pop("score_threshold"),
-            "nms_iou": decode_options.pop("nms_iou"),
-            "decode_options": decode_options,
-        }
+        arguments = checkpoint_files.settings_of_config(config)
         return cls(
             models.build(config.model), variables, grid, **(arguments | overrides)
+        )
+
+    @classmethod
+    def from_checkpoint(
+        cls,
+        path: str | pathlib.Path,
+        *,
+        image_backbone: str | pathlib.Path | None = None,
+        **overrides: Any,
+    ) -> Detector:
+        """Detector of a folder with a model, wherever it came from.
+
+        Args:
+            path: What `radejax export` wrote, in either format; the `checkpoints`
+                folder of a run, or one step in it (without the rest of the run); or
+                the run itself.
+            image_backbone: Folder of DINOv3's weights, for packed radar-camera models,
+                which are without them.
+            **overrides: Arguments of `Detector`.
+
+        Raises:
+            FileNotFoundError: There is no model in that folder.
+        """
+        loaded = checkpoint_files.load(path, image_backbone=image_backbone)
+        return cls(
+            loaded.model, loaded.variables, loaded.grid, **(loaded.settings | overrides)
         )
 
     @classmethod
@@ -135,23 +161,36 @@ class Detector:
         path_or_state_dict: str | pathlib.Path | Mapping[str, Any],
         *,
         grid: RadarGrid | None = None,
+        image_backbone: str | pathlib.Path | None = None,
         model_overrides: Mapping[str, Any] | None = None,
         **overrides: Any,
     ) -> Detector:
-        """Detector of an official RADE-Net checkpoint.
+        """Detector of an official RADE-Net or DinoRADE checkpoint.
 
         Args:
-            path_or_state_dict: `.pth` file, or mapping of names to arrays.
+            path_or_state_dict: `.pth` file, or mapping of names to arrays. Names with
+                `rad_backbone.` are DinoRADE's.
             grid: K-Radar's if None.
+            image_backbone: Folder of DINOv3's weights, for DinoRADE checkpoints
+                without them.
             model_overrides: For what names and shapes cannot tell.
             **overrides: Arguments of `Detector`.
         """
-        from radejax.interop import radenet_torch
+        from radejax.interop import dinorade_torch, radenet_torch
+        from radejax.models.lifting import OFFICIAL_OFFSET_M
 
-        model, variables = radenet_torch.load(
-            path_or_state_dict, **(model_overrides or {})
-        )
-        arguments = {"azimuth_mapping": "stretched"} | overrides
+        content = path_or_state_dict
+        if isinstance(content, str | pathlib.Path):
+            content = dinorade_torch.read(content)
+        fields: dict[str, Any] = dict(model_overrides or {})
+        arguments: dict[str, Any] = {"azimuth_mapping": "stretched"}
+        if dinorade_torch.is_dinorade(content):
+            load = functools.partial(dinorade_torch.load, dinov3=image_backbone)
+            arguments["camera_options"] = CameraOptions("pinhole", OFFICIAL_OFFSET_M)
+        else:
+            load = radenet_torch.load
+        model, variables = load(path_or_state_dict, **fields)
+        arguments |= overrides
         return cls(model, variables, grid or RadarGrid.kradar(), **arguments)
 
     # Use -----------------------------------------------------------------------------
@@ -172,9 +211,14 @@ class Detector:
             frames: Projections `[B, R, A, D+E]` or `[R, A, D+E]` as
                 `radejax.data.projection.project` makes them; tesseracts
                 `[B, D, R, E, A]` or `[D, R, E, A]` in linear power, projected on the
-                device; or the path of a tesseract or projection file, or several.
-            image: `[B, H, W, 3]` left front images for radar-camera models.
-            camera: Their calibration, as the model takes it.
+                device; the path of a tesseract or projection file, or several; or a
+                `Batch`, with its images and cameras.
+            image: Left front images for radar-camera models: `[B, H, W, 3]` uint8, or
+                a list with one image, path or None a frame.
+            camera: Their calibration: one for all frames, or a list with one (or None)
+                a frame; see `radejax.detector_inputs.prepare`. Frames without image or
+                calibration are predicted from the radar alone and counted in
+                `num_radar_alone`, or are an error, as `camera_options` say.
             score_threshold: Instead of the detector's own.
             nms_iou: Likewise.
             roi: Likewise; `(x0, x1, y0, y1, z0, z1)` in metres.
@@ -185,10 +229,13 @@ class Detector:
         Raises:
             UserError: The shape fits neither; says what was expected.
         """
+        if isinstance(frames, Batch):
+            frames, image, camera = frames.projection, frames.image, frames.camera
         frames, is_tesseract = self._batch(frames)
         num_frames = frames.shape[0]
         if num_frames == 0:
             raise UserError("no frames: the batch is empty")
+        image, camera = self._camera_inputs(image, camera, num_frames)
         roi = roi if roi is not None else self.roi
         settings = (
             np.float32(
@@ -215,10 +262,22 @@ class Detector:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def warmup(self, batch_size: int = 1, *, tesseract: bool = False) -> Detector:
-        """Compiles for a batch size, so that the first real call is fast."""
+    def warmup(
+        self, batch_size: int = 1, *, tesseract: bool = False, image: bool | None = None
+    ) -> Detector:
+        """Compiles for a batch size, so that the first real call is fast.
+
+        Args:
+            batch_size: Of the calls to come.
+            tesseract: They give tesseracts, not projections.
+            image: They give images; None: if the model takes them.
+        """
         shape = self.grid.shape_drea if tesseract else self.grid.projection_shape
-        jax.block_until_ready(self(np.zeros((batch_size, *shape), np.float32)))
+        inputs: tuple[Any, ...] = (np.zeros((batch_size, *shape), np.float32),)
+        if self.takes_camera and image in (None, True):
+            pictures, camera = detector_inputs.placeholder(batch_size, self.model)
+            inputs += pictures, camera.replace(is_valid=np.ones(batch_size, bool))
+        jax.block_until_ready(self(*inputs))
         return self
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
@@ -227,14 +286,14 @@ class Detector:
         Reading and projecting the next item overlap with the device's work on this.
 
         Args:
-            frames: Items as `__call__` takes them; tuples of frames, image and camera
-                for radar-camera models.
+            frames: Items as `__call__` takes them first; a tuple is frames, image and
+                camera.
             **settings: Keyword arguments of `__call__`.
         """
         pending = None
         for item in frames:
-            item = item if isinstance(item, tuple) else (item,)
-            started = self(*item, **settings)
+            inputs = item if isinstance(item, tuple) else (item,)
+            started = self(*inputs, **settings)
             if pending is not None:
                 yield pending
             pending = started
@@ -242,6 +301,34 @@ class Detector:
             yield pending
 
     # Inside --------------------------------------------------------------------------
+
+    def detect_function(self) -> Callable[..., Detections]:
+        """The pure function that is jitted.
+
+        Its arguments are variables, frames, image, camera (or None, None), score
+        threshold, NMS IoU, region `[6]`, and the keyword `is_tesseract`.
+        """
+        grid = map_grid(self.grid, self.model, self.azimuth_mapping)
+        return functools.partial(_detect, self.model, grid, self.decode_options)
+
+    def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
+        """Images and cameras as arrays; counts the frames without."""
+        if not self.takes_camera:
+            if image is None and camera is None:
+                return None, None
+            raise UserError("image and camera are given, but the model is radar alone")
+        image, camera, num_missing = detector_inputs.prepare(
+            image, camera, num_frames, self.model, self.camera_options
+        )
+        is_raw = image is not None and image.shape[-1] == 3
+        if is_raw and "image_backbone" not in self.variables["params"]:
+            raise UserError(
+                "these weights are without the image backbone: give "
+                "image_backbone=FOLDER with DINOv3's, or embedded images"
+            )
+        with self._lock:
+            self.num_radar_alone += num_missing
+        return image, camera
 
     def _batch(self, frames: Any) -> tuple[Any, bool]:
         if isinstance(frames, str | pathlib.Path):
@@ -262,20 +349,6 @@ class Detector:
             f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
             f"[B, {', '.join(map(str, tesseract))}]"
         )
-
-
-def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
-    """`[R, A, D+E]` float32 projection of a tesseract file or a released projection.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        DataError: It is damaged, or of another shape than the grid.
-    """
-    if pathlib.Path(path).suffix == ".npy":
-        shape = grid.projection_shape
-        projection = read_projection_npy(path, projection_shape=shape)
-        return projection.astype(np.float32)
-    return project_file(path, shape_drea=grid.shape_drea)
 
 
 def _detect(

@@ -15,6 +15,7 @@ import numpy as np
 
 from radejax.data.projection import project, project_columns
 from radejax.errors import DataError
+from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
 
@@ -212,6 +213,20 @@ def read_projection_npy(
             "(Doppler + elevation, range, azimuth)"
         )
     return projection
+
+
+def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
+    """`[R, A, D+E]` float32 projection of a tesseract file or a released projection.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: It is damaged, or of another shape than the grid.
+    """
+    if pathlib.Path(path).suffix == ".npy":
+        shape = grid.projection_shape
+        projection = read_projection_npy(path, projection_shape=shape)
+        return projection.astype(np.float32)
+    return project_file(path, shape_drea=grid.shape_drea)
 
 
 def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:

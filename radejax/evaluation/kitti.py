@@ -100,6 +100,23 @@ def write_kitti(
     return len(listed[root / "all"])
 
 
+def prediction_texts(
+    predictions: Mapping[str, np.ndarray], num_frames: int
+) -> list[str]:
+    """Content of the prediction files of frames 0 to `num_frames - 1`.
+
+    Args:
+        predictions: Columns frame, box, cls and score; every row is written.
+        num_frames: Frames without predictions get the line "dummy".
+
+    Raises:
+        UserError: A class K-Radar has no key for.
+    """
+    score = np.asarray(predictions["score"], np.float64)
+    found = _lines(predictions, np.arange(score.size), score)
+    return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
+
+
 def _write(path: pathlib.Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")

@@ -61,7 +61,7 @@ def load(
     source = "state dict"
     if isinstance(state_dict_or_path, str | pathlib.Path):
         source = str(state_dict_or_path)
-        state_dict_or_path = _read(pathlib.Path(source))
+        state_dict_or_path = read(source)
     tensors = _find(state_dict_or_path, source)
     known = set(RADAR_FIELDS) | set(_FUSION_FIELDS)
     if unknown := sorted(set(model_overrides) - known):
@@ -288,7 +288,19 @@ def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
 # Files -------------------------------------------------------------------------------
 
 
-def _read(path: pathlib.Path) -> Any:
+def is_dinorade(content: Any) -> bool:
+    """Whether a state dict, or a checkpoint that holds one, is DinoRADE's."""
+    if not isinstance(content, Mapping):
+        return False
+    return any(
+        (isinstance(name, str) and "rad_backbone." in name) or is_dinorade(value)
+        for name, value in content.items()
+    )
+
+
+def read(path: str | pathlib.Path) -> Any:
+    """Content of a `.pth`, `.pt`, `.npz` or `.safetensors` file."""
+    path = pathlib.Path(path)
     if path.suffix == ".npz":
         with np.load(path) as arrays:
             return dict(arrays)

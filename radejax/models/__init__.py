@@ -36,3 +36,18 @@ def build(config: Mapping[str, Any]) -> nn.Module:
         )
     # Imported on demand: a radar-only run does not load the camera's modules.
     return importlib.import_module(_MODULES[config["name"]]).from_config(config)
+
+
+def with_dtype(model: nn.Module, dtype: str) -> nn.Module:
+    """The same model computing in another dtype; parameters stay float32.
+
+    Raises:
+        UserError: Neither "float32" nor "bfloat16".
+    """
+    from radejax.models.radenet import DTYPES
+
+    if dtype not in DTYPES:
+        raise UserError(f"dtype is {dtype!r}, expected one of {DTYPES}")
+    if hasattr(model, "radar"):
+        return model.clone(radar=model.radar.clone(dtype=dtype, parent=None))
+    return model.clone(dtype=dtype)

@@ -1,0 +1,108 @@
+"""Untrained detectors of a few thousand parameters, with and without a camera."""
+
+import functools
+import importlib.util
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+from ml_collections import ConfigDict
+
+from radejax import Detector, models
+from radejax.config import base_config
+from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.radar_grid import RadarGrid
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
+IMAGE_SIZE = (32, 48)
+
+
+def small_grid() -> RadarGrid:
+    return RadarGrid.reduced(
+        num_doppler=2, num_range=16, num_elevation=3, num_azimuth=14, max_range_m=30.0
+    )
+
+
+def _shrink(config: ConfigDict) -> ConfigDict:
+    config.model.update(
+        doppler_bins=2,
+        elevation_bins=3,
+        widths=(8, 8),
+        decoder_width=8,
+        num_groups=4,
+        neck="plain",
+        heads="default",
+    )
+    config.decode.score_threshold = 0.3
+    return config
+
+
+def radar_config() -> ConfigDict:
+    return _shrink(base_config())
+
+
+def camera_config() -> ConfigDict:
+    """The whole DinoRADE in small."""
+    spec = importlib.util.spec_from_file_location("dinorade", CONFIGS / "dinorade.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    config = _shrink(module.get_config())
+    config.model.image.update(
+        size=IMAGE_SIZE, hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16
+    )
+    config.model.fusion.update(num_heads=2, num_points=2, num_elevation=3)
+    config.model.axes.update(range_m=(1.0, 1.9), azimuth_deg=(-50.0, 7.0))
+    return config
+
+
+@functools.lru_cache(maxsize=4)
+def _variables(kind: str) -> Any:
+    """Random and not as initialised, where zeros hide what they multiply."""
+    config = {"radar": radar_config, "camera": camera_config}[kind]()
+    model = models.build(config.model)
+    inputs = [np.zeros((1, *small_grid().projection_shape), np.float32)]
+    if kind == "camera":
+        inputs.append(np.zeros((1, *IMAGE_SIZE, 3), np.uint8))
+        inputs.append(stack_cameras([calibration().camera()]))
+    # Shapes alone: to compile the initialisation takes longer than the tests.
+    shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
+    rng = np.random.default_rng(0)
+
+    def fill(path: tuple, shape: jax.ShapeDtypeStruct) -> np.ndarray:
+        noise = rng.normal(size=shape.shape).astype(shape.dtype)
+        if path[-1].key in ("scale", "var", "layer_scale_1", "layer_scale_2"):
+            return np.exp(0.1 * noise)
+        return noise / np.sqrt(max(1, np.prod(shape.shape[:-1])))
+
+    return jax.tree_util.tree_map_with_path(fill, shapes)
+
+
+def detector(kind: str = "radar", **overrides: Any) -> Detector:
+    config = {"radar": radar_config, "camera": camera_config}[kind]()
+    overrides = {"batch_sizes": (4,), "score_threshold": 0.1} | overrides
+    return Detector.from_config(config, _variables(kind), small_grid(), **overrides)
+
+
+def projections(count: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    shape = (count, *small_grid().projection_shape)
+    return rng.uniform(0, 1, shape).astype(np.float32)
+
+
+def images(count: int) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return rng.integers(0, 256, (count, *IMAGE_SIZE, 3), dtype=np.uint8)
+
+
+def calibration(**fields: Any) -> CameraCalibration:
+    settings = {
+        "intrinsics": (24.0, 24.0, 24.0, 16.0),
+        "yaw_deg": 90.0,
+        "pitch_deg": 0.0,
+        "roll_deg": 90.0,
+        "translation_m": (0.0, 0.0, 0.0),
+        "width": IMAGE_SIZE[1],
+        "height": IMAGE_SIZE[0],
+    }
+    return CameraCalibration.from_angles(**(settings | fields))
