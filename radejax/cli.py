@@ -2,46 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
-from collections.abc import Callable
-from typing import Any
 
 import click
 
-from radejax import entry
-
-PATH = click.Path(path_type=pathlib.Path)
-EXISTING = click.Path(path_type=pathlib.Path, exists=True)
+from radejax import cli_models, entry
+from radejax.cli_options import EXISTING, PATH, Group, echo_result, json_option
 
 
-class _Group(click.Group):
-    """Turns the user's errors into one line and an exit code, for every command."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        with entry.exit_codes(debug=ctx.params.get("debug", False)):
-            return super().invoke(ctx)
-
-
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
 @click.version_option(package_name="radejax")
 def main(debug: bool) -> None:
     """3D object detection in 4D radar tensors: data, detection, pictures.
 
-    Training is `python train.py`, evaluation `python evaluate.py`.
+    Training is `python train.py`.
     """
-    del debug  # read by _Group
+    del debug  # read by Group
 
 
-def _json_option(command: Callable) -> Callable:
-    return click.option(
-        "--json", "as_json", is_flag=True, help="Print the result as JSON."
-    )(command)
-
-
-def _report(as_json: bool, values: dict[str, Any], text: str) -> None:
-    click.echo(json.dumps(values) if as_json else text)
+for _command in cli_models.COMMANDS:
+    main.add_command(_command)
 
 
 @main.command()
@@ -51,7 +32,7 @@ def _report(as_json: bool, values: dict[str, Any], text: str) -> None:
 @click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
 @click.option("--sequences", help="Of the labels, such as 1,5,58; all by default.")
 @click.option("--frames", type=int, help="A sequence; 0 for all of the labels.")
-@_json_option
+@json_option
 def simulate(
     config: str,
     out: pathlib.Path,
@@ -84,7 +65,7 @@ def simulate(
         except ValueError:
             raise UserError(f"--sequences {sequences!r}, expected 1,5,58") from None
     simulate_dataset(simulation, out)
-    _report(as_json, {"root": str(out)}, f"simulated data set in {out}")
+    echo_result(as_json, {"root": str(out)}, f"simulated data set in {out}")
 
 
 @main.group()
@@ -97,7 +78,7 @@ def data() -> None:
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
 @click.option("--deep", is_flag=True, help="Read every tesseract whole.")
-@_json_option
+@json_option
 def check(
     roots: tuple[pathlib.Path, ...],
     labels: pathlib.Path | None,
@@ -116,7 +97,7 @@ def check(
     report = check_dataset(
         roots, labels=labels, version=label_version, deep=deep, progress=not as_json
     )
-    _report(as_json, report.to_dict(), report.to_text())
+    echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
         raise SystemExit(entry.FAILED)
 
@@ -136,7 +117,7 @@ def check(
 @click.option(
     "--skip-bad", "--skip_bad", is_flag=True, help="Leave out what is corrupt."
 )
-@_json_option
+@json_option
 def project(
     roots: tuple[pathlib.Path, ...],
     out: pathlib.Path,
@@ -161,52 +142,7 @@ def project(
     summary = project_dataset(
         frames, out, dtype=dtype, num_workers=workers, shard=shard, skip_bad=skip_bad
     )
-    _report(as_json, summary.to_dict(), summary.to_text())
-
-
-@main.command()
-@click.argument("roots", nargs=-1, required=True, type=EXISTING)
-@click.option("--workdir", required=True, type=EXISTING, help="Run of train.py.")
-@click.option("--out", required=True, type=PATH, help="Folder of the boxes.")
-@click.option("--step", type=int, help="Of the checkpoint; the newest by default.")
-@click.option("--score-threshold", type=float, help="Instead of the config's.")
-@click.option("--nms-iou", type=float, help="Instead of the config's.")
-@click.option("--batch-size", type=int, default=8, show_default=True)
-@_json_option
-def detect(
-    roots: tuple[pathlib.Path, ...],
-    workdir: pathlib.Path,
-    out: pathlib.Path,
-    step: int | None,
-    score_threshold: float | None,
-    nms_iou: float | None,
-    batch_size: int,
-    as_json: bool,
-) -> None:
-    """Find boxes in every frame below the folders; one JSON file a frame.
-
-    A folder is a K-Radar root, a folder with tesseract_*.mat or projection files, or
-    such a file itself. No labels are needed.
-
-    Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
-    """
-    from radejax.detect_files import detect_files
-
-    entry.set_up_jax()
-    count = detect_files(
-        workdir,
-        roots,
-        out,
-        step=step,
-        batch_size=batch_size,
-        score_threshold=score_threshold,
-        nms_iou=nms_iou,
-    )
-    _report(
-        as_json,
-        {**count, "out": str(out)},
-        f"{count['boxes']} boxes in {count['frames']} frames written to {out}",
-    )
+    echo_result(as_json, summary.to_dict(), summary.to_text())
 
 
 @main.command()
@@ -215,7 +151,7 @@ def detect(
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
 @click.option("--out", type=PATH, default="overlay.png", show_default=True)
-@_json_option
+@json_option
 def overlay(
     name: str,
     roots: tuple[pathlib.Path, ...],
@@ -231,7 +167,7 @@ def overlay(
     from radejax.overlay import draw_overlay
 
     draw_overlay(name, roots, out, labels=labels, version=label_version)
-    _report(as_json, {"picture": str(out)}, f"drew {out}")
+    echo_result(as_json, {"picture": str(out)}, f"drew {out}")
 
 
 @main.command()
@@ -243,7 +179,7 @@ def overlay(
 @click.option("--workdir", type=EXISTING, help="Run whose detections are shown too.")
 @click.option("--max-frames", type=int, help="All by default.")
 @click.option("--open", "open_it", is_flag=True, help="Open it in the viewer.")
-@_json_option
+@json_option
 def view(
     roots: tuple[pathlib.Path, ...],
     out: pathlib.Path,
@@ -273,62 +209,4 @@ def view(
     )
     if open_it:
         open_viewer(out)
-    _report(as_json, {"recording": str(out)}, f"wrote {out}")
-
-
-@main.command()
-@click.argument("roots", nargs=-1, required=True, type=EXISTING)
-@click.option("--config", required=True, type=str, help="As of train.py, :words too.")
-@click.option(
-    "--image-backbone",
-    "--image_backbone",
-    required=True,
-    type=EXISTING,
-    help="DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.",
-)
-@click.option("--out", required=True, type=PATH, help="Folder of the embeddings.")
-@click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
-@click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32")
-@click.option("--batch-size", "--batch_size", type=click.IntRange(1), default=8)
-@_json_option
-def embed(
-    roots: tuple[pathlib.Path, ...],
-    config: str,
-    image_backbone: pathlib.Path,
-    out: pathlib.Path,
-    labels: pathlib.Path | None,
-    dtype: str,
-    batch_size: int,
-    as_json: bool,
-) -> None:
-    """Run the front images through the frozen backbone once, to train from.
-
-    Resumes where it stopped. Training then takes --embeddings OUT in place of images.
-
-    Example: radejax embed /disk1/kradar --config configs/dinorade.py
-    --image-backbone dinov3-vits16 --out /fast/embeddings
-    """
-    entry.set_up_jax()
-    from radejax import camera_inputs
-    from radejax.config import load_config
-    from radejax.data.kradar import KRadar
-    from radejax.embed import embed_dataset
-    from radejax.models import build
-
-    settings = load_config(config)
-    camera_inputs.require_camera(settings)
-    model = build(settings.model)
-    variables = camera_inputs.load_image_backbone(image_backbone, settings)
-    frames = KRadar(roots, labels, version=settings.data.label_version)
-    counts = embed_dataset(
-        model,
-        variables,
-        settings.model.image,
-        frames,
-        out,
-        dtype=dtype,
-        resize=settings.data.camera.resize,
-        batch_size=batch_size,
-    )
-    text = ", ".join(f"{number:,} {name}" for name, number in counts.items())
-    _report(as_json, counts, text)
+    echo_result(as_json, {"recording": str(out)}, f"wrote {out}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import pathlib
 import threading
@@ -87,8 +88,8 @@ class Detector:
         self.score_threshold = score_threshold
         self.nms_iou = nms_iou
         self.roi = roi
-        self._device = device if device is not None else jax.devices()[0]
-        self.variables = jax.device_put(variables, self._device)
+        self.device = device if device is not None else jax.devices()[0]
+        self.variables = jax.device_put(variables, self.device)
         self._batch_sizes = tuple(sorted(batch_sizes))
         self.azimuth_mapping = azimuth_mapping
         self.decode_options = {"max_detections": 100, **(decode_options or {})}
@@ -253,7 +254,7 @@ class Detector:
             count = chunk[0].shape[0]
             size = next(s for s in self._batch_sizes if s >= count)
             chunk = jax.tree.map(lambda x, s=size: _pad_batch(x, s), chunk)
-            chunk = jax.device_put(chunk, self._device)
+            chunk = jax.device_put(chunk, self.device)
             found = self._run(
                 self.variables, *chunk, *settings, is_tesseract=is_tesseract
             )
@@ -279,6 +280,12 @@ class Detector:
             inputs += pictures, camera.replace(is_valid=np.ones(batch_size, bool))
         jax.block_until_ready(self(*inputs))
         return self
+
+    def with_batch_sizes(self, batch_sizes: Sequence[int]) -> Detector:
+        """The same detector compiling other batch sizes; weights are shared."""
+        other = copy.copy(self)
+        other._batch_sizes = tuple(sorted(batch_sizes))
+        return other
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
         """Detections of one item after the other, each started before the last ends.

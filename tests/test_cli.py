@@ -6,9 +6,11 @@ import pathlib
 import click.testing
 import pytest
 
-from radejax import cli
+from radejax import checkpoint_files, cli
 from radejax.data import kradar_write
 from radejax.data.labels import Label
+
+from . import small_models
 
 
 def _run(*arguments: object) -> click.testing.Result:
@@ -73,3 +75,34 @@ def test_a_folder_without_frames_says_what_was_looked_for(
     result = _run("detect", root, "--workdir", tmp_path, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "tesseract_*.mat" in result.output
+
+
+def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
+    arguments = ("export", tmp_path, "--out", tmp_path / "out")
+    plain = _run(*arguments)
+    assert plain.exit_code == 2
+    assert plain.output.startswith(f"error: no model in {tmp_path}")
+    assert isinstance(_run("--debug", *arguments).exception, FileNotFoundError)
+
+
+def test_evaluate_and_benchmark_want_one_source() -> None:
+    for command in ("evaluate", "benchmark"):
+        result = _run(command)
+        assert result.exit_code == 2
+        assert "error: give one of" in result.output
+
+
+def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> None:
+    packed = tmp_path / "packed"
+    checkpoint_files.write_packed(packed, small_models.detector())
+    done = _run(
+        "export", packed, "--out", tmp_path / "hub", "--format", "huggingface", "--json"
+    )
+    assert json.loads(done.output)["kind"] == "huggingface"
+    for name in ("model.safetensors", "config.json"):
+        written = (tmp_path / "hub" / name).read_bytes()
+        assert written == (packed / name).read_bytes()
+    timed = _run("benchmark", packed, "--batch-size", 1, "--repeats", 1, "--json")
+    (row,) = json.loads(timed.output)
+    assert row["batch"] == 1
+    assert row["whole_s"] > 0

@@ -1,0 +1,49 @@
+"""Boxes from radar with jax and numpy alone: python load.py projection.npy [...]."""
+
+import json
+import pathlib
+import sys
+
+import jax
+import numpy as np
+
+FOLDER = pathlib.Path(__file__).resolve().parent
+sys.path.append(str(FOLDER / "third_party"))  # flatbuffers, with which jax.export reads
+
+
+def read_weights(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Arrays of a safetensors file: a JSON header, then float32 numbers."""
+    data = path.read_bytes()
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = {k: v for k, v in json.loads(data[8:start]).items() if k[0] != "_"}
+    flat = np.frombuffer(data, "<f4", offset=start)
+    ends = {name: [x // 4 for x in v["data_offsets"]] for name, v in header.items()}
+    return {n: flat[slice(*ends[n])].reshape(v["shape"]) for n, v in header.items()}
+
+
+def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
+    """`detect(projection, ...)` -> dictionary of arrays; see README.md."""
+    folder = pathlib.Path(folder)
+    config = json.loads((folder / "config.json").read_text())["decode"]
+    program = jax.export.deserialize((folder / "detector.stablehlo").read_bytes())
+    run = jax.jit(program.call)
+    weights = jax.device_put(read_weights(folder / "model.safetensors"), device)
+
+    def detect(*inputs, score_threshold=None, nms_iou=None, roi=None):
+        score = (
+            config["score_threshold"] if score_threshold is None else score_threshold
+        )
+        iou = config["nms_iou"] if nms_iou is None else nms_iou
+        roi = [-np.inf, np.inf] * 3 if roi is None else roi
+        settings = np.float32(score), np.float32(iou), np.asarray(roi, np.float32)
+        return run(weights, jax.device_put(inputs, device), *settings)
+
+    return detect
+
+
+if __name__ == "__main__":
+    detect = load()
+    for path in sys.argv[1:]:
+        found = jax.device_get(detect(np.load(path).astype(np.float32)[None]))
+        rows = found["is_valid"][0]
+        print(path, found["scores"][0][rows], found["boxes"][0][rows], sep="\n")
