@@ -3,7 +3,7 @@
     python train.py --config configs/simulate_real_scenes.py \\
         --config.simulation.scenes=LABELS.zip
 
-LABELS is K-Radar's label revision v2.1, a folder or zip: every 30th frame of all 58
+LABELS is K-Radar's label revision v2.1, a folder or zip: every 15th frame of all 58
 sequences becomes a simulated radar frame, with K-Radar's split. `docs/simulator.md`
 has the numbers to expect, beside those of a classical detector (CFAR).
 """
@@ -21,13 +21,14 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.simulation = ConfigDict(default_config())
     config.simulation.update(
         scenes="labels_v2_1.zip",
-        frame_stride=30,
+        frame_stride=15,
         frames_per_sequence=0,
         image_width=0,
         image_height=180,
         output="projection",
     )
     grid = config.simulation.grid
+    config.data.mirror_probability = 0.5
     config.model.update(
         doppler_bins=grid.num_doppler,
         elevation_bins=grid.num_elevation,
@@ -39,10 +40,11 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.loss.sigma_cells = 1.0
     config.train.update(
         batch_size=4,
-        num_epochs=10,
+        num_epochs=4,
         warmup_steps=20,
         log_every_steps=20,
         checkpoint_every_steps=100,
     )
     config.evaluation.score_threshold = 0.05
+    config.evaluation.protocols = ("exact", "kradar_r40", "kradar_r40_yaw", "coco101")
     return config

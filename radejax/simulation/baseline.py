@@ -1,8 +1,8 @@
-"""The classical detector to beat: CA-CFAR, clusters, boxes by rule. Nothing learned.
+"""The classical detector to beat: CA-CFAR, clusters, boxes by rule.
 
 Cells that stand out of their surroundings (cell-averaging CFAR) are grouped into
 clusters; the cross-section that the radar equation gives a cluster chooses its class,
-and the class's usual size its box.
+and the class's usual size its box. Only the steps between the classes are fitted.
 
 References:
     Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
@@ -13,6 +13,8 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -21,17 +23,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar import TPM_OFFSET_DB, TPM_SPAN_DB, RadarParameters
 from radejax.simulation.traffic import SIZES
 from radejax.structures import CLASSES
-
-# Smallest apparent cross-section in dBsm of each class, the largest first: quartiles of
-# clusters on the training split. A cell holds a part of an object's power only, hence
-# some 8 dB less than the cross-sections of `scattering`. Weaker clusters are clutter.
-_RCS_STEPS = (
-    ("Bus or Truck", 9.0),
-    ("Sedan", -5.0),
-    ("Motorcycle", -7.0),
-    ("Bicycle", -9.0),
-    ("Pedestrian", -16.0),
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +36,10 @@ class CfarSettings:
         peak_drop_db: A cluster ends where power falls this far below its peak.
         merge_m: Clusters whose peaks are nearer become one.
         min_score: Clusters below this score are left out.
+        rcs_steps: Smallest apparent cross-section in dBsm of each class, the largest
+            first; weaker clusters are clutter. A cell holds a part of an object's power
+            only. `fit_rcs_steps` finds them on a training split; the defaults are those
+            of the quickstart's data set.
     """
 
     threshold_db: float = 9.0
@@ -53,6 +48,93 @@ class CfarSettings:
     peak_drop_db: float = 12.0
     merge_m: float = 4.5
     min_score: float = 0.0
+    rcs_steps: tuple[tuple[str, float], ...] = (
+        ("Bus or Truck", 9.0),
+        ("Sedan", -5.0),
+        ("Motorcycle", -7.0),
+        ("Bicycle", -9.0),
+        ("Pedestrian", -16.0),
+    )
+
+
+def fit_rcs_steps(
+    cls: Sequence[str],
+    rcs_dbsm: Sequence[float],
+    *,
+    balanced: bool = False,
+    least_gap_db: float = 1.0,
+) -> tuple[tuple[str, float], ...]:
+    """Steps between classes from apparent cross-sections of labelled objects.
+
+    Classes are ordered by their medians; the step between neighbours is the one that
+    takes the fewest of their objects for the other class. The last class ends at its
+    lower quartile: what is weaker is clutter.
+
+    Args:
+        cls: Class names, one an object.
+        rcs_dbsm: Apparent cross-sections, see `object_rcs_db`.
+        balanced: Count errors as shares of their classes, so that rare classes weigh as
+            much as frequent ones.
+        least_gap_db: Width that a class keeps at least.
+
+    Returns:
+        Pairs of name and smallest cross-section, for `CfarSettings.rcs_steps`.
+    """
+    cls, values = np.asarray(cls), np.asarray(rcs_dbsm, float)
+    groups = {name: values[cls == name] for name in CLASSES if (cls == name).any()}
+    order = sorted(groups, key=lambda name: -np.median(groups[name]))
+    steps: list[tuple[str, float]] = []
+    for upper, lower in itertools.pairwise(order):
+        strong, weak = groups[upper], groups[lower]
+        limit = steps[-1][1] - least_gap_db if steps else np.inf
+        candidates = np.unique(np.concatenate([strong, weak]))
+        candidates = np.minimum(candidates, limit)
+        missed = (strong[:, None] < candidates).sum(0)
+        wrong = (weak[:, None] >= candidates).sum(0)
+        if balanced:
+            missed, wrong = missed / strong.size, wrong / weak.size
+        steps.append((upper, float(candidates[np.argmin(missed + wrong)])))
+    if order:
+        least = float(np.percentile(groups[order[-1]], 25.0))
+        limit = steps[-1][1] - least_gap_db if steps else np.inf
+        steps.append((order[-1], min(least, limit)))
+    return tuple(steps)
+
+
+def object_rcs_db(
+    projection: np.ndarray,
+    boxes: np.ndarray,
+    grid: RadarGrid,
+    parameters: RadarParameters,
+    *,
+    margin_m: float = 0.5,
+) -> np.ndarray:
+    """`[N]` apparent cross-section of boxes `[N, 7]`: of the strongest cell in each.
+
+    NaN for boxes that hold no cell's center.
+    """
+    power_db = _power_db(projection, grid)
+    rcs = apparent_rcs_db(power_db, grid.range_m[:, None], parameters)
+    centers = grid.cell_centers_ego()  # [R, A, 2]
+    result = np.full(len(boxes), np.nan)
+    for n, box in enumerate(boxes):
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        x, y = centers[..., 0] - box[0], centers[..., 1] - box[1]
+        inside = np.abs(cos * x + sin * y) < box[3] / 2 + margin_m
+        inside &= np.abs(cos * y - sin * x) < box[4] / 2 + margin_m
+        if inside.any():
+            result[n] = rcs[inside].max()
+    return result
+
+
+def apparent_rcs_db(power_db, range_m, parameters: RadarParameters):
+    """Cross-section in dBsm that the radar equation gives a cell's power in dB."""
+    return power_db - parameters.gain_db + 40.0 * np.log10(np.maximum(range_m, 1.0))
+
+
+def _power_db(projection: np.ndarray, grid: RadarGrid) -> np.ndarray:
+    """`[R, A]` range-azimuth map in dB."""
+    return projection[..., : grid.num_doppler].max(-1) * TPM_SPAN_DB - TPM_OFFSET_DB
 
 
 def detect(
@@ -77,12 +159,13 @@ def detect(
         [0, 1], strongest first.
     """
     settings = settings or CfarSettings()
-    power_db = projection[..., : grid.num_doppler].max(-1) * TPM_SPAN_DB - TPM_OFFSET_DB
+    power_db = _power_db(projection, grid)
     excess_db = power_db - local_mean_db(power_db, settings)
     peaks = find_peaks(power_db, excess_db, grid, settings)
     boxes, names, scores = [], [], []
     for r, a in peaks:
-        name = _class_of(power_db[r, a], grid.range_m[r], parameters)
+        rcs = apparent_rcs_db(power_db[r, a], grid.range_m[r], parameters)
+        name = next((n for n, least in settings.rcs_steps if rcs >= least), None)
         if name is None:
             continue
         near, sideways = _extent(power_db, excess_db, r, a, grid, settings)
@@ -137,14 +220,6 @@ def find_peaks(
     return [tuple(cells[i]) for i in kept]
 
 
-def _class_of(
-    power_db: float, range_m: float, parameters: RadarParameters
-) -> str | None:
-    """Class by the cross-section that explains the power, None for clutter."""
-    rcs_db = power_db - parameters.gain_db + 40.0 * np.log10(max(range_m, 1.0))
-    return next((name for name, least in _RCS_STEPS if rcs_db >= least), None)
-
-
 def _extent(power_db, excess_db, r, a, grid, settings) -> tuple[np.ndarray, float]:
     """Ground position of the near side of a cluster, and its width across, metres."""
     level = power_db[r, a] - settings.peak_drop_db
@@ -172,6 +247,3 @@ def _fit_box(
     length, width, height = SIZES[name][0]
     x, y = near
     return [x + length / 2.0, y, ground_m + height / 2.0, length, width, height, 0.0]
-
-
-assert {name for name, _ in _RCS_STEPS} == set(CLASSES)

@@ -14,7 +14,7 @@ from radejax.simulation.radar import RadarParameters
 from radejax.simulation.traffic import ENVIRONMENTS
 from radejax.simulation.weather import WEATHERS
 
-SIMULATOR_VERSION = 2
+SIMULATOR_VERSION = 3
 """Raised whenever the same config gives other files than before."""
 
 # Environment, time and weather of the procedural sequences, in turn.

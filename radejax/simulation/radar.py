@@ -22,7 +22,10 @@ from jax import lax
 
 from radejax.geometry.radar_grid import RadarGrid
 
-Output = Literal["tesseract", "projection"]
+Output = Literal["tesseract", "rows", "projection"]
+
+TESSERACT_OF_ROWS = (2, 0, 1, 3)
+"""Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
 
 TPM_OFFSET_DB = 1.2
 TPM_SPAN_DB = 184.3
@@ -48,7 +51,7 @@ class RadarParameters:
             ones; what lies below them is dropped.
     """
 
-    gain_db: float = 184.0
+    gain_db: float = 178.0
     noise_db: float = 95.0
     wavelength_m: float = 0.0039
     azimuth_elements: float = 48.0
@@ -160,7 +163,8 @@ def simulate(
         key: `uint32 [2]` seed of the noise of this frame.
         grid: Axes of the tensor.
         parameters: The sensor.
-        output: "tesseract" for `[D, R, E, A]` linear power, "projection" for
+        output: "tesseract" for `[D, R, E, A]` linear power, "rows" for the same as it is
+            made, `[R, E, D, A]` (turning 260 MB around takes time), "projection" for
             `[R, A, D+E]` normalised projections: the numbers that
             `radejax.data.projection.project` makes of the tesseract.
         rows_per_step: Range rows at a time: 1 on CPU, 64 or more on accelerators.
@@ -169,9 +173,11 @@ def simulate(
     Returns:
         float32 array as `output` says.
     """
-    return _simulate(
-        scatterers, noise_power, key, grid, parameters, output, rows_per_step
+    made = "projection" if output == "projection" else "rows"
+    result = _simulate(
+        scatterers, noise_power, key, grid, parameters, made, rows_per_step
     )
+    return jnp.transpose(result, TESSERACT_OF_ROWS) if output == "tesseract" else result
 
 
 @functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
@@ -191,6 +197,13 @@ def _simulate(scatterers, noise_power, key, grid, parameters, output, rows_per_s
         parameters.array_pedestal,
     )  # [A, S]
     in_range = range_response(scatterers.range_m, grid, parameters)  # [R, S]
+    noise_elevation, noise_azimuth = (
+        array_noise_basis(axis, elements, parameters.array_pedestal)
+        for axis, elements in (
+            (grid.elevation_rad, parameters.elevation_elements),
+            (grid.azimuth_rad, parameters.azimuth_elements),
+        )
+    )  # [E, M], [A, N]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
     _, kept = lax.top_k(jnp.abs(in_range) * magnitude[None], num_kept)  # [R, K]
@@ -198,9 +211,9 @@ def _simulate(scatterers, noise_power, key, grid, parameters, output, rows_per_s
     def row(inputs):
         index, weight, noise, row_idx = inputs
         amplitude = scatterers.amplitude[index] * weight[index][:, None]  # [K, 2]
-        left = (doppler[:, None, index] * elevation[None, :, index]).reshape(
+        left = (elevation[:, None, index] * doppler[None, :, index]).reshape(
             -1, num_kept
-        )  # [D E, K]
+        )  # [E D, K]
         right = jnp.concatenate(
             [
                 azimuth[:, index].T * amplitude[:, :1],
@@ -209,43 +222,84 @@ def _simulate(scatterers, noise_power, key, grid, parameters, output, rows_per_s
             axis=1,
         )  # [K, 2 A]
         field = jnp.dot(left, right, precision=lax.Precision.HIGHEST)
-        field = field.reshape(grid.num_doppler, grid.num_elevation, 2, -1)
-        power = _power_with_noise(field, noise, key, row_idx)  # [D, E, A]
-        return power if output == "tesseract" else _project_row(power)
+        field = field.reshape(grid.num_elevation, grid.num_doppler, 2, -1)
+        field += _noise_field(noise, key, row_idx, noise_elevation, noise_azimuth)
+        power = jnp.square(field).sum(axis=2)  # [E, D, A]
+        return power if output == "rows" else _project_row(power)
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
     if rows_per_step == 1:
-        result = lax.map(row, rows)
-    else:
-        result = lax.map(row, rows, batch_size=rows_per_step)
-    if output == "tesseract":
-        return jnp.moveaxis(result, 0, 1)  # [R, D, E, A] -> [D, R, E, A]
-    return result
+        return lax.map(row, rows)
+    return lax.map(row, rows, batch_size=rows_per_step)
 
 
 def _project_row(power: jax.Array) -> jax.Array:
-    """`[A, D+E]` normalised maxima of one range row `[D, E, A]`."""
-    maxima = jnp.concatenate([power.max(axis=1), power.max(axis=0)], axis=0).T
+    """`[A, D+E]` normalised maxima of one range row `[E, D, A]`."""
+    maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
     return (10.0 * jnp.log10(maxima + 1e-10) + TPM_OFFSET_DB) / TPM_SPAN_DB
 
 
-def _power_with_noise(
-    field: jax.Array, noise: jax.Array, key: jax.Array, row_idx: jax.Array
-) -> jax.Array:
-    """`|field + noise|^2` of `field [D, E, 2, A]` and mean noise power `[D]`.
+def array_noise_basis(
+    axis_rad: np.ndarray, elements: float, pedestal: float
+) -> np.ndarray:
+    """`[bins, N]` real matrix B that gives white noise the correlation of array bins.
 
-    Complex Gaussian noise from one 32-bit number a cell: 20 bits for its power, which
-    is exponential, 12 for its phase.
+    Noise of the N elements of an array is independent, so after weights `w_n` and the
+    Fourier transform two bins correlate by `sum_n w_n^2 cos(pi n (sin a - sin b))`,
+    their own beam pattern with squared weights. That is `B B^T`, with a column
+    `sqrt(2) w_n cos(pi n sin a)` and one with the sine for each pair of elements.
+    Rows have length 1: every bin has the power of the white noise.
     """
-    shape = (field.shape[0], field.shape[1], field.shape[3])
-    counter = lax.iota(jnp.uint32, int(np.prod(shape))).reshape(shape)
+    count = max(round(elements), 1)
+    place = np.arange(count) - (count - 1) / 2
+    place = place[place >= 0]
+    weight = pedestal + (1.0 - pedestal) * np.cos(np.pi * place / count) ** 2
+    weight = np.where(place > 0, weight, weight / np.sqrt(2.0))
+    turn = np.pi * np.sin(axis_rad)[:, None] * place
+    basis = np.concatenate(
+        [weight * np.cos(turn), (weight * np.sin(turn))[:, place > 0]], axis=1
+    )
+    return (basis / np.linalg.norm(basis, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _noise_field(
+    power: jax.Array,
+    key: jax.Array,
+    row_idx: jax.Array,
+    elevation_basis: np.ndarray,
+    azimuth_basis: np.ndarray,
+) -> jax.Array:
+    """`[E, D, 2, A]` complex Gaussian noise of one range row, mean power `[D]`.
+
+    White noise of every Doppler bin and pair of elements goes through the Hann window
+    of the Doppler axis (in bins: 1/2, 1, 1/2) and through both arrays.
+    """
+    num_doppler = power.shape[0]
+    (_, m), (_, n) = elevation_basis.shape, azimuth_basis.shape
+    one = np.eye(num_doppler, dtype=np.float32)
+    window = one + 0.5 * (np.roll(one, 1, axis=0) + np.roll(one, -1, axis=0))
+    window = window / np.linalg.norm(window, axis=1, keepdims=True)
+    white = _white_noise(num_doppler * m * 2 * n, key, row_idx)
+    rows = (jnp.sqrt(power)[:, None] * window) @ white.reshape(num_doppler, -1)
+    rows = rows.reshape(-1, n) @ azimuth_basis.T  # [D M 2, A]
+    rows = rows.reshape(num_doppler, m, -1).transpose(1, 0, 2)  # [M, D, 2 A]
+    return (elevation_basis @ rows.reshape(m, -1)).reshape(
+        elevation_basis.shape[0], num_doppler, 2, -1
+    )
+
+
+def _white_noise(count: int, key: jax.Array, row_idx: jax.Array) -> jax.Array:
+    """`[count]` independent Gaussian numbers of mean square 1/2.
+
+    Neighbours are the real and imaginary part of one complex number, made of one
+    32-bit number: 20 bits for its power, which is exponential, 12 for its phase.
+    """
+    counter = lax.iota(jnp.uint32, count)
     row_key = _hash(row_idx * jnp.uint32(0x9E3779B9) + key[0], key[1])
-    bits = _hash(counter + row_key, _hash(row_key, key[1]))
+    bits = _hash((counter >> 1) + row_key, _hash(row_key, key[1]))
     uniform = ((bits >> 12).astype(jnp.float32) + 0.5) * np.float32(2.0**-20)
-    radius = jnp.sqrt(-jnp.log(uniform) * noise[:, None, None])
-    real = field[:, :, 0] + radius * _sine_of_turn(bits + jnp.uint32(1024))
-    imaginary = field[:, :, 1] + radius * _sine_of_turn(bits)
-    return real * real + imaginary * imaginary
+    quarter = (counter & 1) << 10
+    return jnp.sqrt(-jnp.log(uniform)) * _sine_of_turn(bits + quarter)
 
 
 def _sine_of_turn(bits: jax.Array) -> jax.Array:

@@ -4,15 +4,20 @@ Every object gets scattering centers on its faces once per sequence; each frame 
 them to the object's pose, keeps those on faces the radar sees, weakens those behind
 other objects, and moves wheels, legs and pedals (micro-Doppler).
 
+Cross-sections are our choice, one value and one spread a class, of the order that is
+measured at 77 GHz; there is no single source for all five.
+
 References:
-    Radar cross-sections: Yamada et al., "Radar cross section for pedestrian in 76 GHz
-    band", EuMC 2005 (about -8 dBsm, spread of a few dB). Marchetti et al., "Radar
-    cross-section of pedestrians in the low-THz band", IET RSN 2018. Belgiovane and
-    Chen, "Bicycles and human riders backscattering at 77 GHz", EuCAP 2016.
-    Kamel, Peden and Pajusco, "RCS modeling and measurements for automotive radar
-    applications in the W band", EuCAP 2017 (cars 0 to 25 dBsm with aspect).
-    Scattering centers of vehicles: Buddendick and Eibert, "Bistatic image formation
-    from a vehicle for automotive radar", and Schuler et al., "Extraction of virtual
+    Pedestrians: Fortuny-Guasch and Chareau, "Radar cross section measurements of
+    pedestrian dummies and humans in the 24/77 GHz frequency bands", JRC report EUR
+    25762, 2013; Marchetti et al., "Radar cross-section of pedestrians in the low-THz
+    band", IET Radar, Sonar and Navigation 2018 (with values reported at 77 GHz).
+    Bicycles: Belgiovane and Chen, "Surrogate bicycle design for millimeter-wave
+    automotive radar pre-collision testing", IEEE T-ITS 2017; -7 to 5 dBsm
+    from behind (ACEA 2018, as quoted at apnielsen.com/bike-corner-relfector).
+    Log-normal spread of vehicles: Lee et al., "Radar cross section measurement with
+    77 GHz automotive FMCW radar", IEEE 2016.
+    Objects as scattering centers: Schuler, Becker and Wiesbeck, "Extraction of virtual
     scattering centers of vehicles by ray-tracing simulations", IEEE TAP 2008.
 """
 
@@ -54,9 +59,11 @@ CLASS_SCATTERING = {
     "Motorcycle": ClassScattering(2.0, 3.0, 14, 1.0, 0.2),
     "Bicycle": ClassScattering(-2.0, 3.0, 14, 1.0, 0.35),
 }
+"""Our choice, see the module's text; points, glint and moving shares too."""
 
 OCCLUDED_DB = -22.0
-"""Two-way loss behind another object: what creeps around and under it still returns."""
+"""Two-way loss behind another object: what creeps around and under it still returns.
+Our choice."""
 
 _GLINT_WIDTH_RAD = np.deg2rad(6.0)
 _BACK_LEAK = 0.02

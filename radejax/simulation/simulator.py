@@ -8,8 +8,8 @@ import numpy as np
 
 from radejax.data.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation import radar, scattering, surroundings, weather
-from radejax.simulation.scene import SceneFrame, Sequence
+from radejax.simulation import radar, road, scattering, surroundings, weather
+from radejax.simulation.scene import REFLECTOR_KINDS, SceneFrame, Sequence
 
 MIN_SNR_DB = 10.0
 """An object is visible to the radar from this ratio of its power to the noise on."""
@@ -76,15 +76,14 @@ class SequenceSimulator:
             frame, sequence, self._static_phase, parameters
         )
         ghosts = surroundings.scatter_ghosts(objects, frame, sequence)
+        is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
         parts = [
-            dataclasses.replace(
-                part,
-                power=part.power
-                * weather.attenuation(
-                    sequence.weather, np.linalg.norm(part.position_m, axis=1)
-                ),
+            self._on_the_way(part, mirrored)
+            for part, mirrored in (
+                (objects, True),
+                (static, ~is_ground),
+                (ghosts, True),
             )
-            for part in (objects, static, ghosts)
         ]
         power = np.bincount(parts[0].owner, parts[0].power, len(frame.boxes))
         return RadarInput(
@@ -99,6 +98,33 @@ class SequenceSimulator:
             lit=lit,
         )
 
+    def _on_the_way(
+        self, part: scattering.FrameScattering, mirrored: np.ndarray | bool
+    ) -> scattering.FrameScattering:
+        """Scatterers with what road and air do to their power and phase.
+
+        Args:
+            part: Scatterers.
+            mirrored: `[S]` or one bool: seen over the road too. The ground is not: its
+                cross-section stands for what it returns as it lies there.
+        """
+        sequence = self.sequence
+        distance = np.linalg.norm(part.position_m, axis=1)
+        bounce = road.bounce(
+            part.position_m,
+            sequence.ground_m,
+            road.SURFACES[sequence.weather],
+            self.parameters.wavelength_m,
+        )
+        bounce = np.where(mirrored, bounce, 1.0)
+        return dataclasses.replace(
+            part,
+            power=part.power
+            * weather.attenuation(sequence.weather, distance)
+            * np.square(np.abs(bounce)),
+            phase_rad=part.phase_rad + np.angle(bounce),
+        )
+
     def radar_frame(
         self, index: int, output: radar.Output = "projection", rows_per_step: int = 1
     ) -> np.ndarray:
@@ -111,18 +137,24 @@ class SequenceSimulator:
         output: radar.Output = "projection",
         rows_per_step: int = 1,
     ) -> np.ndarray:
-        """The radar frame of an input; see `radar.simulate`."""
-        return np.asarray(
+        """The radar frame of an input; see `radar.simulate`.
+
+        A tesseract comes as a view of the rows that the device made, without a copy.
+        """
+        result = np.asarray(
             radar.simulate(
                 given.scatterers,
                 given.noise_power,
                 given.key,
                 grid=self.grid,
                 parameters=self.parameters,
-                output=output,
+                output="rows" if output == "tesseract" else output,
                 rows_per_step=rows_per_step,
             )
         )
+        if output == "tesseract":
+            return result.transpose(radar.TESSERACT_OF_ROWS)
+        return result
 
     def is_radar_visible(self, frame: SceneFrame, given: RadarInput) -> np.ndarray:
         """`[N]` bool: in the field of view, strong enough, and not hidden."""

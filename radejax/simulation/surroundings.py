@@ -155,8 +155,8 @@ def scatter_ghosts(
         sequence: Whose `mirrors_m` are used.
 
     References:
-        Kraus et al., "Using machine learning to detect ghost images in automotive
-        radar", ITSC 2020.
+        Ghosts: Kraus et al., "Using machine learning to detect ghost images in
+        automotive radar", ITSC 2020, arXiv:2007.05280. The loss is our choice.
     """
     parts = []
     near = np.flatnonzero(

@@ -77,3 +77,42 @@ def test_near_peaks_become_one_and_scores_descend():
     assert (np.diff(found["score"]) <= 0).all()
     near = np.hypot(found["box"][:, 0] - 32.0, found["box"][:, 1]) < 6.0
     assert near.sum() == 1
+
+
+class TestFit:
+    def test_steps_by_hand(self):
+        # Cars 8 to 12, people -8 to -4: any step between -4 and 8 makes no error, the
+        # first candidate is the weakest car. People end at their lower quartile.
+        names = ["Sedan"] * 5 + ["Pedestrian"] * 5
+        values = [8.0, 9.0, 10.0, 11.0, 12.0, -8.0, -7.0, -6.0, -5.0, -4.0]
+        steps = baseline.fit_rcs_steps(names, values)
+        assert steps == (("Sedan", 8.0), ("Pedestrian", -7.0))
+
+    def test_rare_classes_count_only_if_balanced(self):
+        # A step at 11.5 keeps both trucks and takes two of six cars: 2 errors, 2/6. At
+        # 20 one of two trucks is lost: 1 error, 1/2.
+        names = ["Bus or Truck"] * 2 + ["Sedan"] * 6
+        values = [11.5, 20.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0]
+        plain = dict(baseline.fit_rcs_steps(names, values))
+        even = dict(baseline.fit_rcs_steps(names, values, balanced=True))
+        assert plain["Bus or Truck"] == 20.0
+        assert even["Bus or Truck"] == 11.5
+
+    def test_classes_that_overlap_keep_a_gap(self):
+        names = ["Motorcycle"] * 3 + ["Bicycle"] * 3
+        steps = baseline.fit_rcs_steps(names, [1.0, 2.0, 3.0, 0.0, 5.0, -9.0])
+        assert steps[1][1] <= steps[0][1] - 1.0
+
+    def test_no_objects_no_steps(self):
+        assert baseline.fit_rcs_steps([], []) == ()
+
+
+def test_apparent_cross_section_of_a_point_is_its_own():
+    projection = projection_of((20.4, 0.0, 8.0))
+    box = np.array([[20.4, 0.0, -0.9, 4.0, 2.0, 1.5, 0.0], [60.0, 0, 0, 4, 2, 2, 0]])
+    nowhere = np.array([[-20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
+    found = baseline.object_rcs_db(projection, box, GRID, PARAMETERS)
+    # Half a bin off in range (Hann) and angle costs at most 1.4 + 1.4 dB.
+    assert 5.0 < found[0] < 8.5
+    assert found[1] < 0.0  # noise
+    assert np.isnan(baseline.object_rcs_db(projection, nowhere, GRID, PARAMETERS)[0])

@@ -230,18 +230,58 @@ class TestNoise:
         distance = np.abs(np.arange(noise.size) / noise.size - expected).max()
         assert distance < 1.63 / np.sqrt(noise.size)  # 1 % level
 
-    def test_cells_and_frames_are_independent(self):
+    def test_frames_and_range_rows_are_independent(self):
         first = tesseract(self.NONE, noise=self.POWER)
         second = tesseract(self.NONE, noise=self.POWER, seed=(2,))
-        limit = 4.0 / np.sqrt(first.size)
-        for a, b in (
-            (first, second),
-            (first[1:], first[:-1]),
-            (first[:, 1:], first[:, :-1]),
-            (first[:, :, 1:], first[:, :, :-1]),
-            (first[..., 1:], first[..., :-1]),
-        ):
+        limit = 8.0 / np.sqrt(first.size)  # neighbours in a row are not independent
+        for a, b in ((first, second), (first[:, 1:], first[:, :-1])):
             assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < limit
+
+    def test_neighbours_correlate_as_windows_and_arrays_say(self):
+        # Powers of complex Gaussian noise correlate by the square of the field's
+        # correlation, here summed over samples and antennas in float64.
+        noise = np.mean(
+            [
+                self.correlations(tesseract(self.NONE, noise=self.POWER, seed=(seed,)))
+                for seed in range(6)
+            ],
+            axis=0,
+        )
+
+        def field_correlation(count, pedestal, shift):
+            n = np.arange(count) - (count - 1) / 2
+            window = pedestal + (1 - pedestal) * np.cos(np.pi * n / count) ** 2
+            phase = np.exp(2j * np.pi * n * shift / count)
+            return ((window**2 * phase).sum() / (window**2).sum()).real
+
+        a, b = np.sin(GRID.azimuth_rad[11:13])
+        c, d = np.sin(GRID.elevation_rad[4:6])
+        expected = np.square(
+            [
+                field_correlation(16, 0.0, 1.0),  # Hann: 2/3
+                field_correlation(16, 0.0, 2.0),  # 1/6
+                field_correlation(20, 0.2, (b - a) * 10),
+                field_correlation(12, 0.2, (d - c) * 6),
+            ]
+        )
+        np.testing.assert_allclose(expected[:2], [4 / 9, 1 / 36], atol=1e-12)
+        np.testing.assert_allclose(noise, expected, atol=0.05)
+
+    @staticmethod
+    def correlations(power):
+        """Doppler 1 and 2 bins apart, azimuth and elevation 1 bin near boresight."""
+        pairs = (
+            (power[1:], power[:-1]),
+            (power[2:], power[:-2]),
+            (power[..., 11], power[..., 12]),
+            (power[:, :, 4], power[:, :, 5]),
+        )
+        return [np.corrcoef(x.ravel(), y.ravel())[0, 1] for x, y in pairs]
+
+    def test_power_of_every_angle_bin_is_the_same(self):
+        rows = radar.array_noise_basis(GRID.azimuth_rad, 21.0, 0.2)
+        assert rows.shape == (24, 21)
+        np.testing.assert_allclose(np.square(rows).sum(1), 1.0, rtol=1e-6)
 
     def test_profile_reaches_its_own_rows_and_doppler_bins(self):
         profile = np.full((32, 16), 1.0, np.float32)

@@ -76,7 +76,9 @@ def test_rain_weakens_targets(urban):
     boxes = urban.sequence.frame(0).boxes
     inside = GRID.in_field_of_view(boxes[:, 0], boxes[:, 1])
     difference = (dry.snr_db - wet.snr_db)[inside]
-    assert (difference > 1.99).all()  # the wet radome alone costs 2 dB
+    # The wet radome costs 2 dB; the wet road mirrors better and gives some of it back.
+    assert (difference > 1.0).all()
+    assert np.median(difference) > 1.9
     assert difference.max() < 4.0
 
 

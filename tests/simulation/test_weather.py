@@ -54,3 +54,12 @@ def test_order_of_weathers():
 
     assert clutter("rain") > clutter("heavysnow") > clutter("lightsnow")
     assert clutter("lightsnow") > clutter("fog") > clutter("normal") * 0.999
+
+
+def test_rain_is_ten_millimetres_an_hour():
+    # ITU-R P.838-3 at 77 GHz, horizontal: k = 1.132, alpha = 0.7177; and 24 dBZ in
+    # Rayleigh's law, pi^5 |K|^2 Z / lambda^4 with |K|^2 = 0.7.
+    law = weather.WEATHERS["rain"]
+    assert law.attenuation_db_per_km == pytest.approx(1.132 * 10**0.7177, abs=0.2)
+    reflectivity = np.pi**5 * 0.7 * 10**2.4 * 1e-18 / PARAMETERS.wavelength_m**4
+    assert law.backscatter_db == pytest.approx(10 * np.log10(reflectivity), abs=0.5)

@@ -1,0 +1,143 @@
+"""CA-CFAR on a data set: the rows of the classical detector in `docs/simulator.md`.
+
+    python examples/cfar_baseline.py --data DATA --out DATA/cfar
+
+DATA is a K-Radar folder, simulated (`train.py` leaves one under data/) or real, with its
+projected records in DATA/records. Steps between the classes are fitted on the training
+split, the detector runs on the test split, and OUT gets the same report as a network's
+(`report.txt`, `metrics.json`, `tables.md`, ...).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import pathlib
+
+import numpy as np
+from tqdm import tqdm
+
+from radejax.data.encoding import decode
+from radejax.data.kradar import KRadar
+from radejax.data.records import RecordSource
+from radejax.evaluate_run import record_positions
+from radejax.evaluation.predictions_io import tables_from_frames
+from radejax.evaluation.report import Report, write_report
+from radejax.simulation.baseline import (
+    CfarSettings,
+    detect,
+    fit_rcs_steps,
+    object_rcs_db,
+)
+from radejax.simulation.radar import RadarParameters
+from radejax.structures import CLASSES, NARROW_ROI
+
+# The gain only shifts the cross-sections, and the steps between classes with them.
+PARAMETERS = RadarParameters()
+
+
+def run_baseline(
+    data: str | pathlib.Path,
+    out: str | pathlib.Path,
+    *,
+    protocols: tuple[str, ...] = ("exact", "kradar_r40", "kradar_r40_yaw", "coco101"),
+    score_threshold: float = 0.05,
+    bootstrap: int = 0,
+    balanced: bool = False,
+) -> Report:
+    """Fits on the training split, detects on the test split, writes the report.
+
+    Args:
+        data: K-Radar folder with `records/` in it.
+        out: Folder of the report.
+        protocols: Names of evaluation protocols.
+        score_threshold: As in the config of the network to compare with.
+        bootstrap: Resamples of sequences for intervals.
+        balanced: Rare classes count as much as frequent ones in the fit.
+    """
+    data = pathlib.Path(data)
+    records = RecordSource(data / "records")
+    settings = fit(records, KRadar(data, split="train"), balanced=balanced)
+    for name, least in settings.rcs_steps:
+        print(f"{name} from {least:.1f} dBsm")
+    frames = KRadar(data, split="test")
+    predictions = predict(records, frames, settings)
+    ground_truth, table = tables_from_frames(frames)
+    return write_report(
+        ground_truth,
+        predictions,
+        table,
+        out,
+        run="CFAR",
+        classes=CLASSES,
+        protocols=protocols,
+        paper_protocol="coco101" if "coco101" in protocols else protocols[0],
+        iou_thresholds=(0.3, 0.5),
+        roi=NARROW_ROI,
+        score_threshold=score_threshold,
+        bootstrap=bootstrap,
+        left_out_before=frames.summary().counts,
+    )
+
+
+def fit(
+    records: RecordSource, frames: KRadar, *, balanced: bool = False
+) -> CfarSettings:
+    """Settings with class steps from the objects of a split."""
+    names, values = [], []
+    for frame, position in _with_records(records, frames, "fit"):
+        projection = decode(records[position]["projection"])
+        names += list(frame.classes)
+        values += [object_rcs_db(projection, frame.boxes, records.grid, PARAMETERS)]
+    rcs = np.concatenate([np.zeros(0), *values])
+    found = ~np.isnan(rcs)
+    names = np.array(names, dtype=np.str_)[found]
+    steps = fit_rcs_steps(names, rcs[found], balanced=balanced)
+    return dataclasses.replace(CfarSettings(), rcs_steps=steps)
+
+
+def predict(
+    records: RecordSource, frames: KRadar, settings: CfarSettings
+) -> dict[str, np.ndarray]:
+    """Detections of a split as columns "frame", "box", "cls", "score"."""
+    parts = []
+    for index, (_, position) in enumerate(_with_records(records, frames, "detect")):
+        projection = decode(records[position]["projection"])
+        found = detect(projection, records.grid, PARAMETERS, settings)
+        parts.append({"frame": np.full(len(found["score"]), index), **found})
+    return {
+        name: np.concatenate([part[name] for part in parts])
+        for name in ("frame", "box", "cls", "score")
+    }
+
+
+def _with_records(records: RecordSource, frames: KRadar, what: str):
+    pairs = zip(frames, record_positions(records, frames), strict=True)
+    return tqdm(pairs, total=len(frames), unit="frame", desc=what)
+
+
+def main() -> None:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", required=True, help="K-Radar folder with records/")
+    parser.add_argument("--out", required=True, help="folder of the report")
+    parser.add_argument("--score-threshold", type=float, default=0.05)
+    parser.add_argument("--bootstrap", type=int, default=0)
+    parser.add_argument(
+        "--balanced", action="store_true", help="rare classes weigh as much as others"
+    )
+    arguments = parser.parse_args()
+    report = run_baseline(
+        arguments.data,
+        arguments.out,
+        score_threshold=arguments.score_threshold,
+        bootstrap=arguments.bootstrap,
+        balanced=arguments.balanced,
+    )
+    print(report.text)
+
+
+if __name__ == "__main__":
+    main()
