@@ -1,0 +1,165 @@
+"""What the camera adds, with a clean and with a covered lens.
+
+    python train.py --config configs/quickstart_fusion.py
+    python train.py --config configs/quickstart_fusion.py:radar
+    python examples/fusion_by_lens.py runs/quickstart_fusion runs/quickstart_fusion-radar
+
+Compares two runs on the same simulated test frames, by weather and by the state of the
+lens, which the simulator knows: AP of both, their difference with an interval from
+resampled sequences, and the camera's share in the fused map. Writes a table and a
+picture into OUT.
+"""
+
+import pathlib
+
+import click
+import numpy as np
+from tabulate import tabulate
+
+from radejax import camera_share, entry, files
+from radejax.data.records import RecordSource
+from radejax.errors import UserError
+from radejax.evaluate_files import Source, load
+from radejax.evaluation import bootstrap
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.measure import repair_sizes
+from radejax.experiment import load_run
+from radejax.simulation.lens import cover_level
+
+GROUPS = {
+    "all": lambda weather, lens: True,
+    "normal, overcast": lambda weather, lens: weather in ("normal", "overcast"),
+    "other weather, lens clear": lambda weather, lens: (
+        lens == "clear" and weather not in ("normal", "overcast")
+    ),
+    "lens partly covered": lambda weather, lens: lens == "partial",
+    "lens heavily or fully covered": lambda weather, lens: lens in ("heavy", "full"),
+}
+
+
+def lens_of(config, sequence, number, weather):
+    """State of the lens in a procedural frame of a simulated data set."""
+    if not config.simulation.cover_lens:
+        return "clear"
+    return cover_level(config.simulation.seed, sequence, number, weather)
+
+
+def lens_of_frames(config, frames):
+    """The same for the rows of a frame table; frames count from 0 in a sequence."""
+    sequences, first = np.asarray(frames["sequence"]), {}
+    levels = []
+    for sequence, weather in zip(sequences.tolist(), frames["weather"], strict=True):
+        number = first.setdefault(sequence, 0)
+        levels.append(lens_of(config, sequence, number, str(weather)))
+        first[sequence] += 1
+    return np.array(levels)
+
+
+def evaluation_set(report, classes, roi, chosen):
+    """Ground truth and predictions of a report on some of its frames."""
+    truth, found, frames, _ = load(report, Source(), classes)
+    found, _ = repair_sizes(found, "false_positive")
+    ids = np.asarray(frames["frame"])[chosen]
+
+    def cut(columns):
+        is_in = np.isin(columns["frame"], ids)
+        return {name: np.asarray(column)[is_in] for name, column in columns.items()}
+
+    frames = {name: np.asarray(column)[chosen] for name, column in frames.items()}
+    data = EvaluationSet(
+        cut(truth), cut(found), classes=classes, frames=frames, roi=roi
+    )
+    return data, frames["sequence"]
+
+
+def rows_of_group(name, reports, config, chosen, shares, resamples):
+    """One row for Sedan, one for the mean of the classes that occur."""
+    options = config.evaluation
+    fusion, radar = (
+        evaluation_set(report, tuple(config.classes), tuple(options.roi), chosen)
+        for report in reports
+    )
+    found = bootstrap.compare(
+        radar[0],
+        fusion[0],
+        radar[1],
+        protocol_names=("exact",),
+        spaces=("bev",),
+        score_threshold=options.score_threshold,
+        resamples=resamples,
+    )
+    return [
+        {
+            "condition": name,
+            "frames": int(chosen.sum()),
+            "class": row.cls,
+            "radar": row.ap_a,
+            "fusion": row.ap_b,
+            "difference": row.difference,
+            "low": row.low,
+            "high": row.high,
+            "camera share": shares.get(name),
+        }
+        for row in found
+        if row.cls in ("Sedan", "mean")
+    ]
+
+
+@click.command()
+@click.argument("fusion", type=click.Path(exists=True, path_type=pathlib.Path))
+@click.argument("radar", type=click.Path(exists=True, path_type=pathlib.Path))
+@click.option("--out", type=click.Path(path_type=pathlib.Path), help="Beside FUSION.")
+@click.option("--resamples", default=1000, show_default=True)
+def main(fusion, radar, out, resamples):
+    """Compares FUSION with RADAR, two work folders evaluated on the same test split."""
+    entry.set_up_jax()
+    with entry.exit_codes():
+        out = out or fusion / "by_lens"
+        reports = [run / "evaluation" for run in (fusion, radar)]
+        run = load_run(fusion)
+        config = run.config
+        if config.simulation.scenes != "procedural":
+            raise UserError(f"{fusion}: the lens is known of procedural scenes only")
+        frames = load(reports[0], Source(), tuple(config.classes))[2]
+        lens = lens_of_frames(config, frames)
+        groups = {
+            name: np.array(
+                [
+                    rule(w, level)
+                    for w, level in zip(frames["weather"], lens, strict=True)
+                ]
+            )
+            for name, rule in GROUPS.items()
+        }
+        dataset = run.paths.open(config, "test")
+        level_of = {f.key: level for f, level in zip(dataset, lens, strict=True)}
+        maps, counts = camera_share.camera_share(
+            config,
+            run.variables,
+            RecordSource(run.paths.records),
+            list(dataset),
+            group=lambda frame: next(
+                name
+                for name, rule in reversed(GROUPS.items())
+                if rule(frame.weather, level_of[frame.key])
+            ),
+            max_frames=len(dataset),
+        )
+        out.mkdir(parents=True, exist_ok=True)
+        ordered = {name: maps[name] for name in GROUPS if name in maps}
+        camera_share.write_camera_share(out, ordered, counts, run.grid)
+        shares = {name: float(share.mean()) for name, share in ordered.items()}
+        rows = [
+            row
+            for name, chosen in groups.items()
+            if chosen.any()
+            for row in rows_of_group(name, reports, config, chosen, shares, resamples)
+        ]
+        files.write_json(out / "by_lens.json", rows)
+        text = tabulate(rows, headers="keys", floatfmt=".2f")
+        files.write_text(out / "by_lens.txt", text + "\n")
+        click.echo(f"AP BEV, IoU 0.3, protocol exact\n\n{text}\n\nWritten to {out}")
+
+
+if __name__ == "__main__":
+    main()
