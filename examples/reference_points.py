@@ -1,0 +1,59 @@
+"""Where the radar's queries look in a camera image, with the labelled boxes.
+
+    python examples/reference_points.py cam-front_00001.png cam_front0.yml \\
+        --label 00033_00001.txt --out reference_points.png
+
+The picture of DinoRADE's Figure 2 for one image: reference points of every 16th range
+bin red, boxes of the label file, the radar's place blue where it is in view.
+"""
+
+import pathlib
+
+import click
+import numpy as np
+
+from radejax import entry
+from radejax.data.frame_table import read_left_image
+from radejax.data.kradar import read_labels
+from radejax.geometry.camera import EGO_FROM_LIDAR_M, CameraCalibration
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.lifting import LiftingAxes, static_reference_points
+from radejax.visualize.bev import save_figure
+from radejax.visualize.camera import draw_camera
+from radejax.visualize.reference_points import draw_reference_points
+
+FILE = click.Path(exists=True, path_type=pathlib.Path)
+
+
+@click.command()
+@click.argument("image", type=FILE)
+@click.argument("calibration", type=FILE)
+@click.option("--label", type=FILE, help="Label file of the frame.")
+@click.option("--version", default="v2.1", show_default=True, help="Of the label file.")
+@click.option("--out", default="reference_points.png", show_default=True)
+def main(image, calibration, label, version, out):
+    """Draws reference points and boxes on IMAGE through CALIBRATION."""
+    with entry.exit_codes():
+        camera = CameraCalibration.from_kradar(calibration)
+        pixels = read_left_image(image, (camera.height, camera.width))
+        grid = RadarGrid.kradar()
+        reference = static_reference_points(
+            camera, LiftingAxes.of_grid(grid), grid.num_range, grid.num_azimuth
+        )
+        ground_truth = None
+        if label is not None:
+            labels = read_labels(label, version)
+            shift = np.array([*EGO_FROM_LIDAR_M, 0, 0, 0, 0])
+            boxes = np.array([x.box for x in labels]).reshape(-1, 7) + shift
+            ground_truth = (boxes, [x.cls for x in labels])
+        ax = draw_camera(pixels, camera, ground_truth=ground_truth)
+        count = draw_reference_points(
+            ax, reference.points[0], reference.is_valid[0], camera
+        )
+        save_figure(ax.figure, out)
+        inside = float(np.mean(reference.is_valid))
+        click.echo(f"{inside:.1%} of the queries are in view; drew {count} in {out}")
+
+
+if __name__ == "__main__":
+    main()
