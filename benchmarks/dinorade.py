@@ -2,6 +2,7 @@
 
     python benchmarks/dinorade.py                      # everything, float32, batch 1
     python benchmarks/dinorade.py --parts attention    # deformable attention alone
+    python benchmarks/dinorade.py --parts training     # gradient, embedded images too
     python benchmarks/dinorade.py --dtype bfloat16 --batch 1 6
 
 256 x 112 x 10 queries, 720 x 1280 images, 180 x 320 x 128 camera map. Weights and inputs
@@ -27,6 +28,7 @@ from radejax.geometry.camera import CameraCalibration
 from radejax.models import build
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import static_reference_points
+from radejax.training.state import merge_parameters, split_parameters
 
 try:
     import torch
@@ -191,7 +193,7 @@ def attention_rows(batch, repeats):
 # The model ---------------------------------------------------------------------------
 
 
-def model_rows(variant, dtype, batch, repeats):
+def model_and_inputs(variant, dtype, batch):
     model = full_size_model(variant, dtype)
     rng = np.random.default_rng(0)
     projection = rng.random((batch, 256, 107, 101), np.float32)
@@ -208,6 +210,13 @@ def model_rows(variant, dtype, batch, repeats):
         shapes,
     )
     features = jnp.zeros((batch, *model.feature_shape))
+    return model, variables, projection, image, features, reference
+
+
+def model_rows(variant, dtype, batch, repeats):
+    model, variables, projection, image, features, reference = model_and_inputs(
+        variant, dtype, batch
+    )
 
     def embed(variables, image):
         return model.apply(variables, image, method="embed")
@@ -224,6 +233,36 @@ def model_rows(variant, dtype, batch, repeats):
         yield row(name, batch, measure({"ours": call}, repeats), memory)
 
 
+def training_rows(variant, dtype, batch, repeats):
+    """Gradient of all that is trained, from images and from embedded images."""
+    model, variables, projection, image, features, reference = model_and_inputs(
+        variant, dtype, batch
+    )
+    params, frozen = split_parameters(variables["params"], model.is_frozen)
+    stats = {k: v for k, v in variables.items() if k != "params"}
+
+    def loss(params, frozen, image):
+        maps, _ = model.apply(
+            {"params": merge_parameters(params, frozen), **stats},
+            projection,
+            image,
+            reference,
+            train=True,
+            rngs={"dropout": jax.random.key(0)},
+            mutable=list(stats),
+        )
+        return (
+            jnp.square(maps.heatmap_logits).mean() + jnp.square(maps.box_params).mean()
+        )
+
+    calls, memories = {}, {}
+    for name, given in (("images", image), ("embedded images", features)):
+        calls[name], memories[name] = compiled(jax.grad(loss), params, frozen, given)
+    times = measure(calls, repeats)
+    for name, time_of in times.items():
+        yield row(f"gradient from {name}", batch, {"ours": time_of}, memories[name])
+
+
 def row(name, batch, times, memory):
     wall, processor = times["ours"]
     cells = [name, batch, 1e3 * wall / batch, processor, memory]
@@ -237,7 +276,9 @@ def row(name, batch, times, memory):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=["attention", "model"])
+    parser.add_argument(
+        "--parts", nargs="+", default=["attention", "model"], help="and training"
+    )
     parser.add_argument("--variant", default="rcw", help="of configs/dinorade.py")
     parser.add_argument("--dtype", default="float32")
     parser.add_argument("--batch", nargs="+", type=int, default=[1])
@@ -249,6 +290,8 @@ def main():
             rows += attention_rows(batch, args.repeats)
         if "model" in args.parts:
             rows += model_rows(args.variant, args.dtype, batch, args.repeats)
+        if "training" in args.parts:
+            rows += training_rows(args.variant, args.dtype, batch, args.repeats)
     names = ["part", "batch", "ms a frame", "CPU s", "MiB", "torch ms", "torch CPU s"]
     names += ["times faster", "in CPU s"]
     print(f"{jax.devices()[0].device_kind}, {args.variant}, {args.dtype}")

@@ -57,7 +57,8 @@ def test_blocked_attention_has_the_gradients_of_the_plain_one():
 
     gradient = jax.jit(jax.grad(loss, (1, 2, 3)), static_argnums=0)
     plain, blocked = gradient("xla", *arrays), gradient("blocked", *arrays)
-    chex.assert_trees_all_close(blocked, plain, atol=2e-5)
+    # Values reach 35; each form is within 2e-5 of float64.
+    chex.assert_trees_all_close(blocked, plain, atol=5e-5)
 
 
 def test_unknown_attention_is_refused():
