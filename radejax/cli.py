@@ -151,6 +151,8 @@ def project(
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
 @click.option("--out", type=PATH, default="overlay.png", show_default=True)
+@click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
+@click.option("--max-frames", type=int, help="Of an animation; all by default.")
 @json_option
 def overlay(
     name: str,
@@ -158,16 +160,29 @@ def overlay(
     labels: pathlib.Path | None,
     label_version: str,
     out: pathlib.Path,
+    slices: bool,
+    max_frames: int | None,
     as_json: bool,
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
-    FRAME is sequence/radar_lidar. Example: radejax overlay 1/00033_00001 --data ROOT
+    FRAME is sequence/radar_lidar, or a sequence: its first frame, or all of them where
+    --out ends in .gif or .mp4.
+
+    Example: radejax overlay 1/00033_00001 --data ROOT
     """
     from radejax.overlay import draw_overlay
 
-    draw_overlay(name, roots, out, labels=labels, version=label_version)
-    echo_result(as_json, {"picture": str(out)}, f"drew {out}")
+    count = draw_overlay(
+        name,
+        roots,
+        out,
+        labels=labels,
+        version=label_version,
+        slices=slices,
+        max_frames=max_frames,
+    )
+    echo_result(as_json, {"picture": str(out), "frames": count}, f"drew {out}")
 
 
 @main.command()

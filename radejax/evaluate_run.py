@@ -99,6 +99,10 @@ def evaluate_run(
         write_camera_share(out, *shares, run.grid)
     count = options.num_pictures if num_pictures is None else num_pictures
     pictures = drawer.draw_spread(out / "pictures", count)
+    if pictures:
+        drawer.draw_scenes(out / "scenes.png")
+    if (run.workdir / "metrics.jsonl").exists():
+        draw_curves(run.workdir, out / "training.png")
     _log.info("drew %d frames in %s", len(pictures), out / "pictures")
     return report
 
@@ -208,20 +212,53 @@ class FrameDrawer:
         """Draws the frame at a position of the data set into a picture file."""
         from radejax.visualize import bev
 
+        scene = self._scene(int(index))
         frame = self._frames[int(index)]
+        figure = bev.draw_frame(
+            scene.projection,
+            self._records.grid,
+            ground_truth=scene.ground_truth,
+            predictions=scene.predictions,
+            roi=self._roi,
+            image=scene.image,
+            camera=scene.camera,
+            title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
+        )
+        bev.save_figure(figure, path)
+
+    def _scene(self, index: int) -> Any:
+        """The frame at a position with its boxes and image."""
+        from radejax.visualize.scenes import Scene
+
+        frame = self._frames[index]
         mine = self._predictions["frame"] == index
         mine &= self._predictions["score"] >= self._score_threshold
         columns = {k: v[mine] for k, v in self._predictions.items()}
-        figure = bev.draw_frame(
-            decode_array(self._records[self._positions[int(index)]]["projection"]),
-            self._records.grid,
+        record = self._records[self._positions[index]]
+        return Scene(
+            decode_array(record["projection"]),
             ground_truth=(frame.boxes, list(frame.classes)),
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
-            roi=self._roi,
             image=read_left_image(frame.camera_path),
             camera=read_camera(frame),
-            title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
+            title=f"{frame.weather} ({frame.key})",
         )
+
+    def draw_scenes(self, path: str | os.PathLike) -> None:
+        """Draws one frame of each weather, that with the most objects, side by side.
+
+        The layout of RADE-Net's Figure 4.
+        """
+        from radejax.visualize import bev
+        from radejax.visualize.scenes import draw_scenes
+
+        fullest: dict[str, int] = {}
+        for i, frame in enumerate(self._frames):
+            best = fullest.setdefault(frame.weather, i)
+            if len(frame.boxes) > len(self._frames[best].boxes):
+                fullest[frame.weather] = i
+        scenes = [self._scene(i) for i in fullest.values()]
+        figure = draw_scenes(scenes, self._records.grid, roi=self._roi)
         bev.save_figure(figure, path)
 
     def draw_spread(self, folder: pathlib.Path, count: int) -> list[pathlib.Path]:
@@ -237,6 +274,14 @@ class FrameDrawer:
             paths.append(folder / f"{frame.sequence:02d}_{frame.name}.png")
             self(index, paths[-1])
         return paths
+
+
+def draw_curves(workdir: pathlib.Path, path: pathlib.Path) -> None:
+    """Draws the losses of a run over its steps into a picture file."""
+    from radejax.visualize import bev, curves
+
+    figure = curves.draw_training(workdir / "metrics.jsonl", title=workdir.name)
+    bev.save_figure(figure, path)
 
 
 def read_camera(frame: Frame) -> CameraCalibration | None:

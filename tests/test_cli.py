@@ -4,11 +4,13 @@ import json
 import pathlib
 
 import click.testing
+import numpy as np
 import pytest
 
 from radejax import checkpoint_files, cli
 from radejax.data import kradar_write
 from radejax.data.labels import Label
+from radejax.evaluation import kitti
 
 from . import small_models
 
@@ -106,3 +108,22 @@ def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> No
     (row,) = json.loads(timed.output)
     assert row["batch"] == 1
     assert row["whole_s"] > 0
+
+
+def test_evaluate_scores_predictions_in_files(tmp_path: pathlib.Path) -> None:
+    box = np.array([[20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [30, 3, 0, 4, 2, 1.5, 0.1]])
+    truth = {"frame": np.arange(2), "box": box, "cls": np.array(["Sedan"] * 2)}
+    found = {**truth, "score": np.array([0.9, 0.8])}
+    kitti.write_kitti(tmp_path / "kitti", truth, found, {"frame": np.arange(2)})
+    arguments = (
+        "evaluate",
+        "--predictions",
+        tmp_path / "kitti",
+        "--out",
+        tmp_path / "out",
+    )
+    text = _run(*arguments)
+    assert text.exit_code == 0, text.output
+    assert "100.0" in text.output
+    assert (tmp_path / "out" / "metrics.json").is_file()
+    assert json.loads(_run(*arguments, "--json").stdout)

@@ -42,3 +42,15 @@ def test_a_frame_that_is_not_there_is_named(
 ) -> None:
     with pytest.raises(UserError, match=message):
         draw_overlay(name, [root], tmp_path / "none.png")
+
+
+def test_slices_and_a_sequence_in_motion(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    assert draw_overlay("1", [root], tmp_path / "slices.png", slices=True) == 1
+    with Image.open(tmp_path / "slices.png") as picture:
+        width, height = picture.size
+    assert width > 2.5 * height  # three planes side by side
+    assert draw_overlay("1", [root], tmp_path / "all.gif", max_frames=3) == 1
+    with Image.open(tmp_path / "all.gif") as picture:
+        assert picture.format == "GIF"

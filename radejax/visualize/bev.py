@@ -45,7 +45,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_bev", "draw_frame", "draw_map", "draw_polar", "save_figure"]
+__all__ = [
+    "draw_bev",
+    "draw_frame",
+    "draw_map",
+    "draw_polar",
+    "draw_view",
+    "save_figure",
+]
 
 _POLAR_OPTIONS = ("channels", "reduce", "units", "color_limits")
 
@@ -237,7 +244,7 @@ def draw_frame(
     )
     if has_image:
         view_ax = figure.add_axes((0.53, 0.40, 0.45, 0.52))
-        _draw_view(view_ax, image, camera, truth, found)
+        draw_view(view_ax, image, camera, truth, found)
     figure.legend(
         handles=legend_handles(truth, found, roi),
         loc="lower center",
@@ -256,8 +263,14 @@ def _to_polar(points: np.ndarray) -> np.ndarray:
     return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
-def _draw_view(
-    ax: Axes, image: Any, camera: Any, truth: Objects | None, found: Objects | None
+def draw_view(
+    ax: Axes,
+    image: Any,
+    camera: Any,
+    truth: Objects | None,
+    found: Objects | None,
+    *,
+    show_labels: bool = True,
 ) -> None:
     """Camera image, with the boxes where a calibration is given."""
     if camera is None:
@@ -266,4 +279,11 @@ def _draw_view(
         return
     from radejax.visualize.camera import draw_camera
 
-    draw_camera(image, camera, ground_truth=truth, predictions=found, ax=ax)
+    draw_camera(
+        image,
+        camera,
+        ground_truth=truth,
+        predictions=found,
+        ax=ax,
+        show_labels=show_labels,
+    )
