@@ -131,7 +131,7 @@ def write_packed(
         The content of `config.json`.
 
     Raises:
-        UserError: The image backbone is DINOv3, fine-tuned: without its weights the
+        UserError: The image transformer was trained along: without its weights the
             model is not the same.
     """
     folder = pathlib.Path(folder)
@@ -141,8 +141,9 @@ def write_packed(
     if is_vit and not with_backbone and BACKBONE in variables["params"]:
         if not detector.model.freeze:
             raise UserError(
-                "the model has a fine-tuned DINOv3 inside, whose licence restricts "
-                "passing it on, and is not the same without"
+                "the image transformer was trained along. Fine-tuned from DINOv3, its "
+                "licence restricts passing it on; trained from scratch, keep it by "
+                "with_backbone (--with-backbone)"
             )
         del variables["params"][BACKBONE]
     if is_vit and BACKBONE not in variables["params"]:

@@ -58,7 +58,7 @@ def test_a_packed_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> None
     tuned = Detector(
         detector.model.clone(freeze=False), detector.variables, detector.grid
     )
-    with pytest.raises(UserError, match="fine-tuned DINOv3"):
+    with pytest.raises(UserError, match="--with-backbone"):
         checkpoint_files.write_packed(tmp_path, tuned)
 
 
