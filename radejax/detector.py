@@ -99,13 +99,20 @@ class Detector:
 
     @classmethod
     def from_workdir(
-        cls, path: str | pathlib.Path, step: int | None = None, **overrides: Any
+        cls,
+        path: str | pathlib.Path,
+        step: int | None = None,
+        *,
+        image_backbone: str | pathlib.Path | None = None,
+        **overrides: Any,
     ) -> Detector:
         """Detector of a training run.
 
         Args:
             path: Work folder of `train.py`.
             step: Of the checkpoint; the newest if None.
+            image_backbone: Weights of a frozen image backbone, where they are not at
+                the place any more that the run was trained from.
             **overrides: Arguments of `Detector`.
 
         Raises:
@@ -113,7 +120,7 @@ class Detector:
         """
         from radejax.experiment import load_run  # above this floor: a convenience
 
-        run = load_run(path, step)
+        run = load_run(path, step, image_backbone)
         return cls.from_config(run.config, run.variables, run.grid, **overrides)
 
     @classmethod
