@@ -49,11 +49,10 @@ def detect(
         score_threshold=score_threshold,
         nms_iou=nms_iou,
     )
-    echo_result(
-        as_json,
-        {**count, "out": str(out)},
-        f"{count['boxes']} boxes in {count['frames']} frames written to {out}",
-    )
+    text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
+    if "radar_alone" in count:
+        text += f"; {count['radar_alone']} without an image, from the radar alone"
+    echo_result(as_json, {**count, "out": str(out)}, text)
 
 
 @click.command()

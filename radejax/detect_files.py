@@ -73,7 +73,9 @@ def detect_files(
         **settings: `score_threshold`, `nms_iou`, `roi` of the detector.
 
     Returns:
-        Counts "frames" and "boxes".
+        Counts "frames" and "boxes", and for a radar-camera model "radar_alone": files
+        of frames name no image, so that these are all of them. Evaluating a run uses
+        the images.
     """
     frames = find_frames(paths)
     detector = Detector.from_workdir(workdir, step)
@@ -95,7 +97,10 @@ def detect_files(
                 files.write_json(out / f"{output_name(path)}.json", boxes)
                 num_boxes += len(boxes)
             bar.update(len(chunk))
-    return {"frames": len(frames), "boxes": num_boxes}
+    count = {"frames": len(frames), "boxes": num_boxes}
+    if detector.takes_camera:
+        count["radar_alone"] = detector.num_radar_alone
+    return count
 
 
 def output_name(path: pathlib.Path) -> str:

@@ -79,15 +79,18 @@ def viewer_frames(
     """What the viewer shows of each frame, read as it is needed."""
     for frame in frames:
         projection = project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
-        found = None
-        if detector is not None:
-            found = jax.tree.map(lambda x: np.asarray(x[0]), detector(projection))
         calibration = None
         if frame.camera_calibration_path is not None:
             calibration = CameraCalibration.from_kradar(
                 frame.camera_calibration_path,
                 ego_from_lidar_m=frame.radar_from_lidar_m,
             )
+        found = None
+        if detector is not None:
+            inputs = (projection,)
+            if detector.takes_camera and frame.camera_path and calibration:
+                inputs += frame.camera_path, calibration
+            found = jax.tree.map(lambda x: np.asarray(x[0]), detector(*inputs))
         yield ViewerFrame(
             projection,
             ground_truth=frame,
