@@ -17,7 +17,9 @@ from absl import app, flags
 from radejax import entry
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run of train.py.")
-_CHECKPOINT = flags.DEFINE_integer("checkpoint", None, "Step; the newest by default.")
+_CHECKPOINT = flags.DEFINE_string(
+    "checkpoint", None, "Step, or best; the newest by default."
+)
 _PREDICTIONS = flags.DEFINE_string("predictions", None, "File or folder.")
 _COMPARE = flags.DEFINE_string(
     "compare", None, "Runs: --compare A B [C ...]. Folders of reports, or predictions."
@@ -80,11 +82,17 @@ def main(argv: list[str]) -> None:
 def evaluate_workdir() -> None:
     """Runs the detector of a run over a split; the config of the run has the options."""
     entry.set_up_jax()
+    from radejax.errors import UserError
     from radejax.evaluate_run import evaluate_run
 
+    step = _CHECKPOINT.value
+    if step is not None and step != "best":
+        if not step.isdigit():
+            raise UserError(f"--checkpoint must be a step or best, got {step}")
+        step = int(step)
     evaluate_run(
         _WORKDIR.value,
-        step=_CHECKPOINT.value,
+        step=step,
         split=_SPLIT.value,
         out=_OUT.value,
         image_backbone=_BACKBONE.value,

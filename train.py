@@ -4,7 +4,8 @@
     python train.py --config configs/radenet.py:official --data /data/kradar1,/data/kradar2
     python train.py --config configs/radenet.py --config.train.batch_size=4 ...
 
-Run the same command again to continue where an earlier start ended.
+Run the same command again to continue where an earlier start ended. On several hosts
+start it once on each, with --distributed (docs/training.md, examples/slurm.sh).
 """
 
 from absl import app, flags
@@ -40,6 +41,14 @@ _BACKBONE = flags.DEFINE_string(
     "Weights of the image backbone: a DINOv3 folder from Hugging Face, or torchvision's "
     "ResNet-50 file.",
 )
+_DISTRIBUTED = flags.DEFINE_bool(
+    "distributed", False, "One of several processes, as Slurm and others start them."
+)
+_COORDINATOR = flags.DEFINE_string(
+    "coordinator", None, "host:port of process 0, where no cluster tells."
+)
+_NUM_PROCESSES = flags.DEFINE_integer("num_processes", None, "Likewise.")
+_PROCESS_ID = flags.DEFINE_integer("process_id", None, "Likewise, from 0.")
 _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 flags.mark_flag_as_required("config")
 
@@ -48,6 +57,10 @@ def main(_: list[str]) -> None:
     """Runs the whole way from data to metrics."""
     entry.set_up_jax()
     with entry.exit_codes(debug=_DEBUG.value):
+        if _DISTRIBUTED.value or _COORDINATOR.value is not None:
+            entry.join_processes(
+                _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
+            )
         from radejax import experiment
 
         experiment.run(

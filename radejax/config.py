@@ -77,6 +77,10 @@ def base_config() -> ConfigDict:
     config.train = _train()
     config.data = _data()
     config.evaluation = _evaluation()
+    config.watch = _watch()
+    # Neither is part of what a run computes, nor compared when it continues.
+    config.seeds = ()  # several runs, one after the other, in seed0, seed1, ...
+    config.profile = ""  # folder for a trace of a few steps
     return config
 
 
@@ -148,7 +152,9 @@ def _train() -> ConfigDict:
             "log_every_steps": 20,
             "checkpoint_every_steps": 500,
             "checkpoints_to_keep": 2,
-            "evaluate_every_epochs": 0,  # 0: at the end only
+            "evaluate_every_epochs": 0,  # 0: after training only
+            # Which checkpoint is the best: mean over classes, in the first protocol.
+            "best_metric": "map_3d_iou30",
             "max_skipped_steps": 20,  # in a row, for loss or gradient not finite
         }
     )
@@ -185,5 +191,16 @@ def _evaluation() -> ConfigDict:
             "bootstrap": 0,  # resamples of sequences for intervals; 1000 is plenty
             "batch_size": 8,
             "num_pictures": 8,
+        }
+    )
+
+
+def _watch() -> ConfigDict:
+    return ConfigDict(
+        {
+            "num_pictures": 4,  # of fixed frames, at every evaluation during training
+            "wandb": False,  # Weights & Biases, beside TensorBoard
+            "wandb_project": "radejax",
+            "profile_steps": (2, 5),  # first and last traced, counted from a start
         }
     )

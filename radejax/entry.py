@@ -83,6 +83,39 @@ def _check_config_file(argv: Sequence[str]) -> None:
                 raise UserError(f"no such config file: {path}")
 
 
+def join_processes(
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
+) -> None:
+    """Joins the other processes of a run; to be called before anything uses JAX.
+
+    Under Slurm, Open MPI, Kubernetes and on TPU pods JAX finds the arguments itself.
+
+    Args:
+        coordinator: "host:port" of process 0, with a port that is free there.
+        num_processes: Of the run.
+        process_id: Of this process, from 0.
+
+    Raises:
+        UserError: JAX finds no cluster, and not all arguments are given.
+    """
+    given = [coordinator, num_processes, process_id]
+    if None in given and given != [None] * 3:
+        raise UserError("give --coordinator, --num_processes and --process_id together")
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        jax.distributed.initialize(*given)
+    except ValueError as error:
+        raise UserError(
+            f"--distributed finds no cluster to join ({error}); without Slurm, Open MPI "
+            "or a TPU pod give --coordinator HOST:PORT, --num_processes and --process_id"
+        ) from error
+    if jax.process_index():
+        logging.getLogger("radejax").setLevel(logging.ERROR)
+        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
+
+
 def set_up_jax(*, cache: bool = True) -> None:
     """Logging at level info without noise, and a compilation cache that persists.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import logging
 import os
 import pathlib
@@ -10,21 +9,21 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import tqdm
 
 from radejax import camera_inputs
 from radejax.camera_share import camera_share, write_camera_share
 from radejax.data.encoding import decode as decode_array
 from radejax.data.frame import Frame
 from radejax.data.kradar import KRadar
-from radejax.data.pipeline import make_loader
 from radejax.data.records import RecordSource
-from radejax.detector import Detector
 from radejax.errors import UserError
+from radejax.evaluation.measure import Options
 from radejax.evaluation.predictions_io import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.experiment import load_run
 from radejax.geometry.camera import CameraCalibration
+from radejax.predict import Predictor, predict_dataset
+from radejax.training import processes
 
 _log = logging.getLogger(__name__)
 
@@ -32,61 +31,52 @@ _log = logging.getLogger(__name__)
 def evaluate_run(
     workdir: str | os.PathLike,
     *,
-    step: int | None = None,
+    step: int | str | None = None,
     split: str = "test",
     out: str | os.PathLike | None = None,
     num_pictures: int | None = None,
     image_backbone: str | os.PathLike | None = None,
-) -> Report:
-    """Evaluates a run's checkpoint as its config says.
+) -> Report | None:
+    """Evaluates a run's checkpoint as its config says, on all devices.
 
     Args:
         workdir: Of `train.py`.
-        step: Of the checkpoint; the newest if None.
+        step: Of the checkpoint, or "best"; the newest if None.
         split: "test", "train", "all" or a split file.
         out: Folder of the results; `evaluation` in the work folder if None.
         num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `load_run`.
 
     Returns:
-        The report that was written.
+        The report that was written; None on all processes but the first.
     """
     run = load_run(workdir, step, image_backbone)
     config = run.config
-    out = pathlib.Path(out or run.workdir / "evaluation")
-    out.mkdir(parents=True, exist_ok=True)
     frames = run.paths.open(config, None if split == "all" else split)
     records = RecordSource(run.paths.records)
     options = config.evaluation
-    detector = Detector.from_config(
+    predictor = Predictor(
         config, run.variables, run.grid, score_threshold=options.score_threshold
     )
     predictions = predict_dataset(
-        detector,
+        predictor,
         records,
         frames,
         options.batch_size,
         inputs=camera_inputs.loader_arguments(config, frames, run.paths.embeddings),
     )
+    if not processes.is_main():
+        return None
+    out = pathlib.Path(out or run.workdir / "evaluation")
+    out.mkdir(parents=True, exist_ok=True)
     drawer = FrameDrawer(records, frames, predictions, config)
     ground_truth, table = tables_from_frames(frames)
-    protocols = tuple(options.protocols)
     report = write_report(
         ground_truth,
         predictions,
         table,
         out,
-        run=run.workdir.name,
-        classes=tuple(config.classes),
-        protocols=protocols,
-        # The papers' printed numbers fit this one best, see docs/evaluation.md.
-        paper_protocol="coco101" if "coco101" in protocols else protocols[0],
-        iou_thresholds=tuple(options.iou_thresholds),
-        roi=tuple(options.roi),
-        score_threshold=options.score_threshold,
-        skip_empty=None if options.skip_empty == "none" else options.skip_empty,
-        label_version=config.data.label_version,
-        invalid_sizes="false_positive",
+        report_options(config, run.workdir.name),
         bootstrap=options.bootstrap,
         left_out_before=frames.summary().counts,
         draw_frame=drawer,
@@ -107,64 +97,24 @@ def evaluate_run(
     return report
 
 
-def predict_dataset(
-    detector: Detector,
-    records: RecordSource,
-    frames: KRadar,
-    batch_size: int = 8,
-    *,
-    inputs: Mapping[str, Any] | None = None,
-    **settings: Any,
-) -> dict[str, np.ndarray]:
-    """Detections on every frame of a data set.
-
-    Args:
-        detector: Runs on batches of projections.
-        records: Projections of the frames.
-        frames: Which frames, in which order.
-        batch_size: Frames at once.
-        inputs: Further arguments of `make_loader`, see `camera_inputs`.
-        **settings: Further keyword arguments of a `Detector` call.
-
-    Returns:
-        Columns "frame" (position in `frames`), "box", "cls", "score".
-    """
-    loader = make_loader(
-        records,
-        frames,
-        batch_size=batch_size,
-        max_objects=max(len(frame.boxes) for frame in frames) or 1,
-        classes=detector.classes,
-        shuffle=False,
-        num_epochs=1,
-        pad_remainder=True,
-        **(inputs or {}),
+def report_options(config: Any, name: str) -> Options:
+    """How the config of a run says that it is evaluated, without intervals."""
+    options = config.evaluation
+    protocols = tuple(options.protocols)
+    return Options(
+        run=name,
+        classes=tuple(config.classes),
+        protocols=protocols,
+        # The papers' printed numbers fit this one best, see docs/evaluation.md.
+        paper_protocol="coco101" if "coco101" in protocols else protocols[0],
+        iou_thresholds=tuple(options.iou_thresholds),
+        roi=tuple(options.roi),
+        score_threshold=options.score_threshold,
+        skip_empty=None if options.skip_empty == "none" else options.skip_empty,
+        label_version=config.data.label_version,
+        invalid_sizes="false_positive",
+        bootstrap=0,
     )
-    taken: collections.deque[np.ndarray] = collections.deque()
-
-    def batches() -> Any:
-        for batch in loader:
-            taken.append(batch.frame)
-            has_image = batch.image is not None
-            yield (
-                (batch.projection, batch.image, batch.camera)
-                if has_image
-                else batch.projection
-            )
-
-    parts = []
-    with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:
-        for detections in detector.stream(batches(), **settings):
-            columns = detections.to_columns(detector.classes)
-            frame = taken.popleft()  # -1 where a batch was filled up
-            columns["frame"] = frame[columns["frame"]]
-            is_real = columns["frame"] >= 0
-            parts.append({name: c[is_real] for name, c in columns.items()})
-            bar.update(int((frame >= 0).sum()))
-    return {
-        name: np.concatenate([part[name] for part in parts])
-        for name in ("frame", "box", "cls", "score")
-    }
 
 
 def record_positions(records: RecordSource, frames: KRadar) -> list[int]:

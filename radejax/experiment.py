@@ -35,8 +35,8 @@ from radejax.data.records import RecordSource
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.training import loop
-from radejax.training.checkpoints import Checkpoints
+from radejax.training import loop, processes, sharding
+from radejax.training.checkpoints import BEST, Checkpoints
 from radejax.training.step import map_grid
 
 _log = logging.getLogger(__name__)
@@ -117,7 +117,8 @@ def run(
     """Everything from nothing to metrics; run again, it continues where it stopped.
 
     Args:
-        config: Complete configuration.
+        config: Complete configuration; with `seeds` one run of each, see
+            `seeds.run_seeds`.
         name: Of the config, for the default work folder.
         workdir: `runs/<name>` if None.
         data: K-Radar folders; None simulates them if the config says how.
@@ -134,17 +135,32 @@ def run(
         UserError: The work folder belongs to another configuration, no data, or no
             space.
     """
+    if config.seeds:
+        from radejax.seeds import run_seeds
+
+        return run_seeds(
+            config,
+            name=name,
+            workdir=workdir,
+            data=data,
+            labels=labels,
+            records=records,
+            init_from=init_from,
+        )
     started = time.perf_counter()
     workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
     models.build(config.model)  # a config that cannot be built should fail first
-    claim_workdir(workdir, config)
+    processes.main_first(lambda: claim_workdir(workdir, config))
     paths = dataclasses.replace(
-        prepare_data(config, data=data, labels=labels, records=records),
+        processes.main_first(
+            lambda: prepare_data(config, data=data, labels=labels, records=records)
+        ),
         embeddings=camera_inputs.saved_path(embeddings),
         image_backbone=camera_inputs.saved_path(image_backbone),
     )
     info = run_info(paths)
-    files.write_json(workdir / "run.json", info)
+    if processes.is_main():
+        files.write_json(workdir / "run.json", info)
     result = train(config, workdir, paths, info=info, init_from=init_from)
     if not result.finished:
         _log.info("stopped at step %d; run the same command to continue", result.step)
@@ -177,10 +193,10 @@ def claim_workdir(workdir: pathlib.Path, config: ConfigDict) -> None:
             fields that differ.
     """
     path = workdir / "config.json"
-    wanted = json.loads(config.to_json())
+    wanted = json.loads(config.to_json()) | {"profile": "", "seeds": []}
     if path.exists():
         found = files.read_json(path)
-        if found != wanted:
+        if found | {"watch": None} != wanted | {"watch": None}:
             raise UserError(
                 f"{_relative(workdir)} holds a run with another config: "
                 + "; ".join(_differences(found, wanted))
@@ -281,6 +297,9 @@ def train(
     frames = paths.open(config, split="train")
     if not len(frames):
         raise UserError(f"no frames of the train split in {', '.join(paths.roots)}")
+    sharding.check_batch_size(
+        config.train.batch_size, sharding.make_mesh(), "train.batch_size"
+    )
     loader = pipeline.make_loader(
         records,
         frames,
@@ -294,6 +313,11 @@ def train(
         label_permutation_seed=config.data.label_permutation_seed,
         **camera_inputs.loader_arguments(config, frames, paths.embeddings),
     )
+    evaluate = None
+    if config.train.evaluate_every_epochs:
+        from radejax.validation import Validation  # above: it reads whole runs
+
+        evaluate = Validation(config, paths)
     model, variables = models.build(config.model), None
     if init_from is not None:
         variables = initial_variables(init_from, config)
@@ -318,6 +342,8 @@ def train(
             process_count=jax.process_count(),
         ),
         pretrained=pretrained,
+        evaluate=evaluate,
+        trace_folder=config.profile,
     )
 
 
@@ -384,7 +410,9 @@ def run_info(paths: DataPaths) -> dict[str, Any]:
 
 
 def load_run(
-    workdir: PathLike, step: int | None = None, image_backbone: PathLike | None = None
+    workdir: PathLike,
+    step: int | str | None = None,
+    image_backbone: PathLike | None = None,
 ) -> Run:
     """The model of a work folder.
 
@@ -393,7 +421,7 @@ def load_run(
 
     Args:
         workdir: Of `train.py`.
-        step: Of the checkpoint; the newest if None.
+        step: Of the checkpoint, or "best" by `train.best_metric`; the newest if None.
         image_backbone: Weights of a frozen backbone, in place of those that the run
             was trained with.
 
@@ -406,7 +434,10 @@ def load_run(
         raise FileNotFoundError(
             f"no checkpoints in {workdir}: the run has not trained yet"
         )
-    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
+    folder = workdir / "checkpoints"
+    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
+        if step == "best":
+            step = checkpoints.best_step()
         state, info, step = checkpoints.restore_variables(step)
     params = state["ema_params"] if state.get("ema_params") else state["params"]
     data = info["run"]["data"]

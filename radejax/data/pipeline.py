@@ -159,9 +159,8 @@ def steps_per_epoch(
     process_count: int = 1,
 ) -> int:
     """Number of batches that `make_loader` gives per epoch and process."""
-    per_process = num_frames // process_count
     if drop_remainder:
-        return per_process // batch_size
+        return num_frames // (process_count * batch_size)
     return -(-num_frames // (process_count * batch_size))
 
 
@@ -194,12 +193,12 @@ def _make_order(
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
     if shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
-    dataset = dataset.random_map(_AddSeed())
-    if count > 1:
-        # Equal shares: all processes must take the same number of steps.
-        last = total // count * count if drop_remainder else total
-        dataset = dataset[slice(index, last, count)]
-    return dataset.batch(batch_size, drop_remainder=drop_remainder, batch_fn=np.stack)
+    dataset = dataset.random_map(_AddSeed()).batch(
+        batch_size * count, drop_remainder=drop_remainder, batch_fn=np.stack
+    )
+    # Of every global batch, its own rows: what is trained on, and in which order, does
+    # not depend on the number of processes.
+    return dataset if count == 1 else dataset.map(_Share(index, count))
 
 
 class _AddSeed(grain.transforms.RandomMap):
@@ -207,6 +206,19 @@ class _AddSeed(grain.transforms.RandomMap):
 
     def random_map(self, element: int, rng: np.random.Generator) -> np.ndarray:
         return np.array([element, rng.integers(2**62)], np.int64)
+
+
+class _Share(grain.transforms.Map):
+    """The rows of one process of a global batch."""
+
+    def __init__(self, index: int, count: int) -> None:
+        self._index, self._count = index, count
+
+    def __repr__(self) -> str:
+        return "_Share()"
+
+    def map(self, element: np.ndarray) -> np.ndarray:
+        return np.array_split(element, self._count)[self._index]
 
 
 class _LoadBatch(grain.transforms.Map):

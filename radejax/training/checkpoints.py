@@ -15,12 +15,18 @@ from typing import Any
 
 import grain
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as policies
 
+from radejax import files
 from radejax.errors import DataError, UserError
-from radejax.files import is_no_space
+from radejax.training import processes, sharding
 
 _log = logging.getLogger(__name__)
+
+BEST = "best"
+"""Name of the metric that decides which checkpoint is best; higher is better."""
 
 
 class Checkpoints:
@@ -43,10 +49,20 @@ class Checkpoints:
     ) -> None:
         self.folder = pathlib.Path(folder).absolute()
         self._best_metric = best_metric
+        kept = [policies.LatestN(n=max_to_keep)]
+        if best_metric is not None:
+            kept.append(
+                policies.BestN(
+                    get_metric_fn=lambda m: m[best_metric],
+                    n=1,
+                    keep_checkpoints_without_metrics=False,
+                )
+            )
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=None if read_only else max_to_keep,
+            preservation_policy=None
+            if read_only
+            else policies.AnyPreservationPolicy(kept),
             best_fn=(lambda m: m[best_metric]) if best_metric else None,
-            keep_checkpoints_without_metrics=True,
             create=not read_only,
             cleanup_tmp_directories=not read_only,
             read_only=read_only,
@@ -58,6 +74,24 @@ class Checkpoints:
         """Steps of the finished checkpoints, oldest first."""
         self._manager.reload()
         return sorted(self._manager.all_steps())
+
+    def best_step(self) -> int:
+        """Step of the checkpoint with the highest `best_metric`.
+
+        Raises:
+            FileNotFoundError: None was evaluated.
+        """
+        values = {}
+        for step in self.steps():
+            metrics = self._manager.metrics(step)
+            if metrics is not None and self._best_metric in metrics:
+                values[step] = metrics[self._best_metric]
+        if not values:
+            raise FileNotFoundError(
+                f"no checkpoint in {self.folder} was evaluated: train with "
+                "--config.train.evaluate_every_epochs=1 to have a best one"
+            )
+        return max(values, key=values.__getitem__)
 
     def save(
         self,
@@ -122,21 +156,19 @@ class Checkpoints:
         """
         steps = self.steps()
         for step in reversed(steps):
+            restored, reason = None, "another process could not read it"
             try:
                 restored = self._manager.restore(
-                    step,
-                    args=ocp.args.Composite(
-                        state=ocp.args.StandardRestore(state),
-                        data=grain.checkpoint.CheckpointRestore(data_iterator),
-                    ),
-                )
+                    step, args=ocp.args.Composite(state=ocp.args.StandardRestore(state))
+                )["state"]
+                self._restore_position(step, data_iterator)
             # Whatever a damaged file makes orbax, tensorstore or json raise.
             except Exception as error:
-                reason = str(error).strip().split("\n")[0]
-                _log.warning("checkpoint %d does not restore: %s", step, reason)
-                self._set_aside(step)
-                continue
-            return restored["state"], step
+                restored, reason = None, str(error).strip().split("\n")[0]
+            if processes.all_agree(restored is not None):
+                return restored, step
+            _log.warning("checkpoint %d does not restore: %s", step, reason)
+            self._set_aside(step)
         if steps:
             raise DataError(
                 f"none of the checkpoints {steps} in {self.folder} restores"
@@ -150,7 +182,8 @@ class Checkpoints:
             step: The newest if None.
 
         Returns:
-            State as nested dictionaries of arrays, the `info` saved with it, the step.
+            State as nested dictionaries of NumPy arrays, the `info` saved with it, the
+            step.
 
         Raises:
             FileNotFoundError: No checkpoint, or not that step.
@@ -166,20 +199,43 @@ class Checkpoints:
         restored = self._manager.restore(
             step,
             args=ocp.args.Composite(
-                state=ocp.args.StandardRestore(), info=ocp.args.JsonRestore()
+                state=ocp.args.StandardRestore(self._abstract(step)),
+                info=ocp.args.JsonRestore(),
             ),
         )
-        return restored["state"], restored["info"], step
+        state = jax.tree.map(np.asarray, restored["state"])
+        return state, restored["info"], step
+
+    def _abstract(self, step: int) -> Any:
+        """What a checkpoint holds, to restore whole on whatever devices there are."""
+        whole = sharding.replicated(sharding.make_mesh())
+        saved = self._manager.item_metadata(step)["state"]
+        return jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), saved
+        )
+
+    def _restore_position(self, step: int, data_iterator: Any) -> None:
+        """Sets the iterator to where it was, with any number of processes then and now.
+
+        All processes share each batch and stand at the same place, so that the file
+        of the first one is right for all.
+        """
+        folder = self.folder / str(step) / "data"
+        saved = sorted(folder.glob("process_0-of-*.json"))
+        if not saved:
+            raise FileNotFoundError(f"no position in the data in {folder}")
+        data_iterator.set_state(files.read_json(saved[0]))
 
     def _set_aside(self, step: int) -> None:
         """Renames a damaged checkpoint so that it can be looked at and saved anew."""
-        damaged = self.folder / str(step)
         target = self.folder.with_name(self.folder.name + "_damaged") / str(step)
-        if target.exists():
-            shutil.rmtree(target)
-        target.parent.mkdir(exist_ok=True)
-        damaged.rename(target)
-        _log.warning("moved it to %s", target)
+        if processes.is_main():
+            if target.exists():
+                shutil.rmtree(target)
+            target.parent.mkdir(exist_ok=True)
+            (self.folder / str(step)).rename(target)
+            _log.warning("moved it to %s", target)
+        processes.all_agree(True)  # the others wait until it is gone
         self._manager.reload()
 
     def close(self) -> None:
@@ -202,7 +258,7 @@ def abstract_state(state: Any, sharding: Any) -> Any:
 
 
 def _disk_full(error: OSError, folder: pathlib.Path) -> Exception:
-    if is_no_space(error):
+    if files.is_no_space(error):
         free = shutil.disk_usage(folder).free
         return UserError(
             f"no space left for a checkpoint in {folder} ({free / 2**20:.0f} MiB free); "

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import logging
 import pathlib
 import signal
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from radejax.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.training import sharding
-from radejax.training.checkpoints import Checkpoints, abstract_state
+from radejax.structures import Batch
+from radejax.training import processes, sharding
+from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
+from radejax.training.clock import Trace, seconds_since_start
 from radejax.training.state import (
     TrainState,
     create_state,
@@ -28,7 +29,7 @@ from radejax.training.state import (
     make_schedule,
 )
 from radejax.training.step import make_train_step, model_inputs
-from radejax.training.watch import Watch
+from radejax.training.watch import Scores, Watch
 
 _log = logging.getLogger(__name__)
 
@@ -48,7 +49,7 @@ class TrainResult:
     finished: bool
 
 
-Evaluate = Callable[[TrainState, int], Mapping[str, float]]
+Evaluate = Callable[[TrainState, int], Scores]
 
 
 def train(
@@ -64,6 +65,7 @@ def train(
     mesh: jax.sharding.Mesh | None = None,
     evaluate: Evaluate | None = None,
     pretrained: Mapping[str, Any] | None = None,
+    trace_folder: str = "",
 ) -> TrainResult:
     """Trains until the configured epochs are done, from where an earlier start ended.
 
@@ -74,14 +76,16 @@ def train(
         loader: Checkpointable grain iterator of `Batch`; endless.
         grid: Grid of the model's maps.
         workdir: Checkpoints and logs go here.
-        config: The whole configuration; `seed`, `loss` and `train` are read.
+        config: The whole configuration; `seed`, `loss`, `train` and `watch` are read.
         info: Plain values that each checkpoint carries.
         steps_per_epoch: Batches of one pass over the data.
         mesh: Devices to use; all by default.
-        evaluate: Called every `train.evaluate_every_epochs` epochs; what it returns is
-            logged and kept with the checkpoint.
+        evaluate: Called every `train.evaluate_every_epochs` epochs and at the end; what
+            it returns is logged and kept with the checkpoint, and the best checkpoint
+            is kept as well as the newest ones.
         pretrained: Part of the variables that takes the place of drawn ones, an image
             backbone's weights for example.
+        trace_folder: Writes a trace of the steps `watch.profile_steps` there.
 
     Raises:
         DataError: More than `train.max_skipped_steps` steps in a row without a finite
@@ -104,7 +108,8 @@ def train(
         gradient_clip_norm=options.gradient_clip_norm,
     )
     init = functools.partial(_init_state, model, optimizer, config)
-    given = _first_inputs(loader), variables, pretrained
+    # NumPy arrays: the same on every process, and so on every device.
+    given = _first_batch(loader), *jax.tree.map(np.asarray, (variables, pretrained))
     abstract = jax.eval_shape(init, *given)
     placement = sharding.state_sharding(abstract, mesh, options.parameter_sharding)
     step_fn = jax.jit(
@@ -119,29 +124,39 @@ def train(
         donate_argnums=0,
         out_shardings=(placement, sharding.replicated(mesh)),
     )
-    rng = jax.device_put(jax.random.key(config.seed + 1), sharding.replicated(mesh))
+    rng = jax.jit(jax.random.key, out_shardings=sharding.replicated(mesh))(
+        np.uint32(config.seed + 1)
+    )
     checkpoints = Checkpoints(
-        workdir / "checkpoints", max_to_keep=options.checkpoints_to_keep
+        workdir / "checkpoints",
+        max_to_keep=options.checkpoints_to_keep,
+        best_metric=BEST,
     )
     with checkpoints:
         # Frozen parameters are not in a checkpoint: they come from where they came from.
         saved = abstract_state(abstract, placement).replace(frozen={})
-        restored = checkpoints.restore(saved, loader)
+        restored, step = checkpoints.restore(saved, loader) or (None, 0)
+        state = restored
         if restored is None or abstract.frozen:
-            state, start = jax.jit(init, out_shardings=placement)(*given), 0
+            state = jax.jit(init, out_shardings=placement)(*given)
         if restored is not None:
-            found, start = restored
-            state = found.replace(frozen=state.frozen) if abstract.frozen else found
-            _log.info("continuing from step %d of %d", start, num_steps)
-        run = _Run(step_fn, loader, mesh, rng, checkpoints, info, options, evaluate)
+            state = restored.replace(frozen=state.frozen)
+            _log.info("continuing from step %d of %d", step, num_steps)
+        del given, restored
+        trace = Trace(trace_folder, *config.watch.profile_steps)
+        run = _Run(
+            step_fn, loader, mesh, rng, checkpoints, info, options, evaluate, trace
+        )
         with Watch(
             workdir,
-            start_step=start,
+            start_step=step,
             num_steps=num_steps,
             frames_per_step=options.batch_size,
-            is_main=jax.process_index() == 0,
+            is_main=processes.is_main(),
+            wandb_project=config.watch.wandb_project if config.watch.wandb else None,
+            config=info.get("config"),
         ) as watch:
-            return run(state, start, num_steps, steps_per_epoch, watch)
+            return run(state, step, num_steps, steps_per_epoch, watch)
 
 
 @dataclasses.dataclass
@@ -156,6 +171,7 @@ class _Run:
     info: Mapping[str, Any]
     options: Any
     evaluate: Evaluate | None
+    trace: Trace
 
     def __call__(
         self,
@@ -166,21 +182,21 @@ class _Run:
         watch: Watch,
     ) -> TrainResult:
         options, saved = self.options, start
-        with _StopOnSignal() as stop:
+        with _StopOnSignal() as event, contextlib.closing(self.trace):
+            stop = processes.AgreedStop(event, self.mesh)
             step = start
-            while step < num_steps and not stop.is_set():
-                waiting = time.perf_counter()
-                batch = sharding.put_batch(next(self.loader), self.mesh)
-                watch.add_data_wait(time.perf_counter() - waiting)
-                state, metrics = self.step_fn(state, batch, self.rng)
+            while step < num_steps and not stop():
+                state, metrics = self._step(state, watch, is_first=step == start)
                 step += 1
                 watch.tick(step)
                 if step % options.log_every_steps == 0 or step == num_steps:
                     watch.log(step, metrics, epoch=step / steps_per_epoch)
                     _check_skipped(state, options.max_skipped_steps)
-                scores = self._evaluate(state, step, num_steps, steps_per_epoch, watch)
+                scores = None
+                if self._is_evaluated(step, num_steps, steps_per_epoch):
+                    scores = self._evaluate(state, step, watch)
                 due = step % options.checkpoint_every_steps == 0 or step == num_steps
-                if due or scores:
+                if due or scores is not None:
                     self._save(step, state, scores)
                     saved = step
             if saved < step:
@@ -188,25 +204,50 @@ class _Run:
             self.checkpoints.wait()
         return TrainResult(state=state, step=step, finished=step >= num_steps)
 
-    def _evaluate(
-        self,
-        state: TrainState,
-        step: int,
-        num_steps: int,
-        steps_per_epoch: int,
-        watch: Watch,
-    ) -> Mapping[str, float] | None:
+    def _step(
+        self, state: TrainState, watch: Watch, *, is_first: bool
+    ) -> tuple[TrainState, Mapping[str, jax.Array]]:
+        """One step, begun; its time goes to data, host and compute."""
+        clock, busy = watch.clock, state.step
+        clock.lap("host")
+        batch = next(self.loader)
+        # While devices still work, nobody waits for data.
+        clock.lap("data" if is_first or busy.is_ready() else "compute")
+        self.trace.before_step()
+        batch = sharding.put_batch(batch, self.mesh)
+        clock.lap("host")
+        state, metrics = self.step_fn(state, batch, self.rng)
+        if is_first:
+            jax.block_until_ready(metrics)
+            took = clock.lap("other")
+            clock.take()
+            _log.info(
+                "first step %.1f s after the start, %.1f s of it to compile and run it",
+                seconds_since_start(),
+                took,
+            )
+        self.trace.after_step(metrics)
+        clock.lap("compute")
+        return state, metrics
+
+    def _is_evaluated(self, step: int, num_steps: int, steps_per_epoch: int) -> bool:
         every = self.options.evaluate_every_epochs * steps_per_epoch
-        if self.evaluate is None or not every or step % every or step == num_steps:
-            return None
+        if self.evaluate is None or not every:
+            return False
+        return step % every == 0 or step == num_steps
+
+    def _evaluate(self, state: TrainState, step: int, watch: Watch) -> Scores:
+        watch.clock.lap("host")
         scores = self.evaluate(state, step)
-        watch.write(step, scores)
+        watch.log_scores(step, scores)
+        watch.clock.lap("other")
         return scores
 
-    def _save(
-        self, step: int, state: TrainState, metrics: Mapping[str, float] | None
-    ) -> None:
+    def _save(self, step: int, state: TrainState, scores: Scores | None) -> None:
         _check_skipped(state, self.options.max_skipped_steps)
+        metrics = None
+        if scores is not None and scores.best is not None:
+            metrics = {**scores.values, BEST: scores.best}
         self.checkpoints.save(
             step,
             state.replace(frozen={}),
@@ -220,7 +261,7 @@ def _init_state(
     model: nn.Module,
     optimizer: Any,
     config: Any,
-    inputs: Any,
+    batch: Batch,
     variables: Mapping[str, Any] | None,
     pretrained: Mapping[str, Any] | None,
 ) -> TrainState:
@@ -228,7 +269,7 @@ def _init_state(
     if variables is None:
         keys = jax.random.split(jax.random.key(config.seed))
         rngs = {"params": keys[0], "dropout": keys[1]}
-        variables = model.init(rngs, *inputs, train=False)
+        variables = model.init(rngs, *model_inputs(batch), train=False)
     if pretrained is not None:
         from radejax.models.dinorade import with_pretrained
 
@@ -242,13 +283,12 @@ def _init_state(
     )
 
 
-def _first_inputs(loader: Any) -> Any:
-    """Inputs of the right shape to initialise with, without moving the iterator on."""
+def _first_batch(loader: Any) -> Batch:
+    """One empty frame of the right shapes, without moving the iterator on."""
     position = loader.get_state()
     batch = next(loader)
     loader.set_state(position)
-    one = jax.tree.map(lambda x: jnp.zeros((1, *x.shape[1:]), x.dtype), batch)
-    return model_inputs(one)
+    return jax.tree.map(lambda x: np.zeros((1, *x.shape[1:]), x.dtype), batch)
 
 
 def _check_skipped(state: TrainState, limit: int) -> None:
@@ -268,18 +308,16 @@ class _StopOnSignal:
         self._event = threading.Event()
         self._previous: dict[int, Any] = {}
 
-    def is_set(self) -> bool:
-        return self._event.is_set()
-
-    def __enter__(self) -> _StopOnSignal:
+    def __enter__(self) -> threading.Event:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGTERM, signal.SIGINT):
                 self._previous[number] = signal.signal(number, self._handle)
-        return self
+        return self._event
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
-            signal.signal(number, handler)
+            # None: set outside Python, by jax.distributed; it cannot be put back.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
     def _handle(self, number: int, _: Any) -> None:
         if self._event.is_set():

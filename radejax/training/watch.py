@@ -1,10 +1,12 @@
-"""What a run tells while it goes: progress bar, metrics.jsonl, TensorBoard."""
+"""What a run tells while it goes: bar, metrics.jsonl, TensorBoard, Weights & Biases."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 import pathlib
-import time
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +15,23 @@ import tensorboardX
 import tqdm
 
 from radejax import files
+from radejax.errors import UserError
+from radejax.training.clock import StepClock
+
+
+@dataclasses.dataclass(frozen=True)
+class Scores:
+    """What an evaluation during training found.
+
+    Attributes:
+        values: Metrics; the name of each tells its protocol.
+        best: The one that decides which checkpoint is best; None where undefined.
+        pictures: `[H, W, 3]` uint8 by name, on the main process.
+    """
+
+    values: Mapping[str, float]
+    best: float | None = None
+    pictures: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 class Watch:
@@ -27,6 +46,11 @@ class Watch:
         num_steps: Of the whole training.
         frames_per_step: For the rate.
         is_main: False on all processes but the first, which then log nothing.
+        wandb_project: Also log to this project of Weights & Biases; None: do not.
+        config: What Weights & Biases shows as the run's configuration.
+
+    Raises:
+        UserError: Weights & Biases is asked for and not installed.
     """
 
     def __init__(
@@ -37,6 +61,8 @@ class Watch:
         num_steps: int,
         frames_per_step: int,
         is_main: bool = True,
+        wandb_project: str | None = None,
+        config: Mapping[str, Any] | None = None,
     ) -> None:
         self._is_main = is_main
         self._frames_per_step = frames_per_step
@@ -58,29 +84,31 @@ class Watch:
             disable=not is_main,
             dynamic_ncols=True,
         )
-        self._last_time = time.perf_counter()
+        self._wandb = (
+            _start_wandb(wandb_project, folder, config)
+            if is_main and wandb_project is not None
+            else None
+        )
         self._last_step = start_step
-        self._data_wait_s = 0.0
-
-    def add_data_wait(self, seconds: float) -> None:
-        """Counts time in which the step had no batch to work on."""
-        self._data_wait_s += seconds
+        self.clock = StepClock()
 
     def tick(self, step: int) -> None:
         """Moves the bar."""
         self._bar.update(step - self._bar.n)
 
     def log(self, step: int, metrics: Mapping[str, Any], *, epoch: float) -> None:
-        """Writes the metrics of a step, with rate and data wait since the last log."""
-        now = time.perf_counter()
-        elapsed = now - self._last_time
-        steps = max(step - self._last_step, 1)
+        """Writes the metrics of a step, with rate and times since the last log."""
         values = {k: float(np.asarray(v)) for k, v in metrics.items()}
+        self.clock.lap("compute")  # the metrics had to be waited for
+        seconds = self.clock.take()
+        elapsed = max(sum(seconds.values()), 1e-9)
+        steps = max(step - self._last_step, 1)
         speed = {
             "frames_per_s": steps * self._frames_per_step / elapsed,
-            "data_wait_share": self._data_wait_s / elapsed,
+            "data_wait_share": seconds["data"] / elapsed,
+            **{f"{k}_ms_per_step": 1e3 * v / steps for k, v in seconds.items()},
         }
-        self._last_time, self._last_step, self._data_wait_s = now, step, 0.0
+        self._last_step = step
         self._bar.set_postfix_str(
             " ".join(f"{k} {v:.4g}" for k, v in values.items() if k in _ON_THE_BAR)
             + f" {speed['frames_per_s']:.1f} frames/s"
@@ -88,19 +116,36 @@ class Watch:
         )
         self.write(step, {**values, **speed, "epoch": epoch})
 
+    def log_scores(self, step: int, scores: Scores) -> None:
+        """Writes what an evaluation found."""
+        self.write(step, scores.values)
+        if not self._is_main:
+            return
+        for name, picture in scores.pictures.items():
+            self._board.add_image(name, picture, step, dataformats="HWC")
+        if self._wandb is not None and scores.pictures:
+            import wandb
+
+            images = {k: wandb.Image(v) for k, v in scores.pictures.items()}
+            self._wandb.log(images, step=step)
+
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Writes values that belong to a step, those of an evaluation for example."""
+        """Writes values that belong to a step."""
         if not self._is_main:
             return
         with self._jsonl.open("a") as file:
             file.write(json.dumps({"step": step, **values}) + "\n")
         for name, value in values.items():
-            self._board.add_scalar(name, value, step)
+            self._board.add_scalar(_board_name(name), value, step)
+        if self._wandb is not None:
+            self._wandb.log(dict(values), step=step)
 
     def close(self) -> None:
         self._bar.close()
         if self._board is not None:
             self._board.close()
+        if self._wandb is not None:
+            self._wandb.finish()
 
     def __enter__(self) -> Watch:
         return self
@@ -122,3 +167,29 @@ class Watch:
 
 
 _ON_THE_BAR = ("focal", "gwd", "smooth_l1")
+
+
+def _board_name(name: str) -> str:
+    """A name with the characters that TensorBoard takes."""
+    return re.sub(r"[^\w./-]", "_", name)
+
+
+def _start_wandb(
+    project: str, folder: pathlib.Path, config: Mapping[str, Any] | None
+) -> Any:
+    """The run of a work folder at Weights & Biases, continued if it is there."""
+    try:
+        import wandb
+    except ImportError as error:
+        raise UserError(
+            "config.watch.wandb is set, and wandb is not installed: "
+            "pip install 'radejax[wandb]'"
+        ) from error
+    return wandb.init(
+        project=project,
+        name=folder.name,
+        id=hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:16],
+        resume="allow",
+        dir=str(folder),
+        config=dict(config or {}),
+    )

@@ -132,6 +132,24 @@ def test_processes_share_every_epoch(loader, count):
         assert sorted(drawn) == list(range(12))
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_batches_do_not_depend_on_the_number_of_processes(loader, count):
+    whole = frames_of(loader(batch_size=6, num_epochs=2))
+    shares = [
+        frames_of(
+            loader(
+                batch_size=6 // count,
+                num_epochs=2,
+                process_index=i,
+                process_count=count,
+            )
+        )
+        for i in range(count)
+    ]
+    for rows, batch in zip(zip(*shares, strict=True), whole, strict=True):
+        assert list(itertools.chain(*rows)) == batch
+
+
 def test_processes_take_as_many_steps_when_frames_do_not_divide(loader):
     for batch_size, steps in ((1, 2), (2, 1)):
         options = {"process_count": 5, "num_epochs": 1, "batch_size": batch_size}

@@ -14,7 +14,8 @@ import pytest
 
 from radejax.errors import DataError
 from radejax.training import loop, sharding
-from radejax.training.checkpoints import Checkpoints
+from radejax.training.checkpoints import BEST, Checkpoints
+from radejax.training.watch import Scores
 
 Tiny = Any  # the fixture `tiny` of conftest.py
 STEPS_PER_EPOCH = 4
@@ -166,16 +167,40 @@ def test_steps_without_finite_loss_end_the_run_and_name_the_frames(
         run(workdir, Poisoned(tiny.loader(), 99, None))
 
 
-def test_evaluation_on_the_way_is_logged(run: Any, tiny: Tiny, workdir: Any) -> None:
+def test_evaluation_on_the_way_is_logged_and_the_best_kept(
+    run: Any, tiny: Tiny, workdir: Any
+) -> None:
     config = tiny.config.copy_and_resolve_references()
-    config.train.evaluate_every_epochs = 1
+    config.train.update(evaluate_every_epochs=1, num_epochs=3, checkpoints_to_keep=1)
     seen = []
 
-    def evaluate(state: Any, step: int) -> dict[str, float]:
+    def evaluate(state: Any, step: int) -> Scores:
         seen.append((step, int(state.step)))
-        return {"ap_bev_iou30_exact": 1.5}
+        best = {4: 1.5, 8: 3.5, 12: 2.5}[step]
+        picture = np.zeros((4, 6, 3), np.uint8)
+        return Scores({"validation/ap_bev_iou30/exact": best}, best, {"a": picture})
 
     run(workdir, config=config, evaluate=evaluate)
-    assert seen == [(4, 4)]  # the end of the run has its own evaluation
-    lines = (workdir / "metrics.jsonl").read_text().splitlines()
-    assert any(json.loads(line).get("ap_bev_iou30_exact") == 1.5 for line in lines)
+    assert seen == [(4, 4), (8, 8), (12, 12)]
+    rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
+    name = "validation/ap_bev_iou30/exact"
+    assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5]
+    with Checkpoints(
+        workdir / "checkpoints", best_metric=BEST, read_only=True
+    ) as checkpoints:
+        assert checkpoints.steps() == [8, 12]
+        assert checkpoints.best_step() == 8
+
+
+def test_times_of_a_step_are_split_and_a_trace_is_written(
+    run: Any, workdir: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", logger="radejax"):
+        run(workdir, trace_folder=str(workdir / "trace"))
+    assert "first step" in caplog.text
+    rows = [*map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())]
+    for row in rows[1:]:
+        parts = [row[f"{part}_ms_per_step"] for part in ("data", "compute", "host")]
+        assert min(parts) >= 0
+        np.testing.assert_allclose(sum(parts), 4e3 / row["frames_per_s"], rtol=1e-6)
+    assert list((workdir / "trace").rglob("*.xplane.pb"))

@@ -1,0 +1,85 @@
+"""Where the time of a training goes, and traces of it."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import time
+
+import jax
+
+_IMPORTED = time.perf_counter()
+
+PARTS = ("data", "compute", "host")
+
+
+class StepClock:
+    """Splits the time of the loop into waiting for data, computing, and the rest.
+
+    Each `lap` counts the time since the one before. "data": no device had work because
+    the batch was not there; "compute": waiting for devices; "host": everything else in
+    the loop, such as placing batches and writing logs; "other" does not belong to steps.
+    """
+
+    def __init__(self) -> None:
+        self._mark = time.perf_counter()
+        self._seconds = dict.fromkeys((*PARTS, "other"), 0.0)
+
+    def lap(self, part: str) -> float:
+        """Counts the time since the last lap for a part; returns it."""
+        now = time.perf_counter()
+        seconds = now - self._mark
+        self._seconds[part] += seconds
+        self._mark = now
+        return seconds
+
+    def take(self) -> dict[str, float]:
+        """Seconds of every part of steps since the last call."""
+        taken = {part: self._seconds[part] for part in PARTS}
+        self._seconds = dict.fromkeys(self._seconds, 0.0)
+        return taken
+
+
+class Trace:
+    """A trace of some steps for TensorBoard's profiler or Perfetto.
+
+    Args:
+        folder: Where it goes; empty for none.
+        first: First step of this start that is traced; 0 compiles.
+        last: Last one.
+    """
+
+    def __init__(self, folder: str, first: int, last: int) -> None:
+        self._folder, self._first, self._last = folder, first, last
+        self._count = 0
+        self._is_on = False
+
+    def before_step(self) -> None:
+        """Starts where the first traced step begins."""
+        if self._folder and self._count == self._first:
+            pathlib.Path(self._folder).mkdir(parents=True, exist_ok=True)
+            jax.profiler.start_trace(self._folder)
+            self._is_on = True
+
+    def after_step(self, result: object) -> None:
+        """Stops when the last traced step has computed its result."""
+        if self._is_on and self._count == self._last:
+            jax.block_until_ready(result)
+            self.close()
+        self._count += 1
+
+    def close(self) -> None:
+        """Writes what there is; nothing if no trace is under way."""
+        if self._is_on:
+            jax.profiler.stop_trace()
+            self._is_on = False
+
+
+def seconds_since_start() -> float:
+    """Age of this process; where the system does not tell, since the import of this."""
+    try:
+        fields = pathlib.Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()
+        started = int(fields[19]) / os.sysconf("SC_CLK_TCK")
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - started
+    except (OSError, AttributeError, ValueError, IndexError):
+        return time.perf_counter() - _IMPORTED

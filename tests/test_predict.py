@@ -1,0 +1,106 @@
+"""Predictions and scores of a data set: the same on one device and on eight."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from radejax import models
+from radejax.config import base_config
+from radejax.data.projection_job import project_dataset
+from radejax.data.records import RecordSource
+from radejax.detector import Detector
+from radejax.errors import UserError
+from radejax.experiment import DataPaths
+from radejax.predict import Predictor, predict_dataset
+from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.training import sharding
+from radejax.validation import Validation
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Five simulated frames, and a detector that was never trained."""
+    folder = tmp_path_factory.mktemp("predict")
+    simulation = default_config()
+    simulation.update(train_sequences=0, test_sequences=1, frames_per_sequence=5)
+    root = simulate_dataset(simulation, folder / "data", progress=False)
+    config = base_config()
+    config.model.update(
+        doppler_bins=simulation["grid"]["num_doppler"],
+        elevation_bins=simulation["grid"]["num_elevation"],
+        widths=(8, 8, 8),
+        decoder_width=8,
+        num_groups=4,
+        cbam="off",
+        neck="plain",
+        heads="default",
+    )
+    config.evaluation.update(score_threshold=0.45, batch_size=3)
+    config.watch.num_pictures = 1
+    paths = DataPaths((str(root),), None, str(folder / "records"))
+    frames = paths.open(config, "test")
+    project_dataset(frames, paths.records, num_workers=0, progress=False)
+    records = RecordSource(paths.records)
+    model = models.build(config.model)
+    inputs = np.zeros((1, *records.grid.projection_shape), np.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), inputs)
+    return SimpleNamespace(
+        config=config, paths=paths, frames=frames, records=records, variables=variables
+    )
+
+
+def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
+    predictor = Predictor(
+        setup.config,
+        setup.variables,
+        setup.records.grid,
+        score_threshold=0.45,
+        mesh=sharding.make_mesh(num_devices),
+    )
+    return predict_dataset(predictor, setup.records, setup.frames, 3, progress=False)
+
+
+def _assert_same(actual: Any, expected: Any) -> None:
+    np.testing.assert_array_equal(actual["frame"], expected["frame"])
+    np.testing.assert_array_equal(actual["cls"], expected["cls"])
+    np.testing.assert_allclose(actual["score"], expected["score"], rtol=1e-5)
+    np.testing.assert_allclose(actual["box"], expected["box"], rtol=1e-4, atol=1e-4)
+
+
+def test_eight_devices_and_a_detector_predict_the_same_as_one(
+    setup: SimpleNamespace,
+) -> None:
+    expected = _predict(setup, 1)
+    assert set(expected["frame"]) == set(range(5))
+    assert len(expected["frame"]) > 50
+    _assert_same(_predict(setup, 8), expected)
+    detector = Detector.from_config(
+        setup.config, setup.variables, setup.records.grid, score_threshold=0.45
+    )
+    alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
+    _assert_same(alone, expected)
+
+
+def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
+    state = SimpleNamespace(eval_variables=setup.variables)
+    scores = Validation(setup.config, setup.paths)(state, 7)
+    name = "validation/map_3d_iou30/kradar_r40/score>0.45"
+    assert any(key.startswith(name) for key in scores.values)
+    assert any(key.endswith("/Sedan") for key in scores.values)
+    means = [v for k, v in scores.values.items() if k.startswith(name)]
+    assert means == [scores.best]
+    (picture,) = scores.pictures.values()
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
+    alone = Validation(setup.config, setup.paths, sharding.make_mesh(1))(state, 7)
+    assert alone.values == pytest.approx(scores.values)
+
+
+def test_a_best_metric_that_is_not_measured_is_refused(setup: SimpleNamespace) -> None:
+    config = setup.config.copy_and_resolve_references()
+    config.train.best_metric = "map_3d_iou70"
+    with pytest.raises(UserError, match=r"'map_3d_iou70'.* map_3d_iou30, "):
+        Validation(config, setup.paths)

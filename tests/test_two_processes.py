@@ -1,0 +1,121 @@
+"""Two processes that train one model together, against one process with two devices."""
+
+import json
+import os
+import pathlib
+import shutil
+import socket
+import subprocess
+import sys
+
+import chex
+import numpy as np
+import pytest
+
+from radejax.experiment import load_run
+
+REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
+OVERRIDES = [
+    "--config=configs/quickstart.py:short",
+    "--config.simulation.train_sequences=2",
+    "--config.simulation.frames_per_sequence=5",
+    "--config.model.widths=(8,8,16)",
+    "--config.model.decoder_width=8",
+    "--config.model.num_groups=4",
+    "--config.model.cbam=off",
+    "--config.train.num_epochs=3",
+    "--config.train.log_every_steps=1",
+    "--config.train.checkpoint_every_steps=3",
+    "--config.train.checkpoints_to_keep=9",
+    "--config.evaluation.num_pictures=0",
+    "--config.evaluation.batch_size=3",
+]
+MIDDLE = 3  # of six steps
+
+
+def _train(folder: pathlib.Path, run: str, num_processes: int) -> None:
+    """Runs train.py on two devices, of one process or one of each of two."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        coordinator = f"127.0.0.1:{free.getsockname()[1]}"
+    command = [sys.executable, "train.py", *OVERRIDES]
+    command += [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
+    started = []
+    for i in range(num_processes):
+        more = [f"--coordinator={coordinator}", f"--num_processes={num_processes}"]
+        more = [*more, f"--process_id={i}"] if num_processes > 1 else []
+        started.append(
+            subprocess.Popen(
+                command + more,
+                cwd=REPOSITORY,
+                env={
+                    **os.environ,
+                    "JAX_PLATFORMS": "cpu",
+                    "JAX_NUM_CPU_DEVICES": str(2 // num_processes),
+                },
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
+        )
+    outputs = [process.communicate(timeout=900)[0] for process in started]
+    for process in started:
+        assert process.returncode == 0, "\n".join(outputs)
+    assert "Done in" in outputs[0]
+    assert not any("Done in" in output for output in outputs[1:])
+
+
+def _cut(folder: pathlib.Path, run: str, to: str) -> None:
+    """A copy of a run as it was in its middle."""
+    shutil.copytree(folder / run, folder / to)
+    for path in (folder / to / "checkpoints").iterdir():
+        if path.name.isdigit() and int(path.name) > MIDDLE:
+            shutil.rmtree(path)
+    shutil.rmtree(folder / to / "evaluation")
+
+
+def _losses(folder: pathlib.Path) -> list[tuple[int, list[float]]]:
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    rows = [json.loads(line) for line in lines]
+    names = ("focal", "gwd", "smooth_l1", "grad_norm")
+    return [(row["step"], [row[name] for name in names]) for row in rows]
+
+
+def _aps(folder: pathlib.Path) -> list:
+    rows = (folder / "evaluation" / "metrics.csv").read_text().splitlines()
+    return [row.split(",")[1:] for row in rows[1:]]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Folder with the runs "one" and "two", and what each continued of the other."""
+    folder = tmp_path_factory.mktemp("processes")
+    _train(folder, "two", 2)
+    _train(folder, "one", 1)
+    _cut(folder, "two", "two_then_one")
+    _train(folder, "two_then_one", 1)
+    _cut(folder, "one", "one_then_two")
+    _train(folder, "one_then_two", 2)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("run", ["two", "two_then_one", "one_then_two"])
+def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
+    expected, actual = _losses(runs / "one"), _losses(runs / run)
+    assert [step for step, _ in actual] == list(range(1, 7))
+    np.testing.assert_allclose(
+        [v for _, v in actual], [v for _, v in expected], rtol=1e-5
+    )
+    chex.assert_trees_all_close(
+        load_run(runs / run).variables, load_run(runs / "one").variables, atol=1e-6
+    )
+    assert _aps(runs / run) == _aps(runs / "one")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_only_one_process_writes(runs: pathlib.Path) -> None:
+    assert len(list((runs / "two" / "tensorboard").iterdir())) == 1
+    assert not list(runs.rglob("*.tmp"))
