@@ -101,7 +101,7 @@ def _model() -> ConfigDict:
             "pad_multiple": 8,
             "crop_output": True,
             "dtype": "float32",  # of the computation; parameters are float32
-            "remat": False,
+            "remat": "none",  # "blocks", "full": less memory, more time
             "heatmap_prior": 0.5,  # confidence of an untrained model, as released
         }
     )

@@ -61,7 +61,8 @@ class DinoRade(nn.Module):
 
     def setup(self) -> None:
         radar, dtype = self.radar, jnp.dtype(self.radar.dtype)
-        self.backbone = Backbone(
+        stage, blocks = radenet.remat_stage(radar.remat), radar.remat != "none"
+        self.backbone = stage(Backbone)(
             radar.doppler_bins,
             radar.widths,
             radar.decoder_width,
@@ -69,15 +70,15 @@ class DinoRade(nn.Module):
             radar.cbam,
             radar.input_stem,
             dtype=dtype,
-            remat=radar.remat,
+            remat=blocks,
         )
-        self.neck = Neck(radar.neck, radar.num_groups, dtype, radar.remat)
-        self.heads = Heads(
+        self.neck = stage(Neck)(radar.neck, radar.num_groups, dtype, blocks)
+        self.heads = stage(Heads)(
             radar.num_classes,
             radar.heads,
             radar.num_groups,
             dtype,
-            radar.remat,
+            blocks,
             radar.heatmap_prior,
         )
         if self.vit is None:
@@ -92,7 +93,7 @@ class DinoRade(nn.Module):
             **self.fusion,
             num_groups=radar.num_groups,
             dtype=dtype,
-            remat=radar.remat,
+            remat=blocks,
         )
 
     def __call__(

@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -21,6 +21,10 @@ from radejax.models.neck import Neck, NeckKind
 from radejax.structures import DetectionMaps
 
 DTYPES = ("float32", "bfloat16")
+
+REMAT = ("none", "blocks", "full")
+"""What the backward pass computes again instead of keeping: nothing, the inside of each
+block, or also all but the ends of backbone, neck and heads."""
 
 
 class RadeNet(nn.Module):
@@ -43,7 +47,7 @@ class RadeNet(nn.Module):
         pad_multiple: Multiple of 2 ** len(widths).
         crop_output: Cut the maps back to the projection's bins.
         dtype: "float32" or "bfloat16", of the computation; outputs are float32.
-        remat: Recompute blocks in the backward pass: less memory, more time.
+        remat: One of `REMAT`: less memory, more time, the same gradients.
         heatmap_prior: Confidence of an untrained model; see `radejax.models.heads.Heads`.
     """
 
@@ -60,7 +64,7 @@ class RadeNet(nn.Module):
     pad_multiple: int = 8
     crop_output: bool = False
     dtype: str = "float32"
-    remat: bool = False
+    remat: str = "none"
     heatmap_prior: float = 0.5
 
     @nn.compact
@@ -85,7 +89,9 @@ class RadeNet(nn.Module):
             )
         dtype = jnp.dtype(self.dtype)
         x = pad_to_multiple(projection.astype(dtype), self.pad_multiple)
-        x = Backbone(
+        stage = remat_stage(self.remat)
+        blocks = self.remat != "none"
+        x = stage(Backbone)(
             self.doppler_bins,
             self.widths,
             self.decoder_width,
@@ -93,16 +99,16 @@ class RadeNet(nn.Module):
             self.cbam,
             self.input_stem,
             dtype=dtype,
-            remat=self.remat,
+            remat=blocks,
             name="backbone",
         )(x)
-        x = Neck(self.neck, self.num_groups, dtype, self.remat, name="neck")(x)
-        maps = Heads(
+        x = stage(Neck)(self.neck, self.num_groups, dtype, blocks, name="neck")(x)
+        maps = stage(Heads)(
             self.num_classes,
             self.heads,
             self.num_groups,
             dtype,
-            self.remat,
+            blocks,
             self.heatmap_prior,
             name="heads",
         )(x)
@@ -110,6 +116,11 @@ class RadeNet(nn.Module):
             r, a = projection.shape[1:3]
             maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
         return maps
+
+
+def remat_stage(remat: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
+    """What makes a large part of a model forget its inside, where `remat` says so."""
+    return nn.remat if remat == "full" else lambda module: module
 
 
 def pad_to_multiple(x: jax.Array, multiple: int) -> jax.Array:
@@ -142,6 +153,7 @@ _CHOICES = {
     "neck": ("dilated", "plain"),
     "heads": ("expanded", "default"),
     "dtype": DTYPES,
+    "remat": (*REMAT, False, True),  # as configs of earlier versions say it
 }
 
 
@@ -164,6 +176,8 @@ def from_config(config: Mapping[str, Any]) -> RadeNet:
     fields["widths"] = tuple(fields["widths"])
     if fields["cbam"] == "off":
         fields["cbam"] = None
+    if isinstance(fields["remat"], bool):
+        fields["remat"] = "blocks" if fields["remat"] else "none"
     model = RadeNet(**fields)
     _check_sizes(model)
     return model

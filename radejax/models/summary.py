@@ -68,7 +68,7 @@ def summarize(
     x = jax.ShapeDtypeStruct((batch, num_range, num_azimuth, channels), jnp.float32)
     variables = jax.eval_shape(model.init, jax.random.key(0), x)
     # Without rematerialisation every module's output can be seen.
-    run = functools.partial(model.clone(remat=False).apply, capture_intermediates=True)
+    run = functools.partial(model.clone(remat="none").apply, capture_intermediates=True)
     _, captured = jax.eval_shape(run, variables, x)
     outputs = {
         path[:-1]: value[0]

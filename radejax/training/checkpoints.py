@@ -126,7 +126,8 @@ class Checkpoints:
                 ),
                 metrics=dict(metrics) if metrics else None,
             )
-        except OSError as error:
+        # tensorstore's errors have no class of their own.
+        except Exception as error:
             raise _disk_full(error, self.folder) from error
 
     def wait(self) -> None:
@@ -137,7 +138,8 @@ class Checkpoints:
         """
         try:
             self._manager.wait_until_finished()
-        except OSError as error:
+        # tensorstore's errors have no class of their own.
+        except Exception as error:
             raise _disk_full(error, self.folder) from error
 
     def restore(self, state: Any, data_iterator: Any) -> int | None:
@@ -209,7 +211,9 @@ class Checkpoints:
     def _abstract(self, step: int) -> Any:
         """What a checkpoint holds, to restore whole on whatever devices there are."""
         whole = sharding.replicated(sharding.make_mesh())
-        saved = self._manager.item_metadata(step)["state"]
+        with ocp.StandardCheckpointer() as checkpointer:
+            metadata = checkpointer.metadata(self.folder / str(step) / "state")
+        saved = metadata.item_metadata.tree
         return jax.tree.map(
             lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), saved
         )
@@ -257,7 +261,7 @@ def abstract_state(state: Any, sharding: Any) -> Any:
     )
 
 
-def _disk_full(error: OSError, folder: pathlib.Path) -> Exception:
+def _disk_full(error: Exception, folder: pathlib.Path) -> Exception:
     if files.is_no_space(error):
         free = shutil.disk_usage(folder).free
         return UserError(

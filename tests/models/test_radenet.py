@@ -99,8 +99,11 @@ def test_remat_changes_neither_parameters_nor_gradients(small):
 
         return jax.jit(jax.grad(loss))(variables)
 
-    remat = gradient(models.build(small | {"remat": True}))
-    chex.assert_trees_all_close(remat, gradient(model), rtol=1e-3, atol=1e-3)
+    expected = gradient(model)
+    for policy in ("blocks", "full"):
+        remat = gradient(models.build(small | {"remat": policy}))
+        chex.assert_trees_all_close(remat, expected, rtol=1e-3, atol=1e-3)
+    assert models.build(small | {"remat": True}).remat == "blocks"
 
 
 def test_bfloat16_is_near_float32(small):

@@ -1,6 +1,8 @@
 """Checkpoints by themselves: what is kept, what is refused."""
 
 import pathlib
+import subprocess
+from collections.abc import Iterator
 from typing import Any
 
 import grain
@@ -9,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import DataError
+from radejax.errors import DataError, UserError
 from radejax.training import sharding
 from radejax.training.checkpoints import Checkpoints, abstract_state
 
@@ -93,3 +95,44 @@ def test_a_half_written_folder_is_not_a_checkpoint(tmp_path: pathlib.Path) -> No
     with Checkpoints(tmp_path) as checkpoints:
         assert checkpoints.steps() == [1, 2]
         assert checkpoints.restore(_abstract(), _iterator())[1] == 2
+
+
+@pytest.fixture
+def small_disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A file system of 3 MiB; needs the rights to mount one."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", str(folder)]
+    try:
+        subprocess.run(mount, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("cannot mount a small file system here")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_one_clear_error_and_earlier_checkpoints_stay(
+    small_disk: pathlib.Path,
+) -> None:
+    # Random bits do not compress: 1 MiB a checkpoint.
+    values = np.random.default_rng(0).random((8, 2**15), np.float32)
+
+    def state(step: int) -> dict[str, jax.Array]:
+        return {"w": jnp.asarray(values * step), "step": jnp.int32(step)}
+
+    iterator, folder = _iterator(), small_disk / "checkpoints"
+    checkpoints = Checkpoints(folder, max_to_keep=None)
+
+    def fill() -> None:
+        for step in range(1, 99):
+            checkpoints.save(step, state(step), iterator, info={})
+            checkpoints.wait()
+
+    with pytest.raises(UserError, match=r"no space left for a checkpoint .*intact"):
+        fill()
+    whole = sharding.replicated(sharding.make_mesh(1))
+    with Checkpoints(folder) as intact:
+        wanted = abstract_state(state(1), {"w": whole, "step": whole})
+        restored, step = intact.restore(wanted, _iterator())
+    assert step >= 2
+    np.testing.assert_array_equal(restored["w"], values * step)

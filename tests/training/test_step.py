@@ -149,6 +149,24 @@ def _metrics_of(step: Any, state: Any, batch: Any, rng: Any) -> Any:
     return step(state, batch, rng)[1]
 
 
+def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(
+    tiny: Tiny, start: Any
+) -> None:
+    optimizer, state = start
+    narrow = make_train_step(
+        tiny.model.clone(dtype="bfloat16"),
+        optimizer,
+        tiny.map_grid,
+        loss=dict(tiny.config.loss),
+        ema_decay=0.9,
+    )
+    after, metrics = jax.eval_shape(narrow, state, _batch(tiny), RNG)
+    floats = [x.dtype for x in jax.tree.leaves(after) if x.dtype != jnp.int32]
+    assert set(floats) == {jnp.dtype("float32")}
+    losses = ("loss", "focal", "gwd", "smooth_l1", "grad_norm")
+    assert {metrics[name].dtype for name in losses} == {jnp.dtype("float32")}
+
+
 def test_map_grid_follows_padding_and_cropping(tiny: Tiny) -> None:
     padded = map_grid(tiny.grid, tiny.model.clone(crop_output=False), "true")
     assert (padded.num_range, padded.num_azimuth) == (16, 16)

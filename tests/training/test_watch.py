@@ -2,8 +2,13 @@
 
 import json
 import pathlib
+import sys
 
-from radejax.training.watch import Watch
+import numpy as np
+import pytest
+
+from radejax.errors import UserError
+from radejax.training.watch import Scores, Watch
 
 
 def _steps(folder: pathlib.Path) -> list[int]:
@@ -39,3 +44,57 @@ def test_other_processes_write_nothing(tmp_path: pathlib.Path) -> None:
     ) as watch:
         watch.log(1, {"focal": 1.0}, epoch=1.0)
     assert not list(tmp_path.iterdir())
+
+
+class FakeWandb:
+    """What `Watch` needs of the module wandb."""
+
+    def __init__(self) -> None:
+        self.init_arguments: dict = {}
+        self.logged: list = []
+        self.is_finished = False
+
+    def init(self, **arguments: object) -> "FakeWandb":
+        self.init_arguments = arguments
+        return self
+
+    def log(self, values: dict, step: int) -> None:
+        self.logged.append((step, values))
+
+    def finish(self) -> None:
+        self.is_finished = True
+
+    def Image(self, pixels: np.ndarray) -> tuple:
+        return ("image", pixels.shape)
+
+
+def test_weights_and_biases_gets_metrics_pictures_and_the_config(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = FakeWandb()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    options = {"num_steps": 4, "frames_per_step": 2, "wandb_project": "p"}
+    with Watch(tmp_path, start_step=0, config={"seed": 3}, **options) as watch:
+        watch.log(1, {"focal": 2.5}, epoch=0.5)
+        picture = np.zeros((4, 6, 3), np.uint8)
+        watch.log_scores(2, Scores({"ap/exact": 7.0}, 7.0, {"frame": picture}))
+    assert fake.init_arguments["project"] == "p"
+    assert fake.init_arguments["config"] == {"seed": 3}
+    assert fake.logged[0][0] == 1
+    assert fake.logged[0][1]["focal"] == 2.5
+    assert fake.logged[1:] == [
+        (2, {"ap/exact": 7.0}),
+        (2, {"frame": ("image", (4, 6, 3))}),
+    ]
+    assert fake.is_finished
+    run_id = fake.init_arguments["id"]
+    with Watch(tmp_path, start_step=2, **options):
+        assert fake.init_arguments["id"] == run_id  # the same run goes on
+
+
+def test_weights_and_biases_that_is_not_installed_is_named(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(UserError, match=r"wandb is not installed: pip install"):
+        Watch(tmp_path, start_step=0, num_steps=1, frames_per_step=1, wandb_project="p")
