@@ -344,6 +344,7 @@ def train(
         pretrained=pretrained,
         evaluate=evaluate,
         trace_folder=config.profile,
+        frame_names=[frame.key for frame in frames],
     )
 
 

@@ -9,7 +9,7 @@ import logging
 import pathlib
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -66,6 +66,7 @@ def train(
     evaluate: Evaluate | None = None,
     pretrained: Mapping[str, Any] | None = None,
     trace_folder: str = "",
+    frame_names: Sequence[str] | None = None,
 ) -> TrainResult:
     """Trains until the configured epochs are done, from where an earlier start ended.
 
@@ -86,6 +87,7 @@ def train(
         pretrained: Part of the variables that takes the place of drawn ones, an image
             backbone's weights for example.
         trace_folder: Writes a trace of the steps `watch.profile_steps` there.
+        frame_names: What `Batch.frame` counts, for messages; its numbers if None.
 
     Raises:
         DataError: More than `train.max_skipped_steps` steps in a row without a finite
@@ -145,7 +147,16 @@ def train(
         del given, restored
         trace = Trace(trace_folder, *config.watch.profile_steps)
         run = _Run(
-            step_fn, loader, mesh, rng, checkpoints, info, options, evaluate, trace
+            step_fn,
+            loader,
+            mesh,
+            rng,
+            checkpoints,
+            info,
+            options,
+            evaluate,
+            trace,
+            frame_names,
         )
         with Watch(
             workdir,
@@ -172,6 +183,7 @@ class _Run:
     options: Any
     evaluate: Evaluate | None
     trace: Trace
+    frame_names: Sequence[str] | None
 
     def __call__(
         self,
@@ -191,7 +203,7 @@ class _Run:
                 watch.tick(step)
                 if step % options.log_every_steps == 0 or step == num_steps:
                     watch.log(step, metrics, epoch=step / steps_per_epoch)
-                    _check_skipped(state, options.max_skipped_steps)
+                    self._check_skipped(state)
                 scores = None
                 if self._is_evaluated(step, num_steps, steps_per_epoch):
                     scores = self._evaluate(state, step, watch)
@@ -244,7 +256,7 @@ class _Run:
         return scores
 
     def _save(self, step: int, state: TrainState, scores: Scores | None) -> None:
-        _check_skipped(state, self.options.max_skipped_steps)
+        self._check_skipped(state)
         metrics = None
         if scores is not None and scores.best is not None:
             metrics = {**scores.values, BEST: scores.best}
@@ -255,6 +267,18 @@ class _Run:
             info=self.info,
             metrics=metrics,
         )
+
+    def _check_skipped(self, state: TrainState) -> None:
+        in_row, limit = int(state.num_skipped_in_row), self.options.max_skipped_steps
+        if in_row > limit:
+            frames = np.asarray(state.skipped_frames).tolist()
+            if self.frame_names is not None:
+                frames = [self.frame_names[i] for i in frames]
+            raise DataError(
+                f"loss or gradient was not finite in {in_row} steps in a row (limit "
+                f"train.max_skipped_steps={limit}); frames of the last batch: "
+                + ", ".join(map(str, frames))
+            )
 
 
 def _init_state(
@@ -289,16 +313,6 @@ def _first_batch(loader: Any) -> Batch:
     batch = next(loader)
     loader.set_state(position)
     return jax.tree.map(lambda x: np.zeros((1, *x.shape[1:]), x.dtype), batch)
-
-
-def _check_skipped(state: TrainState, limit: int) -> None:
-    in_row = int(state.num_skipped_in_row)
-    if in_row > limit:
-        frames = np.asarray(state.skipped_frames).tolist()
-        raise DataError(
-            f"loss or gradient was not finite in {in_row} steps in a row (limit "
-            f"train.max_skipped_steps={limit}); frames of the last batch: {frames}"
-        )
 
 
 class _StopOnSignal:

@@ -139,15 +139,21 @@ def test_a_damaged_newest_checkpoint_falls_back(
     chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
 
 
-def test_a_run_on_four_devices_continues_on_one(
-    run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
+@pytest.mark.parametrize(("first", "then"), [(4, 1), (1, 4)])
+def test_a_run_continues_on_another_number_of_devices(
+    first: int,
+    then: int,
+    run: Any,
+    tiny: Tiny,
+    undisturbed: Any,
+    workdir: pathlib.Path,
 ) -> None:
     def stop() -> None:
         raise RuntimeError("moved")
 
     with pytest.raises(RuntimeError, match="moved"):
-        run(workdir, Stopping(tiny.loader(), 6, stop), mesh=sharding.make_mesh(4))
-    again = run(workdir)
+        run(workdir, Stopping(tiny.loader(), 6, stop), mesh=sharding.make_mesh(first))
+    again = run(workdir, mesh=sharding.make_mesh(then))
     assert again.finished
     losses, expected = _losses(workdir), _losses(undisturbed[1])
     np.testing.assert_allclose(
@@ -163,8 +169,11 @@ def test_steps_without_finite_loss_end_the_run_and_name_the_frames(
             batch = super().__next__()
             return batch.replace(projection=batch.projection * np.float16(np.nan))
 
-    with pytest.raises(DataError, match=r"3 steps in a row .*frames.*: \[\d+, "):
-        run(workdir, Poisoned(tiny.loader(), 99, None))
+    names = [f"7/frame{i}" for i in range(16)]
+    with pytest.raises(
+        DataError, match=r"3 steps in a row .*batch: 7/frame\d+, 7/frame\d+, "
+    ):
+        run(workdir, Poisoned(tiny.loader(), 99, None), frame_names=names)
 
 
 def test_evaluation_on_the_way_is_logged_and_the_best_kept(

@@ -10,6 +10,10 @@ import numpy as np
 import optax
 import pytest
 
+from radejax.data.encoding import to_float
+from radejax.detection.decode import decode
+from radejax.geometry.boxes import boxes7_from_8
+from radejax.geometry.rotated_iou import bev_iou
 from radejax.training import sharding
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step, map_grid
@@ -58,6 +62,26 @@ def test_steps_lower_the_loss(tiny: Tiny, start: Any, step: Any) -> None:
     assert int(state.num_skipped) == 0
 
 
+def test_one_scene_is_learnt_by_heart(tiny: Tiny, start: Any, step: Any) -> None:
+    state = start[1]
+    batch = jax.tree.map(lambda x: np.repeat(x[:1], 4, 0), tiny.frames)
+    first = None
+    for _ in range(400):
+        state, metrics = step(state, batch, RNG)
+        first = first or metrics
+    assert float(metrics["focal"]) < 0.01 * float(first["focal"])
+    assert float(metrics["smooth_l1"]) < 0.1 * float(first["smooth_l1"])
+    maps = jax.jit(tiny.model.apply)(
+        state.eval_variables, to_float(batch.projection[:1])
+    )
+    found = decode(maps, tiny.map_grid, max_detections=8, score_threshold=0.3)
+    boxes = np.asarray(found.boxes[0])[np.asarray(found.is_valid[0])]
+    wanted = np.asarray(boxes7_from_8(batch.boxes[0, :2]))
+    overlap = np.asarray(bev_iou(wanted, boxes))
+    assert len(boxes) == 2
+    assert overlap.max(1).min() > 0.5
+
+
 def test_moving_average_follows_the_parameters(
     tiny: Tiny, start: Any, step: Any
 ) -> None:
@@ -104,14 +128,15 @@ def plain(tiny: Tiny, start: Any) -> tuple[Any, Any, Any]:
     """
     optimizer = optax.sgd(0.1)
     variables = {"params": start[1].params}
-    state = create_state(variables, optimizer, batch_size=4, use_ema=True)
-    return optimizer, state, jax.jit(_make(tiny, optimizer))(state, _batch(tiny), RNG)
+    state = create_state(variables, optimizer, batch_size=8, use_ema=True)
+    result = jax.jit(_make(tiny, optimizer))(state, _batch(tiny, 8), RNG)
+    return optimizer, state, result
 
 
 @pytest.mark.parametrize("parameters", ["replicated", "fsdp"])
-def test_four_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None:
+def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None:
     optimizer, state, (expected, expected_metrics) = plain
-    mesh = sharding.make_mesh(4)
+    mesh = sharding.make_mesh(8)
     placement = sharding.state_sharding(state, mesh, parameters, min_size=64)
     if parameters == "fsdp":
         assert any(not s.is_fully_replicated for s in jax.tree.leaves(placement.params))
@@ -119,7 +144,7 @@ def test_four_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None
         _make(tiny, optimizer), out_shardings=(placement, sharding.replicated(mesh))
     )
     on_mesh = jax.device_put((state, RNG), (placement, sharding.replicated(mesh)))
-    batch = sharding.put_batch(_batch(tiny), mesh)
+    batch = sharding.put_batch(_batch(tiny, 8), mesh)
     with jax.transfer_guard("disallow"):
         actual, metrics = sharded(on_mesh[0], batch, on_mesh[1])
     chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-4, atol=1e-5)

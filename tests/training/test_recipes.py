@@ -1,0 +1,180 @@
+"""The configs of both papers: what they say, and two steps of each at tiny size."""
+
+import importlib.util
+import pathlib
+from typing import Any
+
+import chex
+import jax
+import numpy as np
+import pytest
+
+from radejax import models
+from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.structures import Batch
+from radejax.training.state import create_state, make_optimizer, make_schedule
+from radejax.training.step import make_train_step, map_grid
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
+SIZE = (32, 48)
+ALL = [
+    *(("radenet", words) for words in ("", "paper", "official", "sedan", "stem")),
+    *(("radenet", words) for words in ("base", "cbam", "cbam_heads", "expand")),
+    *(("dinorade", words) for words in ("", "paper", "official", "rc", "r")),
+    *(("dinorade", words) for words in ("rcw_resnet50", "sedan")),
+    *((name, "") for name in ("quickstart", "quickstart_fusion")),
+    ("simulate_real_scenes", ""),
+]
+
+
+def _get(name: str, words: str = "") -> Any:
+    spec = importlib.util.spec_from_file_location(name, CONFIGS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.get_config(words)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "batch", "epochs", "floor", "classes", "labels"),
+    [
+        ("radenet", "", 10, 10, 1e-4, 5, "v2.1"),
+        ("radenet", "sedan", 10, 10, 1e-4, 1, "v1.1"),
+        ("radenet", "paper,sedan", 10, 10, 1e-4, 1, "v1.1"),
+        ("radenet", "official", 10, 11, 1e-5, 5, "v2.1"),
+        ("radenet", "official,sedan", 10, 11, 1e-5, 1, "v1.1"),
+        ("dinorade", "", 6, 11, 1e-4, 5, "v2.1"),
+        ("dinorade", "paper,sedan", 6, 11, 1e-4, 1, "v1.1"),
+        ("dinorade", "official", 6, 11, 1e-5, 5, "v2.1"),
+    ],
+)
+def test_trainings_are_those_of_the_papers(
+    name: str,
+    words: str,
+    batch: int,
+    epochs: int,
+    floor: float,
+    classes: int,
+    labels: str,
+) -> None:
+    config = _get(name, words)
+    train = config.train
+    assert (train.batch_size, train.num_epochs) == (batch, epochs)
+    assert (len(config.classes), config.model.num_classes) == (classes, classes)
+    assert config.data.label_version == labels
+    assert train.weight_decay == 0.01
+    assert (train.gradient_clip_norm, train.ema_decay) == (None, None)
+    assert config.data.mirror_probability == 0.0
+    steps = 17_458 // batch * epochs
+    schedule = make_schedule(
+        learning_rate=train.learning_rate,
+        final_learning_rate=train.final_learning_rate,
+        num_steps=steps,
+        warmup_steps=train.warmup_steps,
+    )
+    values = [float(schedule(step)) for step in (0, steps // 2, steps)]
+    np.testing.assert_allclose(values, [1e-3, (1e-3 + floor) / 2, floor], rtol=1e-3)
+
+
+def _shrink(config: Any) -> None:
+    """The same choices on a sensor of 8 x 8 bins."""
+    model = config.model
+    wide = model.decoder_width > model.widths[0]
+    model.update(
+        doppler_bins=5,
+        elevation_bins=4,
+        widths=(8, 8),
+        decoder_width=16 if wide else 8,
+        num_groups=4,
+        pad_multiple=4,
+    )
+    if model.heads == "default":
+        model.decoder_width = 8
+    if model.name == "dinorade":
+        model.image.update(
+            size=SIZE,
+            hidden_size=16,
+            num_layers=1,
+            num_heads=2,
+            mlp_dim=16,
+            num_registers=1,
+            resnet_width=4,
+        )
+        model.fusion.update(num_heads=2, num_elevation=3, chunk_size=16)
+        model.axes.update(
+            range_m=(2.0, 4.0), azimuth_deg=(-45.0, 12.0), elevation_deg=(-10.0, 10.0)
+        )
+    config.train.batch_size = 2
+    config.train.num_epochs = 2
+    config.train.warmup_steps = 0
+
+
+def _batch(config: Any, grid: RadarGrid) -> Batch:
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((2, 3, 8), np.float32)
+    boxes[..., 0] = rng.uniform(5, 25, (2, 3))
+    boxes[..., 3:] = (4.4, 1.9, 1.6, 0.0, 1.0)
+    batch = Batch(
+        projection=rng.random((2, *grid.projection_shape)).astype(np.float16),
+        boxes=boxes,
+        classes=np.zeros((2, 3), np.int32),
+        is_valid=np.tile([True, True, False], (2, 1)),
+        frame=np.arange(2, dtype=np.int32),
+    )
+    if config.model.name != "dinorade":
+        return batch
+    camera = CameraCalibration.from_angles(
+        intrinsics=(24.0, 24.0, 24.0, 16.0),
+        yaw_deg=90.0,
+        pitch_deg=0.0,
+        roll_deg=90.0,
+        translation_m=(0.0, 0.0, 0.0),
+        width=SIZE[1],
+        height=SIZE[0],
+    ).camera(is_valid=True)
+    return batch.replace(
+        image=rng.integers(0, 256, (2, *SIZE, 3)).astype(np.uint8),
+        camera=stack_cameras([camera, camera]),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "words"), ALL)
+def test_two_steps_of_every_config(name: str, words: str) -> None:
+    config = _get(name, words)
+    _shrink(config)
+    grid = RadarGrid.reduced(
+        num_doppler=5, num_range=8, num_elevation=4, num_azimuth=8, max_range_m=30.0
+    )
+    batch = jax.device_put(_batch(config, grid))
+    model = models.build(config.model)
+    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=config.train.weight_decay)
+    inputs = [batch.projection]
+    inputs += [] if batch.image is None else [batch.image, batch.camera]
+    start = create_state(
+        jax.jit(model.init)(jax.random.key(0), *inputs),
+        optimizer,
+        batch_size=2,
+        use_ema=False,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
+    step = jax.jit(
+        make_train_step(
+            model,
+            optimizer,
+            map_grid(grid, model, config.data.azimuth_mapping),
+            loss=dict(config.loss),
+        )
+    )
+    state = start
+    for _ in range(2):
+        state, metrics = step(state, batch, jax.random.key(1))
+    assert (int(state.step), int(state.num_skipped)) == (2, 0)
+    chex.assert_tree_all_finite((state.params, metrics))
+    changed = jax.tree.map(
+        lambda a, b: bool((a != b).any()), state.params, start.params
+    )
+    assert np.mean(jax.tree.leaves(changed)) > 0.9
+    chex.assert_trees_all_equal(state.frozen, start.frozen)
+    has_frozen_part = config.model.name == "dinorade" and config.model.image.freeze
+    assert bool(start.frozen) == has_frozen_part
