@@ -146,6 +146,8 @@ def run(
             labels=labels,
             records=records,
             init_from=init_from,
+            embeddings=embeddings,
+            image_backbone=image_backbone,
         )
     started = time.perf_counter()
     workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()

@@ -198,7 +198,7 @@ class _Run:
             stop = processes.AgreedStop(event, self.mesh)
             step = start
             while step < num_steps and not stop():
-                state, metrics = self._step(state, watch, is_first=step == start)
+                state, metrics = self._step(state, watch, step, is_first=step == start)
                 step += 1
                 watch.tick(step)
                 if step % options.log_every_steps == 0 or step == num_steps:
@@ -217,7 +217,7 @@ class _Run:
         return TrainResult(state=state, step=step, finished=step >= num_steps)
 
     def _step(
-        self, state: TrainState, watch: Watch, *, is_first: bool
+        self, state: TrainState, watch: Watch, step: int, *, is_first: bool
     ) -> tuple[TrainState, Mapping[str, jax.Array]]:
         """One step, begun; its time goes to data, host and compute."""
         clock, busy = watch.clock, state.step
@@ -231,8 +231,8 @@ class _Run:
         state, metrics = self.step_fn(state, batch, self.rng)
         if is_first:
             jax.block_until_ready(metrics)
-            took = clock.lap("other")
-            clock.take()
+            took = clock.lap("compute")
+            watch.start_timing(step + 1)
             _log.info(
                 "first step %.1f s after the start, %.1f s of it to compile and run it",
                 seconds_since_start(),

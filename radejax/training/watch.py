@@ -100,21 +100,32 @@ class Watch:
         """Writes the metrics of a step, with rate and times since the last log."""
         values = {k: float(np.asarray(v)) for k, v in metrics.items()}
         self.clock.lap("compute")  # the metrics had to be waited for
-        seconds = self.clock.take()
-        elapsed = max(sum(seconds.values()), 1e-9)
-        steps = max(step - self._last_step, 1)
-        speed = {
+        speed = self._speed(step)
+        text = [f"{k} {v:.4g}" for k, v in values.items() if k in _ON_THE_BAR]
+        if speed:
+            text.append(f"{speed['frames_per_s']:.1f} frames/s")
+            text.append(f"wait {speed['data_wait_share']:.0%}")
+        self._bar.set_postfix_str(" ".join(text))
+        self.write(step, {**values, **speed, "epoch": epoch})
+
+    def start_timing(self, step: int) -> None:
+        """Forgets the time up to a step: the first one's is that of compiling."""
+        self.clock.lap("other")
+        self.clock.take()
+        self._last_step = step
+
+    def _speed(self, step: int) -> dict[str, float]:
+        """Rate and times since the last log; nothing where no step was timed."""
+        seconds, steps = self.clock.take(), step - self._last_step
+        self._last_step = step
+        elapsed = sum(seconds.values())
+        if not steps or not elapsed:
+            return {}
+        return {
             "frames_per_s": steps * self._frames_per_step / elapsed,
             "data_wait_share": seconds["data"] / elapsed,
             **{f"{k}_ms_per_step": 1e3 * v / steps for k, v in seconds.items()},
         }
-        self._last_step = step
-        self._bar.set_postfix_str(
-            " ".join(f"{k} {v:.4g}" for k, v in values.items() if k in _ON_THE_BAR)
-            + f" {speed['frames_per_s']:.1f} frames/s"
-            + f" wait {speed['data_wait_share']:.0%}"
-        )
-        self.write(step, {**values, **speed, "epoch": epoch})
 
     def log_scores(self, step: int, scores: Scores) -> None:
         """Writes what an evaluation found."""

@@ -9,10 +9,12 @@ import jax
 import numpy as np
 import pytest
 
-from radejax import models
+from radejax import experiment, models
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.interop import radenet_torch
 from radejax.structures import Batch
+from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step, map_grid
 
@@ -136,6 +138,34 @@ def _batch(config: Any, grid: RadarGrid) -> Batch:
         image=rng.integers(0, 256, (2, *SIZE, 3)).astype(np.uint8),
         camera=stack_cameras([camera, camera]),
     )
+
+
+@pytest.mark.slow
+def test_fine_tuning_starts_from_an_official_checkpoint(
+    tiny: Any, workdir: pathlib.Path
+) -> None:
+    torch = pytest.importorskip("torch")
+    config = tiny.config.copy_and_resolve_references()
+    # A rate of nothing: what comes out is what went in.
+    config.train.update(num_epochs=1, learning_rate=1e-30, final_learning_rate=1e-31)
+    inputs = np.zeros((1, *tiny.grid.projection_shape), np.float32)
+    official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
+    state = radenet_torch.save(tiny.model, official)
+    torch.save({k: torch.tensor(v) for k, v in state.items()}, workdir / "best.pth")
+    variables = experiment.initial_variables(str(workdir / "best.pth"), config)
+    result = loop.train(
+        tiny.model,
+        variables,
+        tiny.loader(),
+        tiny.map_grid,
+        workdir,
+        config=config,
+        info={},
+        steps_per_epoch=2,
+        mesh=sharding.make_mesh(1),
+    )
+    assert result.step == 2
+    chex.assert_trees_all_close(result.state.params, official["params"], atol=1e-7)
 
 
 @pytest.mark.slow
