@@ -238,8 +238,9 @@ class _Run:
                 seconds_since_start(),
                 took,
             )
-        self.trace.after_step(metrics)
         clock.lap("compute")
+        self.trace.after_step(metrics)
+        clock.lap("other")  # writing a trace takes seconds
         return state, metrics
 
     def _is_evaluated(self, step: int, num_steps: int, steps_per_epoch: int) -> bool:
