@@ -61,7 +61,7 @@ def draw(weather, environment, time, seed, path):
     axes[0].imshow(renderer.render(frame)[:, :640])
     axes[0].axis("off")
     axes[0].set_title(f"{weather}, {environment}, {time}", fontsize=9)
-    colors = {"cmap": "viridis", "vmin": 99, "vmax": 132}
+    colors = {"cmap": "viridis", "vmin": 96, "vmax": 130}
     centers = GRID.cell_centers_ego()
     axes[1].pcolormesh(
         -centers[..., 1], centers[..., 0], power_db.max((0, 2)), shading="nearest",

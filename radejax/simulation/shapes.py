@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from radejax.geometry.camera import CameraCalibration, project
-from radejax.simulation import lens
+from radejax.simulation import details, lens
 
 # A block in units of the half extents: x, y, z ranges; colour role; share kept of the
 # length and width at its top (a taper).
@@ -24,7 +24,7 @@ BLOCKS: dict[str, tuple[_Block, ...]] = {
     "Sedan": (
         ((-0.96, 0.96), (-0.92, 0.92), (-1.0, -0.72), "dark", _STRAIGHT),
         ((-1.0, 1.0), (-1.0, 1.0), (-0.72, 0.12), "body", (0.98, 0.97)),
-        ((-0.82, 0.42), (-0.9, 0.9), (0.12, 1.0), "cabin", (0.72, 0.86)),
+        ((-0.82, 0.42), (-0.9, 0.9), (0.12, 1.0), "body", (0.72, 0.86)),
     ),
     "Bus or Truck": (
         ((-0.98, 0.98), (-0.95, 0.95), (-1.0, -0.78), "dark", _STRAIGHT),
@@ -73,6 +73,8 @@ _FACES = (
     ((4, 7, 6, 5), (0.0, 0.0, 1.0)),  # top
 )
 _EDGE_PARTS = 3
+_DETAIL_M = 60.0
+"""Farther objects show no details: a plate is two pixels wide there."""
 _SUN = np.array([0.35, 0.45, 0.82])
 
 
@@ -97,6 +99,7 @@ def object_colors(cls: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """`[N, 2, 3]` body colour and second colour (legs) of objects by class index."""
     paint = _PAINT[rng.integers(len(_PAINT), size=len(cls))]
     clothes = _CLOTHES[rng.integers(len(_CLOTHES), size=len(cls))]
+    paint = paint * rng.uniform(0.82, 1.08, (len(cls), 1))
     is_person = np.asarray(cls)[:, None] == 2
     return np.stack([np.where(is_person, clothes, paint), clothes * 0.7], 1)
 
@@ -208,25 +211,37 @@ def _faces(boxes, classes, colors, origin):
     vertices = np.array([v for v, _ in _FACES])
     normals = np.array([n for _, n in _FACES])
     for index in np.flatnonzero(boxes[:, 0] > -3.0):
-        box, blocks = boxes[index], _BLOCK_CORNERS[classes[index]]
+        box, cls = boxes[index], classes[index]
         cos, sin = np.cos(box[6]), np.sin(box[6])
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-        corners = (blocks * box[3:6] / 2.0) @ turn.T + box[:3]  # [K, 8, 3]
-        count = len(blocks)
+        corners = _BLOCK_CORNERS[cls] * box[3:6] / 2.0 @ turn.T + box[:3]  # [K, 8, 3]
+        depth = np.linalg.norm(box[:3] - origin)
+        block = np.repeat(np.arange(len(corners)), len(_FACES))
+        face = np.tile(np.arange(len(_FACES)), len(corners))
+        quads = corners[:, vertices].reshape(-1, 4, 3)
+        rgb = np.array(
+            [_role_color(role, colors[index]) for *_, role, _ in BLOCKS[cls]]
+        )[block]
+        if depth < _DETAIL_M:  # after their blocks, so that they are painted on them
+            d = _DETAIL_TABLES[cls]
+            chosen = quads[d.block * len(_FACES) + d.face]
+            quads = np.concatenate([quads, details.on_faces(chosen, d.u, d.v)])
+            block, face = np.r_[block, d.block], np.r_[face, d.face]
+            rgb = np.concatenate([rgb, d.color])
         block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)
-        roles = [
-            {"body": colors[index, 0], "legs": colors[index, 1]}.get(role)
-            if role in ("body", "legs")
-            else _ROLE_COLORS[role]
-            for *_, role, _ in BLOCKS[classes[index]]
-        ]
-        parts[0].append(corners[:, vertices].reshape(-1, 4, 3))
-        parts[1].append(np.tile(normals @ turn.T, (count, 1)))
-        parts[2].append(np.full(count * 5, np.linalg.norm(box[:3] - origin)))
-        parts[3].append(np.repeat(block_depth, 5))
-        parts[4].append(np.full(count * 5, index))
-        parts[5].append(np.repeat(np.array(roles, float), 5, axis=0))
+        parts[0].append(quads)
+        parts[1].append(normals[face] @ turn.T)
+        parts[2].append(np.full(len(quads), depth))
+        parts[3].append(block_depth[block])
+        parts[4].append(np.full(len(quads), index))
+        parts[5].append(rgb)
     return [np.concatenate(p) if p else np.zeros(0) for p in parts]
+
+
+def _role_color(role: str, colors: np.ndarray) -> np.ndarray:
+    """Colour of a block: the object's own two, or a fixed one."""
+    own = {"body": colors[0], "legs": colors[1]}
+    return np.asarray(own.get(role, _ROLE_COLORS.get(role)), float)
 
 
 def _project_faces(faces, calibration, near_m) -> list[list[tuple[float, float]]]:
@@ -271,3 +286,12 @@ def _cut_near(outline, depth, near_m) -> np.ndarray:
 
 
 _BLOCK_CORNERS = {name: blocks_of(name) for name in BLOCKS}
+_DETAIL_TABLES = {
+    name: details.Detail(
+        *(
+            np.array([getattr(detail, f.name) for detail in details.DETAILS[name]])
+            for f in dataclasses.fields(details.Detail)
+        )
+    )
+    for name in BLOCKS
+}

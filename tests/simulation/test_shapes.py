@@ -5,6 +5,7 @@ import pytest
 
 from radejax.simulation import shapes
 from radejax.simulation.camera import stereo_calibration
+from radejax.simulation.details import DETAILS
 from radejax.structures import CLASSES
 
 CALIBRATION = stereo_calibration((-2.54, 0.3, 0.7), 320, 180)[0]
@@ -34,8 +35,19 @@ def test_far_objects_come_first_and_hidden_faces_not_at_all():
     depth = [p.depth_m for p in found]
     assert depth == sorted(depth, reverse=True)
     assert {p.box for p in found} == {0, 1}
-    # Three blocks, of five faces at most three look at the camera.
-    assert len([p for p in found if p.box == 0]) <= 9
+    # Three blocks, of five faces at most three look at the camera, and their details.
+    assert len([p for p in found if p.box == 0]) <= 9 + len(DETAILS["Sedan"])
+
+
+def test_details_are_painted_on_their_blocks_and_left_out_far_away():
+    near = [12.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]  # we look at its rear
+    colors = [p.color for p in polygons([near], ["Sedan"])]
+    lamp = max(range(len(colors)), key=lambda i: colors[i][0] - colors[i][1])
+    assert colors[lamp][0] > 2 * colors[lamp][1]  # red
+    body = [i for i, c in enumerate(colors) if c[0] == c[1] == c[2]]
+    assert lamp > min(body)
+    far = [shapes._DETAIL_M + 5.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]
+    assert len(polygons([far], ["Sedan"])) <= 9
 
 
 def test_objects_behind_or_beside_the_image_are_left_out():

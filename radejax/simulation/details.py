@@ -1,0 +1,138 @@
+"""What makes a block look like a vehicle: windows, wheels, lights, plates, hair.
+
+A detail is a rectangle on a face of a block of `shapes.BLOCKS`, in fractions of that
+face; it lies within the object's box and is painted right after its block.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+FRONT, REAR, LEFT, RIGHT, TOP = range(5)
+"""Faces of a block, in the order of `shapes`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Detail:
+    """A rectangle on a face.
+
+    Attributes:
+        block: Index of the block.
+        face: `FRONT`, `REAR`, `LEFT`, `RIGHT` or `TOP`.
+        u: From and to, from the face's first corner to its second.
+        v: From and to, upward; may leave [0, 1] where the block's neighbour is there.
+        color: Red, green, blue.
+    """
+
+    block: int
+    face: int
+    u: tuple[float, float]
+    v: tuple[float, float]
+    color: tuple[float, float, float]
+
+
+_GLASS = (44.0, 54.0, 68.0)
+_TYRE = (24.0, 24.0, 26.0)
+_RIM = (150.0, 152.0, 156.0)
+_LAMP = (238.0, 236.0, 214.0)
+_RED = (168.0, 26.0, 24.0)
+_PLATE = (226.0, 226.0, 218.0)
+_DARK = (36.0, 38.0, 42.0)
+_HAIR = (48.0, 38.0, 32.0)
+
+
+def _sides(block, u, v, color) -> list[Detail]:
+    """On both sides; u runs from the rear to the front."""
+    back = (1.0 - u[1], 1.0 - u[0])
+    return [Detail(block, LEFT, u, v, color), Detail(block, RIGHT, back, v, color)]
+
+
+def _pair(block, face, u, v, color) -> list[Detail]:
+    """At u and mirrored across the middle of a front or rear."""
+    other = (1.0 - u[1], 1.0 - u[0])
+    return [Detail(block, face, u, v, color), Detail(block, face, other, v, color)]
+
+
+def _wheel(block, center, half_u, low, high) -> list[Detail]:
+    """A wheel on both sides: two rectangles make an octagon, a third its rim."""
+    middle, half_v = (low + high) / 2.0, (high - low) / 2.0
+    result = []
+    for share_u, share_v, color in (
+        (1.0, 0.55, _TYRE),
+        (0.55, 1.0, _TYRE),
+        (0.42, 0.42, _RIM),
+    ):
+        u = (center - half_u * share_u, center + half_u * share_u)
+        v = (middle - half_v * share_v, middle + half_v * share_v)
+        result += _sides(block, u, v, color)
+    return result
+
+
+DETAILS: dict[str, tuple[Detail, ...]] = {
+    "Sedan": (
+        *_wheel(1, 0.19, 0.072, -0.333, 0.56),
+        *_wheel(1, 0.82, 0.072, -0.333, 0.56),
+        *_pair(1, FRONT, (0.04, 0.26), (0.5, 0.76), _LAMP),
+        *_pair(1, REAR, (0.03, 0.22), (0.5, 0.8), _RED),
+        Detail(1, FRONT, (0.32, 0.68), (0.4, 0.7), _DARK),
+        Detail(1, FRONT, (0.38, 0.62), (0.1, 0.28), _PLATE),
+        Detail(1, REAR, (0.36, 0.64), (0.48, 0.7), _PLATE),
+        *_sides(2, (0.08, 0.49), (0.12, 0.84), _GLASS),
+        *_sides(2, (0.53, 0.92), (0.12, 0.84), _GLASS),
+        Detail(2, FRONT, (0.06, 0.94), (0.06, 0.9), _GLASS),
+        Detail(2, REAR, (0.07, 0.93), (0.1, 0.86), _GLASS),
+    ),
+    "Bus or Truck": (
+        *_wheel(1, 0.16, 0.07, -0.12, 0.22),
+        *_wheel(1, 0.34, 0.07, -0.12, 0.22),
+        *_wheel(2, 0.5, 0.33, -0.155, 0.28),
+        *_sides(1, (0.02, 0.98), (0.5, 0.58), _PLATE),
+        *_pair(1, REAR, (0.04, 0.14), (0.06, 0.14), _RED),
+        Detail(1, REAR, (0.4, 0.6), (0.06, 0.12), _PLATE),
+        Detail(1, REAR, (0.49, 0.51), (0.18, 0.96), _DARK),
+        Detail(2, FRONT, (0.06, 0.94), (0.52, 0.93), _GLASS),
+        *_pair(2, FRONT, (0.05, 0.2), (0.1, 0.2), _LAMP),
+        Detail(2, FRONT, (0.4, 0.6), (0.06, 0.15), _PLATE),
+        *_sides(2, (0.3, 0.85), (0.52, 0.9), _GLASS),
+    ),
+    "Pedestrian": (
+        Detail(3, REAR, (0.0, 1.0), (0.15, 1.0), _HAIR),
+        *_sides(3, (0.0, 1.0), (0.55, 1.0), _HAIR),
+        Detail(3, FRONT, (0.0, 1.0), (0.75, 1.0), _HAIR),
+        Detail(3, TOP, (0.0, 1.0), (0.0, 1.0), _HAIR),
+        *_pair(2, FRONT, (0.0, 0.16), (0.1, 0.95), _DARK),
+        *_pair(2, REAR, (0.0, 0.16), (0.1, 0.95), _DARK),
+    ),
+    "Motorcycle": (
+        *_sides(0, (0.3, 0.7), (0.3, 0.7), _RIM),
+        *_sides(1, (0.3, 0.7), (0.3, 0.7), _RIM),
+        Detail(2, FRONT, (0.3, 0.7), (0.45, 0.95), _LAMP),
+        Detail(2, REAR, (0.3, 0.7), (0.6, 0.9), _RED),
+        Detail(2, REAR, (0.3, 0.7), (0.2, 0.5), _PLATE),
+    ),
+    "Bicycle": (
+        *_sides(0, (0.25, 0.75), (0.25, 0.75), _RIM),
+        *_sides(1, (0.25, 0.75), (0.25, 0.75), _RIM),
+        Detail(4, REAR, (0.0, 1.0), (0.2, 1.0), _HAIR),
+        Detail(4, TOP, (0.0, 1.0), (0.0, 1.0), _HAIR),
+    ),
+}
+
+
+def on_faces(faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Rectangles on quadrilaterals.
+
+    Args:
+        faces: `[F, 4, 3]` corners: below first, below second, above second, above
+            first.
+        u: `[F, 2]` from and to along the lower edge.
+        v: `[F, 2]` from and to upward.
+
+    Returns:
+        `[F, 4, 3]` corners in the same order, bilinear between those of the face.
+    """
+    u, v = u[:, [0, 1, 1, 0], None], v[:, [0, 0, 1, 1], None]  # [F, 4, 1]
+    a, b, c, d = (faces[:, None, i] for i in range(4))
+    return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * d + u * c)
