@@ -1,14 +1,24 @@
 """Speed and memory of the simulator.
 
-    python benchmarks/simulation.py [--grid kradar|quickstart] [--frames 4] [--rows 1]
+    python benchmarks/simulation.py                            # full size, on CPU
+    python benchmarks/simulation.py --grid quickstart
+    python benchmarks/simulation.py --rows 64 --batch 16       # on a GPU or TPU
 
-Prints one line per piece: milliseconds a frame (wall, CPU time of the process) and the
-process's peak memory so far. On an accelerator use `--rows 64`.
+Every piece runs in a process of its own, so that its peak memory is its own. Pieces:
+
+- `tree`: a whole data set on disk: tesseract, stereo image, labels; two frames at a time.
+- `tesseract`: the radar's tensor alone, in memory.
+- `fused`: projections without the tensor; with `--batch`, that many frames in one call.
+- `parts`: what a frame of the tree consists of, one after the other.
+
+One line each: wall and processor time per frame, frames/s, peak memory of the process.
 """
 
 import argparse
 import pathlib
 import resource
+import subprocess
+import sys
 import tempfile
 import time
 
@@ -18,96 +28,150 @@ import numpy as np
 from radejax.data import kradar_write
 from radejax.simulation import radar
 from radejax.simulation.camera import CameraRenderer, stereo_calibration
-from radejax.simulation.config import SimulationConfig, default_config
-from radejax.simulation.dataset import encode_png
+from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
+from radejax.simulation.dataset import encode_png, simulate_dataset
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.traffic import make_sequence
 
+PIECES = ("tree", "tesseract", "fused", "parts")
 
-def measure(name, function, frames):
-    function(0)  # compile, allocate
+
+def measure(name, function, frames, frames_per_call=1):
+    """Calls once to compile and allocate, then for `frames` frames on the clock."""
+    function(0)
+    calls = max(frames // frames_per_call, 1)
     wall, cpu = time.perf_counter(), time.process_time()
-    for i in range(frames):
+    for i in range(calls):
         function(i)
+    report(name, wall, cpu, calls * frames_per_call)
+
+
+def report(name, wall, cpu, frames):
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{name:34s} {1e3 * wall / frames:9.1f} ms wall {1e3 * cpu / frames:9.1f} ms cpu"
-        f" {frames / wall:7.2f} frames/s   peak {peak:6.0f} MiB",
+        f"{name:36s} {1e3 * wall / frames:8.1f} ms wall {1e3 * cpu / frames:8.1f} ms cpu"
+        f" {frames / wall:8.2f} frames/s   peak {peak:6.0f} MiB {jax.default_backend()}",
         flush=True,
     )
 
 
+class Bench:
+    """One rainy urban sequence, and everything that makes frames of it."""
+
+    def __init__(self, arguments):
+        self.frames, self.rows = arguments.frames, arguments.rows
+        self.batch_size = arguments.batch
+        values = default_config()
+        if arguments.grid == "kradar":
+            values |= FULL_SIZE
+        self.values = values
+        self.config = SimulationConfig.from_mapping(values)
+        self.sequence = make_sequence(
+            1, environment="urban", time="day", weather="rain",
+            num_frames=max(self.frames, self.batch_size),
+            rng=np.random.default_rng(0),
+        )  # fmt: skip
+        self.simulator = SequenceSimulator(
+            self.sequence,
+            self.config.make_grid(),
+            self.config.make_parameters(),
+            seed=0,
+        )
+        self.inputs = [
+            self.simulator.radar_input(i) for i in range(self.sequence.num_frames)
+        ]
+
+    def run(self, output):
+        return lambda i: self.simulator.run(self.inputs[i], output, self.rows)
+
+    def tesseract(self):
+        measure("tesseract", self.run("tesseract"), self.frames)
+
+    def fused(self):
+        if not self.batch_size:
+            measure("fused projection", self.run("projection"), self.frames)
+            return
+        batch = jax.device_put(
+            jax.tree.map(
+                lambda *leaves: np.stack(leaves),
+                *[(x.scatterers, x.noise_power, x.key) for x in self.inputs],
+            )
+        )
+        grid, parameters = self.simulator.grid, self.simulator.parameters
+
+        def one(scatterers, noise, key):
+            return radar.simulate(
+                scatterers, noise, key, grid=grid, parameters=parameters,
+                rows_per_step=self.rows,
+            )  # fmt: skip
+
+        run = jax.jit(jax.vmap(one))
+        count = len(self.inputs)
+        measure(
+            f"fused projection, {count} frames a call",
+            lambda i: run(*batch).block_until_ready(),
+            4 * count,
+            count,
+        )
+
+    def tree(self):
+        """The writer of `radejax simulate`, compiled and with its threads."""
+        count = 2 * self.frames
+        with tempfile.TemporaryDirectory() as folder:
+
+            def write(name, frames):
+                values = self.values | {
+                    "train_sequences": 1,
+                    "test_sequences": 0,
+                    "frames_per_sequence": frames,
+                }
+                root = pathlib.Path(folder) / name
+                simulate_dataset(values, root, num_threads=2, progress=False)
+
+            write("first", 1)
+            wall, cpu = time.perf_counter(), time.process_time()
+            write("second", count)
+            report("tree: tesseract, image, labels", wall, cpu, count)
+
+    def parts(self):
+        frames, config = self.frames, self.config
+        measure("scene to scatterers", self.simulator.radar_input, frames)
+        tesseract = self.run("tesseract")(0)
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / "tesseract_00001.mat"
+            measure(
+                "tesseract to .mat",
+                lambda i: kradar_write.write_tesseract(path, tesseract),
+                frames,
+            )
+        pair = stereo_calibration(
+            config.lidar_to_radar_m, config.image_width, config.image_height
+        )
+        renderer = CameraRenderer(self.sequence, pair, seed=0)
+        frame = self.sequence.frame
+        image = renderer.render(frame(0))
+        measure("camera image", lambda i: renderer.render(frame(i)), frames)
+        measure("camera image to .png", lambda i: encode_png(image), frames)
+
+
 def main():
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--grid", default="kradar", choices=["kradar", "quickstart"])
     parser.add_argument("--frames", type=int, default=4)
     parser.add_argument("--rows", type=int, default=1, help="range rows per step")
     parser.add_argument("--batch", type=int, default=0, help="frames in one call")
+    parser.add_argument("--piece", choices=PIECES, help="only this one, in here")
     arguments = parser.parse_args()
-    values = default_config()
-    if arguments.grid == "kradar":
-        values |= {"grid": "kradar", "radar": {}}
-        values |= {"image_width": 1280, "image_height": 720}
-    config = SimulationConfig.from_mapping(values)
-    sequence = make_sequence(
-        1, environment="urban", time="day", weather="rain",
-        num_frames=max(arguments.frames, arguments.batch),
-        rng=np.random.default_rng(0),
-    )  # fmt: skip
-    grid, parameters = config.make_grid(), config.make_parameters()
-    simulator = SequenceSimulator(sequence, grid, parameters, seed=0)
-    pair = stereo_calibration(
-        config.lidar_to_radar_m, config.image_width, config.image_height
-    )
-    renderer = CameraRenderer(sequence, pair, seed=0)
-    inputs = [simulator.radar_input(i) for i in range(sequence.num_frames)]
-    amplitude = np.abs(inputs[0].scatterers.amplitude).sum(-1)
-    print(f"{jax.devices()[0].platform}, {int((amplitude > 0).sum())} scatterers")
-
-    frames = arguments.frames
-    measure("scene to scatterers", simulator.radar_input, frames)
-    measure(
-        "fused projection",
-        lambda i: simulator.run(inputs[i], "projection", arguments.rows),
-        frames,
-    )
-    if arguments.batch:
-        batch = jax.device_put(
-            jax.tree.map(
-                lambda *leaves: np.stack(leaves),
-                *[(x.scatterers, x.noise_power, x.key) for x in inputs],
-            )
-        )
-        run = jax.jit(
-            jax.vmap(
-                lambda s, n, k: radar.simulate(
-                    s, n, k, grid=grid, parameters=parameters,
-                    rows_per_step=arguments.rows,
-                )
-            )
-        )  # fmt: skip
-        measure(
-            f"fused projection, {len(inputs)} frames",
-            lambda i: run(*batch).block_until_ready(),
-            frames,
-        )
-    measure(
-        "tesseract",
-        lambda i: simulator.run(inputs[i], "tesseract", arguments.rows),
-        frames,
-    )
-    tesseract = simulator.run(inputs[0], "tesseract", arguments.rows)
-    with tempfile.TemporaryDirectory() as folder:
-        path = pathlib.Path(folder) / "tesseract_00001.mat"
-        measure(
-            "tesseract to .mat",
-            lambda i: kradar_write.write_tesseract(path, tesseract),
-            frames,
-        )
-    image = renderer.render(sequence.frame(0))
-    measure("camera image", lambda i: renderer.render(sequence.frame(i)), frames)
-    measure("camera image to .png", lambda i: encode_png(image), frames)
+    if arguments.piece:
+        getattr(Bench(arguments), arguments.piece)()
+        return
+    print(f"{arguments.grid} grid", flush=True)
+    for piece in PIECES:
+        command = [sys.executable, __file__, *sys.argv[1:], "--piece", piece]
+        subprocess.run(command, check=True)
 
 
 if __name__ == "__main__":

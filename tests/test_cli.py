@@ -41,6 +41,8 @@ def test_help_shows_an_example(command: list[str]) -> None:
     [
         (["detect", "/nowhere", "--workdir", "/nowhere", "--out", "x"], "'/nowhere'"),
         (["simulate", "--config", "nowhere.py", "--out", "x"], "nowhere.py"),
+        (["simulate", "--sequences", "5", "--out", "x"], "real labels"),
+        (["simulate", "--sequences", "5-6", "--out", "x"], "expected 1,5,58"),
         (["fly"], "No such command 'fly'"),
         (["project", ".", "--out", "x", "--shard", "3/2"], "3/2"),
     ],

@@ -38,6 +38,15 @@ CONDITIONS = (
 )
 
 
+FULL_SIZE = {
+    "grid": "kradar",
+    "radar": {},
+    "image_width": 1280,
+    "image_height": 720,
+}
+"""Fields that make a config one of K-Radar's own sensors."""
+
+
 def default_config() -> dict[str, Any]:
     """Values of the quickstart's data set: small, but with every kind of thing in it.
 
@@ -157,6 +166,11 @@ class SimulationConfig:
             self.train_sequences + self.test_sequences == 0
         ):
             raise UserError("simulation has no sequences: train_sequences is 0")
+        if self.scenes == "procedural" and self.sequences is not None:
+            raise UserError(
+                "simulation.sequences chooses sequences of real labels; procedural ones"
+                " are counted by train_sequences and test_sequences"
+            )
         if self.output not in ("tesseract", "projection"):
             raise UserError(
                 "simulation.output must be 'tesseract' or 'projection',"

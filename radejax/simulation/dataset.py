@@ -64,6 +64,7 @@ def simulate_dataset(
     try:
         root.mkdir(parents=True, exist_ok=True)
         _write_marker(root, checked, finished=False)
+        _remove_leftovers(root)
         _write_common(root, checked, source)
         _write_frames(root, checked, source, num_threads, progress)
         _write_marker(root, checked, finished=True)
@@ -111,6 +112,24 @@ def _write_marker(
     }
     with files.atomic_write(root / MARKER) as file:
         file.write(json.dumps(content, indent=1, sort_keys=True).encode())
+
+
+def _remove_leftovers(root: pathlib.Path) -> None:
+    """Removes temporary files of writers that were killed."""
+    for path in root.rglob(".*.tmp"):
+        process = path.name.split(".")[-2]
+        if process.isdigit() and not _is_alive(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # somebody else's
+        pass
+    return True
 
 
 def _write_common(

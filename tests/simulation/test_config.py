@@ -63,6 +63,7 @@ def test_fingerprint_follows_every_change():
         ({"grid": {"num_range": 3}}, "simulation.grid"),
         ({"radar": {"power": 3}}, "simulation.radar: unknown field"),
         ({"lidar_to_radar_m": [0.0]}, "three numbers"),
+        ({"sequences": [5]}, "chooses sequences of real labels"),
     ],
 )
 def test_wrong_values(change, message):

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -138,7 +140,18 @@ class TestRepeating:
             simulate_dataset(small_config(), root, num_threads=1, progress=False)
         assert not json.loads((root / dataset.MARKER).read_text())["finished"]
         monkeypatch.setattr(dataset._SequenceWriter, "write", write)
+        # A killed writer leaves its temporary file; a living one's is not touched.
+        dead = subprocess.Popen([sys.executable, "-c", ""])
+        dead.wait()
+        left, busy = (
+            root / "1" / f".tesseract_00001.mat.{process}.tmp"
+            for process in (dead.pid, os.getpid())
+        )
+        left.write_bytes(b"half")
+        busy.write_bytes(b"half")
         simulate_dataset(small_config(), root, progress=False)
+        assert not left.exists()
+        busy.unlink()  # was still there
         assert digests(root) == digests(tree)
 
     def test_finished_data_set_is_reused_untouched(self, tree, monkeypatch):
