@@ -136,7 +136,7 @@ def _check_script(script: str, arguments: list[str]) -> None:
     path = ROOT / script
     assert path.is_file(), f"no such script: {script}"
     flags = [word for word in arguments if word.startswith("--")]
-    if path.parent.name == "benchmarks":
+    if path.parent.name in ("benchmarks", "examples"):
         text = path.read_text(encoding="utf-8")
         for flag in flags:
             assert f'"{flag.partition("=")[0]}"' in text
