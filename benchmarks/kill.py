@@ -9,12 +9,11 @@ bit, the logged losses and the metrics of the evaluation.
 
 import argparse
 import collections
+import importlib.util
 import json
-import os
+import multiprocessing
 import pathlib
 import random
-import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,41 +21,64 @@ import time
 import jax
 import numpy as np
 
-from radejax.experiment import load_run
+from radejax import entry, experiment
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
-OVERRIDES = [
-    "--config=configs/quickstart.py:short",
-    "--config.simulation.train_sequences=2",
-    "--config.simulation.frames_per_sequence=5",
-    "--config.model.widths=(8,8,8)",
-    "--config.model.decoder_width=8",
-    "--config.model.num_groups=4",
-    "--config.model.cbam=off",
-    "--config.model.neck=plain",
-    "--config.model.heads=default",
-    "--config.train.checkpoint_every_steps=7",
-    "--config.train.log_every_steps=5",
-    "--config.evaluation.num_pictures=0",
-    "--config.evaluation.protocols=('exact',)",
-]
+
+# Every start is a new process that has the modules already: imports are not tested.
+PROCESSES = multiprocessing.get_context("forkserver")
+PROCESSES.set_forkserver_preload(
+    ["radejax.entry", "radejax.evaluate_run", "radejax.simulation.dataset"]
+)
 
 
-def start(folder, run, steps):
-    command = [sys.executable, "train.py", *OVERRIDES, f"--workdir={folder / run}"]
-    command += [f"--data={folder / 'data'}", f"--config.train.num_epochs={steps // 2}"]
-    return subprocess.Popen(
-        command,
-        cwd=REPOSITORY,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        stdout=subprocess.DEVNULL,
-        stderr=(folder / f"{run}.log").open("a"),
+def make_config(steps):
+    """The quickstart in so small that most of a start is not training."""
+    path = REPOSITORY / "configs" / "quickstart.py"
+    spec = importlib.util.spec_from_file_location("quickstart", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    config = module.get_config("short")
+    config.simulation.update(train_sequences=2, frames_per_sequence=5)
+    config.model.update(
+        widths=(8, 8, 8),
+        decoder_width=8,
+        num_groups=4,
+        cbam="off",
+        neck="plain",
+        heads="default",
+    )
+    # Ten frames are two steps of an epoch.
+    config.train.update(
+        num_epochs=steps // 2, checkpoint_every_steps=7, log_every_steps=5
+    )
+    config.evaluation.update(num_pictures=0, protocols=("exact",))
+    return config
+
+
+def run(folder, name, steps):
+    """What a child process does."""
+    sys.stdout = sys.stderr = (folder / f"{name}.log").open("a")
+    jax.config.update("jax_platforms", "cpu")
+    entry.set_up_jax()
+    experiment.run(
+        make_config(steps),
+        name=name,
+        workdir=folder / name,
+        data=[str(folder / "data")],
     )
 
 
+def start(folder, name, steps):
+    process = PROCESSES.Process(target=run, args=(folder, name, steps))
+    process.start()
+    return process
+
+
 def finish(process):
-    if process.wait() != 0:
-        raise SystemExit(f"the run ended with exit code {process.returncode}")
+    process.join()
+    if process.exitcode != 0:
+        raise SystemExit(f"the run ended with exit code {process.exitcode}")
 
 
 def stage(folder):
@@ -70,7 +92,7 @@ def stage(folder):
 def same(folder, a, b):
     """Names of what is not equal."""
     different = []
-    variables = [load_run(folder / run).variables for run in (a, b)]
+    variables = [experiment.load_run(folder / run).variables for run in (a, b)]
     equal = jax.tree.map(np.array_equal, *variables)
     different += ["parameters"] * (not all(jax.tree.leaves(equal)))
     losses = [
@@ -110,14 +132,14 @@ def main():
     stages, kills = collections.Counter(), 0
     while kills < arguments.kills:
         process = start(folder, "killed", arguments.steps)
-        try:
-            process.wait(timeout=moments.uniform(0.0, whole))
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
+        process.join(timeout=moments.uniform(0.0, whole))
+        if process.is_alive():
+            process.kill()
+            process.join()
             kills += 1
-            stages[stage(folder / "killed")] += 1
-            sys.stdout.write(f"kill {kills}: {stage(folder / 'killed')}\n")
+            reached = stage(folder / "killed")
+            stages[reached] += 1
+            sys.stdout.write(f"kill {kills}: {reached}\n")
             sys.stdout.flush()
     finish(start(folder, "killed", arguments.steps))
     different = same(folder, "undisturbed", "killed")

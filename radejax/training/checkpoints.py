@@ -29,6 +29,19 @@ BEST = "best"
 """Name of the metric that decides which checkpoint is best; higher is better."""
 
 
+_NO_NEWS = (
+    "tracked_metric",  # most checkpoints are not evaluated
+    "read_only",  # as asked for
+    "read only",
+    "Metadata file does not exist",  # of a kind that we do not write
+)
+
+
+def _is_worth_telling(record: logging.LogRecord) -> bool:
+    """False for orbax's warnings of what is meant to be."""
+    return not any(text in str(record.msg) for text in _NO_NEWS)
+
+
 class Checkpoints:
     """The checkpoints of one work folder.
 
@@ -68,6 +81,7 @@ class Checkpoints:
             read_only=read_only,
             enable_async_checkpointing=not read_only,
         )
+        logging.getLogger("absl").addFilter(_is_worth_telling)
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def steps(self) -> list[int]:

@@ -55,6 +55,27 @@ def test_state_position_and_info_come_back(tmp_path: pathlib.Path) -> None:
     assert (info["step"], step, float(state["w"][0, 0])) == (2, 2, 2.0)
 
 
+def test_the_best_stays_and_those_without_metrics_are_no_news(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    iterator = _iterator()
+    metrics = {2: {"best": 5.0}, 4: {"best": 3.0}}
+    with Checkpoints(tmp_path, max_to_keep=1, best_metric="best") as checkpoints:
+        for step in range(1, 6):
+            checkpoints.save(
+                step, _state(step), iterator, info={}, metrics=metrics.get(step)
+            )
+            checkpoints.wait()
+        assert checkpoints.steps() == [2, 5]
+        assert checkpoints.best_step() == 2
+    assert "metric" not in caplog.text
+    with (
+        Checkpoints(tmp_path / "other", best_metric="best") as checkpoints,
+        pytest.raises(FileNotFoundError, match="was evaluated: train with"),
+    ):
+        checkpoints.best_step()
+
+
 def test_nothing_to_restore(tmp_path: pathlib.Path) -> None:
     with Checkpoints(tmp_path / "new") as checkpoints:
         assert checkpoints.restore(_abstract(), _iterator()) is None
