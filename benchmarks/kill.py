@@ -3,8 +3,9 @@
     python benchmarks/kill.py --kills 20 [--seed 0] [--workdir DIR]
 
 First an undisturbed run, then the same one killed again and again: every start gets a
-random time to live, up to that of a whole start. Compared are all parameters, bit for
-bit, the logged losses and the metrics of the evaluation.
+random time to live, up to that of a whole start. A run that comes to its end all the same
+is compared, and another one begins. Compared are all parameters, bit for bit, the logged
+losses and the metrics of the evaluation.
 """
 
 import argparse
@@ -132,26 +133,38 @@ def main():
         whole = time.perf_counter() - begin
         sys.stdout.write(f"an undisturbed run takes {whole:.1f} s\n")
     moments = random.Random(arguments.seed)
-    stages, kills = collections.Counter(), 0
+    stages, kills, runs = collections.Counter(), 0, 0
     while kills < arguments.kills:
-        process = start(folder, "killed", arguments.steps)
+        process = start(folder, f"killed{runs}", arguments.steps)
         process.join(timeout=moments.uniform(0.0, whole))
         if process.is_alive():
             process.kill()
             process.join()
             kills += 1
-            reached = stage(folder / "killed")
+            reached = stage(folder / f"killed{runs}")
             stages[reached] += 1
             sys.stdout.write(f"kill {kills}: {reached}\n")
             sys.stdout.flush()
-    finish(start(folder, "killed", arguments.steps))
-    different = same(folder, "undisturbed", "killed")
-    sys.stdout.write(f"{kills} kills; reached when killed: {dict(stages)}\n")
-    if different:
-        raise SystemExit(f"not equal to the undisturbed run: {', '.join(different)}")
+        else:
+            compare(folder, process, f"killed{runs}")
+            runs += 1
+    process = start(folder, f"killed{runs}", arguments.steps)
+    process.join()
+    compare(folder, process, f"killed{runs}")
     sys.stdout.write(
-        "parameters, losses and metrics equal those of the undisturbed run\n"
+        f"{kills} kills of {runs + 1} runs, all equal to the undisturbed one in "
+        f"parameters, losses and metrics; reached when killed: {dict(stages)}\n"
     )
+
+
+def compare(folder, process, name):
+    """Ends the program where a finished run is not what it should be."""
+    finish(process)
+    different = same(folder, "undisturbed", name)
+    if different:
+        raise SystemExit(f"{name} is not the undisturbed run: {', '.join(different)}")
+    sys.stdout.write(f"{name} ended, equal to the undisturbed run\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":
