@@ -12,6 +12,7 @@ from radejax.config import base_config
 from radejax.data import kradar_write
 from radejax.data.projection import project
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.interop import dinorade_torch
 
 
 @pytest.fixture(scope="module")
@@ -125,6 +126,29 @@ def test_detections_as_columns_and_lists(
     assert first["score"] == pytest.approx(float(found.scores[0, 0]))
     assert first["x"] == pytest.approx(float(found.boxes[0, 0, 0]))
     assert first["cls"] in detector.classes
+
+
+def test_detections_as_k_radars_text(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    found = detector(projections[:2])
+    texts = found.to_kitti(detector.classes)
+    assert [len(text.splitlines()) for text in texts] == found.is_valid.sum(1).tolist()
+    words = texts[0].splitlines()[0].split(" ")
+    assert words[0] in ("sed", "bus", "ped", "mot", "bic")
+    numbers = [float(word) for word in words[8:]]  # h w l y z x yaw score
+    expected = np.asarray(found.boxes[0, 0])[[5, 4, 3, 1, 2, 0, 6]]
+    np.testing.assert_allclose(numbers[:7], expected, rtol=1e-6)
+    assert numbers[7] == pytest.approx(float(found.scores[0, 0]))
+    nothing = detector(projections[:1], score_threshold=2.0).to_kitti(detector.classes)
+    assert nothing == ["dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"]
+
+
+def test_official_state_dicts_are_told_apart() -> None:
+    weight = np.zeros(3, np.float32)
+    nested = {"epoch": 1, "model": {"module.rad_backbone.conv.weight": weight}}
+    assert dinorade_torch.is_dinorade(nested)
+    assert not dinorade_torch.is_dinorade({"model": {"backbone.conv.weight": weight}})
 
 
 def test_a_wrong_shape_names_what_was_expected(detector: Detector) -> None:

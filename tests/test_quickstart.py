@@ -10,7 +10,11 @@ import sys
 import time
 from collections.abc import Callable
 
+import jax
+import numpy as np
 import pytest
+
+from radejax import checkpoint_files
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
@@ -102,6 +106,19 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
     )
     assert json.loads(done.stdout)["frames"] == 6
     assert len(list((folder / "boxes").glob("3_tesseract_*.json"))) == 6
+
+
+@pytest.mark.timeout(900)
+def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
+    run = undisturbed[0] / "run"
+    expected = checkpoint_files.load(run)
+    newest = max((run / "checkpoints").glob("[0-9]*"), key=lambda p: int(p.name))
+    for path in (run / "checkpoints", newest):
+        found = checkpoint_files.load(path)
+        assert found.model == expected.model
+        assert found.grid == expected.grid
+        assert found.settings == expected.settings
+        jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
 
 
 @pytest.mark.timeout(900)
