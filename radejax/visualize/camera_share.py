@@ -44,27 +44,30 @@ def draw_camera_share(
     maps = {
         k: np.asarray(m)[: grid.num_range, : grid.num_azimuth] for k, m in maps.items()
     }
-    low = min(float(m.min()) for m in maps.values())
-    high = max(float(m.max()) for m in maps.values())
+    # Bins that no query sees in the image have share 0: they say nothing of the gate.
+    seen = np.concatenate([m[m > 0] for m in maps.values()] or [np.zeros(0)])
+    low, high = (seen.min(), seen.max()) if seen.size else (0.0, 1.0)
+    colors = plt.get_cmap("cividis").with_extremes(bad="0.85")
     azimuth = np.rad2deg(grid.azimuth_rad)
     extent = (azimuth[0], azimuth[-1], grid.range_m[0], grid.range_m[-1])
     for ax, (name, share) in zip(axes.flat, maps.items(), strict=False):
         picture = ax.imshow(
-            share,
+            np.ma.masked_equal(share, 0.0),
             origin="lower",
             aspect="auto",
             extent=extent,
             vmin=low,
             vmax=max(high, low + 1e-3),
-            cmap="cividis",
+            cmap=colors,
             interpolation="nearest",
         )
         number = "" if counts is None else f", {counts[name]} frames"
-        ax.set_title(f"{name}: mean {share.mean():.2f}{number}", fontsize=9)
+        ax.set_title(f"{name}\nmean {share.mean():.2f}{number}", fontsize=8)
+        ax.tick_params(labelbottom=True, labelsize=8)
     for ax in axes.flat[len(maps) :]:
         ax.set_visible(False)
     figure.supxlabel("azimuth (degrees, positive to the right)", fontsize=9)
     figure.supylabel("range (m)", fontsize=9)
     bar = figure.colorbar(picture, ax=axes.ravel().tolist(), shrink=0.8)
-    bar.set_label("share of the camera in the fused map")
+    bar.set_label("share of the camera in the fused map (grey: not in view)")
     return figure
