@@ -6,6 +6,8 @@ from radejax import benchmark
 
 from . import small_models as small
 
+pytestmark = pytest.mark.slow  # compiles each stage on its own
+
 
 def test_stages_add_up_and_are_shown() -> None:
     detector = small.detector()
