@@ -18,6 +18,7 @@ from radejax.detector import Detector
 from radejax.errors import DataError, UserError
 from radejax.evaluate_run import evaluate_run, predict_dataset
 from radejax.models import build
+from radejax.training import sharding
 
 pytestmark = pytest.mark.slow  # several programs to compile
 
@@ -28,7 +29,11 @@ def small_config():
     """A few bins, small images, and the tiny DINOv3's sizes, frozen."""
     config = load_config(f"{CONFIG}:short")
     config.simulation.update(
-        train_sequences=2, test_sequences=1, image_width=96, image_height=32
+        train_sequences=2,
+        test_sequences=1,
+        frames_per_sequence=4,
+        image_width=96,
+        image_height=32,
     )
     config.simulation.grid.update(
         num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
@@ -62,6 +67,15 @@ class _Data:
     def losses(self, workdir):
         rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
         return [[row[k] for k in ("focal", "gwd", "smooth_l1")] for row in rows]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_device():
+    """Eight fake devices on few cores compile slowly; that is tested elsewhere."""
+    mesh = sharding.make_mesh(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sharding, "make_mesh", lambda *_: mesh)
+        yield
 
 
 @pytest.fixture(scope="module")
