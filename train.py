@@ -41,6 +41,12 @@ _BACKBONE = flags.DEFINE_string(
     "Weights of the image backbone: a DINOv3 folder from Hugging Face, or torchvision's "
     "ResNet-50 file.",
 )
+_CALIBRATION = flags.DEFINE_string(
+    "camera_calibration",
+    None,
+    "Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's repository); "
+    "the roots' own by default.",
+)
 _DISTRIBUTED = flags.DEFINE_bool(
     "distributed", False, "One of several processes, as Slurm and others start them."
 )
@@ -73,6 +79,7 @@ def main(_: list[str]) -> None:
             init_from=_INIT.value,
             embeddings=_EMBEDDINGS.value,
             image_backbone=_BACKBONE.value,
+            camera_calibration=_CALIBRATION.value,
         )
 
 

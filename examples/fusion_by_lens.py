@@ -23,8 +23,8 @@ from radejax.evaluate_files import Source, load
 from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import repair_sizes
-from radejax.experiment import load_run
 from radejax.simulation.lens import cover_level
+from radejax.workdir import load_run
 
 GROUPS = {
     "all": lambda weather, lens: True,

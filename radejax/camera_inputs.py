@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -12,9 +13,10 @@ import jax
 import jax.numpy as jnp
 from ml_collections import ConfigDict
 
+from radejax import models
 from radejax.data.cameras import frame_cameras
 from radejax.data.frame import Frame
-from radejax.embed import open_embeddings
+from radejax.embed import embeddings_sha256, open_embeddings, weights_sha256
 from radejax.errors import UserError
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.models.lifting import ReferencePoints
@@ -61,6 +63,10 @@ def loader_arguments(
             )
         return {}
     options, image = config.data.camera, config.model.image
+    features = None
+    if embeddings is not None:
+        _check_embeddable(config)
+        features = open_embeddings(embeddings, config.model)
     arguments = {
         "cameras": frame_cameras(
             frames,
@@ -69,14 +75,18 @@ def loader_arguments(
             ego_from_lidar_m=options.ego_from_lidar_m,
             resize=options.resize,
             allow_missing=options.allow_missing,
+            embedded=() if features is None else features.index_of(),
         ),
         "allow_missing_images": options.allow_missing,
         "image_size": tuple(image.size),
         "resize_images": options.resize,
     }
-    if embeddings is None:
-        return {**arguments, "images": True}
-    if not image.freeze:
+    given = {"images": True} if features is None else {"features": features}
+    return {**arguments, **given}
+
+
+def _check_embeddable(config: ConfigDict) -> None:
+    if not config.model.image.freeze:
         raise UserError(
             "embeddings are what a frozen backbone makes of images, but "
             "config.model.image.freeze is False"
@@ -85,24 +95,53 @@ def loader_arguments(
         raise UserError(
             "embeddings cannot be mirrored: set config.data.mirror_probability to 0"
         )
-    return {**arguments, "features": open_embeddings(embeddings, config.model)}
 
 
-def load_image_backbone(path: PathLike | None, config: ConfigDict) -> Any:
+def require_images(frames: Sequence[Frame], arguments: Mapping[str, Any]) -> None:
+    """`UserError` if no frame to train on has both an image and a calibration.
+
+    Args:
+        frames: Of the train split.
+        arguments: Of `loader_arguments`; empty for models without a camera.
+    """
+    cameras = arguments.get("cameras")
+    if cameras is None or any(camera.is_valid for camera in cameras):
+        return
+    lacking = {
+        "front image (cam-front/cam-front_*.png)": sum(
+            frame.camera_path is None for frame in frames
+        ),
+        "camera calibration (calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of "
+        "K-Radar's repository: --camera_calibration FOLDER)": sum(
+            frame.camera_calibration_path is None for frame in frames
+        ),
+    }
+    reasons = "; ".join(f"{n} have no {what}" for what, n in lacking.items() if n)
+    raise UserError(
+        f"no frame of the train split ({len(frames)}) can use the camera: {reasons}"
+    )
+
+
+def load_image_backbone(
+    path: PathLike | None, config: ConfigDict, embeddings: PathLike | None = None
+) -> Any:
     """Pretrained part of the variables, for `radejax.models.dinorade.with_pretrained`.
 
     Args:
         path: A DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
         config: Of the run; `model.image` says which kind is expected.
+        embeddings: Folder of `radejax embed` that stands for the frozen part: what is
+            left is the ResNet's last stage, and nothing of a DINOv3.
 
     Returns:
-        None without a path.
+        None without a path, and where embeddings leave nothing.
 
     Raises:
         FileNotFoundError: Not there, or a folder lacks a file.
         DataError: Tensors are missing, unexpected or mis-shaped.
-        UserError: It is another model than the configured one; or the model has a
-            frozen backbone and no weights are given.
+        UserError: It is another model than the configured one, or not the one that the
+            embeddings are from; or the model has a frozen backbone and no weights are
+            given.
     """
     if not has_camera(config):
         if path is not None:
@@ -112,6 +151,8 @@ def load_image_backbone(path: PathLike | None, config: ConfigDict) -> Any:
             )
         return None
     image = config.model.image
+    if embeddings is not None and path is None and image.kind == "vit":
+        return None
     if path is None:
         if image.freeze:
             raise UserError(
@@ -124,19 +165,48 @@ def load_image_backbone(path: PathLike | None, config: ConfigDict) -> Any:
     if image.kind == "resnet50":
         from radejax.interop import resnet_torch
 
-        return resnet_torch.load(path)
+        part = resnet_torch.load(path)
+    else:
+        part = {"params": {IMAGE_BACKBONE: _load_dinov3(path, config)}}
+    if embeddings is not None:
+        params = dict(part["params"])
+        check_same_backbone(params.pop(IMAGE_BACKBONE), embeddings, path)
+        part = {**part, "params": params}
+    return part
+
+
+def check_same_backbone(params: Any, embeddings: PathLike, source: PathLike) -> None:
+    """`UserError` unless embeddings were made with these weights."""
+    found, wanted = embeddings_sha256(embeddings), weights_sha256(params)
+    if found != wanted:
+        raise UserError(
+            f"{source} is not the backbone that {embeddings} was made with: weights "
+            f"{wanted[:12]}, the embeddings' {found[:12]} (sha256)"
+        )
+
+
+def _load_dinov3(path: PathLike, config: ConfigDict) -> Any:
+    """Parameters of the backbone in a Hugging Face folder."""
     from radejax.interop import dinov3_hf
 
-    model, variables = dinov3_hf.load(path)
-    names = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
-    for name in (*names, "num_registers", "gated_mlp"):
-        found = getattr(model, name)
-        if found != image[name]:
-            raise UserError(
-                f"{path}: the backbone has {name} = {found}, config.model.image.{name} "
-                f"is {image[name]}"
-            )
-    return {"params": {IMAGE_BACKBONE: variables["params"]}}
+    image = config.model.image
+
+    found, variables = dinov3_hf.load(path)
+    wanted = models.build(config.model).vit
+    for field in dataclasses.fields(found):
+        name = field.name
+        if name in _FREE_FIELDS or getattr(found, name) == getattr(wanted, name):
+            continue
+        field = f"config.model.image.{name}" if name in image else "the configured one"
+        raise UserError(
+            f"{path}: the backbone has {name} = {getattr(found, name)}, {field} is "
+            f"{getattr(wanted, name)}"
+        )
+    return variables["params"]
+
+
+# Fields of a ViT that are not its weights' own.
+_FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
 
 
 def check_fits(model: DinoRade, variables: Mapping[str, Any], source: str) -> None:

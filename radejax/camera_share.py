@@ -55,6 +55,8 @@ def camera_share(
         shuffle=False,
         num_epochs=1,
         pad_remainder=True,
+        process_index=0,  # only the main process draws
+        process_count=1,
         **camera_inputs.loader_arguments(config, frames, embeddings),
     )
     model = models.build(config.model)

@@ -256,7 +256,7 @@ def _has_checkpoint(path: pathlib.Path) -> bool:
 
 
 def _of_run(path: pathlib.Path, image_backbone: Any) -> LoadedModel:
-    from radejax.experiment import load_run  # training's rooms: not for packed models
+    from radejax.workdir import load_run  # training's rooms: not for packed models
 
     run = load_run(path, image_backbone=image_backbone)
     return LoadedModel(

@@ -18,7 +18,9 @@ from radejax.cli_options import EXISTING, PATH, echo_result, json_option
 @click.option("--step", type=int, help="Of the checkpoint; the newest by default.")
 @click.option("--score-threshold", type=float, help="Instead of the config's.")
 @click.option("--nms-iou", type=float, help="Instead of the config's.")
-@click.option("--batch-size", type=int, default=8, show_default=True)
+@click.option("--batch-size", type=click.IntRange(1), default=8, show_default=True)
+@click.option("--labels", type=EXISTING, help="Revision that names frames' images.")
+@click.option("--image-backbone", "--image_backbone", type=EXISTING)
 @json_option
 def detect(
     roots: tuple[pathlib.Path, ...],
@@ -28,12 +30,15 @@ def detect(
     score_threshold: float | None,
     nms_iou: float | None,
     batch_size: int,
+    labels: pathlib.Path | None,
+    image_backbone: pathlib.Path | None,
     as_json: bool,
 ) -> None:
     """Find boxes in every frame below the folders; one JSON file a frame.
 
     A folder is a K-Radar root, a folder with tesseract_*.mat or projection files, or
-    such a file itself. No labels are needed.
+    such a file itself. No labels are needed; a radar-camera model finds a frame's image
+    by its label file, and goes by the radar alone without.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
@@ -46,6 +51,8 @@ def detect(
         out,
         step=step,
         batch_size=batch_size,
+        labels=labels,
+        image_backbone=image_backbone,
         score_threshold=score_threshold,
         nms_iou=nms_iou,
     )

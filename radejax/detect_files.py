@@ -1,4 +1,8 @@
-"""Boxes for folders of frames, without labels: what `radejax detect` does."""
+"""Boxes for folders of frames: what `radejax detect` does.
+
+Labels are not needed, but for images: in K-Radar only the header of a label file says
+which image belongs to a frame.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,14 @@ import numpy as np
 import tqdm
 
 from radejax import files
+from radejax.data.cameras import frame_cameras
+from radejax.data.kradar import KRadar
 from radejax.data.tesseract import read_frame
 from radejax.detector import Detector
 from radejax.errors import UserError
+from radejax.geometry.camera import Camera
 from radejax.structures import Detections
+from radejax.workdir import load_run
 
 PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
 """Names of the files that hold a frame."""
@@ -52,6 +60,57 @@ def _frame_key(path: pathlib.Path) -> tuple[pathlib.Path, str]:
     return path.parent.parent, path.stem.removeprefix("DERA_")
 
 
+def front_images(
+    paths: Sequence[pathlib.Path],
+    detector: Detector,
+    labels: str | os.PathLike | None = None,
+    version: str = "v2.1",
+) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
+    """Image and camera of the files of frames that have both.
+
+    Args:
+        paths: Of `find_frames`.
+        detector: Of a radar-camera model.
+        labels: Label revision, see `KRadar`; the sequences' own label files if None,
+            where there are any.
+        version: Of these labels.
+
+    Raises:
+        UserError: The labels are of another version, or a calibration is of images of
+            another size than the model's.
+    """
+    sequences = [
+        folder
+        for folder in {path.absolute().parent.parent for path in paths}
+        if folder.name.isdecimal() and (labels or (folder / "info_label").is_dir())
+    ]
+    if not sequences:
+        return {}
+    frames = KRadar(
+        sorted({folder.parent for folder in sequences}),
+        labels,
+        version=version,
+        visibility=None,
+        field_of_view=False,
+        sequence_numbers={int(folder.name) for folder in sequences},
+    )
+    options = detector.camera_options
+    cameras = frame_cameras(
+        frames,
+        detector.model.image_size,
+        projection=options.projection,
+        ego_from_lidar_m=options.ego_from_lidar_m,
+        resize=options.resize,
+        allow_missing=True,
+    )
+    return {
+        path: (frame.camera_path, camera)
+        for frame, camera in zip(frames, cameras, strict=True)
+        for path in (frame.tesseract_path, frame.projection_path)
+        if path is not None and frame.camera_path is not None and camera.is_valid
+    }
+
+
 def detect_files(
     workdir: str | os.PathLike,
     paths: Sequence[str | os.PathLike],
@@ -59,6 +118,8 @@ def detect_files(
     *,
     step: int | None = None,
     batch_size: int = 8,
+    labels: str | os.PathLike | None = None,
+    image_backbone: str | os.PathLike | None = None,
     **settings: Any,
 ) -> dict[str, int]:
     """Detects in every frame and writes one JSON file each, atomically.
@@ -70,22 +131,39 @@ def detect_files(
             w, h, yaw}, metres and radians in the ego frame.
         step: Of the checkpoint; the newest if None.
         batch_size: Frames at once.
+        labels: Label revision that says which image belongs to a frame, for
+            radar-camera models; the one that the run was trained with if None.
+        image_backbone: See `Detector.from_workdir`.
         **settings: `score_threshold`, `nms_iou`, `roi` of the detector.
 
     Returns:
-        Counts "frames" and "boxes", and for a radar-camera model "radar_alone": files
-        of frames name no image, so that these are all of them. Evaluating a run uses
-        the images.
+        Counts "frames" and "boxes", and for a radar-camera model "radar_alone": frames
+        without a label file, image or calibration.
+
+    Raises:
+        FileNotFoundError: A path does not exist.
+        UserError: There is no frame, or an image or a weight is not as expected.
     """
     frames = find_frames(paths)
-    detector = Detector.from_workdir(workdir, step)
+    run = load_run(workdir, step, image_backbone)
+    detector = Detector.from_config(run.config, run.variables, run.grid)
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
 
-    def batches() -> Iterator[np.ndarray]:
+    known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
+    if detector.takes_camera:
+        labels = labels or (run.paths and run.paths.labels)
+        known = front_images(frames, detector, labels, run.config.data.label_version)
+
+    def batches() -> Iterator[tuple[Any, ...]]:
         for chunk in chunks:
-            yield np.stack([read_frame(path, detector.grid) for path in chunk])
+            radar = np.stack([read_frame(path, detector.grid) for path in chunk])
+            if known:
+                pairs = [known.get(path.absolute(), (None, None)) for path in chunk]
+                yield radar, *map(list, zip(*pairs, strict=True))
+            else:
+                yield (radar,)
 
     num_boxes = 0
     found: Iterator[Detections] = detector.stream(batches(), **settings)

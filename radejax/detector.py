@@ -118,7 +118,7 @@ class Detector:
         Raises:
             FileNotFoundError: No run or no such checkpoint there.
         """
-        from radejax.experiment import load_run  # above this floor: a convenience
+        from radejax.workdir import load_run  # above this floor: a convenience
 
         run = load_run(path, step, image_backbone)
         return cls.from_config(run.config, run.variables, run.grid, **overrides)

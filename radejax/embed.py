@@ -166,6 +166,11 @@ def open_embeddings(
     return ArrayRecords(folder, files, shape, dtype)
 
 
+def embeddings_sha256(folder: str | os.PathLike) -> str:
+    """Checksum of the weights that embeddings were made with."""
+    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
+
+
 def weights_sha256(params: Mapping[str, Any]) -> str:
     """Checksum of a tree of weights: names, shapes and values."""
     digest = hashlib.sha256()

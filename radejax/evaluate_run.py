@@ -14,16 +14,17 @@ from radejax import camera_inputs
 from radejax.camera_share import camera_share, write_camera_share
 from radejax.data.encoding import decode as decode_array
 from radejax.data.frame import Frame
+from radejax.data.frame_table import IMAGE_SIZE, read_left_image
 from radejax.data.kradar import KRadar
 from radejax.data.records import RecordSource
 from radejax.errors import UserError
 from radejax.evaluation.measure import Options
 from radejax.evaluation.predictions_io import tables_from_frames
 from radejax.evaluation.report import Report, write_report
-from radejax.experiment import load_run
 from radejax.geometry.camera import CameraCalibration
 from radejax.predict import Predictor, predict_dataset
 from radejax.training import processes
+from radejax.workdir import load_run
 
 _log = logging.getLogger(__name__)
 
@@ -185,12 +186,13 @@ class FrameDrawer:
         mine &= self._predictions["score"] >= self._score_threshold
         columns = {k: v[mine] for k, v in self._predictions.items()}
         record = self._records[self._positions[index]]
+        image, camera = front_view(frame)
         return Scene(
             decode_array(record["projection"]),
             ground_truth=(frame.boxes, list(frame.classes)),
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
-            image=read_left_image(frame.camera_path),
-            camera=read_camera(frame),
+            image=image,
+            camera=camera,
             title=f"{frame.weather} ({frame.key})",
         )
 
@@ -243,12 +245,19 @@ def read_camera(frame: Frame) -> CameraCalibration | None:
     )
 
 
-def read_left_image(path: pathlib.Path | None) -> np.ndarray | None:
-    """`[H, W, 3]` uint8 left half of a stereo front image; None where there is none."""
-    if path is None:
-        return None
-    from PIL import Image
+def front_view(
+    frame: Frame,
+) -> tuple[np.ndarray | None, CameraCalibration | None]:
+    """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
 
-    with Image.open(path) as image:
-        pixels = np.asarray(image.convert("RGB"))
-    return pixels[:, : pixels.shape[1] // 2]
+    Images of another size than the calibration's are resized to it. None where there is
+    none.
+
+    Raises:
+        DataError: A file is damaged.
+    """
+    camera = read_camera(frame)
+    if frame.camera_path is None:
+        return None, None
+    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
+    return read_left_image(frame.camera_path, size, resize=True), camera

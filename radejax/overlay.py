@@ -13,7 +13,7 @@ from radejax.data.frame import Frame
 from radejax.data.kradar import KRadar
 from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.errors import UserError
-from radejax.evaluate_run import read_camera, read_left_image
+from radejax.evaluate_run import front_view
 from radejax.structures import WIDE_ROI
 from radejax.visualize import animate, bev, projections
 
@@ -72,12 +72,13 @@ def draw_overlay(
             figure = projections.draw_slices(projection, frames.grid)
             figure.suptitle(title)
             return figure
+        image, camera = front_view(frame)
         return bev.draw_frame(
             projection,
             frames.grid,
             ground_truth=(frame.boxes, list(frame.classes)),
-            image=read_left_image(frame.camera_path),
-            camera=read_camera(frame),
+            image=image,
+            camera=camera,
             roi=WIDE_ROI,
             title=title,
         )

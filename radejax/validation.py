@@ -18,11 +18,11 @@ from radejax.evaluate_run import FrameDrawer, report_options
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import measure, repair_sizes
 from radejax.evaluation.predictions_io import tables_from_frames
-from radejax.experiment import DataPaths
 from radejax.predict import Predictor, predict_dataset
 from radejax.training import processes
 from radejax.training.state import TrainState
 from radejax.training.watch import Scores
+from radejax.workdir import DataPaths
 
 
 class Validation:

@@ -15,8 +15,7 @@ from radejax.data.frame import Frame
 from radejax.data.kradar import KRadar
 from radejax.data.tesseract import project_file
 from radejax.errors import UserError
-from radejax.evaluate_run import read_left_image
-from radejax.geometry.camera import CameraCalibration
+from radejax.evaluate_run import front_view
 from radejax.visualize.viewer import ViewerFrame, write_recording
 
 
@@ -79,16 +78,11 @@ def viewer_frames(
     """What the viewer shows of each frame, read as it is needed."""
     for frame in frames:
         projection = project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
-        calibration = None
-        if frame.camera_calibration_path is not None:
-            calibration = CameraCalibration.from_kradar(
-                frame.camera_calibration_path,
-                ego_from_lidar_m=frame.radar_from_lidar_m,
-            )
+        image, calibration = front_view(frame)
         found = None
         if detector is not None:
             inputs = (projection,)
-            if detector.takes_camera and frame.camera_path and calibration:
+            if detector.takes_camera and calibration is not None:
                 inputs += frame.camera_path, calibration
             found = jax.tree.map(lambda x: np.asarray(x[0]), detector(*inputs))
         yield ViewerFrame(
@@ -96,7 +90,7 @@ def viewer_frames(
             ground_truth=frame,
             predictions=found,
             track_ids=track_ids(frame),
-            image=read_left_image(frame.camera_path),
+            image=image,
             calibration=calibration,
             time_s=frame.header.timestamp_s,
             name=f"sequence {frame.sequence}, {frame.name}, {frame.weather}",

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import logging
 import pathlib
+import shutil
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from radejax import camera_inputs, embed, experiment
 from radejax.cli import main
 from radejax.config import load_config
 from radejax.data.records import RecordSource
+from radejax.detect_files import detect_files
 from radejax.detector import Detector
 from radejax.errors import DataError, UserError
 from radejax.evaluate_run import evaluate_run, predict_dataset
@@ -200,6 +202,47 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     run.config.data.camera.allow_missing = False
     with pytest.raises(UserError, match="1 of 4 frames"):
         camera_inputs.loader_arguments(run.config, blind)
+
+
+def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
+    run = experiment.load_run(from_images)
+    frames = list(run.paths.open(run.config, "test"))
+    folder = frames[0].tesseract_path.parents[1]
+    root = tmp_path / "kradar"
+    shutil.copytree(folder, root / folder.name)
+    for calibration in ("calib_seq_v2", "common"):
+        if (folder.parent / calibration).is_dir():
+            shutil.copytree(folder.parent / calibration, root / calibration)
+
+    def detect(name):
+        out = tmp_path / name
+        counts = detect_files(from_images, [root], out, score_threshold=0.0)
+        boxes = {path.name: json.loads(path.read_text()) for path in out.iterdir()}
+        assert counts["frames"] == len(boxes) == len(frames)
+        assert counts["boxes"] == sum(map(len, boxes.values()))
+        return counts["radar_alone"], boxes
+
+    none_missing, seen = detect("seen")
+    assert none_missing == 0
+    detector = Detector.from_workdir(from_images, score_threshold=0.0)
+    frame = frames[0]
+    expected = detector(
+        frame.tesseract_path, [frame.camera_path], [frame.camera_calibration_path]
+    ).to_list(detector.classes)[0]
+    name = f"{folder.name}_{frame.tesseract_path.stem}.json"
+    assert [box["x"] for box in seen[name]] == pytest.approx(
+        [box["x"] for box in expected], abs=1e-3
+    )
+
+    (root / folder.name / "cam-front" / frame.camera_path.name).unlink()
+    one_missing, blind = detect("blind")
+    assert one_missing == 1
+    assert blind.keys() == seen.keys()
+    assert blind[name] != seen[name]
+
+    shutil.rmtree(root / folder.name / "info_label")
+    all_missing, _ = detect("unlabelled")
+    assert all_missing == len(frames)
 
 
 def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):

@@ -13,11 +13,11 @@ from radejax.data.projection_job import project_dataset
 from radejax.data.records import RecordSource
 from radejax.detector import Detector
 from radejax.errors import UserError
-from radejax.experiment import DataPaths
 from radejax.predict import Predictor, predict_dataset
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import sharding
 from radejax.validation import Validation
+from radejax.workdir import DataPaths
 
 
 @pytest.fixture(scope="module")

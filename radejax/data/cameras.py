@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import numpy as np
 
@@ -23,6 +23,7 @@ def frame_cameras(
     ego_from_lidar_m: Sequence[float] | None = None,
     resize: bool = False,
     allow_missing: bool = False,
+    embedded: Container[str] = (),
 ) -> list[Camera]:
     """Cameras of left front images, each calibration file read once.
 
@@ -35,6 +36,7 @@ def frame_cameras(
         resize: Images of another size are resized, and their calibration with them.
         allow_missing: Frames without an image or a calibration get a camera whose
             `is_valid` is False; how many is logged. Otherwise they are an error.
+        embedded: Keys of frames whose image is not needed, being embedded already.
 
     Returns:
         One camera a frame, NumPy float64.
@@ -45,11 +47,12 @@ def frame_cameras(
         DataError: A calibration file is damaged.
     """
     height, width = image_size
-    missing = [
-        frame.key
-        for frame in frames
-        if frame.camera_path is None or frame.camera_calibration_path is None
-    ]
+
+    def has_none(frame: Frame) -> bool:
+        has_image = frame.camera_path is not None or frame.key in embedded
+        return not has_image or frame.camera_calibration_path is None
+
+    missing = [frame.key for frame in frames if has_none(frame)]
     if missing and not allow_missing:
         raise UserError(
             f"{len(missing)} of {len(frames)} frames have no front image or no camera "
@@ -77,7 +80,7 @@ def frame_cameras(
         return calibration.camera(projection)
 
     def camera(frame: Frame) -> Camera:
-        if frame.camera_path is None or frame.camera_calibration_path is None:
+        if has_none(frame):
             return no_camera(image_size)
         shift = ego_from_lidar_m or frame.radar_from_lidar_m
         return read(str(frame.camera_calibration_path), tuple(map(float, shift)))

@@ -156,6 +156,7 @@ def make_table(
     if features is not None:
         position = features.index_of()
         feature_record = np.array([position.get(f.key, -1) for f in frames], np.int64)
+        _check_embedded(frames, feature_record, features)
         _check_images(frames, feature_record < 0, allow_missing_images)
     return FrameTable(
         record,
@@ -236,6 +237,23 @@ def _image_paths(
     paths = tuple(frame.camera_path for frame in frames)
     _check_images(frames, [path is None for path in paths], allow_missing)
     return paths
+
+
+def _check_embedded(
+    frames: Sequence[Frame], record: np.ndarray, features: ArrayRecords
+) -> None:
+    """`UserError` for frames whose image is there but was not embedded."""
+    forgotten = [
+        frame.key
+        for frame, position in zip(frames, record, strict=True)
+        if position < 0 and frame.camera_path is not None
+    ]
+    if forgotten:
+        raise UserError(
+            f"{features.folder}: {len(forgotten)} of {len(frames)} frames have an image "
+            f"that is not embedded, the first is {forgotten[0]}; embed all of the data: "
+            "`radejax embed`"
+        )
 
 
 def _check_images(

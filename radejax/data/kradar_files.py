@@ -182,15 +182,21 @@ def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | 
 
 def find_camera_calibration(
     folders: Sequence[pathlib.Path], sequence: int
-) -> pathlib.Path | None:
-    """Calibration of the left front camera: of the sequence, else the common one."""
-    per_sequence = f"seq_{sequence:02d}/cam_1.yml"
-    names = (f"calib_seq_v2/{per_sequence}", per_sequence, "common/cam_front0.yml")
-    for folder in folders:
-        for name in (*names, "cam_front0.yml"):
-            if (folder / name).is_file():
-                return folder / name
-    return None
+) -> tuple[pathlib.Path | None, bool]:
+    """Calibration of the left front camera: of the sequence, else the common one.
+
+    Returns:
+        The file, None where there is none, and whether it is the sequence's own.
+    """
+    own = f"seq_{sequence:02d}/cam_1.yml"
+    of_sequence = (f"calib_seq_v2/{own}", own)
+    common = ("common/cam_front0.yml", "cam_front0.yml")
+    for names, is_own in ((of_sequence, True), (common, False)):
+        for folder in folders:
+            for name in names:
+                if (folder / name).is_file():
+                    return folder / name, is_own
+    return None, False
 
 
 def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:

@@ -53,10 +53,13 @@ def read_sequence_info(
         x, y = _read_offset(number, folder, findings)
     else:
         x, y = map(float, radar_from_lidar)
+    camera, is_own = kradar_files.find_camera_calibration(camera_folders, number)
+    if camera is None:
+        findings.counts["sequences without camera calibration"] += 1
+    elif not is_own:
+        findings.counts["sequences with the common camera calibration"] += 1
     return SequenceInfo(
-        _read_conditions(number, folder, findings),
-        (x, y, z_offset_m),
-        kradar_files.find_camera_calibration(camera_folders, number),
+        _read_conditions(number, folder, findings), (x, y, z_offset_m), camera
     )
 
 

@@ -87,8 +87,6 @@ class CameraNeck(nn.Module):
             train: Normalise by the batch and update the running statistics
                 (collection "batch_stats").
         """
-        # A batch without any image must not divide by zero; its map is not used.
-        is_counted = has_image | ~has_image.any()
         x = Dense(self.features, dtype=self.dtype, name="proj")(tokens)
         layers = [
             TransposedConv(self.features, dtype=self.dtype, name="up_1"),
@@ -98,10 +96,18 @@ class CameraNeck(nn.Module):
         for layer in layers:
             x = layer(x)
             x = batch_norm(f"{layer.name}_norm", self.dtype, train)(
-                x, mask=is_counted[:, None, None, None]
+                x, mask=counted_frames(has_image)
             )
             x = nn.relu(x)
         return x
+
+
+def counted_frames(has_image: jax.Array) -> jax.Array:
+    """`[B, 1, 1, 1]` mask of the frames that enter batch statistics.
+
+    A batch without any image must not divide by zero; its map is not used.
+    """
+    return (has_image | ~has_image.any())[:, None, None, None]
 
 
 def batch_norm(name: str, dtype: Any, train: bool) -> nn.BatchNorm:

@@ -22,7 +22,12 @@ from radejax.models.camera_neck import CameraNeck
 from radejax.models.fusion import Fusion
 from radejax.models.heads import Heads
 from radejax.models.image import normalize
-from radejax.models.lifting import LiftingAxes, ReferencePoints, reference_points
+from radejax.models.lifting import (
+    MARGIN_PX,
+    LiftingAxes,
+    ReferencePoints,
+    reference_points,
+)
 from radejax.models.neck import Neck
 from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
 from radejax.models.vit import ViT
@@ -87,7 +92,9 @@ class DinoRade(nn.Module):
                 radar.decoder_width, self.resnet_width, dtype=dtype
             )
         else:
-            self.image_backbone = self.vit.clone(dtype=dtype, parent=None)
+            self.image_backbone = self.vit.clone(
+                dtype=dtype, remat=blocks and not self.freeze, parent=None
+            )
             self.image_neck = CameraNeck(radar.decoder_width, dtype)
         self.image_fusion = Fusion(
             **self.fusion,
@@ -291,6 +298,11 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
                 f"config.model.{key} is {fields[section][name]!r}, expected one of "
                 f"{choices}"
             )
+    if image["kind"] == "resnet50" and not image["freeze"]:
+        raise UserError(
+            "config.model.image.freeze is False, but the ResNet's first stages have "
+            "fixed batch statistics and are not to be trained (its last stage is)"
+        )
     radar = {k: fields[k] for k in radenet.FIELDS}
     model = DinoRade(
         radar=radenet.from_config({"name": "radenet"} | radar),
@@ -340,6 +352,11 @@ def _check_sizes(model: DinoRade) -> None:
                 f"config.model.image: {hidden} channels in {heads} heads; each head "
                 "needs a multiple of 4"
             )
+    if model.fusion["invalid"] == "official" and model.image_size[1] <= 2 * MARGIN_PX:
+        raise UserError(
+            f"config.model.fusion.invalid='official' leaves out {MARGIN_PX} pixels left "
+            f"and right, but config.model.image.size is {model.image_size}"
+        )
     width, heads = model.radar.decoder_width, model.fusion["num_heads"]
     if width % heads:
         raise UserError(

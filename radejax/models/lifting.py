@@ -32,7 +32,10 @@ OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
 """Released offsets between radar and camera rig: the `ego_from_lidar_m` to project
 with, together with the "pinhole" image."""
 
-_OFFICIAL_MARGIN_PX = 280  # left and right: a leftover of square image crops
+MARGIN_PX = 280
+"""Left and right, of an image 1280 wide, that `invalid="official"` leaves out: a leftover
+of square image crops."""
+
 _OFFICIAL_DEPTH_OFFSET_M = 1e-6
 
 
@@ -150,7 +153,7 @@ def reference_points(
     offset = _OFFICIAL_DEPTH_OFFSET_M if invalid == "official" else 0.0
     pixels, depth = project(centers, camera, depth_offset_m=offset)
     width, height = (camera.size_px[:, i, None, None, None] for i in (0, 1))
-    margin = _OFFICIAL_MARGIN_PX if invalid == "official" else 0.0
+    margin = MARGIN_PX if invalid == "official" else 0.0
     u, v = pixels[..., 0], pixels[..., 1]
     is_valid = (depth > 0) & (u >= margin) & (u < width - margin)
     is_valid = is_valid & (v >= 0) & (v < height)

@@ -16,7 +16,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from radejax.models.camera_neck import batch_norm
+from radejax.models.camera_neck import batch_norm, counted_frames
 from radejax.models.layers import Conv, uniform_fan_in
 
 STRIDE = 16
@@ -95,12 +95,14 @@ class Bottleneck(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array, train: bool) -> jax.Array:
+    def __call__(
+        self, x: jax.Array, train: bool, mask: jax.Array | None = None
+    ) -> jax.Array:
         def block(x: jax.Array, features: int, size: int, stride: int, name: str):
             x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
             if self.frozen:
                 return FrozenBatchNorm(self.dtype, name=f"norm_{name}")(x)
-            return batch_norm(f"norm_{name}", self.dtype, train)(x)
+            return batch_norm(f"norm_{name}", self.dtype, train)(x, mask=mask)
 
         y = nn.relu(block(x, self.features, 1, 1, "1"))
         y = nn.relu(block(y, self.features, 3, self.stride, "2"))
@@ -160,8 +162,8 @@ class ResNetNeck(nn.Module):
     def __call__(
         self, x: jax.Array, has_image: jax.Array, *, train: bool = False
     ) -> jax.Array:
-        """As `CameraNeck`; `has_image` has no effect."""
-        del has_image
+        """As `CameraNeck`: frames without an image do not enter the statistics."""
+        mask = counted_frames(has_image)
         for i in range(self.depth):
             x = Bottleneck(
                 8 * self.width,
@@ -170,5 +172,5 @@ class ResNetNeck(nn.Module):
                 frozen=False,
                 dtype=self.dtype,
                 name=f"block_{i + 1}",
-            )(x, train)
+            )(x, train, mask)
         return Conv(self.features, 1, use_bias=False, dtype=self.dtype, name="proj")(x)

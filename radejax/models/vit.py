@@ -264,11 +264,12 @@ def attend(
     plain = jax.nn.dot_product_attention
     if kind == "auto":
         is_half = query.dtype in (jnp.bfloat16, jnp.float16)
-        if is_half and jax.default_backend() == "gpu":
-            return plain(query, key, value, implementation="cudnn")
+        flash = {}
+        if is_half and jax.default_backend() == "gpu":  # else it cannot be traced
+            flash["cuda"] = functools.partial(plain, implementation="cudnn")
         # Decided when lowered, so that one traced program serves several platforms.
         return jax.lax.platform_dependent(
-            query, key, value, cpu=_attend_blocked, default=plain
+            query, key, value, cpu=_attend_blocked, default=plain, **flash
         )
     if kind == "blocked":
         return _attend_blocked(query, key, value)

@@ -101,9 +101,9 @@ def test_split_files_and_camera_calibration_are_found(tmp_path):
     assert kradar_files.find_split_file("train", near) is None
     common = touch(tmp_path / "c/common/cam_front0.yml")
     own = touch(tmp_path / "c/calib_seq_v2/seq_03/cam_1.yml")
-    assert kradar_files.find_camera_calibration([tmp_path / "c"], 3) == own
-    assert kradar_files.find_camera_calibration([tmp_path / "c"], 4) == common
-    assert kradar_files.find_camera_calibration([tmp_path / "d"], 4) is None
+    assert kradar_files.find_camera_calibration([tmp_path / "c"], 3) == (own, True)
+    assert kradar_files.find_camera_calibration([tmp_path / "c"], 4) == (common, False)
+    assert kradar_files.find_camera_calibration([tmp_path / "d"], 4) == (None, False)
 
 
 def test_grid_of_the_roots(tmp_path):

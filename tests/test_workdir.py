@@ -1,0 +1,69 @@
+"""What a work folder keeps of a run, and weights taken from another."""
+
+import json
+import pathlib
+
+import pytest
+
+from radejax import workdir
+from radejax.config import base_config
+from radejax.errors import UserError
+
+
+def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
+    config = base_config()
+    workdir.claim_workdir(tmp_path / "run", config)
+    workdir.claim_workdir(tmp_path / "run", config)
+    loaded = workdir.load_config(tmp_path / "run")
+    assert json.loads(loaded.to_json()) == json.loads(config.to_json())
+
+
+def test_another_config_is_refused_and_the_difference_named(
+    tmp_path: pathlib.Path,
+) -> None:
+    config = base_config()
+    workdir.claim_workdir(tmp_path, config)
+    config.train.batch_size = 3
+    config.seed = 5
+    with pytest.raises(
+        UserError,
+        match=r"config\.seed is 0 there and 5 here; "
+        r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
+    ):
+        workdir.claim_workdir(tmp_path, config)
+
+
+def test_no_run_in_a_folder(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no run in .*config\.json is missing"):
+        workdir.load_run(tmp_path)
+
+
+def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
+    paths = workdir.DataPaths(roots=("a",), labels=None, records="r")
+    info = workdir.run_info(tmp_path, paths, tmp_path / "model.pth")
+    assert info["init_from"] == str(tmp_path / "model.pth")
+    (tmp_path / "run.json").write_text(json.dumps(info))
+    again = workdir.run_info(tmp_path, paths)
+    assert again["init_from"] == info["init_from"]
+    assert again["data"]["roots"] == ("a",)
+
+
+def test_weights_of_another_run_need_the_same_model(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = base_config()
+    config.model.name = "radenet"
+    workdir.claim_workdir(tmp_path, config)
+    other = workdir.Run(
+        tmp_path, workdir.load_config(tmp_path), None, None, {"w": 1}, 3
+    )
+    monkeypatch.setattr(workdir, "load_run", lambda path: other)
+    # A config from JSON has lists where the other one has tuples.
+    config.model.widths = (8, 16)
+    other.config.model.widths = [8, 16]
+    assert workdir.initial_variables(tmp_path, config) == {"w": 1}
+    config.model.widths = (8, 32)
+    with pytest.raises(
+        UserError, match=r"widths is \[8, 16\] there and \[8, 32\] here"
+    ):
+        workdir.initial_variables(tmp_path, config)
