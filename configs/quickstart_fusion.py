@@ -5,7 +5,7 @@
 
 The first trains a narrow DinoRADE with a small image transformer from scratch, the
 second the same model without its camera, on the same simulated data: the difference is
-what the camera adds. `docs/training.md` has the numbers to expect.
+what the camera adds. `docs/radar_camera.md` has the numbers to expect.
 
 Words: `radar` for the model without the camera; `short` makes a run of two minutes that
 learns next to nothing, to see that everything works.

@@ -82,7 +82,7 @@ def front_images(
     sequences = [
         folder
         for folder in {path.absolute().parent.parent for path in paths}
-        if folder.name.isdecimal() and (labels or (folder / "info_label").is_dir())
+        if folder.name.isdecimal() and (labels or any(folder.glob("info_label*")))
     ]
     if not sequences:
         return {}

@@ -14,8 +14,9 @@ from click.testing import CliRunner
 from radejax import camera_inputs, embed, experiment
 from radejax.cli import main
 from radejax.config import load_config
+from radejax.data.frame_table import make_table
 from radejax.data.records import RecordSource
-from radejax.detect_files import detect_files
+from radejax.detect_files import detect_files, output_name
 from radejax.detector import Detector
 from radejax.errors import DataError, UserError
 from radejax.evaluate_run import evaluate_run, predict_dataset
@@ -139,6 +140,76 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings):
     assert reports[0]["ap"] == reports[1]["ap"]
 
 
+def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
+    # No --image_backbone: the weights come with those that the run starts from.
+    workdir = data.train("continued", init_from=str(from_images))
+    assert (workdir / "evaluation" / "metrics.json").exists()
+    first, second = (experiment.load_run(w).variables for w in (from_images, workdir))
+    for name, is_same in (("image_backbone", True), ("image_neck", False)):
+        pairs = zip(
+            jax.tree.leaves(first["params"][name]),
+            jax.tree.leaves(second["params"][name]),
+            strict=True,
+        )
+        assert all(np.array_equal(a, b) for a, b in pairs) == is_same
+
+
+def test_a_backbone_that_is_gone_leaves_embedded_images(
+    data, from_images, tmp_path, caplog
+):
+    copy = tmp_path / "copy"
+    shutil.copytree(from_images, copy)
+    info = copy / "checkpoints"
+    newest = max(info.iterdir(), key=lambda path: int(path.name))
+    stored = newest / "info" / "metadata"
+    text = stored.read_text().replace(str(data.backbone), str(tmp_path / "gone"))
+    stored.write_text(text)
+    with caplog.at_level(logging.WARNING):
+        run = experiment.load_run(copy)
+    assert "image backbone" in caplog.text
+    assert "is gone" in caplog.text
+    assert "image_backbone" not in run.variables["params"]
+    again = experiment.load_run(copy, image_backbone=data.backbone)
+    assert "image_backbone" in again.variables["params"]
+
+
+def test_images_that_are_not_embedded_are_an_error(data, embeddings):
+    run = experiment.load_run(data.runs / "images")
+    frames = list(run.paths.open(run.config, "test"))
+    records = RecordSource(run.paths.records)
+    other = [dataclasses.replace(frames[0], name="99999_99999"), *frames[1:]]
+    inputs = camera_inputs.loader_arguments(run.config, other, embeddings)
+    with pytest.raises(
+        UserError, match=r"1 of 4 frames have an image that .* `radejax embed`"
+    ):
+        make_table(
+            _Renamed(records, other[0].key, frames[0].key),
+            other,
+            max_objects=50,
+            cameras=inputs["cameras"],
+            features=inputs["features"],
+        )
+    # Embedded images need no files.
+    gone = [dataclasses.replace(frame, camera_path=None) for frame in frames]
+    inputs = camera_inputs.loader_arguments(run.config, gone, embeddings)
+    assert all(camera.is_valid for camera in inputs["cameras"])
+    inputs = camera_inputs.loader_arguments(run.config, gone)
+    with pytest.raises(UserError, match=r"\(4\) can use the camera: 4 have no front"):
+        camera_inputs.require_images(gone, inputs)
+
+
+class _Renamed:
+    """Records in which one frame has another key."""
+
+    def __init__(self, records, key, old):
+        self._index = {**records.index_of(), key: records.index_of()[old]}
+        self.manifest = records.manifest
+        self.folder = records.folder
+
+    def index_of(self):
+        return self._index
+
+
 def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path):
     config = small_config()
     config.model.image.standardize = False
@@ -207,12 +278,12 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
 def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     run = experiment.load_run(from_images)
     frames = list(run.paths.open(run.config, "test"))
-    folder = frames[0].tesseract_path.parents[1]
+    path = frames[0].projection_path
+    folder = path.parents[1]
     root = tmp_path / "kradar"
-    shutil.copytree(folder, root / folder.name)
-    for calibration in ("calib_seq_v2", "common"):
-        if (folder.parent / calibration).is_dir():
-            shutil.copytree(folder.parent / calibration, root / calibration)
+    others = [x.name for x in folder.parent.iterdir() if x.name.isdecimal()]
+    others.remove(folder.name)
+    shutil.copytree(folder.parent, root, ignore=shutil.ignore_patterns(*others))
 
     def detect(name):
         out = tmp_path / name
@@ -227,9 +298,9 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     detector = Detector.from_workdir(from_images, score_threshold=0.0)
     frame = frames[0]
     expected = detector(
-        frame.tesseract_path, [frame.camera_path], [frame.camera_calibration_path]
+        path, [frame.camera_path], [frame.camera_calibration_path]
     ).to_list(detector.classes)[0]
-    name = f"{folder.name}_{frame.tesseract_path.stem}.json"
+    name = f"{output_name(path)}.json"
     assert [box["x"] for box in seen[name]] == pytest.approx(
         [box["x"] for box in expected], abs=1e-3
     )
@@ -240,7 +311,8 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     assert blind.keys() == seen.keys()
     assert blind[name] != seen[name]
 
-    shutil.rmtree(root / folder.name / "info_label")
+    for labels in (root / folder.name).glob("info_label*"):
+        shutil.rmtree(labels)
     all_missing, _ = detect("unlabelled")
     assert all_missing == len(frames)
 

@@ -23,6 +23,7 @@ from radejax.data.frame_table import (
 )
 from radejax.data.records import RecordSource
 from radejax.errors import UserError
+from radejax.geometry.camera import stack_cameras
 from radejax.structures import CLASSES, Batch
 
 __all__ = [
@@ -250,7 +251,7 @@ class _LoadBatch(grain.transforms.Map):
                 batch.image[row] = sample["image"]
         if self._table.cameras is None:
             return batch
-        return batch.replace(camera=_stack(cameras))
+        return batch.replace(camera=stack_cameras(cameras))
 
     def _sample(self, index: int) -> dict[str, Any]:
         """One frame; images and cameras None where they are not asked for."""
@@ -274,14 +275,3 @@ class _LoadBatch(grain.transforms.Map):
             frame=np.full(size, -1, np.int32),
             image=self._table.empty_images(size),
         )
-
-
-def _stack(cameras: Sequence[Any]) -> Any:
-    """Leaves `[B, ...]`, float32 or bool, as the device computes."""
-    import jax
-
-    def stack(*leaves: Any) -> np.ndarray:
-        stacked = np.stack(leaves)
-        return stacked if stacked.dtype == bool else stacked.astype(np.float32)
-
-    return jax.tree.map(stack, *cameras)

@@ -332,26 +332,6 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     return jax.tree.map(stack, *cameras)
 
 
-def left_half(image: np.ndarray) -> np.ndarray:
-    """Left camera's image of K-Radar's stereo pair, `[..., H, 2W, 3]` to `[..., H, W, 3]`.
-
-    Raises:
-        UserError: The image is not a side-by-side pair of wide images: its width is
-            not even, or not more than twice its height.
-    """
-    if image.ndim < 3 or image.shape[-1] != 3:
-        raise UserError(
-            f"a colour image [H, W, 3] was expected, got shape {image.shape}"
-        )
-    height, width = image.shape[-3:-1]
-    if width % 2 or width <= 2 * height:
-        raise UserError(
-            f"image of {width} x {height} pixels is not a stereo pair side by side"
-            " (K-Radar's front camera: 2560 x 720)"
-        )
-    return image[..., : width // 2, :]
-
-
 def _to_camera(points: Any, camera: Camera) -> Any:
     xp = _array_module(points, camera.cam_from_ego)
     rotation, shift = camera.cam_from_ego[..., :3], camera.cam_from_ego[..., 3]

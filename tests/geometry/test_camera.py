@@ -209,20 +209,6 @@ def test_points_on_one_ray_share_a_pixel(azimuth_deg, elevation_deg, scale, dept
     np.testing.assert_allclose(near, far, atol=1e-9)
 
 
-def test_left_half_of_a_stereo_pair():
-    pair = np.arange(4 * 20 * 3).reshape(4, 20, 3)
-    np.testing.assert_array_equal(camera_lib.left_half(pair), pair[:, :10])
-
-
-@pytest.mark.parametrize(
-    ("shape", "message"),
-    [((720, 1280, 3), "stereo"), ((4, 21, 3), "stereo"), ((4, 20), "colour image")],
-)
-def test_left_half_refuses_other_images(shape, message):
-    with pytest.raises(UserError, match=message):
-        camera_lib.left_half(np.zeros(shape))
-
-
 def test_calibrations_compare_by_value():
     assert forward_camera() == forward_camera()
     assert hash(forward_camera()) == hash(forward_camera())

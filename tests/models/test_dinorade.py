@@ -346,6 +346,14 @@ def test_images_of_another_size_are_refused():
         ({"image.size": (30, 48)}, r"image.size is \(30, 48\); .* multiples of 16"),
         ({"image.hidden_size": 20}, r"20 channels in 2 heads; .* multiple of 4"),
         ({"fusion.num_heads": 3}, r"fusion.num_heads = 3 does not divide"),
+        (
+            {"fusion.invalid": "official"},
+            r"leaves out 280 pixels left and right, but .*size is \(32, 48\)",
+        ),
+        (
+            {"image.kind": "resnet50", "image.freeze": False},
+            r"freeze is False, but the ResNet's first stages",
+        ),
         ({"image": 3}, r"config.model.image must be a mapping, got 3"),
     ],
 )

@@ -68,7 +68,7 @@ def test_predictions_carry_scores():
 
 
 def test_stereo_pair_is_refused_with_advice():
-    with pytest.raises(UserError, match="left_half"):
+    with pytest.raises(UserError, match="read_left_image"):
         camera.draw_camera(np.zeros((72, 256, 3), np.uint8), CALIBRATION)
 
 
