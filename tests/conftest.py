@@ -6,9 +6,14 @@ import pathlib
 import tempfile
 import types
 
-import jax
 import pytest
 from absl import flags
+
+# Compiling takes most of the time here, so LLVM optimises nothing; read by `import jax`.
+# With XLA_FLAGS= in the environment programs are what users get: CI's slow tests.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
+import jax
 
 # Programs that several tests or processes compile are compiled once in a session; the
 # workers of pytest-xdist inherit the folder.

@@ -40,6 +40,7 @@ def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> No
     assert checkpoint_files.load(tmp_path).config == {"seed": 3}
 
 
+@pytest.mark.slow
 def test_a_packed_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> None:
     detector = small.detector("camera")
     content = checkpoint_files.write_packed(tmp_path, detector)

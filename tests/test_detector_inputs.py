@@ -87,6 +87,7 @@ def test_missing_images_are_predicted_from_the_radar_and_counted(
         strict(projection)
 
 
+@pytest.mark.slow
 def test_embedded_images_and_weights_without_the_backbone(fusion: Detector) -> None:
     projection, image = small.projections(1), small.images(1)
     expected = fusion(projection, image, small.calibration())

@@ -392,7 +392,7 @@ def test_gradient_descent_finds_the_objects():
     maps, batch = small_scene(np.random.default_rng(7))
     optimizer = optax.adam(0.1)
     state = optimizer.init(maps)
-    for _ in range(150):
+    for _ in range(200):
         (_, parts), grad = loss_and_grad(maps, batch)
         updates, state = optimizer.update(grad, state)
         maps = optax.apply_updates(maps, updates)

@@ -108,6 +108,7 @@ def gradient_by_differences(f, x, direction, step=1e-3):
     return (f(x + step * direction) - f(x - step * direction)) / (2 * step)
 
 
+@pytest.mark.slow
 def test_conv_gn_silu_gradient_against_finite_differences():
     with jax.enable_x64(True):
         module = ConvGNSiLU(8, 4, dtype=jnp.float64)

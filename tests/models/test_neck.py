@@ -24,12 +24,12 @@ def test_dilated_residual_equals_official(dilation, module_case, run_like_torch)
 
 def reach(kind):
     """Bins around the center that a change of the center reaches through the convs."""
-    x = jnp.zeros((1, 41, 41, 8))
+    x = jax.random.normal(jax.random.key(1), (1, 41, 41, 8))
     module = Neck(kind, 8)
     params = module.init(jax.random.key(0), x)
-    # Linear in the input where the norms are: perturb and look where maps differ most.
+    # The norms pass a little of every change to all bins: count where far more arrives.
     y = module.apply(params, x)
-    changed = jnp.abs(module.apply(params, x.at[0, 20, 20].set(1e3)) - y).max(-1)[0]
+    changed = jnp.abs(module.apply(params, x.at[0, 20, 20].add(0.1)) - y).max(-1)[0]
     far = np.asarray(changed > 10 * np.median(changed))
     return np.abs(np.argwhere(far) - 20).max()
 

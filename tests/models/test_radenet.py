@@ -85,6 +85,7 @@ def test_frames_do_not_touch_each_other(small):
     chex.assert_trees_all_close(middle, alone, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_remat_changes_neither_parameters_nor_gradients(small):
     x = jax.random.uniform(jax.random.key(0), (1, 16, 8, 13))
     # One level and short ends: rematerialised gradients are slow to compile.

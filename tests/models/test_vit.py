@@ -120,6 +120,7 @@ def test_another_image_size_uses_the_same_parameters():
     chex.assert_shape(tokens, (1, 18, 16))
 
 
+@pytest.mark.slow
 def test_remat_changes_nothing():
     image = np.random.default_rng(0).standard_normal((1, 8, 8, 3)).astype(np.float32)
     variables = jax.jit(ViT(**TINY).init)(jax.random.key(0), image)
