@@ -219,8 +219,9 @@ class Detector:
             frames: Projections `[B, R, A, D+E]` or `[R, A, D+E]` as
                 `radejax.data.projection.project` makes them; tesseracts
                 `[B, D, R, E, A]` or `[D, R, E, A]` in linear power, projected on the
-                device; the path of a tesseract or projection file, or several; or a
-                `Batch`, with its images and cameras.
+                device; the path of a tesseract or projection file; a list of such
+                arrays or paths; or a `Batch`, with its images and cameras. Arrays are
+                copied: their memory may be refilled after the call.
             image: Left front images for radar-camera models: `[B, H, W, 3]` uint8, or
                 a list with one image, path or None a frame.
             camera: Their calibration: one for all frames, or a list with one (or None)
@@ -235,7 +236,8 @@ class Detector:
             Detections with a leading batch axis, also for a single frame.
 
         Raises:
-            UserError: The shape fits neither; says what was expected.
+            UserError: The shape fits neither, or frames of a list differ in shape;
+                says what was expected.
         """
         if isinstance(frames, Batch):
             frames, image, camera = frames.projection, frames.image, frames.camera
@@ -261,7 +263,7 @@ class Detector:
             count = chunk[0].shape[0]
             size = next(s for s in self._batch_sizes if s >= count)
             chunk = jax.tree.map(lambda x, s=size: _pad_batch(x, s), chunk)
-            chunk = jax.device_put(chunk, self.device)
+            chunk = jax.tree.map(self._to_device, chunk)
             found = self._run(
                 self.variables, *chunk, *settings, is_tesseract=is_tesseract
             )
@@ -323,7 +325,9 @@ class Detector:
         threshold, NMS IoU, region `[6]`, and the keyword `is_tesseract`.
         """
         grid = map_grid(self.grid, self.model, self.azimuth_mapping)
-        return functools.partial(_detect, self.model, grid, self.decode_options)
+        return functools.partial(
+            _detect, self.model, grid, self.classes, self.decode_options
+        )
 
     def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
         """Images and cameras as arrays; counts the frames without."""
@@ -347,27 +351,56 @@ class Detector:
     def _batch(self, frames: Any) -> tuple[Any, bool]:
         if isinstance(frames, str | pathlib.Path):
             frames = [frames]
-        if isinstance(frames, Sequence) and all(
-            isinstance(f, str | pathlib.Path) for f in frames
-        ):
-            frames = np.stack([read_frame(f, self.grid) for f in frames])
+        if isinstance(frames, Sequence):
+            frames = self._stack(frames)
         shape = tuple(np.shape(frames))
         projection, tesseract = self.grid.projection_shape, self.grid.shape_drea
         for expected, is_tesseract in ((projection, False), (tesseract, True)):
             if shape[-len(expected) :] == expected and len(shape) - len(expected) < 2:
-                return frames if len(shape) > len(expected) else frames[
-                    None
-                ], is_tesseract
+                is_batch = len(shape) > len(expected)
+                return frames if is_batch else frames[None], is_tesseract
         raise UserError(
             f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
             f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
             f"[B, {', '.join(map(str, tesseract))}]"
         )
 
+    def _stack(self, frames: Sequence[Any]) -> np.ndarray:
+        """One array of the frames of a list: paths or arrays."""
+        arrays = [
+            read_frame(frame, self.grid)
+            if isinstance(frame, str | pathlib.Path)
+            else np.asarray(frame)
+            for frame in frames
+        ]
+        if not arrays:
+            raise UserError("no frames: the list is empty")
+        shapes = {array.shape: i for i, array in reversed(list(enumerate(arrays)))}
+        if len(shapes) > 1:
+            first, *_, other = sorted(shapes, key=shapes.__getitem__)
+            raise UserError(
+                f"frames of one call must have one shape: frame 0 has {list(first)}, "
+                f"frame {shapes[other]} has {list(other)}"
+            )
+        return np.stack(arrays)
+
+    def _to_device(self, x: Any) -> jax.Array:
+        """Copy on the device: the caller may refill its memory at once.
+
+        On CPU `device_put` shares aligned memory whatever `may_alias` says; elsewhere
+        the transfer reads it after the call returns.
+        """
+        if not isinstance(x, np.ndarray):
+            return jax.device_put(x, self.device)
+        if self.device.platform == "cpu":
+            return jax.device_put(x.copy(), self.device)
+        return jax.block_until_ready(jax.device_put(x, self.device))
+
 
 def _detect(
     model: nn.Module,
     grid: RadarGrid,
+    classes: tuple[str, ...],
     options: Mapping[str, Any],
     variables: Any,
     frames: jax.Array,
@@ -384,7 +417,7 @@ def _detect(
         frames = projection_lib.project_jax(frames)
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
     maps = model.apply(variables, *inputs, train=False)
-    return decode(
+    found = decode(
         maps,
         grid,
         score_threshold=score_threshold,
@@ -392,6 +425,7 @@ def _detect(
         roi=roi,
         **options,
     )
+    return found.replace(class_names=classes)
 
 
 def _pad_batch(x: Any, size: int) -> Any:

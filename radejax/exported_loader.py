@@ -36,7 +36,9 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
         iou = config["nms_iou"] if nms_iou is None else nms_iou
         roi = [-np.inf, np.inf] * 3 if roi is None else roi
         settings = np.float32(score), np.float32(iou), np.asarray(roi, np.float32)
-        return run(weights, jax.device_put(inputs, device), *settings)
+        # Copies: on CPU device_put shares memory, which the caller may refill.
+        own = jax.tree.map(np.array, inputs)
+        return run(weights, jax.device_put(own, device), *settings)
 
     return detect
 

@@ -73,6 +73,8 @@ class Detections:
         classes: `[B, K]` int32 class indices; -1 where not `is_valid`.
         is_valid: `[B, K]` bool, True where a row is a detection.
         num_cut: `[B]` int32 peaks above the score threshold that did not fit in K.
+        class_names: Names of the class indices, the detector's; static under `jit`.
+            The methods take others in their place.
     """
 
     boxes: jax.Array
@@ -80,24 +82,28 @@ class Detections:
     classes: jax.Array
     is_valid: jax.Array
     num_cut: jax.Array
+    class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
-    def to_columns(self, classes: Sequence[str] = CLASSES) -> dict[str, np.ndarray]:
+    def to_columns(self, classes: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The valid rows of all frames as plain columns, as evaluation takes them.
 
         Returns:
             "frame" `[N]` position in the batch, "box" `[N, 7]`, "cls" `[N]` names,
             "score" `[N]`; by frame, then by descending score.
         """
+        names = self.class_names if classes is None else classes
         frame, row = np.nonzero(np.asarray(self.is_valid))
         indices = np.asarray(self.classes)[frame, row]
         return {
             "frame": frame,
             "box": np.asarray(self.boxes, np.float64)[frame, row],
-            "cls": np.asarray(classes, object)[indices].astype(str),
+            "cls": np.asarray(names, object)[indices].astype(str),
             "score": np.asarray(self.scores, np.float64)[frame, row],
         }
 
-    def to_list(self, classes: Sequence[str] = CLASSES) -> list[list[dict[str, Any]]]:
+    def to_list(
+        self, classes: Sequence[str] | None = None
+    ) -> list[list[dict[str, Any]]]:
         """One list a frame of dictionaries: cls, score and the seven box numbers."""
         columns = self.to_columns(classes)
         frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
@@ -112,7 +118,7 @@ class Detections:
             frames[frame].append({"cls": cls, "score": score, **values})
         return frames
 
-    def to_pandas(self, classes: Sequence[str] = CLASSES) -> Any:
+    def to_pandas(self, classes: Sequence[str] | None = None) -> Any:
         """One row a detection, as a `pandas.DataFrame` (extra "notebook")."""
         import pandas
 
@@ -120,7 +126,7 @@ class Detections:
         boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
         return pandas.DataFrame({**columns, **boxes})
 
-    def to_kitti(self, classes: Sequence[str] = CLASSES) -> list[str]:
+    def to_kitti(self, classes: Sequence[str] | None = None) -> list[str]:
         """One text a frame as K-Radar's tools write predictions, without a final newline.
 
         Raises:

@@ -13,6 +13,8 @@ from radejax.data import kradar_write
 from radejax.data.projection import project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import dinorade_torch
+from radejax.structures import CLASSES
+from radejax.visualize.canvas import as_objects
 
 
 @pytest.fixture(scope="module")
@@ -163,3 +165,62 @@ def test_a_wrong_shape_names_what_was_expected(detector: Detector) -> None:
 def test_a_run_that_is_not_there(tmp_path: pathlib.Path) -> None:
     with pytest.raises(FileNotFoundError, match="no run in"):
         Detector.from_workdir(tmp_path)
+
+
+def test_memory_of_the_caller_may_be_refilled(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    """Aligned to 64 bytes, where `device_put` on CPU would share it."""
+    for count in (1, 4):  # a compiled size: nothing else copies the frames
+        shape = (count, *projections.shape[1:])
+        memory = np.zeros(4 * np.prod(shape) + 64, np.uint8)
+        start = -memory.ctypes.data % 64
+        ring = memory[start : start + 4 * np.prod(shape)].view(np.float32)
+        ring = ring.reshape(shape)
+
+        def refilled(ring: np.ndarray = ring, count: int = count) -> Any:
+            for i in range(5 - count):
+                ring[:] = projections[i : i + count]
+                yield ring
+            ring[:] = 0.0
+
+        for i, found in enumerate(detector.stream(refilled())):
+            _equal(found, detector(projections[i : i + count]))
+        ring[:] = projections[:count]
+        taken = detector._to_device(ring)
+        ring[:] = 0.0
+        np.testing.assert_array_equal(taken, projections[:count])
+
+
+def test_lists_of_arrays(
+    detector: Detector, tesseracts: np.ndarray, projections: np.ndarray
+) -> None:
+    expected = detector(projections[:2])
+    _equal(detector(list(projections[:2])), expected)
+    _equal(detector(tuple(tesseracts[:2])), expected)
+    with pytest.raises(UserError, match="the list is empty"):
+        detector([])
+    with pytest.raises(
+        UserError, match=r"frame 0 has \[16, 14, 5\], frame 1 has \[8, 14, 5\]"
+    ):
+        detector([projections[0], projections[0, :8]])
+
+
+def test_detections_carry_the_names_of_their_detector(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    names = ("Bicycle", "Motorcycle", "Pedestrian", "Bus or Truck", "Sedan")
+    turned = Detector(
+        detector.model,
+        detector.variables,
+        detector.grid,
+        classes=names,
+        score_threshold=0.3,
+        batch_sizes=(1, 4),
+    )
+    found = turned(projections)  # two chunks
+    index = int(found.classes[0, 0])
+    assert found.to_list()[0][0]["cls"] == names[index]
+    assert as_objects(jax.tree.map(lambda x: x[0], found)).names[0] == names[index]
+    assert found.to_list(CLASSES)[0][0]["cls"] == CLASSES[index]
+    assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]

@@ -64,7 +64,7 @@ def draw_bev(
     roi: Sequence[float] | None = None,
     ground_truth: Any = None,
     predictions: Any = None,
-    class_names: Sequence[str] = CLASSES,
+    class_names: Sequence[str] | None = None,
     ax: Axes | None = None,
     extent: Extent = "roi",
     channels: Channels = "all",
@@ -87,7 +87,7 @@ def draw_bev(
             as `(boxes [N, 7], classes)` or a frame.
         predictions: Boxes with scores and classes, such as `(boxes, scores, classes)`
             or one frame of `Detections`.
-        class_names: Names of class indices.
+        class_names: Names of class indices; see `canvas.as_objects`.
         ax: Where to draw; a new figure by default. Its limits and aspect are set.
         extent: "roi" shows the region of interest and its surroundings (all of the
             field of view without one), "fov" the field of view, or x_min, x_max,
@@ -144,7 +144,7 @@ def draw_polar(
     roi: Sequence[float] | None = None,
     ground_truth: Any = None,
     predictions: Any = None,
-    class_names: Sequence[str] = CLASSES,
+    class_names: Sequence[str] | None = None,
     ax: Axes | None = None,
     channels: Channels = "all",
     reduce: Reduce = "max",
@@ -203,7 +203,7 @@ def draw_frame(
     roi: Sequence[float] | None = None,
     image: Any = None,
     camera: Any = None,
-    class_names: Sequence[str] = CLASSES,
+    class_names: Sequence[str] | None = None,
     title: str | None = None,
     **bev_options: Any,
 ) -> Figure:
@@ -217,7 +217,7 @@ def draw_frame(
         roi: As in `draw_bev`.
         image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
         camera: `CameraCalibration` of the image: draws the boxes on it, or None.
-        class_names: Names of class indices.
+        class_names: Names of class indices; see `canvas.as_objects`.
         title: Title of the figure, such as sequence, frame and weather.
         **bev_options: Further arguments of `draw_bev`.
 

@@ -41,7 +41,7 @@ def draw_camera(
     *,
     ground_truth: Any = None,
     predictions: Any = None,
-    class_names: Sequence[str] = CLASSES,
+    class_names: Sequence[str] | None = None,
     image_kind: ImageKind = "raw",
     ax: Axes | None = None,
     show_labels: bool = True,
@@ -54,7 +54,7 @@ def draw_camera(
         calibration: The camera, with its ego-from-LiDAR offset.
         ground_truth: Boxes with classes in the ego frame; see `canvas.as_objects`.
         predictions: Boxes with scores and classes in the ego frame.
-        class_names: Names of class indices.
+        class_names: Names of class indices; see `canvas.as_objects`.
         image_kind: "raw" as recorded, or how the image was undistorted.
         ax: Where to draw; a new figure by default.
         show_labels: Write class and score at the boxes.

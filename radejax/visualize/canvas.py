@@ -54,7 +54,7 @@ class Objects(NamedTuple):
 
 
 def as_objects(
-    value: Any, class_names: Sequence[str] = CLASSES, *, what: str = "objects"
+    value: Any, class_names: Sequence[str] | None = None, *, what: str = "objects"
 ) -> Objects:
     """Boxes, classes and scores of one frame from whatever holds them.
 
@@ -63,7 +63,8 @@ def as_objects(
             mapping or an object (a frame, one frame of `Detections`) with `boxes`,
             `classes` and perhaps `scores` and `is_valid`; or the evaluation's columns
             `box`, `cls`, `score`. Classes are names or indices into `class_names`.
-        class_names: Names of the class indices.
+        class_names: Names of the class indices; if None those that a `Detections`
+            brings along, K-Radar's otherwise.
         what: Named in errors.
 
     Raises:
@@ -71,6 +72,8 @@ def as_objects(
     """
     if value is None:
         return Objects(np.zeros((0, 7)), ())
+    if class_names is None:
+        class_names = getattr(value, "class_names", CLASSES)
     if isinstance(value, Objects):
         boxes, classes, scores, is_valid = value.boxes, value.names, value.scores, None
     elif isinstance(value, tuple | list):
@@ -107,7 +110,7 @@ def _checked(
     classes: Any,
     scores: Any,
     is_valid: Any,
-    class_names: Sequence[str],
+    class_names: Sequence[str] | None,
     what: str,
 ) -> Objects:
     """Valid rows as `Objects`, after a look at every shape."""
@@ -134,7 +137,7 @@ def _checked(
     )
 
 
-def _class_name(value: Any, class_names: Sequence[str], what: str) -> str:
+def _class_name(value: Any, class_names: Sequence[str] | None, what: str) -> str:
     """Name of a class given by name or index."""
     if isinstance(value, str):
         return str(value)

@@ -30,7 +30,7 @@ _POINTS_PER_EDGE = 8  # straight edges bend in the polar view
 
 
 def both_sets(
-    ground_truth: Any, predictions: Any, class_names: Sequence[str]
+    ground_truth: Any, predictions: Any, class_names: Sequence[str] | None
 ) -> tuple[Objects | None, Objects | None]:
     """Both sets as `Objects`; what was not given stays None."""
     truth = found = None

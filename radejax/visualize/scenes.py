@@ -54,7 +54,7 @@ def draw_scenes(
     *,
     roi: Sequence[float] | None = None,
     columns: int = 4,
-    class_names: Sequence[str] = CLASSES,
+    class_names: Sequence[str] | None = None,
     zoom_m: float = 10.0,
 ) -> Figure:
     """Figure of scenes side by side: ground truth, predictions and region in each.
@@ -64,7 +64,7 @@ def draw_scenes(
         grid: The grid of the projections.
         roi: Region of interest, dashed; as in `bev.draw_bev`.
         columns: Scenes in a row.
-        class_names: Names of class indices.
+        class_names: Names of class indices; see `canvas.as_objects`.
         zoom_m: Width and height of what is magnified, metres.
 
     Raises:
@@ -137,7 +137,7 @@ def _magnify(
     grid: RadarGrid,
     limits: tuple[float, float],
     size_m: float,
-    class_names: Sequence[str],
+    class_names: Sequence[str] | None,
 ) -> None:
     """An orange square on the map and what is in it, larger, in a corner."""
     from matplotlib.patches import Rectangle

@@ -243,7 +243,7 @@ def _log_frame(
         "world/echoes",
         rr.Points3D(points, colors=_colors(strength / brightest), radii=0.12),
     )
-    truth, found = both_sets(frame.ground_truth, frame.predictions, CLASSES)
+    truth, found = both_sets(frame.ground_truth, frame.predictions, None)
     for name, objects, color in (
         ("ground_truth", truth, _GROUND_TRUTH_RGB),
         ("predictions", found, _PREDICTION_RGB),
@@ -309,7 +309,7 @@ def _log_trails(
 
     if frame.track_ids is None or frame.ground_truth is None:
         return
-    truth, _ = both_sets(frame.ground_truth, None, CLASSES)
+    truth, _ = both_sets(frame.ground_truth, None, None)
     if len(frame.track_ids) != len(truth.boxes):
         raise UserError(
             f"{len(truth.boxes)} boxes but {len(frame.track_ids)} track_ids"
