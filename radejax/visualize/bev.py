@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import CLASSES
 from radejax.visualize.canvas import (
     COLOR_MAP,
     Objects,

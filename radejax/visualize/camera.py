@@ -16,7 +16,6 @@ from matplotlib.collections import LineCollection, PolyCollection
 from radejax.errors import UserError
 from radejax.geometry.boxes import corners
 from radejax.geometry.camera import CameraCalibration, ImageKind
-from radejax.structures import CLASSES
 from radejax.visualize.canvas import (
     GROUND_TRUTH_COLOR,
     PREDICTION_COLOR,

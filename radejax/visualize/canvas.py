@@ -137,7 +137,7 @@ def _checked(
     )
 
 
-def _class_name(value: Any, class_names: Sequence[str] | None, what: str) -> str:
+def _class_name(value: Any, class_names: Sequence[str], what: str) -> str:
     """Name of a class given by name or index."""
     if isinstance(value, str):
         return str(value)

@@ -13,7 +13,6 @@ import numpy as np
 
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import CLASSES
 from radejax.visualize import bev
 from radejax.visualize.canvas import new_figure
 from radejax.visualize.overlays import both_sets, legend_handles

@@ -18,7 +18,6 @@ import numpy as np
 from radejax.errors import UserError
 from radejax.files import atomic_path
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import CLASSES
 from radejax.visualize.canvas import COLOR_MAP, Objects, color_limits_of, label_texts
 from radejax.visualize.overlays import both_sets
 from radejax.visualize.projections import check_projection, range_azimuth
