@@ -24,6 +24,7 @@ from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import repair_sizes
 from radejax.simulation.lens import cover_level
+from radejax.visualize.camera_share import mean_share
 from radejax.workdir import load_run
 
 GROUPS = {
@@ -148,7 +149,7 @@ def main(fusion, radar, out, resamples):
         out.mkdir(parents=True, exist_ok=True)
         ordered = {name: maps[name] for name in GROUPS if name in maps}
         camera_share.write_camera_share(out, ordered, counts, run.grid)
-        shares = {name: float(share.mean()) for name, share in ordered.items()}
+        shares = {name: mean_share(share, run.grid) for name, share in ordered.items()}
         rows = [
             row
             for name, chosen in groups.items()

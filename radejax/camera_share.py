@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -42,7 +43,8 @@ def camera_share(
         batch_size: Frames at once.
 
     Returns:
-        `[R, A]` means by group, and how many frames each is of.
+        `[R, A]` means by group, and how many frames with an image each is of; see
+        `average_by_group`.
     """
     spread = np.linspace(0, len(frames) - 1, min(max_frames, len(frames)))
     frames = [frames[int(i)] for i in np.round(spread)]
@@ -67,17 +69,42 @@ def camera_share(
         return sown["intermediates"]["image_fusion"]["camera_share"][0]
 
     variables = jax.device_put(dict(variables))
+
+    def shares() -> Iterator[tuple[str, np.ndarray]]:
+        for batch in loader:
+            found = np.asarray(share_of(variables, model_inputs(batch)), np.float64)
+            for index, share in zip(batch.frame, found, strict=True):
+                if index >= 0:
+                    yield group(frames[index]), share
+
+    return average_by_group(shares())
+
+
+def average_by_group(
+    shares: Iterable[tuple[str, np.ndarray]],
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Mean maps of groups, "all" first, over what the camera sees.
+
+    A bin that no query sees in the image has share 0, which says nothing of the gate:
+    every bin is averaged over the frames that have it in view.
+
+    Args:
+        shares: Group and `[R, A]` share of every frame.
+
+    Returns:
+        `[R, A]` means by group, 0 in bins that no frame has in view, and the numbers of
+        frames with anything in view, that is, with an image.
+    """
     sums: dict[str, Any] = {}
+    seen: dict[str, Any] = {}
     counts: dict[str, int] = {}
-    for batch in loader:
-        shares = np.asarray(share_of(variables, model_inputs(batch)), np.float64)
-        for index, share in zip(batch.frame, shares, strict=True):
-            if index < 0:
-                continue
-            for name in ("all", group(frames[index])):
-                sums[name] = sums.get(name, 0.0) + share
-                counts[name] = counts.get(name, 0) + 1
-    return {name: sums[name] / counts[name] for name in sums}, counts
+    for group, share in shares:
+        is_seen = share > 0
+        for name in ("all", group):
+            sums[name] = sums.get(name, 0.0) + share
+            seen[name] = seen.get(name, 0) + is_seen
+            counts[name] = counts.get(name, 0) + int(is_seen.any())
+    return {name: sums[name] / np.maximum(seen[name], 1) for name in sums}, counts
 
 
 def write_camera_share(
@@ -86,14 +113,17 @@ def write_camera_share(
     counts: Mapping[str, int],
     grid: RadarGrid,
 ) -> None:
-    """Writes `camera_share.json` (means and counts) and `camera_share.png`."""
-    from radejax.visualize import bev
-    from radejax.visualize.camera_share import draw_camera_share
+    """Writes `camera_share.json` (means and counts) and `camera_share.png`.
 
-    rows, columns = grid.num_range, grid.num_azimuth
+    Means are over the bins in view; null without any.
+    """
+    from radejax.visualize import bev
+    from radejax.visualize.camera_share import draw_camera_share, mean_share
+
+    means = {name: mean_share(share, grid) for name, share in maps.items()}
     summary = {
-        name: {"mean": float(m[:rows, :columns].mean()), "frames": counts[name]}
-        for name, m in maps.items()
+        name: {"mean": None if math.isnan(m) else m, "frames": counts[name]}
+        for name, m in means.items()
     }
     files.write_json(out / "camera_share.json", summary)
     bev.save_figure(

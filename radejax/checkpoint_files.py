@@ -44,6 +44,7 @@ class LoadedModel:
         grid: Of the sensor.
         settings: Keyword arguments of `Detector`.
         config: The training config as plain values, or None.
+        labels: Label revision of the run's data, or None.
     """
 
     model: nn.Module
@@ -51,10 +52,14 @@ class LoadedModel:
     grid: RadarGrid
     settings: Mapping[str, Any]
     config: Mapping[str, Any] | None = None
+    labels: str | None = None
 
 
 def load(
-    path: str | pathlib.Path, *, image_backbone: str | pathlib.Path | None = None
+    path: str | pathlib.Path,
+    *,
+    image_backbone: str | pathlib.Path | None = None,
+    step: int | str | None = None,
 ) -> LoadedModel:
     """Model of a packed folder, of a folder of checkpoints, of one of them, or of a run.
 
@@ -62,22 +67,27 @@ def load(
         path: The folder.
         image_backbone: DINOv3's folder from Hugging Face (torchvision's file for a
             ResNet) where the folder is without the weights.
+        step: Of a run or of a folder of checkpoints: a number, or "best" by the run's
+            metric; the newest if None.
 
     Raises:
-        FileNotFoundError: There is no model in the folder.
+        FileNotFoundError: There is no model in the folder, or no such checkpoint.
+        UserError: A step of a folder with only one model.
         DataError: A file is damaged, or config and weights do not fit.
     """
     path = pathlib.Path(path)
     if not path.is_dir():
         raise FileNotFoundError(f"no such folder: {path}")
     if (path / WEIGHTS_FILE).is_file() and (path / CONFIG_FILE).is_file():
+        check_no_step(path, step)
         loaded = read_packed(path)
     elif (path / "checkpoints").is_dir():
-        return _of_run(path, image_backbone)
+        return _of_run(path, image_backbone, step)
     elif path.name.isdigit() and _has_checkpoint(path):
+        check_no_step(path, step)
         loaded = _of_checkpoint(path.parent, int(path.name))
     elif any(_has_checkpoint(child) for child in path.iterdir()):
-        loaded = _of_checkpoint(path, None)
+        loaded = _of_checkpoint(path, step)
     else:
         raise FileNotFoundError(
             f"no model in {path}: expected {CONFIG_FILE} and {WEIGHTS_FILE}, the work "
@@ -93,6 +103,12 @@ def load(
         "params": {**loaded.variables["params"], **frozen},
     }
     return dataclasses.replace(loaded, variables=variables)
+
+
+def check_no_step(path: pathlib.Path, step: int | str | None) -> None:
+    """`UserError` if a step is asked of what holds one model."""
+    if step is not None:
+        raise UserError(f"step {step} of {path}, which holds one model: give none")
 
 
 def settings_of_config(config: Any) -> dict[str, Any]:
@@ -255,24 +271,29 @@ def _has_checkpoint(path: pathlib.Path) -> bool:
     return path.name.isdigit() and (path / "state").is_dir()
 
 
-def _of_run(path: pathlib.Path, image_backbone: Any) -> LoadedModel:
+def _of_run(
+    path: pathlib.Path, image_backbone: Any, step: int | str | None
+) -> LoadedModel:
     from radejax.workdir import load_run  # training's rooms: not for packed models
 
-    run = load_run(path, image_backbone=image_backbone)
+    run = load_run(path, step, image_backbone)
     return LoadedModel(
         models.build(run.config.model),
         run.variables,
         run.grid,
         settings_of_config(run.config),
         json.loads(run.config.to_json()),
+        run.paths and run.paths.labels,
     )
 
 
-def _of_checkpoint(folder: pathlib.Path, step: int | None) -> LoadedModel:
+def _of_checkpoint(folder: pathlib.Path, step: int | str | None) -> LoadedModel:
     """A checkpoint without its run: it carries config and grid itself."""
-    from radejax.training.checkpoints import Checkpoints
+    from radejax.training.checkpoints import BEST, Checkpoints
 
-    with Checkpoints(folder, read_only=True) as checkpoints:
+    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
+        if step == "best":
+            step = checkpoints.best_step()
         state, info, _ = checkpoints.restore_variables(step)
     config = ConfigDict(info["config"], convert_dict=True)
     params = state["ema_params"] if state.get("ema_params") else state["params"]

@@ -7,7 +7,15 @@ import pathlib
 import click
 
 from radejax import cli_models, entry
-from radejax.cli_options import EXISTING, PATH, Group, echo_result, json_option
+from radejax.cli_options import (
+    COUNT,
+    EXISTING,
+    FILE,
+    FOLDER,
+    Group,
+    echo_result,
+    json_option,
+)
 
 
 @click.group(cls=Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -26,18 +34,22 @@ for _command in cli_models.COMMANDS:
 
 
 @main.command()
-@click.option("--config", default="configs/quickstart.py", show_default=True, type=str)
-@click.option("--out", required=True, type=PATH, help="Root of the new data set.")
-@click.option("--seed", type=int, help="Instead of the config's.")
+@click.option("--config", help="With a `simulation` section; small by default.")
+@click.option("--out", required=True, type=FOLDER, help="Root of the new data set.")
+@click.option("--seed", type=click.IntRange(0), help="Instead of the config's.")
 @click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
 @click.option("--sequences", help="Of the labels, such as 1,5,58; all by default.")
-@click.option("--frames", type=int, help="A sequence; 0 for all of the labels.")
+@click.option(
+    "--frames", type=click.IntRange(0), help="A sequence; 0 for all of the labels."
+)
 @click.option("--full-size", is_flag=True, help="K-Radar's own grid and 2560 x 720.")
 @click.option("--projections", is_flag=True, help="Write no tesseracts (260 MB each).")
-@click.option("--threads", default=2, show_default=True, help="Frames at a time.")
+@click.option(
+    "--threads", type=COUNT, default=2, show_default=True, help="Frames at a time."
+)
 @json_option
 def simulate(
-    config: str,
+    config: str | None,
     out: pathlib.Path,
     seed: int | None,
     scenes: str | None,
@@ -57,13 +69,16 @@ def simulate(
     """
     from radejax.config import load_config
     from radejax.errors import UserError
-    from radejax.simulation.config import FULL_SIZE, plain
+    from radejax.simulation.config import FULL_SIZE, default_config, plain
     from radejax.simulation.dataset import simulate_dataset
 
-    section = load_config(config).get("simulation")
-    if section is None:
-        raise UserError(f"{config} has no `simulation` section")
-    simulation = plain(section)
+    entry.set_up_jax()
+    simulation = default_config()
+    if config is not None:
+        section = load_config(config).get("simulation")
+        if section is None:
+            raise UserError(f"{config} has no `simulation` section")
+        simulation = plain(section)
     given = {"seed": seed, "scenes": scenes, "frames_per_sequence": frames}
     simulation |= {name: value for name, value in given.items() if value is not None}
     if full_size:
@@ -115,13 +130,13 @@ def check(
 
 @main.command()
 @click.argument("roots", nargs=-1, required=True, type=EXISTING)
-@click.option("--out", required=True, type=PATH, help="Folder of the records.")
+@click.option("--out", required=True, type=FOLDER, help="Folder of the records.")
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
 @click.option(
     "--dtype", type=click.Choice(["float16", "uint8", "float32"]), default="float16"
 )
-@click.option("--workers", type=int, help="Processes; one per core by default.")
+@click.option("--workers", type=COUNT, help="Processes; one per core by default.")
 @click.option(
     "--shard", default="0/1", show_default=True, help="Part i of n, i from 0."
 )
@@ -161,9 +176,9 @@ def project(
 @click.option("--data", "roots", multiple=True, required=True, type=EXISTING)
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
-@click.option("--out", type=PATH, default="overlay.png", show_default=True)
+@click.option("--out", type=FILE, default="overlay.png", show_default=True)
 @click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
-@click.option("--max-frames", type=int, help="Of an animation; all by default.")
+@click.option("--max-frames", type=COUNT, help="Of an animation; all by default.")
 @json_option
 def overlay(
     name: str,
@@ -198,12 +213,12 @@ def overlay(
 
 @main.command()
 @click.argument("roots", nargs=-1, required=True, type=EXISTING)
-@click.option("--out", type=PATH, default="recording.rrd", show_default=True)
+@click.option("--out", type=FILE, default="recording.rrd", show_default=True)
 @click.option("--sequence", type=int, help="All by default.")
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--label-version", default="v2.1", show_default=True)
 @click.option("--workdir", type=EXISTING, help="Run whose detections are shown too.")
-@click.option("--max-frames", type=int, help="All by default.")
+@click.option("--max-frames", type=COUNT, help="All by default.")
 @click.option("--open", "open_it", is_flag=True, help="Open it in the viewer.")
 @json_option
 def view(
@@ -224,7 +239,7 @@ def view(
     from radejax.view import write_view
     from radejax.visualize.viewer import open_viewer
 
-    write_view(
+    count = write_view(
         roots,
         out,
         sequence=sequence,
@@ -235,4 +250,7 @@ def view(
     )
     if open_it:
         open_viewer(out)
-    echo_result(as_json, {"recording": str(out)}, f"wrote {out}")
+    text = f"{count['frames']} frames written to {out}"
+    if count["without_radar"]:
+        text += f"; {count['without_radar']} without tesseract or projection left out"
+    echo_result(as_json, {**count, "recording": str(out)}, text)

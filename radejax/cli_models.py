@@ -3,30 +3,43 @@
 from __future__ import annotations
 
 import pathlib
-from typing import Any
 
 import click
 
 from radejax import entry
-from radejax.cli_options import EXISTING, PATH, echo_result, json_option
+from radejax.cli_options import (
+    COUNT,
+    EXISTING,
+    FOLDER,
+    STEP,
+    echo_result,
+    json_option,
+)
 
 
 @click.command()
 @click.argument("roots", nargs=-1, required=True, type=EXISTING)
-@click.option("--workdir", required=True, type=EXISTING, help="Run of train.py.")
-@click.option("--out", required=True, type=PATH, help="Folder of the boxes.")
-@click.option("--step", type=int, help="Of the checkpoint; the newest by default.")
+@click.option(
+    "--model",
+    "--workdir",
+    "source",
+    required=True,
+    type=EXISTING,
+    help="Run of train.py, or what `radejax export` takes.",
+)
+@click.option("--out", required=True, type=FOLDER, help="Folder of the boxes.")
+@click.option("--step", type=STEP, help="Of a run; the newest by default.")
 @click.option("--score-threshold", type=float, help="Instead of the config's.")
 @click.option("--nms-iou", type=float, help="Instead of the config's.")
-@click.option("--batch-size", type=click.IntRange(1), default=8, show_default=True)
+@click.option("--batch-size", type=COUNT, default=8, show_default=True)
 @click.option("--labels", type=EXISTING, help="Revision that names frames' images.")
 @click.option("--image-backbone", "--image_backbone", type=EXISTING)
 @json_option
 def detect(
     roots: tuple[pathlib.Path, ...],
-    workdir: pathlib.Path,
+    source: pathlib.Path,
     out: pathlib.Path,
-    step: int | None,
+    step: int | str | None,
     score_threshold: float | None,
     nms_iou: float | None,
     batch_size: int,
@@ -36,9 +49,10 @@ def detect(
 ) -> None:
     """Find boxes in every frame below the folders; one JSON file a frame.
 
-    A folder is a K-Radar root, a folder with tesseract_*.mat or projection files, or
-    such a file itself. No labels are needed; a radar-camera model finds a frame's image
-    by its label file, and goes by the radar alone without.
+    The model is a run, its checkpoints, one of them, an exported folder or an official
+    .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
+    files, or such a file itself. No labels are needed; a radar-camera model finds a
+    frame's image by its label file, and goes by the radar alone without.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
@@ -46,7 +60,7 @@ def detect(
 
     entry.set_up_jax()
     count = detect_files(
-        workdir,
+        source,
         roots,
         out,
         step=step,
@@ -72,10 +86,10 @@ def detect(
     type=EXISTING,
     help="DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.",
 )
-@click.option("--out", required=True, type=PATH, help="Folder of the embeddings.")
+@click.option("--out", required=True, type=FOLDER, help="Folder of the embeddings.")
 @click.option("--labels", type=EXISTING, help="Folder or zip of a label revision.")
 @click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32")
-@click.option("--batch-size", "--batch_size", type=click.IntRange(1), default=8)
+@click.option("--batch-size", "--batch_size", type=COUNT, default=8)
 @json_option
 def embed(
     roots: tuple[pathlib.Path, ...],
@@ -125,17 +139,17 @@ def embed(
 @click.option("--predictions", type=EXISTING, help="File or folder, made elsewhere.")
 @click.option("--data", multiple=True, type=EXISTING, help="K-Radar, for predictions.")
 @click.option("--labels", type=EXISTING, help="Label revision, for predictions.")
-@click.option("--step", type=int, help="Of the checkpoint; the newest by default.")
+@click.option("--step", type=STEP, help="Of the checkpoint; the newest by default.")
 @click.option("--split", default="test", show_default=True)
 @click.option("--image-backbone", "--image_backbone", type=EXISTING)
-@click.option("--out", type=PATH, help="Folder of the report.")
+@click.option("--out", type=FOLDER, help="Folder of the report.")
 @json_option
 def evaluate(
     workdir: pathlib.Path | None,
     predictions: pathlib.Path | None,
     data: tuple[pathlib.Path, ...],
     labels: pathlib.Path | None,
-    step: int | None,
+    step: int | str | None,
     split: str,
     image_backbone: pathlib.Path | None,
     out: pathlib.Path | None,
@@ -176,7 +190,7 @@ def evaluate(
 
 @click.command()
 @click.argument("source", type=EXISTING)
-@click.option("--out", required=True, type=PATH, help="Folder to write.")
+@click.option("--out", required=True, type=FOLDER, help="Folder to write.")
 @click.option(
     "--format",
     "kind",
@@ -218,15 +232,16 @@ def export(
     Example: radejax export runs/quickstart --out exported
     """
     from radejax import export as exporting
+    from radejax.open_detector import open_detector
 
     entry.set_up_jax()
-    detector, config = open_detector(source, image_backbone)
+    detector, loaded = open_detector(source, image_backbone)
     done = exporting.export(
         detector,
         out,
         kind=kind,
         platforms=tuple(platforms.split(",")),
-        training_config=config,
+        training_config=loaded and loaded.config,
         with_backbone=with_backbone,
     )
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
@@ -238,7 +253,7 @@ def export(
 @click.command()
 @click.argument("source", type=EXISTING, required=False)
 @click.option("--config", help="Untrained model of a config instead of SOURCE.")
-@click.option("--batch-size", "--batch_size", "batches", multiple=True, type=int)
+@click.option("--batch-size", "--batch_size", "batches", multiple=True, type=COUNT)
 @click.option(
     "--input",
     "kind",
@@ -246,7 +261,7 @@ def export(
     default="tesseract",
     show_default=True,
 )
-@click.option("--repeats", type=click.IntRange(1), default=5, show_default=True)
+@click.option("--repeats", type=COUNT, default=5, show_default=True)
 @click.option("--dtype", type=click.Choice(["float32", "bfloat16"]))
 @json_option
 def benchmark(
@@ -266,6 +281,7 @@ def benchmark(
     """
     from radejax import benchmark as timing
     from radejax.errors import UserError
+    from radejax.open_detector import open_detector
 
     if (source is None) == (config is None):
         raise UserError("give one of SOURCE and --config")
@@ -273,30 +289,12 @@ def benchmark(
     detector = (
         timing.untrained(config, dtype=dtype)
         if config is not None
-        else open_detector(source, None, dtype=dtype)[0]
+        else open_detector(source, dtype=dtype)[0]
     )
     rows = timing.measure(
         detector, batches or (1, 10), repeats=repeats, tesseract=kind == "tesseract"
     )
     echo_result(as_json, rows, timing.as_table(rows))
-
-
-def open_detector(
-    source: pathlib.Path, image_backbone: pathlib.Path | None, **overrides: Any
-) -> tuple[Any, Any]:
-    """Detector of a folder or an official checkpoint, and its training config if any."""
-    from radejax import checkpoint_files
-    from radejax.detector import Detector
-
-    if source.is_file():
-        detector = Detector.from_torch(
-            source, image_backbone=image_backbone, **overrides
-        )
-        return detector, None
-    loaded = checkpoint_files.load(source, image_backbone=image_backbone)
-    settings = {**loaded.settings, **overrides}
-    detector = Detector(loaded.model, loaded.variables, loaded.grid, **settings)
-    return detector, loaded.config
 
 
 COMMANDS = (detect, evaluate, embed, export, benchmark)

@@ -11,8 +11,29 @@ import click
 
 from radejax import entry
 
-PATH = click.Path(path_type=pathlib.Path)
+COUNT = click.IntRange(1)
+FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
+FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(path_type=pathlib.Path, exists=True)
+
+
+class Step(click.ParamType):
+    """Of a checkpoint: a number, or the best by the run's metric."""
+
+    name = "NUMBER|best"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | str:
+        """The number, or "best"."""
+        if isinstance(value, int) or value == "best":
+            return value
+        if not value.isdecimal():
+            self.fail(f'{value!r} is neither a number nor "best"', param, ctx)
+        return int(value)
+
+
+STEP = Step()
 
 
 class Group(click.Group):

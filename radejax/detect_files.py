@@ -21,8 +21,8 @@ from radejax.data.tesseract import read_frame
 from radejax.detector import Detector
 from radejax.errors import UserError
 from radejax.geometry.camera import Camera
+from radejax.open_detector import open_detector
 from radejax.structures import Detections
-from radejax.workdir import load_run
 
 PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
 """Names of the files that hold a frame."""
@@ -57,7 +57,7 @@ def _by_preference(path: pathlib.Path) -> tuple[bool, pathlib.Path]:
 
 
 def _frame_key(path: pathlib.Path) -> tuple[pathlib.Path, str]:
-    return path.parent.parent, path.stem.removeprefix("DERA_")
+    return path.absolute().parent.parent, path.stem.removeprefix("DERA_")
 
 
 def front_images(
@@ -112,11 +112,11 @@ def front_images(
 
 
 def detect_files(
-    workdir: str | os.PathLike,
+    source: str | os.PathLike,
     paths: Sequence[str | os.PathLike],
     out: str | os.PathLike,
     *,
-    step: int | None = None,
+    step: int | str | None = None,
     batch_size: int = 8,
     labels: str | os.PathLike | None = None,
     image_backbone: str | os.PathLike | None = None,
@@ -125,14 +125,15 @@ def detect_files(
     """Detects in every frame and writes one JSON file each, atomically.
 
     Args:
-        workdir: Run of `train.py`.
+        source: Model, as `open_detector` takes it: a run, an exported folder, ...
         paths: Files and folders of frames.
         out: Folder for `<sequence>_<frame>.json`: a list of {cls, score, x, y, z, l,
             w, h, yaw}, metres and radians in the ego frame.
-        step: Of the checkpoint; the newest if None.
+        step: Of a run: a number or "best"; the newest if None.
         batch_size: Frames at once.
         labels: Label revision that says which image belongs to a frame, for
-            radar-camera models; the one that the run was trained with if None.
+            radar-camera models; the one that a run was trained with if None. Of the
+            version that the model's config states, v2.1 without one.
         image_backbone: See `Detector.from_workdir`.
         **settings: `score_threshold`, `nms_iou`, `roi` of the detector.
 
@@ -142,19 +143,22 @@ def detect_files(
 
     Raises:
         FileNotFoundError: A path does not exist.
-        UserError: There is no frame, or an image or a weight is not as expected.
+        UserError: There is no frame, two would be written to one file, or an image or
+            a weight is not as expected.
     """
     frames = find_frames(paths)
-    run = load_run(workdir, step, image_backbone)
-    detector = Detector.from_config(run.config, run.variables, run.grid)
+    _check_names(frames)
+    detector, loaded = open_detector(source, image_backbone, step=step)
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
 
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or (run.paths and run.paths.labels)
-        known = front_images(frames, detector, labels, run.config.data.label_version)
+        labels = labels or (loaded and loaded.labels)
+        config = (loaded and loaded.config) or {}
+        version = config.get("data", {}).get("label_version", "v2.1")
+        known = front_images(frames, detector, labels, version)
 
     def batches() -> Iterator[tuple[Any, ...]]:
         for chunk in chunks:
@@ -179,6 +183,18 @@ def detect_files(
     if detector.takes_camera:
         count["radar_alone"] = detector.num_radar_alone
     return count
+
+
+def _check_names(frames: Sequence[pathlib.Path]) -> None:
+    """`UserError` if two frames would be written to one file."""
+    seen: dict[str, pathlib.Path] = {}
+    for path in frames:
+        other = seen.setdefault(output_name(path), path)
+        if other is not path:
+            raise UserError(
+                f"{other} and {path} would both be written as "
+                f"{output_name(path)}.json: detect each root into a folder of its own"
+            )
 
 
 def output_name(path: pathlib.Path) -> str:

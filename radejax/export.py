@@ -24,6 +24,7 @@ from radejax.errors import UserError
 from radejax.geometry.camera import Camera
 
 PLATFORMS = ("cpu", "cuda", "tpu")
+KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
 FORMATS = ("stablehlo", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
 
@@ -53,7 +54,7 @@ def export(
         folder: Made if missing.
         kind: "stablehlo": program, weights and `load.py`, which needs jax and numpy
             alone; "huggingface": weights, config and model card.
-        platforms: That the program shall run on.
+        platforms: That the program shall run on: of `KNOWN_PLATFORMS`; "gpu" is CUDA.
         training_config: Kept in `config.json`.
         with_backbone: Keep the image transformer's weights, see `write_packed`.
 
@@ -61,11 +62,12 @@ def export(
         "kind", "folder", "bytes" and "left_out".
 
     Raises:
-        UserError: An unknown kind; or a program would need an image backbone that is
-            left out.
+        UserError: An unknown kind or platform; or a program would need an image
+            backbone that is left out.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
+    platforms = _checked_platforms(platforms)
     folder = pathlib.Path(folder)
     if kind == "stablehlo":
         program = stablehlo(detector, platforms, with_backbone=with_backbone)
@@ -86,6 +88,15 @@ def export(
         "bytes": size,
         "left_out": content["left_out"],
     }
+
+
+def _checked_platforms(platforms: Sequence[str]) -> tuple[str, ...]:
+    names = ["cuda" if p.strip() == "gpu" else p.strip() for p in platforms]
+    for name in names:
+        if name not in KNOWN_PLATFORMS:
+            known = ", ".join(KNOWN_PLATFORMS)
+            raise UserError(f"platform is {name!r}, expected some of {known}")
+    return tuple(dict.fromkeys(names))
 
 
 def stablehlo(

@@ -46,7 +46,8 @@ def draw_overlay(
         Number of frames drawn.
 
     Raises:
-        UserError: There is no such frame, or it has no tesseract.
+        UserError: There is no such frame, or it has neither tesseract nor
+            projection.
     """
     sequence, _, frame_name = name.partition("/")
     if not sequence.isdigit():
@@ -100,7 +101,7 @@ def read_projection(frame: Frame, grid: Any) -> Any:
     if frame.tesseract_path is not None:
         return project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
     if frame.projection_path is None:
-        raise UserError(f"frame {frame.key} has no tesseract")
+        raise UserError(f"frame {frame.key} has no tesseract or projection")
     shape = grid.projection_shape
     found = read_projection_npy(frame.projection_path, projection_shape=shape)
     return found.astype("float32")

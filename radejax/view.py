@@ -13,9 +13,9 @@ import tqdm
 
 from radejax.data.frame import Frame
 from radejax.data.kradar import KRadar
-from radejax.data.tesseract import project_file
 from radejax.errors import UserError
 from radejax.evaluate_run import front_view
+from radejax.overlay import read_projection
 from radejax.visualize.viewer import ViewerFrame, write_recording
 
 
@@ -29,7 +29,7 @@ def write_view(
     workdir: str | os.PathLike | None = None,
     max_frames: int | None = None,
     elevation_sign: int = 1,
-) -> dict[str, Any]:
+) -> dict[str, int]:
     """Records frames for the rerun viewer.
 
     Args:
@@ -43,18 +43,22 @@ def write_view(
         elevation_sign: See `visualize.viewer.echo_points`.
 
     Returns:
-        "frames" recorded, "without_tesseract" left out, "out".
+        Counts "frames" recorded and "without_radar": left out, having neither tesseract
+        nor projection.
 
     Raises:
-        UserError: rerun is not installed, or there is no frame with a tesseract.
+        UserError: rerun is not installed, or no frame has a tesseract or a
+            projection.
     """
     numbers = None if sequence is None else [sequence]
     frames = KRadar(
         roots, labels, version=version, sequence_numbers=numbers, visibility=None
     )
-    complete = [frame for frame in frames if frame.tesseract_path is not None]
+    complete = [f for f in frames if f.tesseract_path or f.projection_path]
     if not complete:
-        raise UserError(f"no tesseract for any of {len(frames)} labelled frames")
+        raise UserError(
+            f"no tesseract or projection for any of {len(frames)} labelled frames"
+        )
     shown = complete[:max_frames]
     detector = None
     if workdir is not None:
@@ -67,8 +71,7 @@ def write_view(
     write_recording(entries, frames.grid, out, elevation_sign=elevation_sign)
     return {
         "frames": len(shown),
-        "without_tesseract": len(frames) - len(complete),
-        "out": str(out),
+        "without_radar": len(frames) - len(complete),
     }
 
 
@@ -77,7 +80,7 @@ def viewer_frames(
 ) -> Iterator[ViewerFrame]:
     """What the viewer shows of each frame, read as it is needed."""
     for frame in frames:
-        projection = project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
+        projection = read_projection(frame, grid)
         image, calibration = front_view(frame)
         found = None
         if detector is not None:

@@ -45,6 +45,18 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["simulate", "--sequences", "5-6", "--out", "x"], "expected 1,5,58"),
         (["fly"], "No such command 'fly'"),
         (["project", ".", "--out", "x", "--shard", "3/2"], "3/2"),
+        (["project", ".", "--out", "x", "--workers", "0"], "0 is not in the range"),
+        (["simulate", "--out", "x", "--threads", "0"], "0 is not in the range"),
+        (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
+        (["benchmark", "--config", "x", "--batch-size", "0"], "0 is not in the range"),
+        (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),
+        (["overlay", "1", "--data", ".", "--out", "."], "'.' is a directory"),
+        (["export", ".", "--out", __file__], "is a file"),
+        (["detect", ".", "--model", ".", "--out", __file__], "is a file"),
+        (
+            ["detect", ".", "--model", ".", "--out", "x", "--step", "last"],
+            "'last' is neither a number nor \"best\"",
+        ),
     ],
 )
 def test_wrong_use_is_exit_code_2_and_a_clear_line(
@@ -106,6 +118,10 @@ def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> No
     for name in ("model.safetensors", "config.json"):
         written = (tmp_path / "hub" / name).read_bytes()
         assert written == (packed / name).read_bytes()
+    for platform in ("foo", "gpu,foo"):
+        wrong = _run("export", packed, "--out", tmp_path / "x", "--platforms", platform)
+        assert wrong.exit_code == 2
+        assert "error: platform is 'foo', expected some of cpu, cuda" in wrong.output
     timed = _run("benchmark", packed, "--batch-size", 1, "--repeats", 1, "--json")
     (row,) = json.loads(timed.output)
     assert row["batch"] == 1
@@ -129,3 +145,20 @@ def test_evaluate_scores_predictions_in_files(tmp_path: pathlib.Path) -> None:
     assert "100.0" in text.output
     assert (tmp_path / "out" / "metrics.json").is_file()
     assert json.loads(_run(*arguments, "--json").stdout)
+
+
+def test_simulate_works_anywhere(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the repository's configs: the package has a small one of its own."""
+    from radejax.simulation import dataset
+
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    monkeypatch.setattr(
+        dataset, "simulate_dataset", lambda *a, **kw: seen.append((a, kw))
+    )
+    assert _run("simulate", "--out", "data", "--frames", 3).exit_code == 0
+    (((config, out), _),) = seen
+    assert config == dataset.default_config() | {"frames_per_sequence": 3}
+    assert out == pathlib.Path("data")

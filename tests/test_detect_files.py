@@ -1,11 +1,20 @@
-"""Finding frames in folders and naming their results."""
+"""Frames in folders, their images, models of every kind, names of results."""
 
+import json
 import pathlib
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from radejax.detect_files import find_frames, output_name
+from radejax import checkpoint_files
+from radejax.detect_files import detect_files, find_frames, front_images, output_name
+from radejax.detector_inputs import CameraOptions
 from radejax.errors import UserError
+from radejax.open_detector import open_detector
+from radejax.simulation.dataset import default_config, simulate_dataset
+
+from . import small_models as small
 
 
 @pytest.fixture
@@ -49,3 +58,57 @@ def test_nothing_found_and_nothing_there(tmp_path: pathlib.Path) -> None:
         find_frames([tmp_path])
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
         find_frames([tmp_path / "gone"])
+
+
+def test_a_folder_named_twice_is_one(
+    root: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(root)
+    assert len(find_frames([root, "."])) == 3
+
+
+def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
+    detector = small.detector()
+    checkpoint_files.write_packed(tmp_path / "packed", detector)
+    frames = small.projections(3)
+    for i, frame in enumerate(frames):
+        path = tmp_path / "data" / "7" / "DERA_tesseract" / f"DERA_tesseract_{i:05}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.moveaxis(frame, -1, 0))
+    out = tmp_path / "out"
+    count = detect_files(tmp_path / "packed", [tmp_path / "data"], out, batch_size=2)
+    expected = detector(frames).to_list()
+    assert count == {"frames": 3, "boxes": sum(map(len, expected))}
+    for i, boxes in enumerate(expected):
+        found = json.loads((out / f"7_tesseract_{i:05}.json").read_text())
+        assert [b["cls"] for b in found] == [b["cls"] for b in boxes]
+        assert [b["x"] for b in found] == pytest.approx(
+            [b["x"] for b in boxes], abs=1e-5
+        )
+    with pytest.raises(
+        UserError, match=r"step best of .*packed, which holds one model"
+    ):
+        open_detector(tmp_path / "packed", step="best")
+
+
+def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:
+    for disk in ("a", "b"):
+        path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* 5_tesseract_00033.json"):
+        detect_files(tmp_path, [tmp_path / "a", tmp_path / "b"], tmp_path / "out")
+
+
+def test_images_of_simulated_folders_are_found(tmp_path: pathlib.Path) -> None:
+    """Their labels are in `info_label_v2_1`."""
+    config = default_config() | {"output": "projection", "frames_per_sequence": 1}
+    config.update(train_sequences=1, test_sequences=0)
+    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    (path,) = find_frames([root])
+    model = SimpleNamespace(image_size=(180, 320))
+    detector = SimpleNamespace(model=model, camera_options=CameraOptions())
+    ((found, (image, camera)),) = front_images([path], detector).items()
+    assert found == path.absolute()
+    assert image.parent.name == "cam-front"
+    assert camera.is_valid

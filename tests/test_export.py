@@ -142,3 +142,11 @@ def test_huggingface_files_name_what_is_left_out(tmp_path: pathlib.Path) -> None
     }
     with pytest.raises(UserError, match="format is 'onnx'"):
         export.export(small.detector(), tmp_path, kind="onnx")
+
+
+def test_names_of_platforms(tmp_path: pathlib.Path) -> None:
+    checked = export._checked_platforms
+    assert checked(["gpu", "cpu", " cuda"]) == ("cuda", "cpu")
+    with pytest.raises(UserError, match="platform is 'foo', expected some of cpu"):
+        export.export(small.detector(), tmp_path, platforms=("cpu", "foo"))
+    assert not any(tmp_path.iterdir())

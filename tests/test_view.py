@@ -2,8 +2,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from radejax.data.kradar import KRadar
 from radejax.data.labels import Label
-from radejax.view import track_ids
+from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.view import track_ids, viewer_frames
 
 
 def label(x: float, track_id: int) -> Label:
@@ -21,3 +23,13 @@ def test_track_ids_belong_to_the_boxes_that_are_left():
     assert track_ids(frame) == [None, (3, 5)]
     frame.boxes = np.zeros((0, 7))
     assert track_ids(frame) == []
+
+
+def test_frames_with_projections_alone_are_shown(tmp_path):
+    config = default_config() | {"output": "projection", "frames_per_sequence": 1}
+    config.update(train_sequences=1, test_sequences=0)
+    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    frames = KRadar([root], version="v2.1", visibility=None)
+    (shown,) = viewer_frames(frames, frames.grid)
+    stored = np.load(frames[0].projection_path)
+    np.testing.assert_allclose(shown.projection, np.moveaxis(stored, 0, -1))

@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.visualize.canvas import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def mean_share(share: np.ndarray, grid: RadarGrid) -> float:
+    """Mean of a map `[R, A]` over the bins in view, those above 0; NaN without any.
+
+    Bins beyond the grid are padding and do not count.
+    """
+    share = np.asarray(share)[: grid.num_range, : grid.num_azimuth]
+    return float(share[share > 0].mean()) if (share > 0).any() else float("nan")
 
 
 def draw_camera_share(
@@ -25,29 +35,22 @@ def draw_camera_share(
     Args:
         maps: `[R, A]` mean share of the camera by condition, 0 (radar alone) to 1.
         grid: Axes of the maps; more bins than the grid has are padding and cut.
-        counts: Frames per condition, for the titles.
+        counts: Frames with an image per condition, for the titles.
         columns: Panels side by side.
     """
-    import matplotlib.pyplot as plt
+    from matplotlib import colormaps
 
     columns = min(columns, len(maps))
     rows = -(-len(maps) // columns)
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(2.6 * columns + 1.2, 2.9 * rows + 0.4),
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )
+    figure = new_figure(2.6 * columns + 1.2, 2.9 * rows + 0.4, layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     maps = {
         k: np.asarray(m)[: grid.num_range, : grid.num_azimuth] for k, m in maps.items()
     }
     # Bins that no query sees in the image have share 0: they say nothing of the gate.
     seen = np.concatenate([m[m > 0] for m in maps.values()] or [np.zeros(0)])
     low, high = (seen.min(), seen.max()) if seen.size else (0.0, 1.0)
-    colors = plt.get_cmap("cividis").with_extremes(bad="0.85")
+    colors = colormaps["cividis"].with_extremes(bad="0.85")
     azimuth = np.rad2deg(grid.azimuth_rad)
     extent = (azimuth[0], azimuth[-1], grid.range_m[0], grid.range_m[-1])
     for ax, (name, share) in zip(axes.flat, maps.items(), strict=False):
@@ -62,7 +65,8 @@ def draw_camera_share(
             interpolation="nearest",
         )
         number = "" if counts is None else f", {counts[name]} frames"
-        ax.set_title(f"{name}\nmean {share.mean():.2f}{number}", fontsize=8)
+        mean = f"mean {mean_share(share, grid):.2f}" if share.any() else "not in view"
+        ax.set_title(f"{name}\n{mean}{number}", fontsize=8)
         ax.tick_params(labelbottom=True, labelsize=8)
     for ax in axes.flat[len(maps) :]:
         ax.set_visible(False)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -183,3 +184,20 @@ class TestWrongUse:
         monkeypatch.setattr(os, "replace", full)
         with pytest.raises(UserError, match="no space left"):
             simulate_dataset(small_config(), tmp_path / "full", progress=False)
+
+
+@pytest.mark.parametrize("output", ["tesseract", "projection"])
+def test_size_is_told_before_the_first_frame(output, tmp_path, caplog):
+    config = small_config(output=output, train_sequences=1, frames_per_sequence=1)
+    log = logging.getLogger("radejax.simulation.dataset")
+    log.addHandler(caplog.handler)
+    log.setLevel(logging.INFO)
+    try:
+        root = simulate_dataset(config, tmp_path / "data", progress=False)
+    finally:
+        log.removeHandler(caplog.handler)
+        log.setLevel(logging.NOTSET)
+    (line,) = caplog.messages
+    assert line.startswith(f"{root}: 2 frames, about ")
+    size = sum(p.stat().st_size for p in root.rglob("*") if p.suffix != ".txt")
+    assert float(line.split()[-2]) * 1e9 == pytest.approx(size, rel=0.2)

@@ -20,7 +20,7 @@ def test_panels_are_named_and_share_one_scale_without_what_is_not_in_view(grid):
     figure = draw_camera_share(maps, grid, counts={"all": 3, "fog": 1})
     panels = [ax for ax in figure.axes if ax.get_images()]
     assert [ax.get_title() for ax in panels] == [
-        "all\nmean 0.42, 3 frames",
+        "all\nmean 0.50, 3 frames",
         "fog\nmean 0.20, 1 frames",
     ]
     for ax in panels:
@@ -34,3 +34,11 @@ def test_panels_are_named_and_share_one_scale_without_what_is_not_in_view(grid):
 def test_no_bin_in_view(grid):
     figure = draw_camera_share({"all": np.zeros((8, 6))}, grid)
     assert figure.axes[0].get_images()[0].get_clim() == (0.0, 1.0)
+    assert figure.axes[0].get_title() == "all\nnot in view"
+
+
+def test_notebooks_show_it_once(grid):
+    import matplotlib.pyplot as plt
+
+    draw_camera_share({"all": np.full((8, 6), 0.5)}, grid)
+    assert not plt.get_fignums()
