@@ -1,6 +1,7 @@
 """Radar-camera runs from images and from embeddings, with a frozen backbone from files."""
 
 import dataclasses
+import importlib.util
 import json
 import logging
 import pathlib
@@ -323,6 +324,60 @@ def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
     assert shares["all"]["frames"] == 4
     assert 0 < shares["all"]["mean"] < 1
     assert (tmp_path / "camera_share.png").stat().st_size > 10_000
+
+
+def _example(name, *arguments):
+    path = CONFIG.parents[1] / "examples" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    result = CliRunner().invoke(module.main, [str(a) for a in arguments])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture
+def three_test_sequences(data):
+    """The training split joins the test split: intervals resample sequences."""
+    split = data.folder / "split"
+    before = (split / "test.txt").read_text()
+    (split / "test.txt").write_text(before + (split / "train.txt").read_text())
+    yield
+    (split / "test.txt").write_text(before)
+
+
+def test_example_compares_fusion_and_radar_by_the_lens(
+    from_images, three_test_sequences, tmp_path
+):
+    out, run = tmp_path / "by_lens", shutil.copytree(from_images, tmp_path / "run")
+    evaluate_run(run, num_pictures=0)
+    # The run with itself: nothing gained, on all frames and by the lens.
+    text = _example("fusion_by_lens", run, run, "--out", out, "--resamples", 10)
+    assert (out / "by_lens.txt").read_text() in text
+    rows = json.loads((out / "by_lens.json").read_text())
+    whole = [row for row in rows if row["condition"] == "all"]
+    assert {row["frames"] for row in whole} == {12}
+    assert {row["difference"] for row in rows} == {0.0}
+    parts = {r["condition"]: r["frames"] for r in rows if r["condition"] != "all"}
+    assert sum(parts.values()) == 12
+    shares = json.loads((out / "camera_share.json").read_text())
+    for row in rows:
+        assert row["camera share"] == shares[row["condition"]]["mean"]
+        assert shares[row["condition"]]["frames"] == row["frames"]
+        assert 0 < row["camera share"] < 1
+
+
+def test_example_draws_reference_points(data, from_images, tmp_path):
+    run = experiment.load_run(from_images)
+    frame = run.paths.open(run.config, "test")[0]
+    files = frame.camera_path, frame.camera_calibration_path
+    (label,) = (data.folder / str(frame.sequence)).glob(f"info_label*/{frame.name}.txt")
+    out = tmp_path / "points.png"
+    text = _example("reference_points", *files, "--label", label, "--out", out)
+    share, count = float(text.split("%")[0]), int(text.split("drew ")[1].split()[0])
+    assert 5 < share < 100
+    assert count > 50
+    assert out.stat().st_size > 10_000
 
 
 def test_embed_command(data, from_images, tmp_path):

@@ -1,17 +1,13 @@
 """Makes the pictures of `docs/simulator.md`: one row of maps per weather, full size.
 
-python docs/images/simulator_pictures.py [FOLDER]
+python docs/images/simulator_pictures.py --out docs/images
 """
 
+import argparse
 import pathlib
-import sys
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from radejax.geometry.radar_grid import RadarGrid
@@ -20,6 +16,8 @@ from radejax.simulation.radar import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.traffic import make_sequence
 from radejax.structures import CLASSES
+from radejax.visualize.canvas import COLOR_MAP, footprints, halo, new_figure
+from radejax.visualize.labels import draw_labels
 
 SCENES = (
     ("normal", "urban", "day", 4),
@@ -32,13 +30,10 @@ SCENES = (
 )
 OFFSET = (-2.54, 0.3, 0.7)
 GRID = RadarGrid.kradar()
-
-
-def outline(box):
-    """`[5, 2]` corners of a box on the ground, closed."""
-    unit = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2 * box[3:5]
-    c, s = np.cos(box[6]), np.sin(box[6])
-    return unit @ np.array([[c, s], [-s, c]]) + box[:2]
+LIMITS_DB = (96, 130)  # noise to echoes of cars
+ANGLE_LIMITS_DB = (96, 150)  # the strongest of all ranges: mostly near ones
+SEEN = {"color": "white", "lw": 1.0, "ls": "-"}
+UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
 
 def draw(weather, environment, time, seed, path):
@@ -51,58 +46,98 @@ def draw(weather, environment, time, seed, path):
     frame = sequence.frame(30)
     given = simulator.radar_input(30, frame)
     power_db = 10 * np.log10(simulator.run(given, "tesseract") + 1e-10)  # [D, R, E, A]
-    visible = simulator.is_radar_visible(frame, given)
     renderer = CameraRenderer(
         sequence, stereo_calibration(OFFSET, 640, 360), 0, cover_lens=weather == "sleet"
     )
-    figure, axes = plt.subplots(
-        1, 4, figsize=(13, 3.1), width_ratios=(1.75, 1.15, 1, 1), layout="constrained"
-    )
+    figure = new_figure(14, 3.3, layout="constrained")
+    axes = figure.subplots(1, 4, width_ratios=(1.75, 1.25, 1, 1))
     axes[0].imshow(renderer.render(frame)[:, :640])
     axes[0].axis("off")
-    axes[0].set_title(f"{weather}, {environment}, {time}", fontsize=9)
-    colors = {"cmap": "viridis", "vmin": 96, "vmax": 130}
-    centers = GRID.cell_centers_ego()
-    axes[1].pcolormesh(
-        -centers[..., 1], centers[..., 0], power_db.max((0, 2)), shading="nearest",
-        rasterized=True, **colors,
-    )  # fmt: skip
-    for box, is_visible, cls in zip(frame.boxes, visible, frame.cls, strict=True):
-        if GRID.in_field_of_view(box[0], box[1]):
-            x, y = outline(box).T
-            color = "red" if is_visible else "white"
-            axes[1].plot(-y, x, color=color, lw=0.7)
-            if is_visible:
-                axes[1].text(
-                    -box[1] + 1.5,
-                    box[0],
-                    CLASSES[cls][:3],
-                    color="white",
-                    fontsize=4.5,
-                    clip_on=True,
-                )
-    axes[1].set(xlim=(-45, 45), ylim=(0, 90), xlabel="right [m]", ylabel="forward [m]")
-    axes[1].set_aspect("equal")
-    degrees = (-53, 53, -18, 18)
-    axes[2].imshow(
-        power_db.max((0, 1)), origin="lower", aspect="auto", extent=degrees, **colors
-    )
-    axes[2].set(xlabel="azimuth [deg]", ylabel="elevation [deg]")
-    speeds = (GRID.doppler_mps[0], GRID.doppler_mps[-1], 0, GRID.range_m[-1])
-    axes[3].imshow(
-        power_db.max((2, 3)).T, origin="lower", aspect="auto", extent=speeds, **colors
-    )
-    axes[3].set(xlabel="Doppler [m/s]", ylabel="range [m]", ylim=(0, 90))
-    for axis in axes[1:]:
-        axis.tick_params(labelsize=6)
-        axis.xaxis.label.set_size(7)
-        axis.yaxis.label.set_size(7)
+    axes[0].set_title(f"{weather}, {environment}, {time}", fontsize=10)
+    maps = draw_maps(axes[1:], power_db)
+    for axis, drawn in zip(axes[1:], maps, strict=True):
+        axis.tick_params(labelsize=7)
+        axis.xaxis.label.set_size(8)
+        axis.yaxis.label.set_size(8)
+        bar = figure.colorbar(drawn, ax=axis, extend="both", pad=0.02)
+        bar.ax.tick_params(labelsize=7)
+    bar.set_label("largest power of the other axes (dB)", fontsize=8)
+    figure.draw_without_rendering()  # labels need the final places of axes
+    draw_boxes(axes[1], frame, simulator.is_radar_visible(frame, given))
     figure.savefig(path, dpi=110)
-    plt.close(figure)
     Image.open(path).convert("RGB").quantize(128).save(path, optimize=True)
 
 
-if __name__ == "__main__":
-    folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images")
+def draw_maps(axes, power_db):
+    """The three maps, each the maximum over the axes that it does not show."""
+    ground, angles, doppler = axes
+    centers = GRID.cell_centers_ego()
+    colors = {"cmap": COLOR_MAP, "vmin": LIMITS_DB[0], "vmax": LIMITS_DB[1]}
+    first = ground.pcolormesh(
+        centers[..., 1], centers[..., 0], power_db.max((0, 2)), shading="nearest",
+        rasterized=True, **colors,
+    )  # fmt: skip
+    ground.set(
+        xlim=(45, -45), ylim=(0, 90), xlabel="y, left [m]", ylabel="x, ahead [m]"
+    )
+    ground.set_aspect("equal")
+    ground.set_facecolor("0.9")
+    second = angles.imshow(
+        power_db.max((0, 1)),
+        origin="lower",
+        aspect="auto",
+        extent=(-53, 53, -18, 18),
+        cmap=COLOR_MAP,
+        vmin=ANGLE_LIMITS_DB[0],
+        vmax=ANGLE_LIMITS_DB[1],
+    )
+    angles.set(xlabel="azimuth, right positive [deg]", ylabel="elevation [deg]")
+    speeds = (GRID.doppler_mps[0], GRID.doppler_mps[-1], 0, GRID.range_m[-1])
+    third = doppler.imshow(
+        power_db.max((2, 3)).T, origin="lower", aspect="auto", extent=speeds, **colors
+    )
+    doppler.set(xlabel="Doppler [m/s]", ylabel="range [m]", ylim=(0, 90))
+    return first, second, third
+
+
+def draw_boxes(axis, frame, is_visible):
+    """Boxes in the field of view: `R` white and named, `L` orange and dashed."""
+    outlines, names = [], []
+    for box, is_seen, cls in zip(frame.boxes, is_visible, frame.cls, strict=True):
+        if not GRID.in_field_of_view(box[0], box[1]):
+            continue
+        outline = footprints(box[None])[0][:, ::-1]
+        style = SEEN if is_seen else UNSEEN
+        axis.plot(*outline.T, path_effects=halo(style["lw"] + 0.8), **style)
+        if is_seen:
+            outlines.append(outline)
+            names.append(CLASSES[cls].split()[0])
+    count = len(names)
+    colors, sides = ["white"] * count, ["right"] * count
+    draw_labels(axis, outlines, names, colors, sides, font_size=5.5)
+    axis.legend(
+        handles=[
+            Line2D([], [], label=name, path_effects=halo(style["lw"] + 1.0), **style)
+            for name, style in (("label R: seen", SEEN), ("label L: hidden", UNSEEN))
+        ],
+        loc="lower right",
+        fontsize=6,
+        framealpha=0.8,
+        facecolor="0.8",
+        handlelength=1.6,
+    )
+
+
+def main():
+    """Draws all scenes, or those named."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/images"))
+    parser.add_argument("--weather", nargs="*", default=[s[0] for s in SCENES])
+    given = parser.parse_args()
     for scene in SCENES:
-        draw(*scene, folder / f"simulator_{scene[0]}.png")
+        if scene[0] in given.weather:
+            draw(*scene, given.out / f"simulator_{scene[0]}.png")
+
+
+if __name__ == "__main__":
+    main()

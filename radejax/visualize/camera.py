@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _FRONT = [0, 3, 7, 4]  # of geometry.boxes.corners
+_FONT_SIZE_PT = 6.5
+_LEAST_HEIGHT_PT = 10.0  # on paper, of a box that gets a label
 _NEAR_M = 0.5
 
 
@@ -97,16 +99,19 @@ def draw_camera(
         outlines += hulls
         texts += [labels[i] for i in drawn]
         colors += [text_color] * len(hulls)
-    if show_labels and outlines:
-        # Small, far boxes stand close together: they get the places next to them.
-        order = np.argsort([np.ptp(hull[:, 1]) for hull in outlines])
+    heights = np.array([np.ptp(hull[:, 1]) for hull in outlines])
+    heights_pt = heights * _points_per_pixel(ax, calibration)
+    # Near boxes first. Far ones stand close together: texts on them would be a heap.
+    order = np.argsort(-heights, kind="stable")
+    order = order[heights_pt[order] >= _LEAST_HEIGHT_PT]
+    if show_labels and order.size:
         draw_labels(
             ax,
             [outlines[i] for i in order],
             [texts[i] for i in order],
             [colors[i] for i in order],
             ["above"] * len(order),
-            font_size=6.5,
+            font_size=_FONT_SIZE_PT,
             keep_boxes_clear=False,
         )
     if title:
@@ -141,9 +146,7 @@ def _draw_boxes(
     lines = np.concatenate([segments[i][is_visible[i]] for i in drawn] or [[]])
     heights = [np.repeat(np.ptp(hull[:, 1]), len(hull) // 2) for hull in hulls]
     # Lines of a small box are thinner, or they would fill it.
-    points_per_pixel = ax.get_window_extent().width / calibration.width
-    points_per_pixel *= 72 / ax.figure.dpi
-    heights_pt = np.concatenate(heights or [[]]) * points_per_pixel
+    heights_pt = np.concatenate(heights or [[]]) * _points_per_pixel(ax, calibration)
     widths = width * np.clip(heights_pt / 24.0, 0.4, 1.0)
     for stroke, extra, order in (("black", 1.0, 4), (color, 0.0, 4.1)):
         collection = LineCollection(
@@ -155,3 +158,8 @@ def _draw_boxes(
         )
         ax.add_collection(collection, autolim=False)
     return drawn, hulls
+
+
+def _points_per_pixel(ax: Axes, calibration: CameraCalibration) -> float:
+    """Points on paper of a pixel of the image."""
+    return ax.get_window_extent().width / calibration.width * 72 / ax.figure.dpi

@@ -17,6 +17,7 @@ Side = Literal["left", "right", "above"]
 # Sizes of DejaVu Sans, in units of the font size: near enough to reserve room.
 _CHARACTER_WIDTH = 0.60
 _LINE_HEIGHT = 1.25
+_MOST_COVERED = 0.1  # of a label by others, to stay readable
 
 
 def place_labels(
@@ -101,7 +102,8 @@ def draw_labels(
     """Writes a text beside each outline; a thin line leads to a text that moved away.
 
     Axes limits and aspect must be final: room is reserved in pixels. Outlines whose
-    center is out of sight get no text.
+    center is out of sight get no text, nor do those for whose text no room is left: of
+    texts that cover each other the first is drawn.
 
     Args:
         ax: Where to draw.
@@ -142,8 +144,25 @@ def draw_labels(
         frame,
         gap=3 * pixel_per_point,
     )
-    for i, anchor, corner, size in zip(shown, anchors, corners, sizes, strict=True):
+    is_free = _is_free(np.concatenate([corners, corners + sizes], -1))
+    for i, anchor, corner, size in zip(
+        shown[is_free],
+        anchors[is_free],
+        corners[is_free],
+        sizes[is_free],
+        strict=True,
+    ):
         _draw_label(ax, texts[i], colors[i], anchor, corner, size, font_size=font_size)
+
+
+def _is_free(places: np.ndarray) -> np.ndarray:
+    """`[N]` True for rectangles `[N, 4]` that those before them do not cover."""
+    areas = (places[:, 2:] - places[:, :2]).prod(-1)
+    covered = _overlap(places, places)
+    is_free = np.ones(len(places), bool)
+    for i in range(len(places)):
+        is_free[i] = covered[i, :i] @ is_free[:i] <= _MOST_COVERED * areas[i]
+    return is_free
 
 
 def _draw_label(

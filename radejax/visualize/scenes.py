@@ -10,12 +10,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import bev
-from radejax.visualize.canvas import new_figure
+from radejax.visualize.canvas import COLOR_MAP, new_figure
 from radejax.visualize.overlays import both_sets, legend_handles
+from radejax.visualize.projections import color_label, range_azimuth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +26,9 @@ if TYPE_CHECKING:
 
 ZOOM_COLOR = "#E69F00"
 """Orange of Okabe and Ito's colour-blind safe set, as the papers' magnified views."""
+
+_COLOR_PERCENTILES = (20.0, 99.5)
+_FOOT_IN = 0.8  # legend and colour bar
 
 
 class Scene(NamedTuple):
@@ -73,7 +79,7 @@ def draw_scenes(
         raise UserError("no scenes to draw")
     columns = min(columns, len(scenes))
     rows = -(-len(scenes) // columns)
-    width, height = 3.9 * columns, 6.4 * rows + 0.5
+    width, height = 3.9 * columns, 6.4 * rows + _FOOT_IN
     figure = new_figure(width, height)
     limits = _common_limits(scenes, grid)
     for index, scene in enumerate(scenes):
@@ -113,21 +119,38 @@ def draw_scenes(
         (above or below).set_title(scene.title, fontsize=11)
         if scene.zoom is not None:
             _magnify(below, scene, grid, limits, zoom_m, class_names)
+    _draw_colorbar(figure, limits)
     first = both_sets(scenes[0].ground_truth, scenes[0].predictions, class_names)
     handles = legend_handles(*first, roi)
     for handle in handles:  # numbers of one scene would mislead
         handle.set_label(handle.get_label().split(" (")[0])
-    figure.legend(handles=handles, loc="lower center", ncols=3, frameon=False)
+    figure.legend(
+        handles=handles,
+        loc="lower left",
+        bbox_to_anchor=(0.3 / width, 0.2 / height),
+        ncols=3 if columns > 1 else 1,
+        frameon=False,
+    )
     return figure
 
 
 def _common_limits(scenes: Sequence[Scene], grid: RadarGrid) -> tuple[float, float]:
-    """One colour scale for all scenes."""
-    from radejax.visualize.canvas import color_limits_of
-    from radejax.visualize.projections import range_azimuth
+    """One colour scale for all scenes, which the few strongest echoes exceed."""
+    values = np.stack([range_azimuth(scene.projection, grid) for scene in scenes])
+    low, high = np.nanpercentile(values, _COLOR_PERCENTILES)
+    return float(low), float(high) if high > low else float(low) + 1.0
 
-    limits = [color_limits_of(range_azimuth(s.projection, grid)) for s in scenes]
-    return min(low for low, _ in limits), max(high for _, high in limits)
+
+def _draw_colorbar(figure: Figure, limits: tuple[float, float]) -> None:
+    """The scale of all maps, below them, beside the legend."""
+    width, height = figure.get_size_inches()
+    cax = figure.add_axes(
+        (1.0 - 3.3 / width, 0.42 / height, 2.7 / width, 0.11 / height)
+    )
+    mappable = ScalarMappable(Normalize(*limits), COLOR_MAP)
+    bar = figure.colorbar(mappable, cax=cax, orientation="horizontal", extend="both")
+    bar.set_label(color_label(), fontsize=8)
+    bar.ax.tick_params(labelsize=8)
 
 
 def _magnify(
