@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _FRONT = [0, 3, 7, 4]  # of geometry.boxes.corners
 _FONT_SIZE_PT = 6.5
-_LEAST_HEIGHT_PT = 10.0  # on paper, of a box that gets a label
+_LEAST_HEIGHT_PT = 12.0  # on paper, of a box that gets a label
 _NEAR_M = 0.5
 
 

@@ -89,3 +89,12 @@ def test_real_frame(shared):
     assert (low < van["uv_raw"]).all()
     assert (high > van["uv_raw"]).all()
     assert (high - low < 200).all()
+
+
+def test_far_boxes_get_no_label():
+    far = [60.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]  # 2 of 72 pixels high
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=([far, BOX], ["Sedan", "Bicycle"])
+    )
+    assert [t.get_text() for t in ax.texts] == ["Bicycle"]
+    assert len(segments_of(ax)) == 24

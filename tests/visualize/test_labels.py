@@ -66,3 +66,17 @@ def test_outlines_out_of_sight_get_no_text():
         ["left", "left"],
     )
     assert [t.get_text() for t in ax.texts] == ["seen"]
+
+
+def test_of_texts_that_cover_each_other_the_first_is_drawn():
+    places = [[0, 0, 10, 10], [5, 0, 15, 10], [14.5, 0, 24, 10], [40, 0, 50, 10]]
+    # The second is covered by the first by half; the third only by the second, gone.
+    is_free = labels._is_free(np.array(places, float))
+    np.testing.assert_array_equal(is_free, [True, False, True, True])
+    ax = new_figure(1.0, 0.3).add_subplot()
+    ax.set(xlim=(0, 10), ylim=(0, 10))
+    square = np.array([[4, 4], [6, 4], [6, 6], [4, 6]])
+    texts = [f"a long text, number {i}" for i in range(60)]
+    labels.draw_labels(ax, [square] * 60, texts, ["white"] * 60, ["left"] * 60)
+    assert 1 <= len(ax.texts) < 60
+    assert ax.texts[0].get_text() == texts[0]

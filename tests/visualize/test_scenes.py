@@ -3,6 +3,7 @@
 import matplotlib.colors
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
 
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
@@ -32,7 +33,8 @@ def test_scenes_share_a_scale_and_have_an_image_above_a_map() -> None:
     figure = draw_scenes(scenes, GRID, roi=(0, 50, -10, 10, -2, 6))
     titles = [ax.get_title() for ax in figure.axes]
     assert [title for title in titles if title] == ["fog", "rain"]
-    assert len(figure.axes) == 3  # image and map, map
+    assert len(figure.axes) == 4  # image and map, map, colour bar
+    assert "power" in figure.axes[-1].get_xlabel()
     meshes = [
         m for ax in figure.axes for m in ax.collections if m.get_array() is not None
     ]
@@ -40,6 +42,15 @@ def test_scenes_share_a_scale_and_have_an_image_above_a_map() -> None:
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["ground truth", "region of interest"]
     assert not _has_color(render(figure).astype(int), ZOOM_COLOR)
+
+
+def test_one_strong_echo_does_not_darken_the_maps() -> None:
+    scene = _scene(0.2)
+    scene.projection[..., :] += np.linspace(0, 0.2, 24)[None, :, None]
+    scene.projection[3, 3] = 5.0
+    figure = draw_scenes([scene], GRID)
+    (mesh,) = [m for m in figure.axes[0].collections if isinstance(m, QuadMesh)]
+    assert mesh.get_clim()[1] < 0.5
 
 
 def test_a_magnified_view_is_framed_in_orange() -> None:
