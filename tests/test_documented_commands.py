@@ -51,6 +51,8 @@ RUN_IN = {
     "::test_cfar_baseline_fits_detects_and_reports",
     "examples/fusion_by_lens.py": "tests/test_fusion_run.py"
     "::test_example_compares_fusion_and_radar_by_the_lens",
+    "examples/online_training.py": "tests/test_online_training.py"
+    "::test_fresh_frames_train_a_model_and_a_stop_changes_nothing",
     "examples/reference_points.py": "tests/test_fusion_run.py"
     "::test_example_draws_reference_points",
     # Measured by hand on quiet machines: that they start is tested.

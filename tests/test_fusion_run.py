@@ -341,7 +341,7 @@ def three_test_sequences(data):
     """The training split joins the test split: intervals resample sequences."""
     split = data.folder / "split"
     before = (split / "test.txt").read_text()
-    (split / "test.txt").write_text(before + (split / "train.txt").read_text())
+    (split / "test.txt").write_text(before + "\n" + (split / "train.txt").read_text())
     yield
     (split / "test.txt").write_text(before)
 

@@ -2,6 +2,7 @@
 
 import ast
 import pathlib
+import re
 
 import pytest
 
@@ -49,3 +50,37 @@ def test_a_floor_imports_only_from_the_floors_below(path: pathlib.Path) -> None:
     rooms = _imported_rooms(path)
     above = set(FLOORS[FLOORS.index(path.parent.name) + 1 :]) | ROOF
     assert not rooms & above
+
+
+def _floors_of_the_page() -> dict[str, int]:
+    """Floor of every room and module, from the ground, as docs/architecture.md says."""
+    page = PACKAGE.parent / "docs" / "architecture.md"
+    table = (
+        page.read_text(encoding="utf-8").split("|---|---|---|\n")[1].split("\n\n")[0]
+    )
+    rows = [
+        re.findall(r"`([\w/]+)(?:\.py)?`", r.split("|")[1]) for r in table.split("\n")
+    ]
+    return {
+        name.rstrip("/"): floor
+        for floor, row in enumerate(reversed(rows))
+        for name in row
+    }
+
+
+def test_the_page_names_every_room_and_its_floor() -> None:
+    floors = _floors_of_the_page()
+    modules = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"}
+    rooms = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert set(floors) - {"train", "evaluate"} == modules | rooms
+    for path in PACKAGE.glob("*.py"):
+        if path.stem == "__init__":
+            continue
+        # Imports inside functions are conveniences, made when they are asked for.
+        tree = ast.parse(path.read_text())
+        imports = [n for n in tree.body if isinstance(n, ast.ImportFrom)]
+        names = [f"{n.module}.{alias.name}" for n in imports for alias in n.names]
+        for name in names:
+            room = name.split(".")[1] if name.startswith("radejax.") else None
+            if room in floors:
+                assert floors[room] <= floors[path.stem], f"{path.stem}: {name}"

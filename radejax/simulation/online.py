@@ -13,6 +13,7 @@ import functools
 import threading
 from typing import Any
 
+import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,6 +89,17 @@ class OnlineBatches:
     def batch(self, step: int) -> Batch:
         """The batch of any step: a pure function of config, seed and step."""
         return self._assemble([f.result() for f in self._submit(step)])
+
+    def loader(self) -> grain.DatasetIterator:
+        """The same batches as an iterator whose position a checkpoint keeps."""
+        steps = grain.MapDataset.range(np.iinfo(np.int32).max)
+        reading = grain.ReadOptions(num_threads=2, prefetch_buffer_size=2)
+        return iter(steps.map(self.batch).to_iter_dataset(reading))
+
+    @property
+    def frame_names(self) -> list[str]:
+        """Sequence and frame that each index of `Batch.frame` stands for."""
+        return [f"{number}/{spec.name}" for number, spec in self._specs]
 
     def _submit(self, step: int) -> list[concurrent.futures.Future]:
         rng = np.random.default_rng([self._seed, step])

@@ -76,3 +76,17 @@ def test_too_many_objects_are_counted():
     batch = source.batch(0)
     assert batch.boxes.shape == (3, 1, 8)
     assert source.num_cut > 0
+
+
+def test_a_loader_continues_at_its_position(source):
+    loader = source.loader()
+    next(loader)
+    position = loader.get_state()
+    expected = next(loader)
+    jax.tree.map(np.testing.assert_array_equal, source.batch(1), expected)
+    other = batches().loader()
+    other.set_state(position)
+    jax.tree.map(np.testing.assert_array_equal, next(other), expected)
+    names = source.frame_names
+    assert len(names) == 12
+    assert names[int(expected.frame[0])].split("/")[0] in ("1", "2", "3")

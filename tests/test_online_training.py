@@ -1,0 +1,74 @@
+"""Training without a data set: resumable, and what it cannot do is said."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from radejax import Detector
+from radejax.config import load_config
+from radejax.errors import UserError
+from radejax.online_training import train_online
+from radejax.training import sharding
+
+from . import small_models as small
+
+
+def _config(num_epochs=2):
+    config = load_config(str(small.CONFIGS / "quickstart.py") + ":short")
+    config.simulation.update(frames_per_sequence=2)
+    config.simulation.grid.update(
+        num_doppler=4, num_range=16, num_elevation=3, num_azimuth=16
+    )
+    config.model.update(doppler_bins=4, elevation_bins=3, widths=(8, 8), num_groups=4)
+    config.model.update(decoder_width=8, neck="plain", heads="default", pad_multiple=4)
+    config.train.update(batch_size=2, num_epochs=num_epochs, log_every_steps=1)
+    config.train.checkpoint_every_steps = 1
+    return config
+
+
+@pytest.mark.slow
+def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeypatch):
+    mesh = sharding.make_mesh(1)
+    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    result = train_online(_config(), whole, num_sequences=2)
+    assert result.step == 4  # 4 frames an epoch
+    # Stops after the first checkpoint, as if killed, and goes on.
+    saved = []
+
+    def stop(self, step, *args, original=None):
+        original(self, step, *args)
+        saved.append(step)
+        raise KeyboardInterrupt
+
+    from radejax.training import loop
+
+    original = loop._Run._save
+    with monkeypatch.context() as patch:
+        patch.setattr(loop._Run, "_save", lambda *a: stop(*a, original=original))
+        with pytest.raises(KeyboardInterrupt):
+            train_online(_config(), parts, num_sequences=2)
+    assert saved == [1]
+    assert train_online(_config(), parts, num_sequences=2).step == 4
+    expected = Detector.from_checkpoint(whole / "checkpoints")
+    found = Detector.from_checkpoint(parts / "checkpoints")
+    jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
+    rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
+    assert len({row["focal"] for row in rows if "focal" in row}) == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"classes": ("Sedan",)}, "classes must be"),
+        ({"simulation": {"scenes": "labels.zip"}}, "scenes must be procedural"),
+    ],
+)
+def test_what_it_cannot_do_is_said(changes, message, tmp_path):
+    config = _config()
+    config.update(changes)
+    with pytest.raises(UserError, match=message):
+        train_online(config, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
