@@ -8,7 +8,6 @@ import pathlib
 
 import numpy as np
 from matplotlib.lines import Line2D
-from PIL import Image
 
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.camera import CameraRenderer, stereo_calibration
@@ -64,8 +63,7 @@ def draw(weather, environment, time, seed, path):
     bar.set_label("largest power of the other axes (dB)", fontsize=8)
     figure.draw_without_rendering()  # labels need the final places of axes
     draw_boxes(axes[1], frame, simulator.is_radar_visible(frame, given))
-    figure.savefig(path, dpi=110)
-    Image.open(path).convert("RGB").quantize(128).save(path, optimize=True)
+    figure.savefig(path, dpi=110)  # in all colours: a palette loses the orange
 
 
 def draw_maps(axes, power_db):
