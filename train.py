@@ -63,10 +63,9 @@ def main(_: list[str]) -> None:
     """Runs the whole way from data to metrics."""
     entry.set_up_jax()
     with entry.exit_codes(debug=_DEBUG.value):
-        if _DISTRIBUTED.value or _COORDINATOR.value is not None:
-            entry.join_processes(
-                _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
-            )
+        place = _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
+        if _DISTRIBUTED.value or place != (None,) * 3:
+            entry.join_processes(*place)
         from radejax import experiment
 
         experiment.run(

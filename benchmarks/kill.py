@@ -6,6 +6,9 @@ First an undisturbed run, then the same one killed again and again: every start 
 random time to live, up to that of a whole start. A run that comes to its end all the same
 is compared, and another one begins. Compared are all parameters, bit for bit, the logged
 losses and the metrics of the evaluation.
+
+Data and records are made by the undisturbed run: no kill falls into simulation or
+projection, and evaluation on the way is off (tests/ have a kill while projecting).
 """
 
 import argparse

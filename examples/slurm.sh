@@ -28,8 +28,12 @@ run() {
         --data "$DATA" --records "$records" --workdir "$WORKDIR"
 }
 
-run
-# Stopped by a signal it has no evaluation yet: back into the queue.
-if [ ! -e "$WORKDIR/evaluation/metrics.json" ]; then
+status=0
+run || status=$?
+# Stopped by a signal, in training (0, and there is no evaluation yet) or in the final
+# evaluation (143 = 128 + SIGTERM): back into the queue. Errors are not tried again.
+if [ "$status" = 143 ] ||
+    { [ "$status" = 0 ] && [ ! -e "$WORKDIR/evaluation/metrics.json" ]; }; then
     scontrol requeue "$SLURM_JOB_ID"
 fi
+exit "$status"

@@ -22,6 +22,7 @@ from radejax.geometry.camera import (
     ImageKind,
     stack_cameras,
 )
+from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
 
 PathLike = str | pathlib.Path
@@ -106,6 +107,21 @@ def placeholder(num_frames: int, model: Any) -> tuple[np.ndarray, Camera]:
     """Black images and a camera that looks nowhere, of the shapes of real ones."""
     image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
     return image, stack_cameras([no_camera(model.image_size)] * num_frames)
+
+
+def check_backbone(image: Any, variables: Mapping[str, Any]) -> None:
+    """`UserError` for images themselves where variables lack the backbone's weights.
+
+    Args:
+        image: `[B, H, W, 3]`, what the backbone made of it, or None.
+        variables: Of a model.
+    """
+    is_raw = image is not None and image.shape[-1] == 3
+    if is_raw and IMAGE_BACKBONE not in variables["params"]:
+        raise UserError(
+            "these weights are without the image backbone: give "
+            "image_backbone=FOLDER with DINOv3's, or embedded images"
+        )
 
 
 def _check_missing(is_missing: np.ndarray, options: CameraOptions) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import pathlib
+import socket
 import sys
 from collections.abc import Iterator, Sequence
 
@@ -13,40 +14,49 @@ import jax
 from absl import flags
 from absl import logging as absl_logging
 
-from radejax.errors import DataError, UserError
+from radejax.errors import DataError, DiskFullError, UserError
 from radejax.files import is_no_space
 
 FAILED = 1
 WRONG_USE = 2
+
+_WRONG_PATH = (
+    FileNotFoundError,
+    NotADirectoryError,
+    IsADirectoryError,
+    PermissionError,
+)
 
 
 @contextlib.contextmanager
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with one line instead of a traceback for the user's errors.
 
-    Exit code 2 for wrong use (arguments, folders, full disk), 1 for damaged data.
+    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk.
 
     Args:
         debug: Let the traceback through.
     """
     try:
         yield
-    except (UserError, FileNotFoundError, NotADirectoryError) as error:
-        _fail(error, WRONG_USE, debug)
-    except DataError as error:
+    except (DataError, DiskFullError) as error:
         _fail(error, FAILED, debug)
+    except (UserError, *_WRONG_PATH) as error:
+        _fail(error, WRONG_USE, debug)
     except OSError as error:
         if not is_no_space(error):
             raise
-        _fail(error, WRONG_USE, debug)
+        _fail(error, FAILED, debug)
 
 
 def _fail(error: Exception, code: int, debug: bool) -> None:
     if debug:
         raise error
     message = str(error)
-    if isinstance(error, FileNotFoundError) and error.filename is not None:
-        message = f"no such file or folder: {error.filename}"
+    if isinstance(error, OSError) and error.filename is not None:
+        message = f"{error.strerror}: {error.filename}"
+        if isinstance(error, FileNotFoundError):
+            message = f"no such file or folder: {error.filename}"
     sys.stderr.write(f"error: {message}\n")
     raise SystemExit(code)
 
@@ -98,11 +108,14 @@ def join_processes(
         process_id: Of this process, from 0.
 
     Raises:
-        UserError: JAX finds no cluster, and not all arguments are given.
+        UserError: JAX finds no cluster, and not all arguments are given; or the
+            coordinator's port is taken or not reached.
     """
     given = [coordinator, num_processes, process_id]
     if None in given and given != [None] * 3:
         raise UserError("give --coordinator, --num_processes and --process_id together")
+    if process_id == 0:
+        _check_port(coordinator)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(*given)
@@ -111,9 +124,28 @@ def join_processes(
             f"--distributed finds no cluster to join ({error}); without Slurm, Open MPI "
             "or a TPU pod give --coordinator HOST:PORT, --num_processes and --process_id"
         ) from error
+    except RuntimeError as error:  # of its service, without a class of their own
+        line = str(error).strip().split("\n")[0]
+        where = coordinator or "the coordinator that the cluster names"
+        raise UserError(f"cannot join the processes at {where}: {line}") from error
     if jax.process_index():
         logging.getLogger("radejax").setLevel(logging.ERROR)
         os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
+
+
+def _check_port(coordinator: str) -> None:
+    """`UserError` unless process 0 can listen there; JAX's service would crash."""
+    host, _, port = coordinator.rpartition(":")
+    if not host or not port.isdigit():
+        raise UserError(f"--coordinator must be HOST:PORT, got {coordinator}")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", int(port)))
+        except (OSError, OverflowError) as error:
+            raise UserError(
+                f"process 0 cannot listen on port {port} of --coordinator: {error}"
+            ) from error
 
 
 def set_up_jax(*, cache: bool = True) -> None:

@@ -24,7 +24,7 @@ from radejax.evaluation.report import Report, write_report
 from radejax.geometry.camera import CameraCalibration
 from radejax.predict import Predictor, predict_dataset
 from radejax.training import processes
-from radejax.workdir import load_run
+from radejax.workdir import Run, load_run
 
 _log = logging.getLogger(__name__)
 
@@ -49,11 +49,17 @@ def evaluate_run(
         image_backbone: Weights of a frozen backbone, see `load_run`.
 
     Returns:
-        The report that was written; None on all processes but the first.
+        The report that was written; None on all processes but the first, which return
+        when it is there.
+
+    Raises:
+        UserError: There are no frames of the split.
     """
     run = load_run(workdir, step, image_backbone)
     config = run.config
     frames = run.paths.open(config, None if split == "all" else split)
+    if not len(frames):
+        raise UserError(f"no frames of split {split} in {', '.join(run.paths.roots)}")
     records = RecordSource(run.paths.records)
     options = config.evaluation
     predictor = Predictor(
@@ -66,9 +72,24 @@ def evaluate_run(
         options.batch_size,
         inputs=camera_inputs.loader_arguments(config, frames, run.paths.embeddings),
     )
-    if not processes.is_main():
-        return None
     out = pathlib.Path(out or run.workdir / "evaluation")
+    count = options.num_pictures if num_pictures is None else num_pictures
+    return processes.main_only(
+        lambda: _report(run, split, frames, records, predictions, out, count)
+    )
+
+
+def _report(
+    run: Run,
+    split: str,
+    frames: KRadar,
+    records: RecordSource,
+    predictions: Mapping[str, np.ndarray],
+    out: pathlib.Path,
+    num_pictures: int,
+) -> Report:
+    """Scores predictions, and writes and draws everything into `out`."""
+    config = run.config
     out.mkdir(parents=True, exist_ok=True)
     drawer = FrameDrawer(records, frames, predictions, config)
     ground_truth, table = tables_from_frames(frames)
@@ -78,7 +99,7 @@ def evaluate_run(
         table,
         out,
         report_options(config, run.workdir.name),
-        bootstrap=options.bootstrap,
+        bootstrap=config.evaluation.bootstrap,
         left_out_before=frames.summary().counts,
         draw_frame=drawer,
     )
@@ -88,8 +109,7 @@ def evaluate_run(
             config, run.variables, records, frames, embeddings=run.paths.embeddings
         )
         write_camera_share(out, *shares, run.grid)
-    count = options.num_pictures if num_pictures is None else num_pictures
-    pictures = drawer.draw_spread(out / "pictures", count)
+    pictures = drawer.draw_spread(out / "pictures", num_pictures)
     if pictures:
         drawer.draw_scenes(out / "scenes.png")
     if (run.workdir / "metrics.jsonl").exists():

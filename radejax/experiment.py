@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -17,7 +18,9 @@ from ml_collections import ConfigDict
 from radejax import camera_inputs, files, models
 from radejax.data import pipeline, projection_job
 from radejax.data.augment import Augmentation
+from radejax.data.frame import Frame
 from radejax.data.records import RecordSource
+from radejax.embed import embeddings_sha256, weights_sha256
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -29,6 +32,7 @@ from radejax.workdir import (
     claim_workdir,
     initial_variables,
     load_run,
+    lock_workdir,
     relative,
     run_info,
 )
@@ -83,8 +87,8 @@ def run(
         The work folder.
 
     Raises:
-        UserError: The work folder belongs to another configuration, no data, or no
-            space.
+        UserError: The work folder belongs to another configuration or is in use, no
+            data, or no space.
     """
     if config.seeds:
         from radejax.seeds import run_seeds
@@ -104,33 +108,50 @@ def run(
     started = time.perf_counter()
     workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
     models.build(config.model)  # a config that cannot be built should fail first
-    processes.main_first(lambda: claim_workdir(workdir, config))
-    paths = dataclasses.replace(
-        processes.main_first(
-            lambda: prepare_data(
-                config,
-                data=data,
-                labels=labels,
-                records=records,
-                camera_calibration=camera_calibration,
-            )
-        ),
-        embeddings=camera_inputs.saved_path(embeddings),
-        image_backbone=camera_inputs.saved_path(image_backbone),
-    )
+    with contextlib.ExitStack() as held:
+        processes.main_only(lambda: held.enter_context(lock_workdir(workdir)))
+        processes.main_first(lambda: claim_workdir(workdir, config))
+        paths = dataclasses.replace(
+            processes.main_first(
+                lambda: prepare_data(
+                    config,
+                    data=data,
+                    labels=labels,
+                    records=records,
+                    camera_calibration=camera_calibration,
+                )
+            ),
+            embeddings=camera_inputs.saved_path(embeddings),
+            image_backbone=camera_inputs.saved_path(image_backbone),
+        )
+        if _train_and_evaluate(config, workdir, paths, init_from):
+            minutes = (time.perf_counter() - started) / 60
+            _log.info(_CLOSING.format(minutes=minutes, workdir=relative(workdir)))
+    return workdir
+
+
+def _train_and_evaluate(
+    config: ConfigDict, workdir: pathlib.Path, paths: DataPaths, init_from: str | None
+) -> bool:
+    """False where a signal stopped it."""
+    has_test = len(paths.open(config, split="test")) > 0
+    if not has_test:
+        _log.warning(
+            "no frames of the test split in %s: the run is trained and not evaluated",
+            ", ".join(paths.roots),
+        )
     info = run_info(workdir, paths, init_from)
     if processes.is_main():
         files.write_json(workdir / "run.json", info)
     result = train(config, workdir, paths, info=info, init_from=init_from)
     if not result.finished:
         _log.info("stopped at step %d; run the same command to continue", result.step)
-        return workdir
-    from radejax.evaluate_run import evaluate_run  # drawing and tables: not to train
+        return False
+    if has_test:
+        from radejax.evaluate_run import evaluate_run  # drawing, tables: not to train
 
-    evaluate_run(workdir)
-    minutes = (time.perf_counter() - started) / 60
-    _log.info(_CLOSING.format(minutes=minutes, workdir=relative(workdir)))
-    return workdir
+        evaluate_run(workdir)
+    return True
 
 
 _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {workdir}:
@@ -211,7 +232,10 @@ def train(
     if not len(frames):
         raise UserError(f"no frames of the train split in {', '.join(paths.roots)}")
     sharding.check_batch_size(
-        config.train.batch_size, sharding.make_mesh(), "train.batch_size"
+        config.train.batch_size,
+        sharding.make_mesh(),
+        "train.batch_size",
+        config.train.num_accumulate,
     )
     inputs = camera_inputs.loader_arguments(config, frames, paths.embeddings)
     camera_inputs.require_images(frames, inputs)
@@ -252,6 +276,7 @@ def train(
             "config": json.loads(config.to_json()),
             "grid": records.grid.to_dict(),
             "run": dict(info),
+            "same": _what_stays(frames, variables, pretrained, paths.embeddings, model),
         },
         steps_per_epoch=pipeline.steps_per_epoch(
             len(frames),
@@ -267,6 +292,33 @@ def train(
 
 def _has_backbone(variables: Mapping[str, Any] | None) -> bool:
     return variables is not None and IMAGE_BACKBONE in variables["params"]
+
+
+def _what_stays(
+    frames: Sequence[Frame],
+    variables: Mapping[str, Any] | None,
+    pretrained: Mapping[str, Any] | None,
+    embeddings: str | None,
+    model: Any,
+) -> dict[str, Any]:
+    """What a checkpoint does not hold and a run must not change on its way.
+
+    Folders may move, therefore frames are compared by their keys and the frozen
+    backbone by its weights.
+    """
+    keys = "\n".join(frame.key for frame in frames)
+    stays = {
+        "frames to train on": len(frames),
+        "sha256 of their keys": hashlib.sha256(keys.encode()).hexdigest()[:16],
+    }
+    if getattr(model, "freeze", False):
+        if embeddings is not None:
+            digest = embeddings_sha256(embeddings)
+        else:
+            source = pretrained if pretrained is not None else variables
+            digest = weights_sha256(source["params"][IMAGE_BACKBONE])
+        stays["sha256 of the frozen image backbone"] = digest[:16]
+    return stays
 
 
 def make_augmentation(data: ConfigDict, grid: RadarGrid) -> Augmentation | None:

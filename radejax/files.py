@@ -10,7 +10,7 @@ import pathlib
 from collections.abc import Iterator
 from typing import IO, Any
 
-from radejax.errors import DataError, UserError
+from radejax.errors import DataError, DiskFullError
 
 
 @contextlib.contextmanager
@@ -21,7 +21,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
     the error also removes the temporary file.
 
     Raises:
-        UserError: No space is left on the disk.
+        DiskFullError: No space is left on the disk.
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     """As `atomic_write` for libraries that want a path: a temporary one to write to.
 
     Raises:
-        UserError: No space is left on the disk; what was written is removed.
+        DiskFullError: No space is left on the disk; what was written is removed.
     """
     path = pathlib.Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -71,9 +71,9 @@ def is_no_space(error: BaseException) -> bool:
     return any(os.strerror(number) in str(error) for number in numbers)
 
 
-def no_space_error(path: str | os.PathLike) -> UserError:
+def no_space_error(path: str | os.PathLike) -> DiskFullError:
     """The one-line error for a full disk or an exhausted quota."""
-    return UserError(
+    return DiskFullError(
         f"no space left on the disk of {pathlib.Path(path).parent}; nothing half-"
         "written was kept, run the same command again with space to continue"
     )

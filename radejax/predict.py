@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -11,12 +11,13 @@ import jax
 import numpy as np
 import tqdm
 
-from radejax import models
+from radejax import detector_inputs, models
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import make_loader
 from radejax.data.records import RecordSource
 from radejax.detection.decode import decode
 from radejax.detector import Detector
+from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.structures import Batch, Detections
 from radejax.training import processes, sharding
@@ -81,11 +82,22 @@ class Predictor:
 
         Returns:
             Detections and `[B]` int32 `Batch.frame`, of the rows of all processes.
+
+        Raises:
+            UserError: Images are given, and the variables are without the weights of
+                the image backbone.
         """
+        detector_inputs.check_backbone(batch.image, self._variables)
         # Ground truth is not looked at; its shapes must not make it compile again.
         none = np.zeros((len(batch.frame), 0), np.float32)
         batch = batch.replace(boxes=none, classes=none, is_valid=none)
-        return self._run(self._variables, sharding.put_batch(batch, self.mesh))
+        batch = sharding.put_batch(batch, self.mesh)
+        with jax.transfer_guard("disallow"):
+            found = self._run(self._variables, batch)
+        if jax.default_backend() == "cpu" and self.mesh.devices.size > 1:
+            # Devices that share cores miss each other where batches pile up.
+            jax.block_until_ready(found)
+        return found
 
 
 def _predict(
@@ -107,6 +119,7 @@ def predict_dataset(
     *,
     inputs: Mapping[str, Any] | None = None,
     progress: bool = True,
+    should_stop: Callable[[], bool] | None = None,
 ) -> dict[str, np.ndarray]:
     """Detections on every frame of a data set; the same on every process.
 
@@ -117,11 +130,18 @@ def predict_dataset(
         batch_size: Frames at once; rounded up to a multiple of the devices.
         inputs: Further arguments of `make_loader`, see `camera_inputs`.
         progress: Show a bar.
+        should_stop: Asked before every batch.
 
     Returns:
         Columns "frame" (position in `frames`), "box", "cls", "score", by frame and
         falling score.
+
+    Raises:
+        UserError: There are no frames.
+        processes.Stopped: `should_stop` said so.
     """
+    if not len(frames):
+        raise UserError("no frames to detect objects in")
     on_mesh = isinstance(detector, Predictor)
     loader = make_loader(
         records,
@@ -131,7 +151,8 @@ def predict_dataset(
         classes=detector.classes,
         shuffle=False,
         num_epochs=1,
-        pad_remainder=True,
+        drop_remainder=False,
+        pad_remainder=on_mesh,  # a `Detector` does it itself
         process_index=None if on_mesh else 0,
         process_count=None if on_mesh else 1,
         **(inputs or {}),
@@ -151,6 +172,8 @@ def predict_dataset(
     ) as bar:
         pending = None
         for batch in loader:
+            if should_stop is not None and should_stop():
+                raise processes.Stopped
             started = detect(batch)
             # The devices work on this batch while the one before is taken apart.
             if pending is not None:

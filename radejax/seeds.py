@@ -56,7 +56,11 @@ def run_seeds(
         _log.info("seed %d of %s", seed, list(seeds))
         folder = run(one, name=name, workdir=workdir / f"seed{seed}", **options)
         if not (folder / "evaluation" / "metrics.csv").exists():
-            _log.info("seed %d is not finished; run the same command to go on", seed)
+            _log.info(
+                "seed %d has no evaluation: it is not finished (run the same command to "
+                "go on), or there are no test frames",
+                seed,
+            )
             break
         tables[seed] = read_aps(folder / "evaluation" / "metrics.csv")
     if tables and processes.is_main():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import pathlib
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -61,9 +61,18 @@ class Validation:
         self._predictor: Predictor | None = None
         _check_best(config.train.best_metric, self._options)
 
-    def __call__(self, state: TrainState, step: int) -> Scores:
-        """Scores of the state's (averaged) parameters on the test split."""
-        predictions = self._predict(state.eval_variables)
+    def __call__(
+        self,
+        state: TrainState,
+        step: int,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> Scores:
+        """Scores of the state's (averaged) parameters on the test split.
+
+        Raises:
+            processes.Stopped: `should_stop`, asked at every batch, said so.
+        """
+        predictions = self._predict(state.eval_variables, should_stop)
         predictions, _ = repair_sizes(predictions, self._options.invalid_sizes)
         data = EvaluationSet(
             self._ground_truth,
@@ -84,10 +93,12 @@ class Validation:
                 values[f"validation/{result.metric}/{result.cls}"] = result.ap
             if self._is_best_metric(result) and not math.isnan(result.ap):
                 best = result.ap
-        pictures = self._draw(predictions) if processes.is_main() else {}
+        pictures = processes.main_only(lambda: self._draw(predictions)) or {}
         return Scores(values, best, pictures)
 
-    def _predict(self, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    def _predict(
+        self, variables: Mapping[str, Any], should_stop: Callable[[], bool] | None
+    ) -> dict[str, np.ndarray]:
         if self._predictor is None:
             self._predictor = Predictor(
                 self._config,
@@ -105,6 +116,7 @@ class Validation:
                 self._config.evaluation.batch_size,
                 inputs=self._inputs,
                 progress=False,
+                should_stop=should_stop,
             )
         finally:
             self._predictor.update(None)  # the state's own arrays go on to be donated

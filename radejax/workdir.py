@@ -5,18 +5,21 @@ run.json         where its data are, versions, command
 checkpoints/     newest, best and last, by step
 metrics.jsonl    losses by step; tensorboard/ the same
 evaluation/      metrics.json, metrics.csv, tables, pictures of the last evaluation
+lock             held by the training under way
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import json
 import logging
 import os
 import pathlib
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -87,6 +90,29 @@ class Run:
     grid: RadarGrid
     variables: Mapping[str, Any]
     step: int
+
+
+@contextlib.contextmanager
+def lock_workdir(workdir: pathlib.Path) -> Iterator[None]:
+    """Keeps a second training out of a work folder, which is made if missing.
+
+    The system releases the lock however the process ends.
+
+    Raises:
+        UserError: Another process holds it.
+    """
+    workdir.mkdir(parents=True, exist_ok=True)
+    with (workdir / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"another training is at work in {relative(workdir)}: wait for its "
+                "end, or give another --workdir"
+            ) from None
+        except OSError as error:
+            _log.warning("no locks on the disk of %s (%s)", workdir, error.strerror)
+        yield
 
 
 def claim_workdir(workdir: pathlib.Path, config: ConfigDict) -> None:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax import models
+from radejax import detector_inputs, models
 from radejax.config import base_config
 from radejax.data.projection_job import project_dataset
 from radejax.data.records import RecordSource
@@ -15,7 +15,8 @@ from radejax.detector import Detector
 from radejax.errors import UserError
 from radejax.predict import Predictor, predict_dataset
 from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.training import sharding
+from radejax.structures import Batch
+from radejax.training import processes, sharding
 from radejax.validation import Validation
 from radejax.workdir import DataPaths
 
@@ -82,6 +83,63 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(
     )
     alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
     _assert_same(alone, expected)
+
+
+def test_an_empty_split_is_said(setup: SimpleNamespace) -> None:
+    with pytest.raises(UserError, match="no frames to detect objects in"):
+        predict_dataset(None, setup.records, setup.frames[:0])
+
+
+def test_a_detector_sees_no_frames_that_are_not_there(setup: SimpleNamespace) -> None:
+    seen = []
+
+    class Spy(Detector):
+        def __call__(self, frames: Any, *inputs: Any) -> Any:
+            seen.append(len(frames))
+            return super().__call__(frames, *inputs)
+
+    spy = Spy.from_config(setup.config, setup.variables, setup.records.grid)
+    predict_dataset(spy, setup.records, setup.frames, 3, progress=False)
+    assert seen == [3, 2]
+
+
+def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
+    asked = []
+
+    def should_stop() -> bool:
+        asked.append(True)
+        return True
+
+    state = SimpleNamespace(eval_variables=setup.variables)
+    with pytest.raises(processes.Stopped):
+        Validation(setup.config, setup.paths)(state, 7, should_stop)
+    assert asked == [True]
+
+
+def test_images_need_the_weights_of_the_backbone() -> None:
+    image = np.zeros((1, 4, 4, 3), np.uint8)
+    lacking, whole = {"params": {}}, {"params": {"image_backbone": {}}}
+    with pytest.raises(UserError, match="without the image backbone"):
+        detector_inputs.check_backbone(image, lacking)
+    detector_inputs.check_backbone(image, whole)
+    detector_inputs.check_backbone(None, lacking)
+    detector_inputs.check_backbone(np.zeros((1, 4, 4, 16)), lacking)
+
+
+def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
+    predictor = Predictor(setup.config, setup.variables, setup.records.grid)
+    projection = np.zeros((8, *setup.records.grid.projection_shape), np.float16)
+    none = np.zeros((8, 0), np.float32)
+    batch = Batch(
+        projection=projection,
+        boxes=none,
+        classes=none,
+        is_valid=none,
+        frame=np.arange(8, dtype=np.int32),
+        image=np.zeros((8, 4, 4, 3), np.uint8),
+    )
+    with pytest.raises(UserError, match="without the image backbone"):
+        predictor(batch)
 
 
 def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:

@@ -33,12 +33,12 @@ OVERRIDES = [
 MIDDLE = 3  # of six steps
 
 
-def _train(folder: pathlib.Path, run: str, num_processes: int) -> None:
+def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) -> None:
     """Runs train.py on two devices, of one process or one of each of two."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         coordinator = f"127.0.0.1:{free.getsockname()[1]}"
-    command = [sys.executable, "train.py", *OVERRIDES]
+    command = [sys.executable, "train.py", *OVERRIDES, *overrides]
     command += [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
     started = []
     for i in range(num_processes):
@@ -76,7 +76,7 @@ def _cut(folder: pathlib.Path, run: str, to: str) -> None:
 
 def _losses(folder: pathlib.Path) -> list[tuple[int, list[float]]]:
     lines = (folder / "metrics.jsonl").read_text().splitlines()
-    rows = [json.loads(line) for line in lines]
+    rows = [row for row in map(json.loads, lines) if "focal" in row]
     names = ("focal", "gwd", "smooth_l1", "grad_norm")
     return [(row["step"], [row[name] for name in names]) for row in rows]
 
@@ -112,6 +112,26 @@ def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
         load_run(runs / run).variables, load_run(runs / "one").variables, atol=1e-6
     )
     assert _aps(runs / run) == _aps(runs / "one")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
+    runs: pathlib.Path,
+) -> None:
+    # The second process must not look for what the first one still writes.
+    _train(
+        runs,
+        "seeds",
+        2,
+        "--config.seeds=0,1",
+        "--config.train.evaluate_every_epochs=2",
+        "--config.watch.num_pictures=2",
+        "--config.evaluation.num_pictures=2",
+    )
+    assert _losses(runs / "seeds" / "seed0") == _losses(runs / "two")
+    rows = json.loads((runs / "seeds" / "seeds.json").read_text())
+    assert set(rows[0]["values"]) == {"0", "1"}
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 import json
 import pathlib
+import subprocess
+import sys
 
 import pytest
 
@@ -31,6 +33,38 @@ def test_another_config_is_refused_and_the_difference_named(
         r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
     ):
         workdir.claim_workdir(tmp_path, config)
+
+
+def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "run"
+    with (
+        workdir.lock_workdir(folder),
+        pytest.raises(UserError, match=r"another training is at work in .*run: wait"),
+        workdir.lock_workdir(folder),
+    ):
+        pass
+    with workdir.lock_workdir(folder):  # let go, though the file is there
+        pass
+
+
+def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) -> None:
+    code = (
+        "import sys, fcntl, time\n"
+        "file = open(sys.argv[1], 'w')\n"
+        "fcntl.flock(file, fcntl.LOCK_EX)\n"
+        "print('held', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path / "lock")], stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(UserError), workdir.lock_workdir(tmp_path):
+            pass
+        other.kill()
+        other.wait()
+        with workdir.lock_workdir(tmp_path):
+            pass
 
 
 def test_no_run_in_a_folder(tmp_path: pathlib.Path) -> None:

@@ -1,8 +1,8 @@
 """Checkpoints of a run: state, position in the data, configuration and metrics.
 
 Written by orbax: in the background, to a temporary folder that gets its final name
-only when whole. A checkpoint that does not restore is set aside with a warning and
-the one before is used.
+only when whole. Where the newest does not restore, the one before is used and those
+after it are set aside with a warning.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax import files
-from radejax.errors import DataError, UserError
+from radejax.errors import DataError, DiskFullError
 from radejax.training import processes, sharding
 
 _log = logging.getLogger(__name__)
@@ -28,6 +28,7 @@ _log = logging.getLogger(__name__)
 BEST = "best"
 """Name of the metric that decides which checkpoint is best; higher is better."""
 
+_VARIABLES = ("params", "ema_params", "model_state")
 
 _NO_NEWS = (
     "tracked_metric",  # most checkpoints are not evaluated
@@ -126,7 +127,7 @@ class Checkpoints:
             metrics: Of an evaluation at this step.
 
         Raises:
-            UserError: The disk is full. Earlier checkpoints stay intact.
+            DiskFullError: Earlier checkpoints stay intact.
         """
         if step in self._manager.all_steps():
             return
@@ -148,7 +149,7 @@ class Checkpoints:
         """Returns when everything that was started is on disk.
 
         Raises:
-            UserError: The disk is full.
+            DiskFullError: Earlier checkpoints stay intact.
         """
         try:
             self._manager.wait_until_finished()
@@ -156,8 +157,12 @@ class Checkpoints:
         except Exception as error:
             raise _disk_full(error, self.folder) from error
 
-    def restore(self, state: Any, data_iterator: Any) -> int | None:
+    def restore(
+        self, state: Any, data_iterator: Any
+    ) -> tuple[Any, dict[str, Any], int] | None:
         """Restores the newest checkpoint that is whole.
+
+        Newer ones are set aside, to be looked at; they will be saved anew.
 
         Args:
             state: Pytree of `jax.ShapeDtypeStruct` with the shardings wanted, which
@@ -165,41 +170,48 @@ class Checkpoints:
             data_iterator: Set to the position that was saved.
 
         Returns:
-            `(state, step)`, or None where there is no checkpoint.
+            State, the `info` saved with it, and step; None where there is no checkpoint.
 
         Raises:
-            DataError: There are checkpoints, and none restores.
+            DataError: There are checkpoints, and none restores; they stay as they are.
         """
-        steps = self.steps()
+        steps, failed = self.steps(), []
         for step in reversed(steps):
             restored, reason = None, "another process could not read it"
             try:
                 restored = self._manager.restore(
-                    step, args=ocp.args.Composite(state=ocp.args.StandardRestore(state))
-                )["state"]
+                    step,
+                    args=ocp.args.Composite(
+                        state=ocp.args.StandardRestore(state),
+                        info=ocp.args.JsonRestore(),
+                    ),
+                )
                 self._restore_position(step, data_iterator)
             # Whatever a damaged file makes orbax, tensorstore or json raise.
             except Exception as error:
                 restored, reason = None, str(error).strip().split("\n")[0]
             if processes.all_agree(restored is not None):
-                return restored, step
+                for damaged in failed:
+                    self._set_aside(damaged)
+                return restored["state"], restored["info"], step
             _log.warning("checkpoint %d does not restore: %s", step, reason)
-            self._set_aside(step)
+            failed.append(step)
         if steps:
             raise DataError(
-                f"none of the checkpoints {steps} in {self.folder} restores"
+                f"none of the checkpoints {steps} in {self.folder} restores; move that "
+                "folder away to train from the start"
             )
         return None
 
     def restore_variables(self, step: int | None = None) -> tuple[Any, dict, int]:
-        """State and configuration alone, as saved, for inference.
+        """What inference needs of a state, and the configuration, as saved.
 
         Args:
             step: The newest if None.
 
         Returns:
-            State as nested dictionaries of NumPy arrays, the `info` saved with it, the
-            step.
+            `params`, `ema_params` and `model_state` as nested dictionaries of NumPy
+            arrays, the `info` saved with them, the step.
 
         Raises:
             FileNotFoundError: No checkpoint, or not that step.
@@ -212,25 +224,32 @@ class Checkpoints:
             raise FileNotFoundError(
                 f"no checkpoint of step {step} in {self.folder}; there are {steps}"
             )
-        restored = self._manager.restore(
-            step,
-            args=ocp.args.Composite(
-                state=ocp.args.StandardRestore(self._abstract(step)),
-                info=ocp.args.JsonRestore(),
-            ),
-        )
-        state = jax.tree.map(np.asarray, restored["state"])
-        return state, restored["info"], step
+        info = self._manager.restore(
+            step, args=ocp.args.Composite(info=ocp.args.JsonRestore())
+        )["info"]
+        return self._read_variables(self.folder / str(step) / "state"), info, step
 
-    def _abstract(self, step: int) -> Any:
-        """What a checkpoint holds, to restore whole on whatever devices there are."""
+    def _read_variables(self, folder: pathlib.Path) -> dict[str, Any]:
+        """Variables of a saved state, whole on whatever devices there are.
+
+        The rest, such as the moments of the optimizer, is not read.
+        """
         whole = sharding.replicated(sharding.make_mesh())
-        with ocp.StandardCheckpointer() as checkpointer:
-            metadata = checkpointer.metadata(self.folder / str(step) / "state")
-        saved = metadata.item_metadata.tree
-        return jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), saved
-        )
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            saved = checkpointer.metadata(folder).item_metadata.tree
+            wanted = jax.tree.map(
+                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole),
+                {name: saved[name] for name in _VARIABLES if name in saved},
+            )
+            found = checkpointer.restore(
+                folder,
+                args=ocp.args.PyTreeRestore(
+                    wanted,
+                    restore_args=ocp.checkpoint_utils.construct_restore_args(wanted),
+                    partial_restore=True,
+                ),
+            )
+        return jax.tree.map(np.asarray, {k: found.get(k) for k in _VARIABLES})
 
     def _restore_position(self, step: int, data_iterator: Any) -> None:
         """Sets the iterator to where it was, with any number of processes then and now.
@@ -278,7 +297,7 @@ def abstract_state(state: Any, sharding: Any) -> Any:
 def _disk_full(error: Exception, folder: pathlib.Path) -> Exception:
     if files.is_no_space(error):
         free = shutil.disk_usage(folder).free
-        return UserError(
+        return DiskFullError(
             f"no space left for a checkpoint in {folder} ({free / 2**20:.0f} MiB free); "
             "earlier checkpoints are intact, free some and run the same command again"
         )

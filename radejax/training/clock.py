@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import pathlib
 import time
 
 import jax
+
+_log = logging.getLogger(__name__)
 
 _IMPORTED = time.perf_counter()
 
@@ -52,7 +55,7 @@ class Trace:
     def __init__(self, folder: str, first: int, last: int) -> None:
         self._folder, self._first, self._last = folder, first, last
         self._count = 0
-        self._is_on = False
+        self._is_on = self._is_done = False
 
     def before_step(self) -> None:
         """Starts where the first traced step begins."""
@@ -69,10 +72,18 @@ class Trace:
         self._count += 1
 
     def close(self) -> None:
-        """Writes what there is; nothing if no trace is under way."""
+        """Writes what there is; a warning where the training ended before the trace."""
         if self._is_on:
             jax.profiler.stop_trace()
-            self._is_on = False
+            self._is_on, self._is_done = False, True
+        if self._folder and not self._is_done:
+            _log.warning(
+                "no trace in %s: this start took %d steps, and watch.profile_steps "
+                "begins at step %d of a start",
+                self._folder,
+                self._count,
+                self._first,
+            )
 
 
 def seconds_since_start() -> float:

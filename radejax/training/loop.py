@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import functools
@@ -16,7 +17,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 
-from radejax.errors import DataError
+from radejax.errors import DataError, UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.structures import Batch
 from radejax.training import processes, sharding
@@ -41,7 +42,8 @@ class TrainResult:
     Attributes:
         state: Placed on the mesh.
         step: Steps taken in all, over every start of the run.
-        finished: False where a SIGTERM ended it early; the state is saved.
+        finished: False where a SIGTERM ended it, or its last evaluation, early; the
+            state is saved.
     """
 
     state: TrainState
@@ -49,7 +51,11 @@ class TrainResult:
     finished: bool
 
 
-Evaluate = Callable[[TrainState, int], Scores]
+Evaluate = Callable[[TrainState, int, Callable[[], bool]], Scores]
+"""Called with the state, its step, and what tells whether to stop; it then raises
+`processes.Stopped`. To be asked as often by every process."""
+
+_STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
 
 
 def train(
@@ -78,7 +84,8 @@ def train(
         grid: Grid of the model's maps.
         workdir: Checkpoints and logs go here.
         config: The whole configuration; `seed`, `loss`, `train` and `watch` are read.
-        info: Plain values that each checkpoint carries.
+        info: Plain values that each checkpoint carries. Those under "same" are the
+            same on every start of a run.
         steps_per_epoch: Batches of one pass over the data.
         mesh: Devices to use; all by default.
         evaluate: Called every `train.evaluate_every_epochs` epochs and at the end; what
@@ -92,13 +99,16 @@ def train(
     Raises:
         DataError: More than `train.max_skipped_steps` steps in a row without a finite
             loss and gradient; names the frames of the last such batch.
-        UserError: A configuration that does not fit the devices; a full disk.
+        UserError: A configuration that does not fit the devices; a run that continues
+            with another `info["same"]`; a full disk.
     """
     workdir = pathlib.Path(workdir)
     mesh = sharding.make_mesh() if mesh is None else mesh
     options = config.train
     num_steps = steps_per_epoch * options.num_epochs
-    sharding.check_batch_size(options.batch_size, mesh, "train.batch_size")
+    sharding.check_batch_size(
+        options.batch_size, mesh, "train.batch_size", options.num_accumulate
+    )
     optimizer = make_optimizer(
         make_schedule(
             learning_rate=options.learning_rate,
@@ -137,7 +147,8 @@ def train(
     with checkpoints:
         # Frozen parameters are not in a checkpoint: they come from where they came from.
         saved = abstract_state(abstract, placement).replace(frozen={})
-        restored, step = checkpoints.restore(saved, loader) or (None, 0)
+        restored, found, step = checkpoints.restore(saved, loader) or (None, {}, 0)
+        _check_same(found.get("same", {}), info.get("same", {}), workdir)
         state = restored
         if restored is None or abstract.frozen:
             state = jax.jit(init, out_shardings=placement)(*given)
@@ -184,6 +195,7 @@ class _Run:
     evaluate: Evaluate | None
     trace: Trace
     frame_names: Sequence[str] | None
+    in_flight: collections.deque = dataclasses.field(default_factory=collections.deque)
 
     def __call__(
         self,
@@ -196,7 +208,7 @@ class _Run:
         options, saved = self.options, start
         with _StopOnSignal() as event, contextlib.closing(self.trace):
             stop = processes.AgreedStop(event, self.mesh)
-            step = start
+            step, is_cut = start, False
             while step < num_steps and not stop():
                 state, metrics = self._step(state, watch, step, is_first=step == start)
                 step += 1
@@ -206,7 +218,8 @@ class _Run:
                     self._check_skipped(state)
                 scores = None
                 if self._is_evaluated(step, num_steps, steps_per_epoch):
-                    scores = self._evaluate(state, step, watch)
+                    scores = self._evaluate(state, step, watch, stop)
+                    is_cut = scores is None
                 due = step % options.checkpoint_every_steps == 0 or step == num_steps
                 if due or scores is not None:
                     self._save(step, state, scores)
@@ -214,7 +227,8 @@ class _Run:
             if saved < step:
                 self._save(step, state, None)
             self.checkpoints.wait()
-        return TrainResult(state=state, step=step, finished=step >= num_steps)
+        finished = step >= num_steps and not is_cut
+        return TrainResult(state=state, step=step, finished=finished)
 
     def _step(
         self, state: TrainState, watch: Watch, step: int, *, is_first: bool
@@ -228,7 +242,11 @@ class _Run:
         self.trace.before_step()
         batch = sharding.put_batch(batch, self.mesh)
         clock.lap("host")
-        state, metrics = self.step_fn(state, batch, self.rng)
+        with jax.transfer_guard("disallow"):
+            state, metrics = self.step_fn(state, batch, self.rng)
+        self.in_flight.append(metrics)
+        if len(self.in_flight) > _STEPS_IN_FLIGHT:
+            jax.block_until_ready(self.in_flight.popleft())
         if is_first:
             jax.block_until_ready(metrics)
             took = clock.lap("compute")
@@ -249,9 +267,20 @@ class _Run:
             return False
         return step % every == 0 or step == num_steps
 
-    def _evaluate(self, state: TrainState, step: int, watch: Watch) -> Scores:
+    def _evaluate(
+        self,
+        state: TrainState,
+        step: int,
+        watch: Watch,
+        stop: Callable[[], bool],
+    ) -> Scores | None:
+        """None where a signal cut it short: the state is then saved without scores."""
         watch.clock.lap("host")
-        scores = self.evaluate(state, step)
+        try:
+            scores = self.evaluate(state, step, stop)
+        except processes.Stopped:
+            _log.warning("the evaluation after step %d is left out", step)
+            return None
         watch.log_scores(step, scores)
         watch.clock.lap("other")
         return scores
@@ -270,7 +299,7 @@ class _Run:
         )
 
     def _check_skipped(self, state: TrainState) -> None:
-        in_row, limit = int(state.num_skipped_in_row), self.options.max_skipped_steps
+        in_row, limit = int(state.most_skipped_in_row), self.options.max_skipped_steps
         if in_row > limit:
             frames = np.asarray(state.skipped_frames).tolist()
             if self.frame_names is not None:
@@ -280,6 +309,22 @@ class _Run:
                 f"train.max_skipped_steps={limit}); frames of the last batch: "
                 + ", ".join(map(str, frames))
             )
+
+
+def _check_same(
+    found: Mapping[str, Any], given: Mapping[str, Any], workdir: pathlib.Path
+) -> None:
+    """`UserError` where a run would continue with other data or frozen weights."""
+    differing = [
+        f"{name}: {found[name]} there, {given.get(name)} now"
+        for name in found
+        if found[name] != given.get(name)
+    ]
+    if differing:
+        raise UserError(
+            f"the run in {workdir} was trained with something else: "
+            f"{'; '.join(differing)}. Give the same, or another --workdir"
+        )
 
 
 def _init_state(

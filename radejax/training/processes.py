@@ -34,28 +34,43 @@ def main_first(prepare: Callable[[], T]) -> T:
     Raises:
         UserError: On the others, if the main process failed; it raises its own error.
     """
+    result = main_only(prepare)
+    if not is_main():
+        result = prepare()
+    wait_for_all("main_first")
+    return result
+
+
+def main_only(work: Callable[[], T]) -> T | None:
+    """Calls a function on the main process, while the others wait; None on those.
+
+    For reports and pictures, which may take long: processes that go on meanwhile would
+    wait in a collective, or at JAX's end, and give up after minutes.
+
+    Raises:
+        UserError: On the others, if the main process failed; it raises its own error.
+    """
     if jax.process_count() == 1:
-        return prepare()
-    error = None
+        return work()
+    result = error = None
     if is_main():
         try:
-            result = prepare()
+            result = work()
         except Exception as failed:
             error = failed
-    wait_for_all("main_first")
+    wait_for_all("main_only")
     is_fine = bool(multihost_utils.broadcast_one_to_all(np.int32(error is None)))
     if error is not None:
         raise error
     if not is_fine:
         raise UserError("process 0 stopped with an error, see its output")
-    if not is_main():
-        result = prepare()
-    wait_for_all("main_first, the others")
     return result
 
 
 def wait_for_all(name: str) -> None:
     """Returns when every process has come here; hours later if need be."""
+    if jax.process_count() == 1:
+        return
     ocp.multihost.sync_global_processes(
         f"radejax {name} {next(_numbers)}",
         timeout=_WAIT_S,
@@ -70,6 +85,10 @@ def all_agree(is_fine: bool) -> bool:
     if jax.process_count() == 1:
         return is_fine
     return bool(multihost_utils.process_allgather(np.int32(is_fine)).all())
+
+
+class Stopped(Exception):
+    """Something long, an evaluation, ends early because all processes should stop."""
 
 
 class AgreedStop:
@@ -91,7 +110,7 @@ class AgreedStop:
         self._any = jax.jit(lambda x: x.any(), out_shardings=sharding.replicated(mesh))
 
     def __call__(self) -> bool:
-        """True when all should stop; to be called once before every step."""
+        """True when all should stop; to be called as often by every process."""
         if jax.process_count() == 1:
             return self._event.is_set()
         before = self._sent

@@ -48,19 +48,33 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
 
 
-def check_batch_size(batch_size: int, mesh: Mesh, name: str = "batch_size") -> None:
+def check_batch_size(
+    batch_size: int, mesh: Mesh, name: str = "batch_size", num_accumulate: int = 1
+) -> None:
     """Refuses a global batch that does not divide over the mesh.
+
+    Args:
+        batch_size: Of all devices.
+        mesh: From `make_mesh`.
+        name: The field's, for the message.
+        num_accumulate: Parts of the batch, each of which must divide too.
 
     Raises:
         UserError: Names the field and the batch sizes that would do.
     """
-    size = mesh.devices.size
+    if num_accumulate < 1:
+        raise UserError(
+            f"train.num_accumulate must be at least 1, got {num_accumulate}"
+        )
+    devices = mesh.devices.size
+    size = devices * num_accumulate
     if batch_size < 1 or batch_size % size:
         lower = batch_size // size * size
         choices = f"{lower} or {lower + size}" if lower else f"{size}"
         raise UserError(
-            f"{name}={batch_size} does not divide over {size} devices; "
-            f"use a multiple, for example {choices}"
+            f"{name}={batch_size} does not divide over {devices} devices"
+            + f" times train.num_accumulate={num_accumulate}" * (num_accumulate > 1)
+            + f"; use a multiple, for example {choices}"
         )
 
 

@@ -27,6 +27,7 @@ class TrainState:
         ema_params: Moving average of `params`, or None.
         num_skipped: Steps skipped in all because loss or gradient was not finite.
         num_skipped_in_row: The same, since the last step that was taken.
+        most_skipped_in_row: The most that this has been.
         skipped_frames: `[B]` int32 frames of the last skipped batch; -1 at first.
         frozen: Parameters that are not trained: in no gradient, optimizer or average,
             and in no checkpoint, as they are known from where they came.
@@ -39,6 +40,7 @@ class TrainState:
     ema_params: Any
     num_skipped: jax.Array
     num_skipped_in_row: jax.Array
+    most_skipped_in_row: jax.Array
     skipped_frames: jax.Array
     frozen: Any = dataclasses.field(default_factory=dict)
 
@@ -61,8 +63,16 @@ def make_schedule(
     RADE-Net section IV-B: cosine per step from 1e-3 to 1e-4, no warm-up.
 
     Raises:
-        UserError: The warm-up is longer than the training.
+        UserError: The warm-up is longer than the training, the learning rate is not
+            positive, or the floor is above it.
     """
+    if learning_rate <= 0:
+        raise UserError(f"train.learning_rate={learning_rate} must be positive")
+    if not 0 <= final_learning_rate <= learning_rate:
+        raise UserError(
+            f"train.final_learning_rate={final_learning_rate} must be from 0 to "
+            f"train.learning_rate={learning_rate}: the rate falls from that one"
+        )
     if not 0 <= warmup_steps < num_steps:
         raise UserError(
             f"train.warmup_steps={warmup_steps} must be less than the {num_steps} steps "
@@ -122,6 +132,7 @@ def create_state(
         ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
         num_skipped=jnp.zeros((), jnp.int32),
         num_skipped_in_row=jnp.zeros((), jnp.int32),
+        most_skipped_in_row=jnp.zeros((), jnp.int32),
         skipped_frames=jnp.full((batch_size,), -1, jnp.int32),
         frozen=frozen,
     )

@@ -86,14 +86,16 @@ def make_train_step(
             )
             return (model_state, jax.tree.map(jnp.add, total, grads)), parts
 
-        split = jax.tree.map(
-            lambda x: x.reshape(num_accumulate, -1, *x.shape[1:]), batch
-        )
+        split = split_batch(batch, num_accumulate)
         start = state.model_state, jax.tree.map(jnp.zeros_like, state.params)
         rngs = jax.random.split(rng, num_accumulate)
         (model_state, grads), parts = jax.lax.scan(body, start, (split, rngs))
         grads = jax.tree.map(lambda g: g / num_accumulate, grads)
-        return grads, model_state, jax.tree.map(lambda p: p.mean(0), parts)
+        metrics = {
+            name: p.mean(0) if jnp.issubdtype(p.dtype, jnp.floating) else p.sum(0)
+            for name, p in parts.items()  # numbers of objects and boxes are sums
+        }
+        return grads, model_state, metrics
 
     def step(
         state: TrainState, batch: Batch, rng: jax.Array
@@ -114,6 +116,7 @@ def make_train_step(
             lambda new, old: jnp.where(is_finite, new, old), taken, kept
         )
         is_skipped = (~is_finite).astype(jnp.int32)
+        in_row = (state.num_skipped_in_row + 1) * is_skipped
         state = state.replace(
             step=state.step + 1,
             params=params,
@@ -121,12 +124,24 @@ def make_train_step(
             opt_state=opt_state,
             ema_params=ema_params,
             num_skipped=state.num_skipped + is_skipped,
-            num_skipped_in_row=(state.num_skipped_in_row + 1) * is_skipped,
+            num_skipped_in_row=in_row,
+            most_skipped_in_row=jnp.maximum(state.most_skipped_in_row, in_row),
             skipped_frames=jnp.where(is_finite, state.skipped_frames, batch.frame),
         )
         return state, {**metrics, "grad_norm": grad_norm, "skipped": state.num_skipped}
 
     return step
+
+
+def split_batch(batch: Batch, num_parts: int) -> Batch:
+    """`[parts, B / parts, ...]`: every part has frames of every device.
+
+    The axis that devices share stays in its place. Were it the first one, over which
+    parts are taken in turn, all devices would gather the whole batch.
+    """
+    return jax.tree.map(
+        lambda x: x.reshape(-1, num_parts, *x.shape[1:]).swapaxes(0, 1), batch
+    )
 
 
 def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: str) -> RadarGrid:

@@ -15,7 +15,7 @@ import tensorboardX
 import tqdm
 
 from radejax import files
-from radejax.errors import UserError
+from radejax.errors import DiskFullError, UserError
 from radejax.training.clock import StepClock
 
 
@@ -69,13 +69,7 @@ class Watch:
         self._jsonl = folder / "metrics.jsonl"
         if is_main:
             self._drop_records_after(start_step)
-        self._board = (
-            tensorboardX.SummaryWriter(
-                str(folder / "tensorboard"), purge_step=start_step + 1
-            )
-            if is_main
-            else None
-        )
+        self._board = _Board(folder / "tensorboard", start_step) if is_main else None
         self._bar = tqdm.tqdm(
             total=num_steps,
             initial=start_step,
@@ -133,7 +127,7 @@ class Watch:
         if not self._is_main:
             return
         for name, picture in scores.pictures.items():
-            self._board.add_image(name, picture, step, dataformats="HWC")
+            self._board.add_image(name, picture, step)
         if self._wandb is not None and scores.pictures:
             import wandb
 
@@ -144,10 +138,15 @@ class Watch:
         """Writes values that belong to a step."""
         if not self._is_main:
             return
-        with self._jsonl.open("a") as file:
-            file.write(json.dumps({"step": step, **values}) + "\n")
+        try:
+            with self._jsonl.open("a") as file:
+                file.write(json.dumps({"step": step, **values}) + "\n")
+        except OSError as error:
+            if files.is_no_space(error):
+                raise _disk_full(self._jsonl) from error
+            raise
         for name, value in values.items():
-            self._board.add_scalar(_board_name(name), value, step)
+            self._board.add_scalar(name, value, step)
         if self._wandb is not None:
             self._wandb.log(dict(values), step=step)
 
@@ -175,6 +174,52 @@ class Watch:
             except json.JSONDecodeError:  # the line a killed run was writing
                 break
         files.write_text(self._jsonl, "".join(kept))
+
+
+class _Board:
+    """TensorBoard's files, written by a thread of tensorboardX.
+
+    On a full disk that thread ends, and a queue of limited length would then take no
+    more and block for ever: its length is not limited (0), and the thread looked at.
+    """
+
+    def __init__(self, folder: pathlib.Path, start_step: int) -> None:
+        self._folder = folder
+        try:
+            self._writer = tensorboardX.SummaryWriter(
+                str(folder), purge_step=start_step + 1, max_queue=0
+            )
+        except OSError as error:
+            if files.is_no_space(error):
+                raise _disk_full(folder) from error
+            raise
+        self._events = self._writer.file_writer.event_writer
+
+    def add_scalar(self, name: str, value: float, step: int) -> None:
+        self._check()
+        self._writer.add_scalar(_board_name(name), value, step)
+
+    def add_image(self, name: str, picture: np.ndarray, step: int) -> None:
+        self._check()
+        self._writer.add_image(name, picture, step, dataformats="HWC")
+
+    def close(self) -> None:
+        if self._events._worker.is_alive():
+            self._writer.close()
+        else:  # the program's end would wait for the queue, and close what is full
+            self._events._event_queue.cancel_join_thread()
+            self._events._closed = True
+
+    def _check(self) -> None:
+        if not self._events._worker.is_alive():
+            raise _disk_full(self._folder)
+
+
+def _disk_full(path: pathlib.Path) -> DiskFullError:
+    return DiskFullError(
+        f"no space left to write {path}; checkpoints are intact, free some and run the "
+        "same command again"
+    )
 
 
 _ON_THE_BAR = ("focal", "gwd", "smooth_l1")

@@ -9,12 +9,13 @@ from typing import Any
 
 import chex
 import grain
+import jax
 import numpy as np
 import pytest
 
-from radejax.errors import DataError
-from radejax.training import loop, sharding
-from radejax.training.checkpoints import BEST, Checkpoints
+from radejax.errors import DataError, UserError
+from radejax.training import loop, processes, sharding
+from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
 from radejax.training.watch import Scores
 
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -122,6 +123,70 @@ def test_sigterm_saves_and_stops(
     chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
 
 
+def test_sigterm_in_an_evaluation_saves_and_stops(
+    run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
+) -> None:
+    config = tiny.config.copy_and_resolve_references()
+    config.train.evaluate_every_epochs = 1
+    cut_at = []
+
+    def evaluate(state: Any, step: int, should_stop: Any) -> Scores:
+        assert not should_stop()
+        if step not in cut_at:
+            cut_at.append(step)
+            os.kill(os.getpid(), signal.SIGTERM)
+        if should_stop():
+            raise processes.Stopped
+        raise AssertionError("the signal was not told")
+
+    def start() -> Any:
+        return run(workdir, config=config, evaluate=evaluate)
+
+    stopped = start()
+    assert (stopped.step, stopped.finished) == (4, False)
+    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
+        assert checkpoints.steps()[-1] == 4
+    last = start()  # cut in the evaluation at the end
+    assert (last.step, last.finished) == (8, False)
+    again = start()
+    assert again.finished
+    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+
+
+def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
+    run: Any, workdir: pathlib.Path
+) -> None:
+    same = {"frames to train on": 16, "sha256 of their keys": "ab"}
+    first = run(workdir, info={"same": same})
+    losses = _losses(workdir)
+    with pytest.raises(
+        UserError,
+        match=r"something else: sha256 of their keys: ab there, cd now\. Give",
+    ):
+        run(workdir, info={"same": same | {"sha256 of their keys": "cd"}})
+    assert _losses(workdir) == losses
+    assert run(workdir, info={"same": same}).step == first.step
+
+
+def test_no_more_than_two_steps_are_under_way(
+    run: Any, workdir: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited = []
+    wait = loop.jax.block_until_ready
+
+    def spy(metrics: Any) -> Any:
+        waited.append(metrics)
+        return wait(metrics)
+
+    monkeypatch.setattr(loop.jax, "block_until_ready", spy)
+    run(workdir)
+    # The first step's for its time, then that of two steps before, from the third on.
+    steps = [waited[0], *waited]
+    assert len(steps) == 8
+    losses = [float(m["focal"]) for m in waited[1:]]
+    assert losses == pytest.approx([v for _, v in _losses(workdir)][:6])
+
+
 def test_a_damaged_newest_checkpoint_falls_back(
     run: Any,
     undisturbed: Any,
@@ -139,6 +204,29 @@ def test_a_damaged_newest_checkpoint_falls_back(
     chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
 
 
+@pytest.mark.parametrize(("first", "then"), [(4, 1), (1, 4)])
+def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
+    first: int, then: int, undisturbed: Any, tmp_path: pathlib.Path, tiny: Tiny
+) -> None:
+    state = undisturbed[0].state
+
+    def placed(count: int) -> Any:
+        return sharding.state_sharding(state, sharding.make_mesh(count), "fsdp", 64)
+
+    saved = jax.device_put(state, placed(first))
+    assert first == 1 or any(
+        not x.is_fully_replicated for x in jax.tree.leaves(saved.params)
+    )
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(8, saved, tiny.loader(), info={})
+        checkpoints.wait()
+        wanted = abstract_state(state, placed(then))
+        restored, _, _ = checkpoints.restore(wanted, tiny.loader())
+    chex.assert_trees_all_equal(restored, state)
+    assert jax.tree.leaves(restored)[0].sharding.device_set == set(jax.devices()[:then])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "then"), [(4, 1), (1, 4)])
 def test_a_run_continues_on_another_number_of_devices(
     first: int,
@@ -167,13 +255,25 @@ def test_steps_without_finite_loss_end_the_run_and_name_the_frames(
     class Poisoned(Stopping):
         def __next__(self) -> Any:
             batch = super().__next__()
+            if self._count > self._at:
+                return batch
             return batch.replace(projection=batch.projection * np.float16(np.nan))
 
     names = [f"7/frame{i}" for i in range(16)]
+    # The row has ended when the next look is taken.
+    rare = tiny.config.copy_and_resolve_references()
+    rare.train.update(log_every_steps=8, checkpoint_every_steps=8)
+    with pytest.raises(DataError, match=r"3 steps in a row .*batch: 7/frame\d+, "):
+        run(
+            workdir / "row",
+            Poisoned(tiny.loader(), 4, lambda: None),
+            frame_names=names,
+            config=rare,
+        )
     with pytest.raises(
         DataError, match=r"3 steps in a row .*batch: 7/frame\d+, 7/frame\d+, "
     ):
-        run(workdir, Poisoned(tiny.loader(), 99, None), frame_names=names)
+        run(workdir, Poisoned(tiny.loader(), 99, lambda: None), frame_names=names)
 
 
 def test_evaluation_on_the_way_is_logged_and_the_best_kept(
@@ -183,7 +283,7 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
     config.train.update(evaluate_every_epochs=1, num_epochs=3, checkpoints_to_keep=1)
     seen = []
 
-    def evaluate(state: Any, step: int) -> Scores:
+    def evaluate(state: Any, step: int, should_stop: Any) -> Scores:
         seen.append((step, int(state.step)))
         best = {4: 1.5, 8: 3.5, 12: 2.5}[step]
         picture = np.zeros((4, 6, 3), np.uint8)

@@ -39,6 +39,23 @@ def test_warm_up_longer_than_the_training_is_refused() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("peak", "floor", "message"),
+    [
+        (1e-5, 1e-4, r"final_learning_rate=0.0001 .* train.learning_rate=1e-05"),
+        (1e-3, -1e-4, r"final_learning_rate=-0.0001 must be"),
+        (0.0, 0.0, r"train.learning_rate=0.0 must be positive"),
+    ],
+)
+def test_a_rate_that_would_rise_or_is_not_positive_is_refused(
+    peak: float, floor: float, message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        make_schedule(
+            learning_rate=peak, final_learning_rate=floor, num_steps=9, warmup_steps=0
+        )
+
+
 def test_first_step_is_adamw_with_torch_defaults() -> None:
     optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.01)
     params = {"kernel": jnp.array([2.0, -3.0]), "bias": jnp.array([0.5])}

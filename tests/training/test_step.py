@@ -1,6 +1,5 @@
 """One step: what it changes, what it leaves, and that devices do not matter."""
 
-import functools
 from typing import Any
 
 import chex
@@ -16,7 +15,7 @@ from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.training import sharding
 from radejax.training.state import create_state, make_optimizer
-from radejax.training.step import make_train_step, map_grid
+from radejax.training.step import make_train_step, map_grid, split_batch
 
 RNG = jax.random.key(7)
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -106,6 +105,7 @@ def test_a_step_without_finite_loss_changes_nothing_and_is_counted(
     np.testing.assert_array_equal(after.skipped_frames, batch.frame)
     again, _ = step(after, batch, RNG)
     assert (int(again.num_skipped), int(again.num_skipped_in_row)) == (1, 0)
+    assert int(again.most_skipped_in_row) == 1
 
 
 def test_a_batch_without_objects_is_a_normal_step(
@@ -151,27 +151,53 @@ def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> Non
     chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
 
 
-def test_accumulation_averages_the_gradients_of_the_parts(
-    tiny: Tiny, start: Any, step: Any
-) -> None:
-    optimizer, state = start
-    accumulate = jax.jit(_make(tiny, optimizer, num_accumulate=2))
-    batch = _batch(tiny)
-    _, whole = accumulate(state, batch, RNG)
-    halves = [
-        jax.jit(functools.partial(_metrics_of, _make(tiny, optimizer)))(
-            state, jax.tree.map(lambda x, s=s: x[s], batch), RNG
-        )
-        for s in (slice(0, 2), slice(2, 4))
+@pytest.fixture(scope="module")
+def parts(tiny: Tiny, plain: Any) -> tuple[Any, Any]:
+    """Mean of the parameters after a plain step with each part, and their metrics."""
+    optimizer, state, _ = plain
+    small = state.replace(skipped_frames=state.skipped_frames[:4])
+    one = jax.jit(_make(tiny, optimizer))
+    batch = _batch(tiny, 8)
+    taken = [
+        one(small, jax.tree.map(lambda x, i=i: x[i::2], batch), RNG) for i in (0, 1)
     ]
+    params = [after.params for after, _ in taken]
+    return jax.tree.map(lambda a, b: (a + b) / 2, *params), [m for _, m in taken]
+
+
+def test_parts_of_a_batch_stay_on_their_devices(tiny: Tiny) -> None:
+    batch = sharding.put_batch(_batch(tiny, 8), sharding.make_mesh(4))
+    split = jax.jit(lambda x: split_batch(x, 2)).lower(batch).compile()
+    for collective in ("all-gather", "all-to-all", "collective-permute"):
+        assert collective not in split.as_text()
+    placed = split(batch).frame
+    assert [s.data.shape for s in placed.addressable_shards] == [(2, 1)] * 4
+    np.testing.assert_array_equal(placed, [[0, 2, 4, 6], [1, 3, 5, 7]])
+
+
+@pytest.mark.parametrize("num_devices", [1, pytest.param(4, marks=pytest.mark.slow)])
+def test_accumulation_averages_the_gradients_of_the_parts(
+    num_devices: int, tiny: Tiny, plain: Any, parts: Any
+) -> None:
+    optimizer, state, _ = plain
+    mesh = sharding.make_mesh(num_devices)
+    everywhere = sharding.replicated(mesh)
+    step = jax.jit(
+        _make(tiny, optimizer, num_accumulate=2), out_shardings=(everywhere, everywhere)
+    )
+    arguments = (
+        jax.device_put(state, everywhere),
+        sharding.put_batch(_batch(tiny, 8), mesh),
+        jax.device_put(RNG, everywhere),
+    )
+    after, metrics = step(*arguments)
+    chex.assert_trees_all_close(after.params, parts[0], rtol=1e-4, atol=1e-6)
     for name in ("focal", "gwd", "smooth_l1"):
-        mean = np.mean([float(h[name]) for h in halves])
-        np.testing.assert_allclose(float(whole[name]), mean, rtol=1e-5)
-
-
-def _metrics_of(step: Any, state: Any, batch: Any, rng: Any) -> Any:
-    state = state.replace(skipped_frames=state.skipped_frames[:2])
-    return step(state, batch, rng)[1]
+        mean = np.mean([float(m[name]) for m in parts[1]])
+        np.testing.assert_allclose(float(metrics[name]), mean, rtol=1e-4)
+    for name in ("num_objects", "num_positive", "num_matched"):
+        assert int(metrics[name]) == sum(int(m[name]) for m in parts[1])
+    assert int(metrics["num_objects"]) == 16
 
 
 def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(

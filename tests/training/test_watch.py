@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.errors import DiskFullError, UserError
 from radejax.training.watch import Scores, Watch
 
 
@@ -44,6 +44,40 @@ def test_other_processes_write_nothing(tmp_path: pathlib.Path) -> None:
     ) as watch:
         watch.log(1, {"focal": 1.0}, epoch=1.0)
     assert not list(tmp_path.iterdir())
+
+
+FULL = pathlib.Path("/dev/full")  # every write to it is "no space left"
+needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
+
+
+@needs_full
+def test_metrics_on_a_full_disk_are_one_clear_error(tmp_path: pathlib.Path) -> None:
+    with _watch(tmp_path, 0) as watch:
+        (tmp_path / "metrics.jsonl").symlink_to(FULL)
+        with pytest.raises(DiskFullError, match=r"write .*metrics.jsonl; .*intact"):
+            watch.log(1, {"focal": 1.0}, epoch=1.0)
+
+
+@needs_full
+@pytest.mark.timeout(60)  # without a look at the thread it waits for ever
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_tensorboard_on_a_full_disk_is_an_error_and_blocks_nothing(
+    tmp_path: pathlib.Path,
+) -> None:
+    with _watch(tmp_path, 0) as watch:
+        records = watch._board._events._ev_writer._py_recordio_writer
+        records._writer.close()
+        records._writer = FULL.open("wb", buffering=0)
+        # More than what a queue of tensorboardX holds by default, before the thread
+        # comes to the first.
+        values = {f"value{i}": 1.0 for i in range(1000)}
+
+        def log() -> None:
+            for step in range(1000):
+                watch.log(step, values, epoch=1.0)
+
+        with pytest.raises(DiskFullError, match=r"write .*tensorboard; .*intact"):
+            log()
 
 
 class FakeWandb:
