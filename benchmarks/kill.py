@@ -8,7 +8,7 @@ is compared, and another one begins. Compared are all parameters, bit for bit, t
 losses and the metrics of the evaluation.
 
 Data and records are made by the undisturbed run: no kill falls into simulation or
-projection, and evaluation on the way is off (tests/ have a kill while projecting).
+projection, and evaluation on the way is off. tests/test_quickstart.py kills at all stages.
 """
 
 import argparse
