@@ -150,10 +150,18 @@ def main(fusion, radar, out, resamples):
         ordered = {name: maps[name] for name in GROUPS if name in maps}
         camera_share.write_camera_share(out, ordered, counts, run.grid)
         shares = {name: mean_share(share, run.grid) for name, share in ordered.items()}
+        sequences = np.asarray(frames["sequence"])
+        # Intervals come from resampled sequences: one alone has none.
+        is_small = {
+            name: len(set(sequences[chosen])) < 2 for name, chosen in groups.items()
+        }
+        for name in filter(is_small.get, groups):
+            count = int(groups[name].sum())
+            click.echo(f"left out: {name} ({count} frames, fewer than two sequences)")
         rows = [
             row
             for name, chosen in groups.items()
-            if chosen.any()
+            if not is_small[name]
             for row in rows_of_group(name, reports, config, chosen, shares, resamples)
         ]
         files.write_json(out / "by_lens.json", rows)
