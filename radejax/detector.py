@@ -196,6 +196,8 @@ class Detector:
             load = functools.partial(dinorade_torch.load, dinov3=image_backbone)
             arguments["camera_options"] = CameraOptions("pinhole", OFFICIAL_OFFSET_M)
         else:
+            if image_backbone is not None:
+                raise UserError("image_backbone is given, but the model is RADE-Net")
             load = radenet_torch.load
         model, variables = load(path_or_state_dict, **fields)
         arguments |= overrides
@@ -338,12 +340,7 @@ class Detector:
         image, camera, num_missing = detector_inputs.prepare(
             image, camera, num_frames, self.model, self.camera_options
         )
-        is_raw = image is not None and image.shape[-1] == 3
-        if is_raw and "image_backbone" not in self.variables["params"]:
-            raise UserError(
-                "these weights are without the image backbone: give "
-                "image_backbone=FOLDER with DINOv3's, or embedded images"
-            )
+        detector_inputs.check_backbone(image, self.variables)
         with self._lock:
             self.num_radar_alone += num_missing
         return image, camera

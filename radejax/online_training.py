@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import pathlib
+from typing import Any
 
 import jax
 from ml_collections import ConfigDict
@@ -21,7 +22,7 @@ from radejax.simulation.online import OnlineBatches
 from radejax.structures import CLASSES
 from radejax.training import loop, sharding
 from radejax.training.step import map_grid
-from radejax.workdir import claim_workdir
+from radejax.workdir import claim_workdir, lock_workdir
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -63,9 +64,25 @@ def train_online(
         if is_wrong:
             raise UserError(f"on-line training: {text}")
     workdir = pathlib.Path(workdir).absolute()
-    claim_workdir(workdir, config)
+    with lock_workdir(workdir):
+        claim_workdir(workdir, config)
+        return _train(config, workdir, simulation, num_sequences, rows_per_step)
+
+
+def _train(
+    config: ConfigDict,
+    workdir: pathlib.Path,
+    simulation: dict[str, Any],
+    num_sequences: int,
+    rows_per_step: int | None,
+) -> loop.TrainResult:
     batch_size = config.train.batch_size
-    sharding.check_batch_size(batch_size, sharding.make_mesh(), "train.batch_size")
+    sharding.check_batch_size(
+        batch_size,
+        sharding.make_mesh(),
+        "train.batch_size",
+        config.train.num_accumulate,
+    )
     if rows_per_step is None:
         rows_per_step = 1 if jax.default_backend() == "cpu" else 64
     simulation |= {
@@ -94,6 +111,7 @@ def train_online(
             "config": json.loads(config.to_json()),
             "grid": batches.grid.to_dict(),
             "run": {"online_sequences": num_sequences},
+            "same": {"number of sequences": num_sequences},
         },
         steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
         frame_names=batches.frame_names,
