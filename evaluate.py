@@ -58,6 +58,11 @@ _BACKBONE = flags.DEFINE_string(
     "With --workdir: weights of a frozen image backbone, where they are not at the "
     "place any more that the run was trained from.",
 )
+_EXCHANGE = flags.DEFINE_integer(
+    "exchange_images",
+    None,
+    "With --workdir: a seed; every frame sees the image of another, as a control.",
+)
 _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 
 
@@ -96,6 +101,7 @@ def evaluate_workdir() -> None:
         split=_SPLIT.value,
         out=_OUT.value,
         image_backbone=_BACKBONE.value,
+        exchange_images=_EXCHANGE.value,
     )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ def evaluate_run(
     out: str | os.PathLike | None = None,
     num_pictures: int | None = None,
     image_backbone: str | os.PathLike | None = None,
+    exchange_images: int | None = None,
 ) -> Report | None:
     """Evaluates a run's checkpoint as its config says, on all devices.
 
@@ -47,13 +49,16 @@ def evaluate_run(
         out: Folder of the results; `evaluation` in the work folder if None.
         num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `load_run`.
+        exchange_images: Seed; every frame gets the image and camera of another one, a
+            control of what a radar-camera model knows from the images. `out` is then
+            `evaluation_exchanged`.
 
     Returns:
         The report that was written; None on all processes but the first, which return
         when it is there.
 
     Raises:
-        UserError: There are no frames of the split.
+        UserError: There are no frames of the split, or images to exchange.
     """
     run = load_run(workdir, step, image_backbone)
     config = run.config
@@ -65,18 +70,43 @@ def evaluate_run(
     predictor = Predictor(
         config, run.variables, run.grid, score_threshold=options.score_threshold
     )
+    seen, name = frames, "evaluation"
+    if exchange_images is not None:
+        camera_inputs.require_camera(config)
+        seen = with_images_exchanged(frames, exchange_images)
+        name = "evaluation_exchanged"
     predictions = predict_dataset(
         predictor,
         records,
-        frames,
+        seen,
         options.batch_size,
-        inputs=camera_inputs.loader_arguments(config, frames, run.paths.embeddings),
+        inputs=camera_inputs.loader_arguments(config, seen, run.paths.embeddings),
     )
-    out = pathlib.Path(out or run.workdir / "evaluation")
+    out = pathlib.Path(out or run.workdir / name)
     count = options.num_pictures if num_pictures is None else num_pictures
     return processes.main_only(
         lambda: _report(run, split, frames, records, predictions, out, count)
     )
+
+
+def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
+    """The frames, each with the image and calibration of another one.
+
+    Raises:
+        UserError: Fewer than two frames have an image.
+    """
+    given = [i for i, frame in enumerate(frames) if frame.camera_path is not None]
+    if len(given) < 2:
+        raise UserError(f"{len(given)} frames have an image: none to exchange")
+    order = np.random.default_rng(seed).permutation(given)
+    exchanged = list(frames)
+    for own, other in zip(order, np.roll(order, 1), strict=True):
+        exchanged[own] = dataclasses.replace(
+            frames[own],
+            camera_path=frames[other].camera_path,
+            camera_calibration_path=frames[other].camera_calibration_path,
+        )
+    return exchanged
 
 
 def _report(
