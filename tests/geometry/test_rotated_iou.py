@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from radejax.geometry import rotated_iou as R
@@ -25,7 +25,8 @@ def polygons(boxes):
 
 
 def shapely_intersection(a, b):
-    return shapely.area(shapely.intersection(polygons(a), polygons(b)))
+    # Without a grid GEOS finds nothing in common of some boxes with collinear edges.
+    return shapely.area(shapely.intersection(polygons(a), polygons(b), grid_size=1e-12))
 
 
 def random_boxes(rng, count, spread=3.0):
@@ -199,6 +200,7 @@ def test_unchanged_by_a_common_rigid_motion(a, b, yaw, shift):
 
 @settings(deadline=None, max_examples=100)
 @given(box_numbers, box_numbers)
+@example((1, 0, 0, 1, 2, 1, -1.2), (1, 0, 0, 4, 2, 1, -1.2))
 def test_against_shapely(a, b):
     a, b = as_box(a), as_box(b)
     expected = shapely_intersection(a, b)
