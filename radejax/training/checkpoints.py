@@ -72,6 +72,7 @@ class Checkpoints:
                     keep_checkpoints_without_metrics=False,
                 )
             )
+        logging.getLogger("absl").addFilter(_is_worth_telling)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=None
             if read_only
@@ -82,7 +83,6 @@ class Checkpoints:
             read_only=read_only,
             enable_async_checkpointing=not read_only,
         )
-        logging.getLogger("absl").addFilter(_is_worth_telling)
         self._manager = ocp.CheckpointManager(self.folder, options=options)
 
     def steps(self) -> list[int]:
