@@ -30,6 +30,7 @@ def _differs(a: Any, b: Any) -> bool:
     return not np.allclose(a.scores, b.scores, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_every_form_of_a_camera_gives_the_same(
     fusion: Detector, tmp_path: pathlib.Path
 ) -> None:

@@ -79,6 +79,7 @@ def _check(found: dict[str, Any], suffix: str, expected: Any) -> None:
         )
 
 
+@pytest.mark.slow
 def test_a_fresh_process_without_radejax_finds_the_same_boxes(
     tmp_path: pathlib.Path,
 ) -> None:

@@ -301,6 +301,7 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
         assert checkpoints.best_step() == 8
 
 
+@pytest.mark.slow
 def test_times_of_a_step_are_split_and_a_trace_is_written(
     run: Any, workdir: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -61,6 +61,7 @@ def test_steps_lower_the_loss(tiny: Tiny, start: Any, step: Any) -> None:
     assert int(state.num_skipped) == 0
 
 
+@pytest.mark.slow
 def test_one_scene_is_learnt_by_heart(tiny: Tiny, start: Any, step: Any) -> None:
     state = start[1]
     batch = jax.tree.map(lambda x: np.repeat(x[:1], 4, 0), tiny.frames)
