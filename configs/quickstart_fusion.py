@@ -80,8 +80,6 @@ def _add_camera(config: ConfigDict) -> None:
         SimulationConfig.from_mapping(config.simulation).make_grid()
     )
     config.data.camera = full.data.camera
-    # Labels are at the LiDAR's height; the radar, whose angles the queries are, is lower.
-    config.data.camera.ego_from_lidar_m = tuple(config.simulation.lidar_to_radar_m)
     config.model.name = "dinorade"
     config.model.image = full.model.image
     config.model.image.update(
