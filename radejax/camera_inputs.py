@@ -23,6 +23,9 @@ from radejax.models.lifting import ReferencePoints
 
 PathLike = str | os.PathLike
 
+# Fields of a ViT that are not its weights' own.
+_FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
+
 
 def has_camera(config: ConfigDict) -> bool:
     """Whether the configured model looks at images."""
@@ -190,23 +193,17 @@ def _load_dinov3(path: PathLike, config: ConfigDict) -> Any:
     from radejax.interop import dinov3_hf
 
     image = config.model.image
-
-    found, variables = dinov3_hf.load(path)
-    wanted = models.build(config.model).vit
-    for field in dataclasses.fields(found):
-        name = field.name
-        if name in _FREE_FIELDS or getattr(found, name) == getattr(wanted, name):
+    model, variables = dinov3_hf.load(path)
+    configured = models.build(config.model).vit
+    for name in (field.name for field in dataclasses.fields(model)):
+        found, wanted = getattr(model, name), getattr(configured, name)
+        if name in _FREE_FIELDS or found == wanted:
             continue
-        field = f"config.model.image.{name}" if name in image else "the configured one"
+        where = f"config.model.image.{name}" if name in image else "the configured one"
         raise UserError(
-            f"{path}: the backbone has {name} = {getattr(found, name)}, {field} is "
-            f"{getattr(wanted, name)}"
+            f"{path}: the backbone has {name} = {found}, {where} is {wanted}"
         )
     return variables["params"]
-
-
-# Fields of a ViT that are not its weights' own.
-_FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
 
 
 def check_fits(model: DinoRade, variables: Mapping[str, Any], source: str) -> None:

@@ -17,7 +17,6 @@ import numpy as np
 from radejax import checkpoint_files, detector_inputs, models
 from radejax.data import projection as projection_lib
 from radejax.data.encoding import to_float
-from radejax.data.tesseract import read_frame
 from radejax.detection.decode import decode
 from radejax.detector_inputs import CameraOptions
 from radejax.errors import UserError
@@ -243,7 +242,7 @@ class Detector:
         """
         if isinstance(frames, Batch):
             frames, image, camera = frames.projection, frames.image, frames.camera
-        frames, is_tesseract = self._batch(frames)
+        frames, is_tesseract = detector_inputs.radar_batch(frames, self.grid)
         num_frames = frames.shape[0]
         if num_frames == 0:
             raise UserError("no frames: the batch is empty")
@@ -344,42 +343,6 @@ class Detector:
         with self._lock:
             self.num_radar_alone += num_missing
         return image, camera
-
-    def _batch(self, frames: Any) -> tuple[Any, bool]:
-        if isinstance(frames, str | pathlib.Path):
-            frames = [frames]
-        if isinstance(frames, Sequence):
-            frames = self._stack(frames)
-        shape = tuple(np.shape(frames))
-        projection, tesseract = self.grid.projection_shape, self.grid.shape_drea
-        for expected, is_tesseract in ((projection, False), (tesseract, True)):
-            if shape[-len(expected) :] == expected and len(shape) - len(expected) < 2:
-                is_batch = len(shape) > len(expected)
-                return frames if is_batch else frames[None], is_tesseract
-        raise UserError(
-            f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
-            f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
-            f"[B, {', '.join(map(str, tesseract))}]"
-        )
-
-    def _stack(self, frames: Sequence[Any]) -> np.ndarray:
-        """One array of the frames of a list: paths or arrays."""
-        arrays = [
-            read_frame(frame, self.grid)
-            if isinstance(frame, str | pathlib.Path)
-            else np.asarray(frame)
-            for frame in frames
-        ]
-        if not arrays:
-            raise UserError("no frames: the list is empty")
-        shapes = {array.shape: i for i, array in reversed(list(enumerate(arrays)))}
-        if len(shapes) > 1:
-            first, *_, other = sorted(shapes, key=shapes.__getitem__)
-            raise UserError(
-                f"frames of one call must have one shape: frame 0 has {list(first)}, "
-                f"frame {shapes[other]} has {list(other)}"
-            )
-        return np.stack(arrays)
 
     def _to_device(self, x: Any) -> jax.Array:
         """Copy on the device: the caller may refill its memory at once.

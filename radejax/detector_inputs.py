@@ -1,4 +1,4 @@
-"""Images and calibrations as people hold them, made into a model's arrays.
+"""Frames, images and calibrations as people hold them, made into a model's arrays.
 
 What comes out is what `data.pipeline` puts into `Batch.image` and `Batch.camera`.
 """
@@ -15,6 +15,7 @@ import numpy as np
 
 from radejax.data.cameras import no_camera
 from radejax.data.frame_table import read_left_image
+from radejax.data.tesseract import read_frame
 from radejax.errors import UserError
 from radejax.geometry.camera import (
     Camera,
@@ -22,6 +23,7 @@ from radejax.geometry.camera import (
     ImageKind,
     stack_cameras,
 )
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
 
@@ -56,6 +58,55 @@ class CameraOptions:
             fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
         names = [field.name for field in dataclasses.fields(cls)]
         return cls(**{name: fields[name] for name in names if name in fields})
+
+
+def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
+    """Radar frames as one array with a leading axis of B.
+
+    Args:
+        frames: Projections or tesseracts, one array or a list of them, or the path of
+            a file or several; see `Detector`.
+        grid: Of the sensor.
+
+    Returns:
+        `[B, R, A, D+E]` or `[B, D, R, E, A]`, and whether they are tesseracts.
+
+    Raises:
+        UserError: The shape fits neither, a list is empty, or its shapes differ.
+    """
+    if isinstance(frames, PathLike):
+        frames = [frames]
+    if isinstance(frames, Sequence):
+        frames = _stack_frames(frames, grid)
+    shape = tuple(np.shape(frames))
+    projection, tesseract = grid.projection_shape, grid.shape_drea
+    for expected, is_tesseract in ((projection, False), (tesseract, True)):
+        if shape[-len(expected) :] == expected and len(shape) - len(expected) < 2:
+            is_batch = len(shape) > len(expected)
+            return frames if is_batch else frames[None], is_tesseract
+    raise UserError(
+        f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
+        f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
+        f"[B, {', '.join(map(str, tesseract))}]"
+    )
+
+
+def _stack_frames(frames: Sequence[Any], grid: RadarGrid) -> np.ndarray:
+    """One array of the frames of a list: paths or arrays."""
+    arrays = [
+        read_frame(frame, grid) if isinstance(frame, PathLike) else np.asarray(frame)
+        for frame in frames
+    ]
+    if not arrays:
+        raise UserError("no frames: the list is empty")
+    shapes = {array.shape: i for i, array in reversed(list(enumerate(arrays)))}
+    if len(shapes) > 1:
+        first, *_, other = sorted(shapes, key=shapes.__getitem__)
+        raise UserError(
+            f"frames of one call must have one shape: frame 0 has {list(first)}, "
+            f"frame {shapes[other]} has {list(other)}"
+        )
+    return np.stack(arrays)
 
 
 def prepare(

@@ -58,10 +58,16 @@ def evaluate_run(
         when it is there.
 
     Raises:
-        UserError: There are no frames of the split, or images to exchange.
+        UserError: There are no frames of the split, or images to exchange; or the run
+            has no data.
     """
     run = load_run(workdir, step, image_backbone)
     config = run.config
+    if run.paths is None:
+        raise UserError(
+            f"{run.workdir}: trained on frames that were never written, there is no "
+            "split to evaluate on; `radejax detect` takes its model"
+        )
     frames = run.paths.open(config, None if split == "all" else split)
     if not len(frames):
         raise UserError(f"no frames of split {split} in {', '.join(run.paths.roots)}")

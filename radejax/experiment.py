@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import json
 import logging
 import pathlib
 import time
@@ -29,6 +28,7 @@ from radejax.training.step import map_grid
 from radejax.workdir import (
     DataPaths,
     PathLike,
+    checkpoint_info,
     claim_workdir,
     initial_variables,
     load_run,
@@ -272,12 +272,12 @@ def train(
         map_grid(records.grid, model, config.data.azimuth_mapping),
         workdir,
         config=config,
-        info={
-            "config": json.loads(config.to_json()),
-            "grid": records.grid.to_dict(),
-            "run": dict(info),
-            "same": _what_stays(frames, variables, pretrained, paths.embeddings, model),
-        },
+        info=checkpoint_info(
+            config,
+            records.grid,
+            info,
+            _what_stays(frames, variables, pretrained, paths.embeddings, model),
+        ),
         steps_per_epoch=pipeline.steps_per_epoch(
             len(frames),
             config.train.batch_size // jax.process_count(),

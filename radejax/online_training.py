@@ -6,7 +6,6 @@ but the simulator itself. A checkpoint is read by `Detector.from_checkpoint`.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import pathlib
@@ -22,7 +21,7 @@ from radejax.simulation.online import OnlineBatches
 from radejax.structures import CLASSES
 from radejax.training import loop, sharding
 from radejax.training.step import map_grid
-from radejax.workdir import claim_workdir, lock_workdir
+from radejax.workdir import checkpoint_info, claim_workdir, lock_workdir
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -107,12 +106,12 @@ def _train(
         map_grid(batches.grid, model, config.data.azimuth_mapping),
         workdir,
         config=config,
-        info={
-            "config": json.loads(config.to_json()),
-            "grid": batches.grid.to_dict(),
-            "run": {"online_sequences": num_sequences},
-            "same": {"number of sequences": num_sequences},
-        },
+        info=checkpoint_info(
+            config,
+            batches.grid,
+            {"online_sequences": num_sequences},
+            {"number of sequences": num_sequences},
+        ),
         steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
         frame_names=batches.frame_names,
     )

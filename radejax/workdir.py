@@ -78,7 +78,7 @@ class Run:
     Attributes:
         workdir: Its folder.
         config: Its configuration.
-        paths: Its data; None where the folder does not say.
+        paths: Its data; None of a run on frames that were never written.
         grid: Of the sensor.
         variables: Of the model, at `step`.
         step: Of the checkpoint.
@@ -190,6 +190,28 @@ def run_info(
     }
 
 
+def checkpoint_info(
+    config: ConfigDict,
+    grid: RadarGrid,
+    run: Mapping[str, Any],
+    same: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What every checkpoint of a run carries, plain values; `load_run` reads it.
+
+    Args:
+        config: Of the run.
+        grid: Of the sensor.
+        run: See `run_info`.
+        same: What a run that continues must not change, by name.
+    """
+    return {
+        "config": json.loads(config.to_json()),
+        "grid": grid.to_dict(),
+        "run": dict(run),
+        "same": dict(same),
+    }
+
+
 def load_run(
     workdir: PathLike,
     step: int | str | None = None,
@@ -223,8 +245,9 @@ def load_run(
             step = checkpoints.best_step()
         state, info, step = checkpoints.restore_variables(step)
     params = state["ema_params"] if state.get("ema_params") else state["params"]
-    data = info["run"]["data"]
-    paths = DataPaths(**{**data, "roots": tuple(data["roots"])})
+    data, paths = info["run"].get("data"), None
+    if data is not None:
+        paths = DataPaths(**{**data, "roots": tuple(data["roots"])})
     if camera_inputs.missing_backbone(params, config):
         backbone = _frozen_backbone(config, info["run"], paths, image_backbone)
         params = {**params, **backbone}

@@ -9,6 +9,7 @@ import pytest
 from radejax import Detector
 from radejax.config import load_config
 from radejax.errors import UserError
+from radejax.evaluate_run import evaluate_run
 from radejax.online_training import train_online
 from radejax.training import sharding
 
@@ -55,6 +56,11 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     expected = Detector.from_checkpoint(whole / "checkpoints")
     found = Detector.from_checkpoint(parts / "checkpoints")
     jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
+    # The folder is a run like any other, but for its data, which are nowhere.
+    again = Detector.from_workdir(whole)
+    jax.tree.map(np.testing.assert_array_equal, again.variables, expected.variables)
+    with pytest.raises(UserError, match=r"never written, .* `radejax detect`"):
+        evaluate_run(whole)
     rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
     assert len({row["focal"] for row in rows if "focal" in row}) == 4
 
