@@ -180,6 +180,9 @@ def prepare_data(
         UserError: No data and nothing to simulate; no space left.
         FileNotFoundError: A folder that was named is not there.
     """
+    calibration = camera_inputs.saved_path(camera_calibration)
+    if calibration is not None and not pathlib.Path(calibration).is_dir():
+        raise FileNotFoundError(f"no such folder: {calibration}")
     simulation = config.get("simulation")
     if data is None and simulation is None:
         raise UserError(
@@ -203,9 +206,6 @@ def prepare_data(
         pathlib.Path(records or pathlib.Path(roots[0]) / "records").absolute()
     )
     labels = labels and str(pathlib.Path(labels).absolute())
-    calibration = camera_inputs.saved_path(camera_calibration)
-    if calibration is not None and not pathlib.Path(calibration).is_dir():
-        raise FileNotFoundError(f"no such folder: {calibration}")
     paths = DataPaths(
         roots=roots, labels=labels, records=records, camera_calibration=calibration
     )
