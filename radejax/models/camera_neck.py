@@ -22,9 +22,10 @@ _PHASE_TAPS = np.array([[3, 1], [2, 0]])
 class TransposedConv(nn.Module):
     """Transposed 4x4 convolution, stride 2, padding 1: `[B,H,W,C]` -> `[B,2H,2W,C']`.
 
-    Every output sees 2x2 inputs through one of four kernels, by its parity: one 2x2
-    convolution to four times the channels, interleaved. As a convolution of a dilated
-    input its weight gradient alone takes seconds on a CPU.
+    Every output sees 2x2 inputs through one of four kernels, by its parity: one matrix
+    product of four neighbours to four times the channels, interleaved. As a convolution,
+    of a dilated input or to four times the channels, its weight gradient alone takes
+    seconds on a CPU.
 
     Attributes:
         features: Output channels C'.
@@ -42,14 +43,18 @@ class TransposedConv(nn.Module):
         kernel = self.param("kernel", init, (4, 4, channels, self.features))
         bias = self.param("bias", init, (self.features,)).astype(self.dtype)
         kernel = kernel[_PHASE_TAPS][:, :, _PHASE_TAPS]  # phase, tap, phase, tap, C, C'
-        kernel = kernel.transpose(1, 3, 4, 0, 2, 5).reshape(2, 2, channels, -1)
-        y = jax.lax.conv_general_dilated(
-            x.astype(self.dtype),
-            kernel.astype(self.dtype),
-            window_strides=(1, 1),
-            padding=((1, 1), (1, 1)),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        ).reshape(b, height + 1, width + 1, 2, 2, self.features)
+        kernel = kernel.transpose(1, 3, 4, 0, 2, 5).reshape(4 * channels, -1)
+        x = jnp.pad(x.astype(self.dtype), ((0, 0), (1, 1), (1, 1), (0, 0)))
+        x = jnp.concatenate(
+            [
+                x[:, i : i + height + 1, j : j + width + 1]
+                for i in (0, 1)
+                for j in (0, 1)
+            ],
+            -1,
+        )
+        y = x @ kernel.astype(self.dtype)
+        y = y.reshape(b, height + 1, width + 1, 2, 2, self.features)
         rows = [
             jnp.stack(
                 [y[:, i : i + height, j : j + width, i, j] for j in (0, 1)], axis=3

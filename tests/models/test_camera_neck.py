@@ -29,6 +29,16 @@ def test_transposed_convolution_follows_its_definition():
     np.testing.assert_allclose(out, scattered(x, kernel, bias), atol=1e-5)
 
 
+def test_the_gradient_is_made_of_matrix_products():
+    """A convolution of this shape takes a CPU seconds by its kernel's gradient."""
+    module, x = TransposedConv(6), jnp.ones((1, 3, 4, 5))
+    variables = module.init(jax.random.key(0), x)
+    gradient = jax.grad(lambda *args: module.apply(*args).sum(), (0, 1))
+    program = jax.jit(gradient).lower(variables, x).as_text()
+    assert "dot_general" in program
+    assert "convolution" not in program
+
+
 def test_shapes_and_running_statistics():
     neck = CameraNeck(8)
     rng = np.random.default_rng(0)
