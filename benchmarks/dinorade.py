@@ -8,15 +8,17 @@
 256 x 112 x 10 queries, 720 x 1280 images, 180 x 320 x 128 camera map. Weights and inputs
 are random. Rivals of one row run in turns within one process, and the fastest of the
 repetitions counts, so that a busy machine hurts both alike; "CPU s" is the processor
-time of all threads, which it hurts least. The torch column is the sampling in its
-pure-torch form (`grid_sample`), as the released code runs where its CUDA operator was
-not built. Memory is what the compiled program needs beside inputs and outputs.
+time of all threads, which it hurts least. The torch column is the same network in plain
+torch, `torch_dinorade.py`. Memory is what the compiled program needs beside inputs and
+outputs.
 """
 
 import argparse
+import functools
 import importlib.util
 import pathlib
 import resource
+import sys
 import time
 
 import jax
@@ -30,8 +32,10 @@ from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import static_reference_points
 from radejax.training.state import merge_parameters, split_parameters
 
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
 try:
     import torch
+    import torch_dinorade
 except ModuleNotFoundError:
     torch = None
 
@@ -48,14 +52,18 @@ CALIBRATION = CameraCalibration.from_angles(
 )
 
 
-def full_size_model(variant, dtype):
+def full_size_config(variant, dtype):
     path = pathlib.Path(__file__).parents[1] / "configs" / "dinorade.py"
     spec = importlib.util.spec_from_file_location("dinorade_config", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     config = module.get_config(variant)
     config.model.dtype = dtype
-    return build(config.model)
+    return config.model
+
+
+def full_size_model(variant, dtype):
+    return build(full_size_config(variant, dtype))
 
 
 def measure(functions, repeats):
@@ -112,56 +120,37 @@ def our_attention(params, feature, scale, points, value):
     )
 
 
-def torch_attention(params, feature, scale, points, value):
-    """All queries through the linear layers, `grid_sample`, projection, then the mean."""
-    functional = torch.nn.functional
-    batch = feature.shape[0]
+def torch_device():
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
-    def linear(name, x):
-        return x @ params[name]["kernel"] + params[name]["bias"]
 
-    query = (scale[..., None] * feature[:, :, None]).reshape(batch, -1, WIDTH)
-    values = linear("value_proj", value.reshape(batch, -1, WIDTH))
-    values = values.reshape(batch, -1, HEADS, WIDTH // HEADS)
-    shape = (batch, query.shape[1], HEADS, POINTS)
-    offsets = linear("sampling_offsets", query).reshape(*shape, 2)
-    weights = linear("attention_weights", query).reshape(shape).softmax(-1)
-    step = torch.tensor([MAP[1], MAP[0]], device=feature.device)
-    centers = points.reshape(1, -1, 1, 1, 2)
-    places = 2 * (centers + offsets / step) - 1
-    grid = places.transpose(1, 2).reshape(batch * HEADS, -1, POINTS, 2)
-    maps = values.permute(0, 2, 3, 1).reshape(batch * HEADS, -1, *MAP)
-    samples = functional.grid_sample(
-        maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False
-    )  # [B heads, D, Q, P]
-    weights = weights.transpose(1, 2).reshape(batch * HEADS, 1, -1, POINTS)
-    out = (samples * weights).sum(-1).reshape(batch, WIDTH, -1).transpose(1, 2)
-    return linear("output_proj", out).reshape(batch, BINS, ELEVATION, -1).mean(2)
+def finish():
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def torch_calls(inputs):
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    leaves, tree = jax.tree.flatten(inputs)
-    leaves = [torch.from_numpy(np.array(x)).to(device) for x in leaves]
-    trained = [i for i, x in enumerate(leaves) if x.shape[-1] != 2]
-
-    def finish():
-        if device == "cuda":
-            torch.cuda.synchronize()
+    params, feature, scale, points, value = inputs
+    module = torch_dinorade.Attention(WIDTH, HEADS, POINTS)
+    state = {f"{k}.weight": v["kernel"].T for k, v in params.items()}
+    state |= {f"{k}.bias": v["bias"] for k, v in params.items()}
+    module.load_state_dict({k: torch.tensor(v) for k, v in state.items()})
+    module = module.to(torch_device())
+    feature, scale, points, value = (
+        torch.tensor(np.array(x), device=torch_device())
+        for x in (feature, scale, points[0], value.transpose(0, 3, 1, 2))
+    )
 
     def forward():
         with torch.no_grad():
-            out = torch_attention(*jax.tree.unflatten(tree, leaves))
+            out = module(feature, scale, points, value)
         finish()
         return out
 
     def gradient():
-        for i in trained:
-            leaves[i].requires_grad_(True)
-            leaves[i].grad = None
-        torch_attention(*jax.tree.unflatten(tree, leaves)).square().sum().backward()
-        for i in trained:
-            leaves[i].requires_grad_(False)
+        module.zero_grad(set_to_none=True)
+        given = [x.detach().requires_grad_() for x in (feature, scale, value)]
+        module(*given[:2], points, given[2]).square().sum().backward()
         finish()
 
     return forward, gradient
@@ -213,10 +202,63 @@ def model_and_inputs(variant, dtype, batch):
     return model, variables, projection, image, features, reference
 
 
+def torch_model(variant, dtype, projection, image, reference):
+    """Calls of the torch model by name, without gradient, and one with."""
+    points = torch.tensor(np.array(reference.points)).reshape(BINS, ELEVATION, 2)
+    model = torch_dinorade.DinoRade(full_size_config(variant, dtype), points)
+    model = model.to(torch_device())
+    x = np.pad(projection, ((0, 0), (0, 0), (0, 5), (0, 0))).transpose(0, 3, 1, 2)
+    x, image = (torch.tensor(a.copy(), device=torch_device()) for a in (x, image))
+    features = model.embed(image)
+
+    def no_gradient(call):
+        is_half = dtype == "bfloat16"
+        with (
+            torch.inference_mode(),
+            torch.autocast(torch_device(), torch.bfloat16, enabled=is_half),
+        ):
+            call()
+        finish()
+
+    def gradient(embed):
+        model.train()
+        model.zero_grad(set_to_none=True)
+        with torch.autocast(
+            torch_device(), torch.bfloat16, enabled=dtype == "bfloat16"
+        ):
+            heatmap, boxes = model(x, embed())
+        (heatmap.float().square().mean() + boxes.float().square().mean()).backward()
+        model.eval()
+        finish()
+
+    forward = {
+        "image backbone": lambda: model.embed(image),
+        "radar alone": lambda: model(x),
+        "radar and fusion, embedded image": lambda: model(x, features),
+        "whole model": lambda: model(x, model.embed(image)),
+    }
+    calls = {k: functools.partial(no_gradient, v) for k, v in forward.items()}
+    calls["gradient from images"] = lambda: gradient(lambda: model.embed(image))
+    calls["gradient from embedded images"] = lambda: gradient(lambda: features)
+    return model, calls
+
+
+def rivals_of(variant, dtype, projection, image, reference, variables):
+    """The torch calls, empty without torch or for another model than its own."""
+    if torch is None or variant != "rcw":
+        return {}
+    model, calls = torch_model(variant, dtype, projection, image, reference)
+    numbers = [sum(x.numel() for x in model.parameters())]
+    numbers.append(sum(x.size for x in jax.tree.leaves(variables["params"])))
+    print("parameters, torch and ours: {:,} and {:,}".format(*numbers))
+    return calls
+
+
 def model_rows(variant, dtype, batch, repeats):
     model, variables, projection, image, features, reference = model_and_inputs(
         variant, dtype, batch
     )
+    rivals = rivals_of(variant, dtype, projection, image, reference, variables)
 
     def embed(variables, image):
         return model.apply(variables, image, method="embed")
@@ -230,7 +272,8 @@ def model_rows(variant, dtype, batch, repeats):
         "whole model": compiled(model.apply, variables, projection, image, reference),
     }
     for name, (call, memory) in parts.items():
-        yield row(name, batch, measure({"ours": call}, repeats), memory)
+        calls = {"ours": call} | ({"torch": rivals[name]} if rivals else {})
+        yield row(name, batch, measure(calls, repeats), memory)
 
 
 def training_rows(variant, dtype, batch, repeats):
@@ -255,12 +298,12 @@ def training_rows(variant, dtype, batch, repeats):
             jnp.square(maps.heatmap_logits).mean() + jnp.square(maps.box_params).mean()
         )
 
-    calls, memories = {}, {}
+    rivals = rivals_of(variant, dtype, projection, image, reference, variables)
     for name, given in (("images", image), ("embedded images", features)):
-        calls[name], memories[name] = compiled(jax.grad(loss), params, frozen, given)
-    times = measure(calls, repeats)
-    for name, time_of in times.items():
-        yield row(f"gradient from {name}", batch, {"ours": time_of}, memories[name])
+        call, memory = compiled(jax.grad(loss), params, frozen, given)
+        name = f"gradient from {name}"
+        calls = {"ours": call} | ({"torch": rivals[name]} if rivals else {})
+        yield row(name, batch, measure(calls, repeats), memory)
 
 
 def row(name, batch, times, memory):

@@ -59,7 +59,7 @@ RUN_IN = {
     **{
         f"benchmarks/{path.name}": HELP
         for path in (ROOT / "benchmarks").glob("*.py")
-        if path.name != "torch_radenet.py"  # a module of radenet.py
+        if not path.name.startswith("torch_")  # modules of the others
     },
     "docs/images/simulator_pictures.py": HELP,
 }
