@@ -1,6 +1,7 @@
 """Evaluates a run, or predictions made elsewhere, or compares two.
 
     python evaluate.py --workdir runs/quickstart
+    python evaluate.py --workdir runs/radenet --data /other/kradar
     python evaluate.py --predictions found.json --data /data/kradar --out results
     python evaluate.py --predictions kitti_folder --out results
     python evaluate.py --compare results_a results_b
@@ -30,6 +31,17 @@ _OUT = flags.DEFINE_string(
     "Folder of the report; beside the predictions or in the workdir if none.",
 )
 _DATA = flags.DEFINE_list("data", [], "Root folders of K-Radar.")
+_RECORDS = flags.DEFINE_string(
+    "records",
+    None,
+    "With --workdir and --data: folder of projected frames; made beside the data if "
+    "missing.",
+)
+_CALIBRATION = flags.DEFINE_string(
+    "camera_calibration",
+    None,
+    "With --workdir and --data: folder of camera calibrations; the roots' own by default.",
+)
 _LABELS = flags.DEFINE_string("labels", None, "Folder or zip of a label revision.")
 _LABEL_VERSION = flags.DEFINE_string("label_version", "v2.1", "v1.0, v1.1, v2.0, v2.1.")
 _SPLIT = flags.DEFINE_string("split", "test", "train, test, all or a split file.")
@@ -65,6 +77,10 @@ _EXCHANGE = flags.DEFINE_integer(
 )
 _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 
+_OF_RUNS = (_CHECKPOINT, _RECORDS, _CALIBRATION, _BACKBONE, _EXCHANGE)
+_OF_FILES = (_LABEL_VERSION, _GROUND_TRUTH, _FRAMES, _CLASSES, _PROTOCOLS, _IOU, _ROI)
+_OF_FILES += (_SCORE, _BOOTSTRAP, _NAME, _SIZES)
+
 
 def main(argv: list[str]) -> None:
     """Chooses between a run, files and a comparison."""
@@ -76,7 +92,13 @@ def main(argv: list[str]) -> None:
             raise UserError("give one of --workdir, --predictions and --compare A B")
         if len(argv) > 1 and _COMPARE.value is None:
             raise UserError(f"unexpected arguments: {' '.join(argv[1:])}")
-        if _WORKDIR.value is not None:
+        is_run = _WORKDIR.value is not None
+        if lost := [f.name for f in (_OF_FILES if is_run else _OF_RUNS) if f.present]:
+            raise UserError(
+                f"--{', --'.join(lost)}: "
+                + ("the run's config says that" if is_run else "only with --workdir")
+            )
+        if is_run:
             evaluate_workdir()
         elif _PREDICTIONS.value is not None:
             evaluate_files()
@@ -87,14 +109,23 @@ def main(argv: list[str]) -> None:
 def evaluate_workdir() -> None:
     """Runs the detector of a run over a split; the config of the run has the options."""
     entry.set_up_jax()
+    from radejax.data_paths import project_data
     from radejax.errors import UserError
     from radejax.evaluate_run import evaluate_run
+    from radejax.workdir import load_config
 
     step = _CHECKPOINT.value
     if step is not None and step != "best":
         if not step.isdigit():
             raise UserError(f"--checkpoint must be a step or best, got {step}")
         step = int(step)
+    paths = None
+    flags_of_data = (_LABELS, _RECORDS, _CALIBRATION)
+    places = {flag.name: flag.value for flag in flags_of_data}
+    if _DATA.value:
+        paths = project_data(load_config(_WORKDIR.value), _DATA.value, **places)
+    elif given := [name for name, value in places.items() if value is not None]:
+        raise UserError(f"--{', --'.join(given)}: only with --data, for other data")
     evaluate_run(
         _WORKDIR.value,
         step=step,
@@ -102,6 +133,7 @@ def evaluate_workdir() -> None:
         out=_OUT.value,
         image_backbone=_BACKBONE.value,
         exchange_images=_EXCHANGE.value,
+        paths=paths,
     )
 
 

@@ -7,9 +7,12 @@
 Compares two runs on the same simulated test frames, by weather and by the state of the
 lens, which the simulator knows: AP of both, their difference with an interval from
 resampled sequences, and the camera's share in the fused map. Writes a table and a
-picture into OUT.
+picture into OUT. `--data ROOT` takes another simulated data set, on which both were
+evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same `--split`.
 """
 
+import collections
+import dataclasses
 import pathlib
 
 import click
@@ -18,11 +21,14 @@ from tabulate import tabulate
 
 from radejax import camera_share, entry, files
 from radejax.data.records import RecordSource
+from radejax.data_paths import project_data
 from radejax.errors import UserError
 from radejax.evaluate_files import Source, load
+from radejax.evaluate_run import evaluation_name
 from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import repair_sizes
+from radejax.simulation.dataset import MARKER
 from radejax.simulation.lens import cover_level
 from radejax.visualize.camera_share import mean_share
 from radejax.workdir import load_run
@@ -38,21 +44,18 @@ GROUPS = {
 }
 
 
-def lens_of(config, sequence, number, weather):
-    """State of the lens in a procedural frame of a simulated data set."""
-    if not config.simulation.cover_lens:
-        return "clear"
-    return cover_level(config.simulation.seed, sequence, number, weather)
-
-
-def lens_of_frames(config, frames):
-    """The same for the rows of a frame table; frames count from 0 in a sequence."""
-    sequences, first = np.asarray(frames["sequence"]), {}
-    levels = []
-    for sequence, weather in zip(sequences.tolist(), frames["weather"], strict=True):
-        number = first.setdefault(sequence, 0)
-        levels.append(lens_of(config, sequence, number, str(weather)))
-        first[sequence] += 1
+def lens_of_frames(root, frames):
+    """State of the lens in the rows of a frame table of a simulated data set."""
+    simulation = files.read_json(pathlib.Path(root) / MARKER)["config"]
+    if simulation["scenes"] != "procedural":
+        raise UserError(f"{root}: the lens is known of procedural scenes only")
+    if not simulation["cover_lens"]:
+        return np.full(len(frames["sequence"]), "clear")
+    levels, counts = [], collections.Counter()  # frames count from 0 in a sequence
+    for sequence, weather in zip(frames["sequence"], frames["weather"], strict=True):
+        place = int(sequence), counts[sequence], str(weather)
+        levels.append(cover_level(simulation["seed"], *place))
+        counts[sequence] += 1
     return np.array(levels)
 
 
@@ -110,19 +113,30 @@ def rows_of_group(name, reports, config, chosen, shares, resamples):
 @click.argument("fusion", type=click.Path(exists=True, path_type=pathlib.Path))
 @click.argument("radar", type=click.Path(exists=True, path_type=pathlib.Path))
 @click.option("--out", type=click.Path(path_type=pathlib.Path), help="Beside FUSION.")
+@click.option(
+    "--data", type=click.Path(exists=True), help="Another data set than the runs'."
+)
+@click.option("--split", default="test", show_default=True, help="Or all.")
 @click.option("--resamples", default=1000, show_default=True)
-def main(fusion, radar, out, resamples):
+def main(fusion, radar, out, data, split, resamples):
     """Compares FUSION with RADAR, two work folders evaluated on the same test split."""
     entry.set_up_jax()
     with entry.exit_codes():
-        out = out or fusion / "by_lens"
-        reports = [run / "evaluation" for run in (fusion, radar)]
-        run = load_run(fusion)
+        run, name = load_run(fusion), "evaluation"
         config = run.config
-        if config.simulation.scenes != "procedural":
-            raise UserError(f"{fusion}: the lens is known of procedural scenes only")
+        if data is not None:
+            run = dataclasses.replace(run, paths=project_data(config, [data]))
+            name = evaluation_name([data])
+        out = out or fusion / name.replace("evaluation", "by_lens")
+        reports = [folder / name for folder in (fusion, radar)]
         frames = load(reports[0], Source(), tuple(config.classes))[2]
-        lens = lens_of_frames(config, frames)
+        dataset = run.paths.open(config, None if split == "all" else split)
+        if len(dataset) != len(frames["frame"]):
+            raise UserError(
+                f"{reports[0]} has {len(frames['frame'])} frames, split {split} has "
+                f"{len(dataset)}: give the split that was evaluated"
+            )
+        lens = lens_of_frames(run.paths.roots[0], frames)
         groups = {
             name: np.array(
                 [
@@ -132,7 +146,6 @@ def main(fusion, radar, out, resamples):
             )
             for name, rule in GROUPS.items()
         }
-        dataset = run.paths.open(config, "test")
         level_of = {f.key: level for f, level in zip(dataset, lens, strict=True)}
         maps, counts = camera_share.camera_share(
             config,

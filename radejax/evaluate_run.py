@@ -18,6 +18,7 @@ from radejax.data.frame import Frame
 from radejax.data.frame_table import IMAGE_SIZE, read_left_image
 from radejax.data.kradar import KRadar
 from radejax.data.records import RecordSource
+from radejax.data_paths import DataPaths
 from radejax.errors import UserError
 from radejax.evaluation.measure import Options
 from radejax.evaluation.predictions_io import tables_from_frames
@@ -39,6 +40,7 @@ def evaluate_run(
     num_pictures: int | None = None,
     image_backbone: str | os.PathLike | None = None,
     exchange_images: int | None = None,
+    paths: DataPaths | None = None,
 ) -> Report | None:
     """Evaluates a run's checkpoint as its config says, on all devices.
 
@@ -46,41 +48,52 @@ def evaluate_run(
         workdir: Of `train.py`.
         step: Of the checkpoint, or "best"; the newest if None.
         split: "test", "train", "all" or a split file.
-        out: Folder of the results; `evaluation` in the work folder if None.
+        out: Folder of the results; `evaluation` in the work folder if None, and of
+            other data `evaluation_<name of their folder>`.
         num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `load_run`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
-            control of what a radar-camera model knows from the images. `out` is then
-            `evaluation_exchanged`.
+            control of what a radar-camera model knows from the images. `out` then ends
+            in `_exchanged`.
+        paths: Other data than the run's own, see `data_paths.project_data`.
 
     Returns:
         The report that was written; None on all processes but the first, which return
         when it is there.
 
     Raises:
-        UserError: There are no frames of the split, or images to exchange; or the run
-            has no data.
+        UserError: There are no frames of the split, or images to exchange; the run has
+            no data and none are given, or they are from another radar grid.
     """
     run = load_run(workdir, step, image_backbone)
-    config = run.config
+    config, name = run.config, "evaluation"
+    if paths is not None:
+        run = dataclasses.replace(run, paths=paths)
+        name = evaluation_name(paths.roots)
     if run.paths is None:
         raise UserError(
             f"{run.workdir}: trained on frames that were never written, there is no "
-            "split to evaluate on; `radejax detect` takes its model"
+            "split to evaluate on; give --data ROOT, or use `radejax detect`"
         )
     frames = run.paths.open(config, None if split == "all" else split)
     if not len(frames):
         raise UserError(f"no frames of split {split} in {', '.join(run.paths.roots)}")
     records = RecordSource(run.paths.records)
+    if records.grid != run.grid:
+        raise UserError(
+            f"{records.folder}: the radar grid is another one than the run was trained "
+            f"on: {records.grid.shape_drea} cells (Doppler, range, elevation, azimuth) "
+            f"to {run.grid.shape_drea}, or the same number at other places"
+        )
     options = config.evaluation
     predictor = Predictor(
         config, run.variables, run.grid, score_threshold=options.score_threshold
     )
-    seen, name = frames, "evaluation"
+    seen = frames
     if exchange_images is not None:
         camera_inputs.require_camera(config)
         seen = with_images_exchanged(frames, exchange_images)
-        name = "evaluation_exchanged"
+        name += "_exchanged"
     predictions = predict_dataset(
         predictor,
         records,
@@ -93,6 +106,11 @@ def evaluate_run(
     return processes.main_only(
         lambda: _report(run, split, frames, records, predictions, out, count)
     )
+
+
+def evaluation_name(roots: Sequence[str]) -> str:
+    """Name of the folder of results of a run on other data than its own."""
+    return f"evaluation_{pathlib.Path(roots[0]).name}"
 
 
 def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:

@@ -15,10 +15,11 @@ import jax
 from ml_collections import ConfigDict
 
 from radejax import camera_inputs, files, models
-from radejax.data import pipeline, projection_job
+from radejax.data import pipeline
 from radejax.data.augment import Augmentation
 from radejax.data.frame import Frame
 from radejax.data.records import RecordSource
+from radejax.data_paths import DataPaths, prepare_data
 from radejax.embed import embeddings_sha256, weights_sha256
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
@@ -26,7 +27,6 @@ from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.training import loop, processes, sharding
 from radejax.training.step import map_grid
 from radejax.workdir import (
-    DataPaths,
     PathLike,
     checkpoint_info,
     claim_workdir,
@@ -41,7 +41,6 @@ __all__ = [
     "config_name",
     "load_run",
     "make_augmentation",
-    "prepare_data",
     "run",
     "train",
 ]
@@ -161,58 +160,6 @@ _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {workdir}:
 Evaluate again:    python evaluate.py --workdir {workdir}
 Boxes for a folder of frames:
                    radejax detect --workdir {workdir} --out boxes FOLDER"""
-
-
-# Data --------------------------------------------------------------------------------
-
-
-def prepare_data(
-    config: ConfigDict,
-    *,
-    data: Sequence[str] | None,
-    labels: str | None,
-    records: str | None,
-    camera_calibration: str | None = None,
-) -> DataPaths:
-    """Simulates if there are no data, and projects what has no record yet.
-
-    Raises:
-        UserError: No data and nothing to simulate; no space left.
-        FileNotFoundError: A folder that was named is not there.
-    """
-    calibration = camera_inputs.saved_path(camera_calibration)
-    if calibration is not None and not pathlib.Path(calibration).is_dir():
-        raise FileNotFoundError(f"no such folder: {calibration}")
-    simulation = config.get("simulation")
-    if data is None and simulation is None:
-        raise UserError(
-            "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
-            "config that simulates them, such as configs/quickstart.py"
-        )
-    if simulation is not None:
-        if data is None:
-            digest = hashlib.sha256(simulation.to_json().encode()).hexdigest()[:8]
-            data = [str(pathlib.Path("data") / f"simulated-{digest}")]
-        if len(data) != 1:
-            raise UserError(f"a simulated data set has one folder, got {list(data)}")
-        from radejax.simulation.dataset import simulate_dataset
-
-        simulate_dataset(simulation, data[0])
-    roots = tuple(str(pathlib.Path(root).absolute()) for root in data)
-    for root in roots:
-        if not pathlib.Path(root).is_dir():
-            raise FileNotFoundError(f"no such folder: {root}")
-    records = str(
-        pathlib.Path(records or pathlib.Path(roots[0]) / "records").absolute()
-    )
-    labels = labels and str(pathlib.Path(labels).absolute())
-    paths = DataPaths(
-        roots=roots, labels=labels, records=records, camera_calibration=calibration
-    )
-    frames = paths.open(config, split=None)
-    _log.info("%s", frames.summary().to_text())
-    projection_job.project_dataset(frames, records)
-    return paths
 
 
 # Training ----------------------------------------------------------------------------

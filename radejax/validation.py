@@ -13,6 +13,7 @@ import numpy as np
 
 from radejax import camera_inputs
 from radejax.data.records import RecordSource
+from radejax.data_paths import DataPaths
 from radejax.errors import UserError
 from radejax.evaluate_run import FrameDrawer, report_options
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -22,7 +23,6 @@ from radejax.predict import Predictor, predict_dataset
 from radejax.training import processes
 from radejax.training.state import TrainState
 from radejax.training.watch import Scores
-from radejax.workdir import DataPaths
 
 
 class Validation:

@@ -27,7 +27,7 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax import camera_inputs, files, models
-from radejax.data.kradar import KRadar
+from radejax.data_paths import DataPaths
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -36,39 +36,6 @@ from radejax.training.checkpoints import BEST, Checkpoints
 _log = logging.getLogger(__name__)
 
 PathLike = str | os.PathLike
-
-
-@dataclasses.dataclass(frozen=True)
-class DataPaths:
-    """Where the data of a run are.
-
-    Attributes:
-        roots: K-Radar folders.
-        labels: Folder or zip of a label revision, or None for the sequences' own.
-        records: Folder of projected frames.
-        embeddings: Folder of embedded images, or None for the images themselves.
-        image_backbone: Weights of the image backbone, or None.
-        camera_calibration: Folder of camera calibrations; the roots' own if None.
-    """
-
-    roots: tuple[str, ...]
-    labels: str | None
-    records: str
-    embeddings: str | None = None
-    image_backbone: str | None = None
-    camera_calibration: str | None = None
-
-    def open(self, config: ConfigDict, split: str | None) -> KRadar:
-        """The frames of a split with the labels that the config asks for."""
-        return KRadar(
-            self.roots,
-            self.labels,
-            version=config.data.label_version,
-            split=split,
-            visibility=config.data.visibility,
-            classes=config.classes,
-            camera_calibration=self.camera_calibration,
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,12 +104,13 @@ def claim_workdir(workdir: pathlib.Path, config: ConfigDict) -> None:
     files.write_json(path, wanted)
 
 
-def load_config(workdir: pathlib.Path) -> ConfigDict:
+def load_config(workdir: PathLike) -> ConfigDict:
     """Configuration of a run.
 
     Raises:
         FileNotFoundError: There is no run in that folder.
     """
+    workdir = pathlib.Path(workdir)
     if not (workdir / "config.json").exists():
         raise FileNotFoundError(f"no run in {workdir}: config.json is missing")
     return ConfigDict(files.read_json(workdir / "config.json"), convert_dict=True)

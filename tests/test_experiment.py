@@ -10,26 +10,15 @@ import pytest
 
 from radejax import experiment
 from radejax.config import base_config
+from radejax.data_paths import DataPaths
 from radejax.embed import weights_sha256
 from radejax.errors import UserError
-from radejax.workdir import DataPaths, lock_workdir
+from radejax.workdir import lock_workdir
 
 
 def test_names_of_runs() -> None:
     assert experiment.config_name("configs/quickstart.py") == "quickstart"
     assert experiment.config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
-
-
-def test_without_data_and_simulation_the_flag_is_named(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(UserError, match=r"give --data ROOT"):
-        experiment.prepare_data(base_config(), data=None, labels=None, records=None)
-
-
-def test_a_missing_data_folder_is_named(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no such folder: .*nowhere"):
-        experiment.prepare_data(
-            base_config(), data=[str(tmp_path / "nowhere")], labels=None, records=None
-        )
 
 
 def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax import camera_inputs, embed, experiment
+from radejax import camera_inputs, embed, experiment, workdir
 from radejax.cli import main
 from radejax.config import load_config
 from radejax.data.frame_table import make_table
 from radejax.data.records import RecordSource
+from radejax.data_paths import project_data
 from radejax.detect_files import detect_files, output_name
 from radejax.detector import Detector
 from radejax.errors import DataError, UserError
@@ -368,6 +369,22 @@ def test_example_compares_fusion_and_radar_by_the_lens(
         assert row["camera share"] == shares[row["condition"]]["mean"]
         assert shares[row["condition"]]["frames"] == row["frames"]
         assert 0 < row["camera share"] < 1
+
+
+def test_example_compares_on_another_data_set(
+    data, from_images, three_test_sequences, tmp_path
+):
+    run = shutil.copytree(from_images, tmp_path / "run")
+    other = shutil.copytree(data.folder, tmp_path / "other")
+    for paths in (None, project_data(workdir.load_config(run), [str(other)])):
+        evaluate_run(run, num_pictures=0, paths=paths)
+    results = []
+    for arguments in ((), ("--data", other)):
+        _example("fusion_by_lens", run, run, *arguments, "--resamples", 10)
+    for name in ("by_lens", "by_lens_other"):
+        results.append((run / name / "by_lens.json").read_text())
+    assert results[0] == results[1]
+    assert len(json.loads(results[0])) > 1
 
 
 def test_example_draws_reference_points(data, from_images, tmp_path):

@@ -59,7 +59,7 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     # The folder is a run like any other, but for its data, which are nowhere.
     again = Detector.from_workdir(whole)
     jax.tree.map(np.testing.assert_array_equal, again.variables, expected.variables)
-    with pytest.raises(UserError, match=r"never written, .* `radejax detect`"):
+    with pytest.raises(UserError, match=r"never written, .* give --data ROOT"):
         evaluate_run(whole)
     rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
     assert len({row["focal"] for row in rows if "focal" in row}) == 4

@@ -11,6 +11,7 @@ from radejax import detector_inputs, models
 from radejax.config import base_config
 from radejax.data.projection_job import project_dataset
 from radejax.data.records import RecordSource
+from radejax.data_paths import DataPaths
 from radejax.detector import Detector
 from radejax.errors import UserError
 from radejax.predict import Predictor, predict_dataset
@@ -18,7 +19,6 @@ from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.structures import Batch
 from radejax.training import processes, sharding
 from radejax.validation import Validation
-from radejax.workdir import DataPaths
 
 
 @pytest.fixture(scope="module")

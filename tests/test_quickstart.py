@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -106,6 +107,39 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
     )
     assert json.loads(done.stdout)["frames"] == 6
     assert len(list((folder / "boxes").glob("3_tesseract_*.json"))) == 6
+
+
+@pytest.mark.timeout(900)
+def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -> None:
+    folder, _ = undisturbed
+    shutil.copytree(folder / "data", tmp_path / "other")
+    shutil.rmtree(tmp_path / "other" / "records")
+
+    def evaluate(*arguments: str) -> subprocess.CompletedProcess:
+        command = [sys.executable, "evaluate.py", f"--workdir={folder / 'run'}"]
+        return subprocess.run(
+            [*command, *arguments],
+            cwd=REPOSITORY,
+            env=_environment(),
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
+
+    done = evaluate(f"--data={tmp_path / 'other'}")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "other" / "records" / "manifest.json").exists()
+    found = folder / "run" / "evaluation_other" / "metrics.json"
+    assert json.loads(found.read_text())["ap"] == _metrics(folder)["ap"]
+    for flag, message in (
+        ("--roi=wide", "--roi: the run's config says that"),
+        ("--records=x", "--records: only with --data"),
+        (f"--data={tmp_path / 'nowhere'}", "no such folder"),
+    ):
+        done = evaluate(flag)
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert "Traceback" not in done.stderr
 
 
 @pytest.mark.timeout(900)

@@ -9,6 +9,7 @@ import pytest
 
 from radejax import workdir
 from radejax.config import base_config
+from radejax.data_paths import DataPaths
 from radejax.errors import UserError
 
 
@@ -73,7 +74,7 @@ def test_no_run_in_a_folder(tmp_path: pathlib.Path) -> None:
 
 
 def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
-    paths = workdir.DataPaths(roots=("a",), labels=None, records="r")
+    paths = DataPaths(roots=("a",), labels=None, records="r")
     info = workdir.run_info(tmp_path, paths, tmp_path / "model.pth")
     assert info["init_from"] == str(tmp_path / "model.pth")
     (tmp_path / "run.json").write_text(json.dumps(info))
