@@ -37,9 +37,9 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config = base_config()
     config.simulation = ConfigDict(default_config())
     config.simulation.update(
-        train_sequences=448,
-        test_sequences=96,
-        frames_per_sequence=2,  # another scene teaches more than the next 0.1 s
+        train_sequences=896,
+        test_sequences=192,
+        frames_per_sequence=1,  # another scene teaches more than the next 0.1 s
         output="projection",
         image_width=320,
         image_height=160,
@@ -68,7 +68,9 @@ def get_config(arg: str | None = None) -> ConfigDict:
     if sensors != "radar":
         _add_camera(config)
     if length == "short":
-        config.simulation.update(train_sequences=4, test_sequences=2)
+        config.simulation.update(
+            train_sequences=4, test_sequences=2, frames_per_sequence=2
+        )
         config.train.update(num_epochs=2, warmup_steps=0, checkpoint_every_steps=2)
         config.evaluation.num_pictures = 2
     return config
