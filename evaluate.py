@@ -30,20 +30,26 @@ _OUT = flags.DEFINE_string(
     None,
     "Folder of the report; beside the predictions or in the workdir if none.",
 )
-_DATA = flags.DEFINE_list("data", [], "Root folders of K-Radar.")
+_DATA = flags.DEFINE_list(
+    "data", [], "Root folders of K-Radar; with --workdir other ones than the run's."
+)
 _RECORDS = flags.DEFINE_string(
     "records",
     None,
-    "With --workdir and --data: folder of projected frames; made beside the data if "
-    "missing.",
+    "With --workdir: folder of projected frames; made beside other data if missing.",
 )
 _CALIBRATION = flags.DEFINE_string(
     "camera_calibration",
     None,
-    "With --workdir and --data: folder of camera calibrations; the roots' own by default.",
+    "With --workdir: folder of camera calibrations; other data's own by default.",
+)
+_EMBEDDINGS = flags.DEFINE_string(
+    "embeddings", None, "With --workdir: folder of `radejax embed` of other images."
 )
 _LABELS = flags.DEFINE_string("labels", None, "Folder or zip of a label revision.")
-_LABEL_VERSION = flags.DEFINE_string("label_version", "v2.1", "v1.0, v1.1, v2.0, v2.1.")
+_LABEL_VERSION = flags.DEFINE_string(
+    "label_version", None, "v1.0, v1.1, v2.0, v2.1 (default), or a run's own."
+)
 _SPLIT = flags.DEFINE_string("split", "test", "train, test, all or a split file.")
 _GROUND_TRUTH = flags.DEFINE_string("ground_truth", None, "File of ground truth.")
 _FRAMES = flags.DEFINE_string("frames", None, "JSON of frame columns, for it.")
@@ -77,9 +83,14 @@ _EXCHANGE = flags.DEFINE_integer(
 )
 _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 
-_OF_RUNS = (_CHECKPOINT, _RECORDS, _CALIBRATION, _BACKBONE, _EXCHANGE)
-_OF_FILES = (_LABEL_VERSION, _GROUND_TRUTH, _FRAMES, _CLASSES, _PROTOCOLS, _IOU, _ROI)
-_OF_FILES += (_SCORE, _BOOTSTRAP, _NAME, _SIZES)
+_OF_OTHER_DATA = (_DATA, _LABELS, _LABEL_VERSION, _RECORDS, _CALIBRATION, _EMBEDDINGS)
+_OF_RUNS = (_CHECKPOINT, _BACKBONE, _EXCHANGE, _RECORDS, _CALIBRATION, _EMBEDDINGS)
+_OF_FILES = (_GROUND_TRUTH, _FRAMES, _CLASSES, _PROTOCOLS, _IOU, _ROI, _SCORE)
+_OF_FILES += (_BOOTSTRAP, _NAME, _SIZES)
+_BY_CONFIG = (
+    "config.evaluation of the run says that; its predictions can be scored again by "
+    "--predictions WORKDIR/evaluation"
+)
 
 
 def main(argv: list[str]) -> None:
@@ -96,7 +107,7 @@ def main(argv: list[str]) -> None:
         if lost := [f.name for f in (_OF_FILES if is_run else _OF_RUNS) if f.present]:
             raise UserError(
                 f"--{', --'.join(lost)}: "
-                + ("the run's config says that" if is_run else "only with --workdir")
+                + (_BY_CONFIG if is_run else "only with --workdir")
             )
         if is_run:
             evaluate_workdir()
@@ -109,23 +120,21 @@ def main(argv: list[str]) -> None:
 def evaluate_workdir() -> None:
     """Runs the detector of a run over a split; the config of the run has the options."""
     entry.set_up_jax()
-    from radejax.data_paths import project_data
+    from radejax.data_paths import OtherData
     from radejax.errors import UserError
     from radejax.evaluate_run import evaluate_run
-    from radejax.workdir import load_config
 
     step = _CHECKPOINT.value
     if step is not None and step != "best":
         if not step.isdigit():
             raise UserError(f"--checkpoint must be a step or best, got {step}")
         step = int(step)
-    paths = None
-    flags_of_data = (_LABELS, _RECORDS, _CALIBRATION)
-    places = {flag.name: flag.value for flag in flags_of_data}
-    if _DATA.value:
-        paths = project_data(load_config(_WORKDIR.value), _DATA.value, **places)
-    elif given := [name for name, value in places.items() if value is not None]:
-        raise UserError(f"--{', --'.join(given)}: only with --data, for other data")
+    other = None
+    if _DATA.present and not any(_DATA.value):
+        raise UserError("--data names no folder")
+    if any(flag.present for flag in _OF_OTHER_DATA):
+        given = {flag.name: flag.value for flag in _OF_OTHER_DATA}
+        other = OtherData(**given | {"data": tuple(_DATA.value)})
     evaluate_run(
         _WORKDIR.value,
         step=step,
@@ -133,7 +142,7 @@ def evaluate_workdir() -> None:
         out=_OUT.value,
         image_backbone=_BACKBONE.value,
         exchange_images=_EXCHANGE.value,
-        paths=paths,
+        other=other,
     )
 
 
@@ -152,13 +161,16 @@ def evaluate_files() -> None:
 def compare(paths: list[str]) -> None:
     """Compares runs with the first of them."""
     from radejax import evaluate_files as commands
+    from radejax.errors import UserError
 
+    if _BOOTSTRAP.value == 0:
+        raise UserError("--bootstrap=0: a comparison needs resamples")
     text, _ = commands.compare_files(
         paths,
         _OUT.value,
         _source(),
         _options("comparison"),
-        resamples=_BOOTSTRAP.value or 2000,
+        resamples=2000 if _BOOTSTRAP.value is None else _BOOTSTRAP.value,
     )
     sys.stdout.write(text)
 
@@ -169,7 +181,7 @@ def _source() -> object:
     return Source(
         data=tuple(_DATA.value),
         labels=_LABELS.value,
-        label_version=_LABEL_VERSION.value,
+        label_version=_LABEL_VERSION.value or "v2.1",
         split=None if _SPLIT.value == "all" else _SPLIT.value,
         ground_truth=_GROUND_TRUTH.value,
         frames=_FRAMES.value,
@@ -194,7 +206,7 @@ def _options(name: str) -> object:
         iou_thresholds=thresholds,
         score_threshold=_SCORE.value,
         roi=None if _ROI.value == "none" else _ROI.value,
-        label_version=_LABEL_VERSION.value,
+        label_version=_LABEL_VERSION.value or "v2.1",
         bootstrap=200 if _BOOTSTRAP.value is None else _BOOTSTRAP.value,
         invalid_sizes=_SIZES.value,
         **changes,

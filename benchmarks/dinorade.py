@@ -206,7 +206,7 @@ def torch_model(variant, dtype, projection, image, reference):
     """Calls of the torch model by name, without gradient, and one with."""
     points = torch.tensor(np.array(reference.points)).reshape(BINS, ELEVATION, 2)
     model = torch_dinorade.DinoRade(full_size_config(variant, dtype), points)
-    model = model.to(torch_device())
+    model = model.to(torch_device()).eval()
     x = np.pad(projection, ((0, 0), (0, 0), (0, 5), (0, 0))).transpose(0, 3, 1, 2)
     x, image = (torch.tensor(a.copy(), device=torch_device()) for a in (x, image))
     features = model.embed(image)
@@ -246,6 +246,7 @@ def torch_model(variant, dtype, projection, image, reference):
 def rivals_of(variant, dtype, projection, image, reference, variables):
     """The torch calls, empty without torch or for another model than its own."""
     if torch is None or variant != "rcw":
+        print("no torch column:", "not installed" if torch is None else "rcw only")
         return {}
     model, calls = torch_model(variant, dtype, projection, image, reference)
     numbers = [sum(x.numel() for x in model.parameters())]

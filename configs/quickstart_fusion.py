@@ -41,8 +41,8 @@ def get_config(arg: str | None = None) -> ConfigDict:
         test_sequences=192,
         frames_per_sequence=1,  # another scene teaches more than the next 0.1 s
         output="projection",
-        image_width=320,
-        image_height=160,
+        image_width=640,  # the whole view, squeezed in height: objects are side by side
+        image_height=80,
     )
     grid = config.simulation.grid
     config.data.mirror_probability = 0.5

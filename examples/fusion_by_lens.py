@@ -12,7 +12,6 @@ evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same `--sp
 """
 
 import collections
-import dataclasses
 import pathlib
 
 import click
@@ -21,13 +20,14 @@ from tabulate import tabulate
 
 from radejax import camera_share, entry, files
 from radejax.data.records import RecordSource
-from radejax.data_paths import project_data
+from radejax.data_paths import OtherData
 from radejax.errors import UserError
 from radejax.evaluate_files import Source, load
-from radejax.evaluate_run import evaluation_name
+from radejax.evaluate_run import with_other_data
 from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.measure import repair_sizes
+from radejax.evaluation.predictions_io import frame_keys
 from radejax.simulation.dataset import MARKER
 from radejax.simulation.lens import cover_level
 from radejax.visualize.camera_share import mean_share
@@ -46,7 +46,10 @@ GROUPS = {
 
 def lens_of_frames(root, frames):
     """State of the lens in the rows of a frame table of a simulated data set."""
-    simulation = files.read_json(pathlib.Path(root) / MARKER)["config"]
+    marker = pathlib.Path(root) / MARKER
+    if not marker.exists():
+        raise UserError(f"{root} is no simulated data set: {MARKER} is missing")
+    simulation = files.read_json(marker)["config"]
     if simulation["scenes"] != "procedural":
         raise UserError(f"{root}: the lens is known of procedural scenes only")
     if not simulation["cover_lens"]:
@@ -122,20 +125,24 @@ def main(fusion, radar, out, data, split, resamples):
     """Compares FUSION with RADAR, two work folders evaluated on the same test split."""
     entry.set_up_jax()
     with entry.exit_codes():
-        run, name = load_run(fusion), "evaluation"
-        config = run.config
+        run, name = load_run(fusion), ""
         if data is not None:
-            run = dataclasses.replace(run, paths=project_data(config, [data]))
-            name = evaluation_name([data])
-        out = out or fusion / name.replace("evaluation", "by_lens")
-        reports = [folder / name for folder in (fusion, radar)]
+            other = OtherData(data=(data,))
+            run, name = with_other_data(run, other), f"_{other.name}"
+        if run.paths is None:
+            raise UserError(f"{fusion}: the run has no data, give --data ROOT")
+        config = run.config
+        out = out or fusion / f"by_lens{name}"
+        reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]
         frames = load(reports[0], Source(), tuple(config.classes))[2]
         dataset = run.paths.open(config, None if split == "all" else split)
-        if len(dataset) != len(frames["frame"]):
-            raise UserError(
-                f"{reports[0]} has {len(frames['frame'])} frames, split {split} has "
-                f"{len(dataset)}: give the split that was evaluated"
-            )
+        for report in reports:
+            table = load(report, Source(), tuple(config.classes))[2]
+            if frame_keys(table) != [frame.key for frame in dataset]:
+                raise UserError(
+                    f"{report} is of other frames than split {split} of "
+                    f"{run.paths.roots[0]}: evaluate both runs on it first"
+                )
         lens = lens_of_frames(run.paths.roots[0], frames)
         groups = {
             name: np.array(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -100,12 +99,15 @@ def _check_embeddable(config: ConfigDict) -> None:
         )
 
 
-def require_images(frames: Sequence[Frame], arguments: Mapping[str, Any]) -> None:
-    """`UserError` if no frame to train on has both an image and a calibration.
+def require_images(
+    frames: Sequence[Frame], arguments: Mapping[str, Any], split: str = "train"
+) -> None:
+    """`UserError` if no frame has both an image and a calibration.
 
     Args:
-        frames: Of the train split.
+        frames: Of the split.
         arguments: Of `loader_arguments`; empty for models without a camera.
+        split: Its name, for the message.
     """
     cameras = arguments.get("cameras")
     if cameras is None or any(camera.is_valid for camera in cameras):
@@ -121,7 +123,7 @@ def require_images(frames: Sequence[Frame], arguments: Mapping[str, Any]) -> Non
     }
     reasons = "; ".join(f"{n} have no {what}" for what, n in lacking.items() if n)
     raise UserError(
-        f"no frame of the train split ({len(frames)}) can use the camera: {reasons}"
+        f"no frame of the {split} split ({len(frames)}) can use the camera: {reasons}"
     )
 
 
@@ -234,11 +236,6 @@ def check_fits(model: DinoRade, variables: Mapping[str, Any], source: str) -> No
             f"weights of {source} do not fit config.model ({len(differing)} tensors), "
             f"for example: {'; '.join(differing[:3])}"
         )
-
-
-def saved_path(path: PathLike | None) -> str | None:
-    """Absolute path as a run keeps it."""
-    return None if path is None else str(pathlib.Path(path).absolute())
 
 
 def missing_backbone(params: Mapping[str, Any], config: ConfigDict) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import os
 import pathlib
@@ -11,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from radejax import camera_inputs
+from radejax import camera_inputs, files
 from radejax.camera_share import camera_share, write_camera_share
 from radejax.data.encoding import decode as decode_array
 from radejax.data.frame import Frame
 from radejax.data.frame_table import IMAGE_SIZE, read_left_image
 from radejax.data.kradar import KRadar
-from radejax.data.records import RecordSource
-from radejax.data_paths import DataPaths
+from radejax.data.kradar_files import read_grid
+from radejax.data.records import RecordSource, describe_grid
+from radejax.data_paths import OtherData, project
 from radejax.errors import UserError
 from radejax.evaluation.measure import Options
 from radejax.evaluation.predictions_io import tables_from_frames
@@ -40,7 +42,7 @@ def evaluate_run(
     num_pictures: int | None = None,
     image_backbone: str | os.PathLike | None = None,
     exchange_images: int | None = None,
-    paths: DataPaths | None = None,
+    other: OtherData | None = None,
 ) -> Report | None:
     """Evaluates a run's checkpoint as its config says, on all devices.
 
@@ -48,14 +50,14 @@ def evaluate_run(
         workdir: Of `train.py`.
         step: Of the checkpoint, or "best"; the newest if None.
         split: "test", "train", "all" or a split file.
-        out: Folder of the results; `evaluation` in the work folder if None, and of
-            other data `evaluation_<name of their folder>`.
+        out: Folder of the results; `evaluation` in the work folder if None, and
+            `evaluation_<name>` for other data.
         num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `load_run`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
             control of what a radar-camera model knows from the images. `out` then ends
             in `_exchanged`.
-        paths: Other data than the run's own, see `data_paths.project_data`.
+        other: Other data than the run's own; projected if they are not yet.
 
     Returns:
         The report that was written; None on all processes but the first, which return
@@ -63,13 +65,13 @@ def evaluate_run(
 
     Raises:
         UserError: There are no frames of the split, or images to exchange; the run has
-            no data and none are given, or they are from another radar grid.
+            no data and none are given; other data do not fit the run, or `out` has
+            results on others.
     """
     run = load_run(workdir, step, image_backbone)
-    config, name = run.config, "evaluation"
-    if paths is not None:
-        run = dataclasses.replace(run, paths=paths)
-        name = evaluation_name(paths.roots)
+    if other is not None:
+        run = with_other_data(run, other)
+    config = run.config
     if run.paths is None:
         raise UserError(
             f"{run.workdir}: trained on frames that were never written, there is no "
@@ -78,39 +80,78 @@ def evaluate_run(
     frames = run.paths.open(config, None if split == "all" else split)
     if not len(frames):
         raise UserError(f"no frames of split {split} in {', '.join(run.paths.roots)}")
-    records = RecordSource(run.paths.records)
-    if records.grid != run.grid:
-        raise UserError(
-            f"{records.folder}: the radar grid is another one than the run was trained "
-            f"on: {records.grid.shape_drea} cells (Doppler, range, elevation, azimuth) "
-            f"to {run.grid.shape_drea}, or the same number at other places"
-        )
-    options = config.evaluation
-    predictor = Predictor(
-        config, run.variables, run.grid, score_threshold=options.score_threshold
-    )
     seen = frames
     if exchange_images is not None:
         camera_inputs.require_camera(config)
         seen = with_images_exchanged(frames, exchange_images)
-        name += "_exchanged"
-    predictions = predict_dataset(
-        predictor,
-        records,
-        seen,
-        options.batch_size,
-        inputs=camera_inputs.loader_arguments(config, seen, run.paths.embeddings),
-    )
+    inputs = camera_inputs.loader_arguments(config, seen, run.paths.embeddings)
+    source = {
+        "step": run.step,
+        "split": split,
+        "exchange_images": exchange_images,
+        "label_version": config.data.label_version,
+        **dataclasses.asdict(run.paths),
+    }
+    name = "evaluation" if other is None else f"evaluation_{other.name}"
+    name += "" if exchange_images is None else "_exchanged"
+    if other is not None:
+        camera_inputs.require_images(frames, inputs, split)
+        if out is None:
+            _check_source(run.workdir / name, source)
+        processes.main_first(lambda: project(config, run.paths))
     out = pathlib.Path(out or run.workdir / name)
+    records = RecordSource(run.paths.records, grid=run.grid)
+    options = config.evaluation
+    predictor = Predictor(
+        config, run.variables, run.grid, score_threshold=options.score_threshold
+    )
+    predictions = predict_dataset(
+        predictor, records, seen, options.batch_size, inputs=inputs
+    )
     count = options.num_pictures if num_pictures is None else num_pictures
     return processes.main_only(
-        lambda: _report(run, split, frames, records, predictions, out, count)
+        lambda: _report(run, source, frames, records, predictions, out, count)
     )
 
 
-def evaluation_name(roots: Sequence[str]) -> str:
-    """Name of the folder of results of a run on other data than its own."""
-    return f"evaluation_{pathlib.Path(roots[0]).name}"
+def with_other_data(run: Run, other: OtherData) -> Run:
+    """A run with other data in place of its own; nothing is projected.
+
+    Raises:
+        UserError: They are of another radar grid, or without what a frozen image
+            backbone makes of their images.
+        FileNotFoundError: A folder is not there.
+    """
+    config, paths = run.config, other.paths(run.paths)
+    if other.label_version is not None:
+        config = config.copy_and_resolve_references()
+        config.data.label_version = other.label_version
+    grid = read_grid(list(map(pathlib.Path, paths.roots)))
+    if grid != run.grid:
+        raise UserError(
+            f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
+            f"{run.workdir} was trained on {describe_grid(run.grid)}"
+        )
+    is_blind = camera_inputs.missing_backbone(run.variables["params"], config)
+    if is_blind and paths.embeddings is None:
+        raise UserError(
+            f"{run.workdir} is without the weights of its image backbone: give "
+            "--image_backbone FOLDER, or --embeddings FOLDER of these images"
+        )
+    return dataclasses.replace(run, config=config, paths=paths)
+
+
+def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
+    """`UserError` if a folder has results on other data than these."""
+    if not (out / "source.json").exists():
+        return
+    found = files.read_json(out / "source.json")
+    names = ("roots", "labels", "label_version", "split")
+    for name in names:
+        if (there := found.get(name)) != (here := json.loads(json.dumps(source[name]))):
+            raise UserError(
+                f"{out} has results of {name} {there}, these are of {here}: give --out"
+            )
 
 
 def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
@@ -135,7 +176,7 @@ def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
 
 def _report(
     run: Run,
-    split: str,
+    source: Mapping[str, Any],
     frames: KRadar,
     records: RecordSource,
     predictions: Mapping[str, np.ndarray],
@@ -145,6 +186,7 @@ def _report(
     """Scores predictions, and writes and draws everything into `out`."""
     config = run.config
     out.mkdir(parents=True, exist_ok=True)
+    files.write_json(out / "source.json", source)
     drawer = FrameDrawer(records, frames, predictions, config)
     ground_truth, table = tables_from_frames(frames)
     report = write_report(
@@ -157,7 +199,7 @@ def _report(
         left_out_before=frames.summary().counts,
         draw_frame=drawer,
     )
-    _log.info("step %d, split %s\n%s", run.step, split, report.text)
+    _log.info("step %d, split %s\n%s", run.step, source["split"], report.text)
     if camera_inputs.has_camera(config):
         shares = camera_share(
             config, run.variables, records, frames, embeddings=run.paths.embeddings

@@ -19,7 +19,7 @@ from radejax.data import pipeline
 from radejax.data.augment import Augmentation
 from radejax.data.frame import Frame
 from radejax.data.records import RecordSource
-from radejax.data_paths import DataPaths, prepare_data
+from radejax.data_paths import DataPaths, prepare_data, saved_path
 from radejax.embed import embeddings_sha256, weights_sha256
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
@@ -120,8 +120,8 @@ def run(
                     camera_calibration=camera_calibration,
                 )
             ),
-            embeddings=camera_inputs.saved_path(embeddings),
-            image_backbone=camera_inputs.saved_path(image_backbone),
+            embeddings=saved_path(embeddings),
+            image_backbone=saved_path(image_backbone),
         )
         if _train_and_evaluate(config, workdir, paths, init_from):
             minutes = (time.perf_counter() - started) / 60

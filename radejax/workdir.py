@@ -4,7 +4,8 @@ config.json      the configuration; a run never changes it
 run.json         where its data are, versions, command
 checkpoints/     newest, best and last, by step
 metrics.jsonl    losses by step; tensorboard/ the same
-evaluation/      metrics.json, metrics.csv, tables, pictures of the last evaluation
+evaluation/      metrics.json, metrics.csv, tables, pictures of the last evaluation;
+                 evaluation_<name>/ of one on other data, source.json says on what
 lock             held by the training under way
 """
 
@@ -27,7 +28,7 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax import camera_inputs, files, models
-from radejax.data_paths import DataPaths
+from radejax.data_paths import DataPaths, saved_path
 from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -142,7 +143,7 @@ def run_info(
 
     A run that continues keeps the weights that it started from.
     """
-    init_from = camera_inputs.saved_path(init_from)
+    init_from = saved_path(init_from)
     if init_from is None and (workdir / "run.json").exists():
         init_from = files.read_json(workdir / "run.json").get("init_from")
     return {

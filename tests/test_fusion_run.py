@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax import camera_inputs, embed, experiment, workdir
+from radejax import camera_inputs, embed, experiment
 from radejax.cli import main
 from radejax.config import load_config
 from radejax.data.frame_table import make_table
 from radejax.data.records import RecordSource
-from radejax.data_paths import project_data
+from radejax.data_paths import OtherData
 from radejax.detect_files import detect_files, output_name
 from radejax.detector import Detector
 from radejax.errors import DataError, UserError
@@ -128,7 +128,7 @@ def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
     assert "image_backbone" not in stored
 
 
-def test_training_from_embeddings_is_the_same(data, from_images, embeddings):
+def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp_path):
     workdir = data.train("embedded", embeddings=str(embeddings))
     found, wanted = data.losses(workdir), data.losses(from_images)
     assert len(found) == len(wanted) > 0
@@ -140,6 +140,13 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings):
         for w in (workdir, from_images)
     ]
     assert reports[0]["ap"] == reports[1]["ap"]
+    other = shutil.copytree(data.folder, tmp_path / "other")
+    with pytest.raises(UserError, match="give --image_backbone FOLDER, or --embedd"):
+        evaluate_run(workdir, other=OtherData(data=(str(other),)))
+    given = OtherData(data=(str(other),), embeddings=str(embeddings))
+    evaluate_run(workdir, other=given, num_pictures=0)
+    report = json.loads((workdir / "evaluation_other/metrics.json").read_text())
+    assert report["ap"] == reports[0]["ap"]
 
 
 def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
@@ -372,19 +379,33 @@ def test_example_compares_fusion_and_radar_by_the_lens(
 
 
 def test_example_compares_on_another_data_set(
-    data, from_images, three_test_sequences, tmp_path
+    data, from_images, three_test_sequences, tmp_path, monkeypatch
 ):
     run = shutil.copytree(from_images, tmp_path / "run")
     other = shutil.copytree(data.folder, tmp_path / "other")
-    for paths in (None, project_data(workdir.load_config(run), [str(other)])):
-        evaluate_run(run, num_pictures=0, paths=paths)
+    for data in (None, OtherData(data=(str(other),))):
+        evaluate_run(run, num_pictures=0, other=data)
     results = []
-    for arguments in ((), ("--data", other)):
+    monkeypatch.chdir(other)
+    for arguments in ((), ("--data", ".")):
         _example("fusion_by_lens", run, run, *arguments, "--resamples", 10)
     for name in ("by_lens", "by_lens_other"):
         results.append((run / name / "by_lens.json").read_text())
     assert results[0] == results[1]
     assert len(json.loads(results[0])) > 1
+    evaluate_run(run, num_pictures=0, split="train")
+    with pytest.raises(AssertionError, match="other frames than split test"):
+        _example("fusion_by_lens", run, run)
+
+
+def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
+    other = shutil.copytree(data.folder, tmp_path / "other")
+    shutil.rmtree(other / "records")
+    for image in other.rglob("cam-front*.png"):
+        image.unlink()
+    with pytest.raises(UserError, match=r"no frame of the test split .* front image"):
+        evaluate_run(from_images, other=OtherData(data=(str(other),)))
+    assert not (other / "records").exists()
 
 
 def test_example_draws_reference_points(data, from_images, tmp_path):

@@ -131,12 +131,17 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     assert (tmp_path / "other" / "records" / "manifest.json").exists()
     found = folder / "run" / "evaluation_other" / "metrics.json"
     assert json.loads(found.read_text())["ap"] == _metrics(folder)["ap"]
+    source = json.loads(found.with_name("source.json").read_text())
+    assert source["roots"] == [str(tmp_path / "other")]
+    assert source["split"] == "test"
     for flag, message in (
-        ("--roi=wide", "--roi: the run's config says that"),
-        ("--records=x", "--records: only with --data"),
+        ("--roi=wide", "--roi: config.evaluation of the run says that"),
+        ("--split=train", "has results of split test, these are of train: give --out"),
+        ("--data=", "--data names no folder"),
         (f"--data={tmp_path / 'nowhere'}", "no such folder"),
     ):
-        done = evaluate(flag)
+        other = () if "data" in flag else (f"--data={tmp_path / 'other'}",)
+        done = evaluate(flag, *other)
         assert done.returncode == 2
         assert message in done.stderr
         assert "Traceback" not in done.stderr

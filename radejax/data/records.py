@@ -147,8 +147,8 @@ class RecordSource(ArrayRecords):
         self.grid = self.manifest.grid
         if grid is not None and grid != self.grid:
             raise UserError(
-                f"{folder}: records of a grid of {_describe(self.grid)}, expected "
-                f"{_describe(grid)}"
+                f"{folder}: records of a grid of {describe_grid(self.grid)}, expected "
+                f"{describe_grid(grid)}"
             )
         super().__init__(
             folder,
@@ -162,7 +162,7 @@ class RecordSource(ArrayRecords):
         return {"projection": self.read(int(index)), "frame": int(index)}
 
 
-def _describe(grid: RadarGrid) -> str:
+def describe_grid(grid: RadarGrid) -> str:
     """Sizes and extent of a grid, short."""
     sizes = " x ".join(map(str, grid.shape_drea))
     return (
