@@ -76,12 +76,13 @@ def draw_camera(
             "(radejax.data.frame_table.read_left_image), and CameraCalibration.resized "
             "follows a resized image"
         )
+    aspect = _pixel_aspect(calibration)
     if ax is None:
         width = 9.0
-        height = width * calibration.height / calibration.width
+        height = width * aspect * calibration.height / calibration.width
         total = height + (0.35 if title else 0.0)
         ax = new_figure(width, total).add_axes((0, 0, 1, height / total))
-    ax.imshow(image, interpolation="bilinear")
+    ax.imshow(image, interpolation="bilinear", aspect=aspect)
     ax.set_axis_off()
     # Pixel centers are whole numbers in imshow, half numbers in the calibration.
     ax.set(xlim=(-0.5, calibration.width - 0.5), ylim=(calibration.height - 0.5, -0.5))
@@ -161,5 +162,12 @@ def _draw_boxes(
 
 
 def _points_per_pixel(ax: Axes, calibration: CameraCalibration) -> float:
-    """Points on paper of a pixel of the image."""
-    return ax.get_window_extent().width / calibration.width * 72 / ax.figure.dpi
+    """Points on paper of a pixel's height."""
+    width = ax.get_window_extent().width / calibration.width * 72 / ax.figure.dpi
+    return width * _pixel_aspect(calibration)
+
+
+def _pixel_aspect(calibration: CameraCalibration) -> float:
+    """Height over width of a pixel drawn so that squeezed images look natural."""
+    focal_x, focal_y = np.asarray(calibration.intrinsics)[:2]
+    return float(focal_x / focal_y)

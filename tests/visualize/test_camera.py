@@ -36,6 +36,19 @@ def test_edges_by_hand():
     assert ax.get_ylim()[0] > ax.get_ylim()[1]
 
 
+def test_squeezed_images_look_natural():
+    squeezed = CALIBRATION.resized(128, 18)
+    image = np.zeros((18, 128, 3), np.uint8)
+    sizes = []
+    for picture, calibration in ((IMAGE, CALIBRATION), (image, squeezed)):
+        ax = camera.draw_camera(
+            picture, calibration, ground_truth=([BOX], ["Sedan"]), title="frame"
+        )
+        sizes.append([*ax.figure.get_size_inches(), *ax.get_window_extent().size])
+        assert [t.get_text() for t in ax.texts] == ["Sedan"]
+    np.testing.assert_allclose(*sizes, rtol=1e-6)
+
+
 def test_tinted_face_is_the_front():
     ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=([BOX], ["Sedan"]))
     face = ax.collections[0].get_paths()[0].vertices
