@@ -87,6 +87,14 @@ def compiled(function, *args):
     return lambda: jax.block_until_ready(program(*args)), memory
 
 
+def matrix_rate(size=2048, repeats=5):
+    """GFLOP/s of a float32 matrix product: what this machine can give at best."""
+    x = jnp.ones((size, size))
+    call, _ = compiled(jnp.matmul, x, x)
+    (wall, _) = measure({"product": call}, repeats)["product"]
+    return 2e-9 * size**3 / wall
+
+
 # Deformable attention ----------------------------------------------------------------
 
 
@@ -211,21 +219,19 @@ def torch_model(variant, dtype, projection, image, reference):
     x, image = (torch.tensor(a.copy(), device=torch_device()) for a in (x, image))
     features = model.embed(image)
 
-    def no_gradient(call):
+    def cast():
         is_half = dtype == "bfloat16"
-        with (
-            torch.inference_mode(),
-            torch.autocast(torch_device(), torch.bfloat16, enabled=is_half),
-        ):
+        return torch.autocast(torch_device(), torch.bfloat16, enabled=is_half)
+
+    def no_gradient(call):
+        with torch.inference_mode(), cast():
             call()
         finish()
 
     def gradient(embed):
         model.train()
         model.zero_grad(set_to_none=True)
-        with torch.autocast(
-            torch_device(), torch.bfloat16, enabled=dtype == "bfloat16"
-        ):
+        with cast():
             heatmap, boxes = model(x, embed())
         (heatmap.float().square().mean() + boxes.float().square().mean()).backward()
         model.eval()
@@ -340,6 +346,7 @@ def main():
     names += ["times faster", "in CPU s"]
     print(f"{jax.devices()[0].device_kind}, {args.variant}, {args.dtype}")
     print(tabulate(rows, names, floatfmt=".2f"))
+    print(f"a plain matrix product here: {matrix_rate():.0f} GFLOP/s")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"peak memory of this process: {peak:.2f} GiB")
 

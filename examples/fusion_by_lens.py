@@ -134,11 +134,10 @@ def main(fusion, radar, out, data, split, resamples):
         config = run.config
         out = out or fusion / f"by_lens{name}"
         reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]
-        frames = load(reports[0], Source(), tuple(config.classes))[2]
         dataset = run.paths.open(config, None if split == "all" else split)
         for report in reports:
-            table = load(report, Source(), tuple(config.classes))[2]
-            if frame_keys(table) != [frame.key for frame in dataset]:
+            frames = load(report, Source(), tuple(config.classes))[2]
+            if frame_keys(frames) != [frame.key for frame in dataset]:
                 raise UserError(
                     f"{report} is of other frames than split {split} of "
                     f"{run.paths.roots[0]}: evaluate both runs on it first"

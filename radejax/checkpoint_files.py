@@ -248,7 +248,7 @@ def model_config(model: nn.Module) -> dict[str, Any]:
 
 
 def _camera_fields(model: Any) -> dict[str, Any]:
-    from radejax.models import dinorade
+    from radejax.models import dinorade_config
     from radejax.models.vit import ViT
 
     vit = model.vit or ViT()
@@ -259,8 +259,10 @@ def _camera_fields(model: Any) -> dict[str, Any]:
         "standardize": model.standardize_image,
         "resnet_width": model.resnet_width,
     }
-    image |= {k: getattr(vit, k) for k in dinorade.IMAGE_FIELDS if k not in image}
-    axes = {name: getattr(model.axes, name) for name in dinorade.AXES_FIELDS}
+    image |= {
+        k: getattr(vit, k) for k in dinorade_config.IMAGE_FIELDS if k not in image
+    }
+    axes = {name: getattr(model.axes, name) for name in dinorade_config.AXES_FIELDS}
     return {"image": image, "fusion": dict(model.fusion), "axes": axes}
 
 

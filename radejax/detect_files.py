@@ -20,7 +20,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.tesseract import read_frame
 from radejax.detector import Detector
 from radejax.errors import UserError
-from radejax.geometry.camera import Camera
+from radejax.geometry.camera_projection import Camera
 from radejax.open_detector import open_detector
 from radejax.structures import Detections
 

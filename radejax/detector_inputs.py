@@ -17,12 +17,8 @@ from radejax.data.cameras import no_camera
 from radejax.data.frame_table import read_left_image
 from radejax.data.tesseract import read_frame
 from radejax.errors import UserError
-from radejax.geometry.camera import (
-    Camera,
-    CameraCalibration,
-    ImageKind,
-    stack_cameras,
-)
+from radejax.geometry.camera import CameraCalibration, ImageKind
+from radejax.geometry.camera_projection import Camera, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
 import pathlib
@@ -91,6 +90,7 @@ def evaluate_run(
         "exchange_images": exchange_images,
         "label_version": config.data.label_version,
         **dataclasses.asdict(run.paths),
+        "roots": list(run.paths.roots),  # as JSON has them
     }
     name = "evaluation" if other is None else f"evaluation_{other.name}"
     name += "" if exchange_images is None else "_exchanged"
@@ -146,9 +146,8 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     if not (out / "source.json").exists():
         return
     found = files.read_json(out / "source.json")
-    names = ("roots", "labels", "label_version", "split")
-    for name in names:
-        if (there := found.get(name)) != (here := json.loads(json.dumps(source[name]))):
+    for name in ("roots", "labels", "label_version", "split"):
+        if (there := found.get(name)) != (here := source[name]):
             raise UserError(
                 f"{out} has results of {name} {there}, these are of {here}: give --out"
             )

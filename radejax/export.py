@@ -21,7 +21,7 @@ from radejax import checkpoint_files, exported_loader, files
 from radejax.checkpoint_files import BACKBONE
 from radejax.detector import Detector
 from radejax.errors import UserError
-from radejax.geometry.camera import Camera
+from radejax.geometry.camera_projection import Camera
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 KNOWN_PLATFORMS = (*PLATFORMS, "rocm")

@@ -9,7 +9,7 @@ import pytest
 
 from radejax import Detector, UserError
 from radejax.detector_inputs import CameraOptions, prepare
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera_projection import stack_cameras
 from radejax.models.lifting import reference_points
 from radejax.structures import Batch
 

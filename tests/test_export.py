@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from radejax import Detector, UserError, export
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera_projection import stack_cameras
 
 from . import small_models as small
 

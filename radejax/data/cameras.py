@@ -10,7 +10,8 @@ import numpy as np
 
 from radejax.data.frame import Frame
 from radejax.errors import UserError
-from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
+from radejax.geometry.camera import CameraCalibration, ImageKind
+from radejax.geometry.camera_projection import Camera
 
 _log = logging.getLogger(__name__)
 

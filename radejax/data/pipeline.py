@@ -23,7 +23,7 @@ from radejax.data.frame_table import (
 )
 from radejax.data.records import RecordSource
 from radejax.errors import UserError
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera_projection import stack_cameras
 from radejax.structures import CLASSES, Batch
 
 __all__ = [

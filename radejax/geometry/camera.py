@@ -1,9 +1,10 @@
-"""Where points of the radar's world appear in the camera image.
+"""Calibration of a camera: from K-Radar's files to what projects points onto an image.
 
 Frames: LiDAR and ego (radar) have parallel axes, x forward, y left, z up, and differ by
 a translation; the camera frame is x right, y down, z forward (depth). Pixels count from
 the upper left corner of the image, u to the right and v down. Host code uses
-`CameraCalibration` (NumPy, float64); jitted code gets the same numbers as a `Camera`.
+`CameraCalibration` (NumPy, float64); jitted code gets the same numbers as a
+`camera_projection.Camera`.
 """
 
 from __future__ import annotations
@@ -14,12 +15,11 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from radejax.errors import DataError, UserError
+from radejax.geometry.boxes import corners
+from radejax.geometry.camera_projection import Camera, project, to_camera, to_pixels
 
 ImageKind = Literal["raw", "rectified", "pinhole"]
 
@@ -36,36 +36,12 @@ _SHIFTS = ("x_ldr2cam", "y_ldr2cam", "z_ldr2cam")
 _LENS = ("k1", "k2", "k3", "k4", "k5")
 _PINHOLE = ("fx", "fy", "px", "py")
 
-# Lower square, then upper square, counter-clockwise from the front left corner.
-_SQUARE = ((0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5))
-_UNIT_CORNERS = np.array([(x, y, z) for z in (-0.5, 0.5) for x, y in _SQUARE])
+# Between the corners of `boxes.corners`.
 _BOX_EDGES = np.array(
     [(i, (i + 1) % 4) for i in range(4)]
     + [(4 + i, 4 + (i + 1) % 4) for i in range(4)]
     + [(i, 4 + i) for i in range(4)]
 )
-
-
-@struct.dataclass
-class Camera:
-    """A calibrated camera as arrays, one or a batch of them: a pytree for jitted code.
-
-    Attributes:
-        cam_from_ego: `[..., 3, 4]` rotation and translation, metres.
-        intrinsics: `[..., 4]` fx, fy, cx, cy in pixels.
-        distortion: `[..., 5]` k1, k2, p1, p2, k3 (OpenCV's order); zeros for none.
-        max_radius: `[...]` largest tangent of the viewing angle at which the distortion
-            is still one-to-one.
-        size_px: `[..., 2]` width and height of the image.
-        is_valid: `[...]` bool, False where the frame has no usable image.
-    """
-
-    cam_from_ego: Any
-    intrinsics: Any
-    distortion: Any
-    max_radius: Any
-    size_px: Any
-    is_valid: Any
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -270,8 +246,7 @@ class CameraCalibration:
             on the raw image), and `[N, 12]` bool, False for edges out of sight.
         """
         camera = self.camera(image)
-        corners = _box_corners(np.asarray(boxes, np.float64))
-        corners_cam = _to_camera(corners, camera)
+        corners_cam = to_camera(corners(np.asarray(boxes, np.float64)), camera)
         ends = corners_cam[:, _BOX_EDGES]  # [N, 12, 2, 3]
         depth = ends[..., 2]
         is_visible = (depth > near_m).any(-1)
@@ -280,7 +255,7 @@ class CameraCalibration:
         safe = np.where(span == 0, 1.0, span)
         part = np.where(depth < near_m, (near_m - depth) / safe, 0.0)
         ends = ends + np.clip(part, 0, 1)[..., None] * (ends[..., ::-1, :] - ends)
-        return _to_pixels(ends, camera, 0.0), is_visible
+        return to_pixels(ends, camera, 0.0), is_visible
 
     # Value semantics -----------------------------------------------------------------
 
@@ -297,89 +272,12 @@ class CameraCalibration:
         return hash(self._key())
 
 
-# Projection, NumPy or JAX ------------------------------------------------------------
-
-
-def project(
-    points_ego: Any, camera: Camera, *, depth_offset_m: float = 0.0
-) -> tuple[Any, Any]:
-    """Pixels and depth of points in the ego frame.
-
-    With `(x, y, z) = cam_from_ego (p, 1)`, the pixel is `fx d(x/z) + cx` and likewise
-    for v, where d is the lens distortion (Brown's model as in OpenCV).
-
-    Args:
-        points_ego: `[..., 3]` metres.
-        camera: A single camera, or a batch of them whose axes are the points' first.
-        depth_offset_m: Added to the depth before the division; the released DinoRADE
-            adds 1e-6.
-
-    Returns:
-        Pixels `[..., 2]` (u, v) and depth `[...]` in metres. Where the depth is not
-        positive the pixels are finite but mean nothing.
-    """
-    points_cam = _to_camera(points_ego, camera)
-    return _to_pixels(points_cam, camera, depth_offset_m), points_cam[..., 2]
-
-
-def stack_cameras(cameras: Sequence[Camera]) -> Camera:
-    """A batch from single cameras, float32 as the accelerator computes."""
-
-    def stack(*leaves: Any) -> np.ndarray:
-        stacked = np.stack(leaves)
-        return stacked if stacked.dtype == bool else stacked.astype(np.float32)
-
-    return jax.tree.map(stack, *cameras)
-
-
-def _to_camera(points: Any, camera: Camera) -> Any:
-    xp = _array_module(points, camera.cam_from_ego)
-    rotation, shift = camera.cam_from_ego[..., :3], camera.cam_from_ego[..., 3]
-    batch = shift.shape[:-1]
-    ones = (1,) * (points.ndim - shift.ndim)  # several points a camera
-    rotation = xp.reshape(rotation, batch + ones + (3, 3))
-    shift = xp.reshape(shift, batch + ones + (3,))
-    # Products and sums rather than a matrix product, which accelerators may round.
-    return xp.sum(rotation * points[..., None, :], -1) + shift
-
-
-def _to_pixels(points_cam: Any, camera: Camera, depth_offset_m: float) -> Any:
-    xp = _array_module(points_cam, camera.intrinsics)
-    depth = points_cam[..., 2] + depth_offset_m
-    depth = xp.where(depth == 0, 1e-12, depth)
-    extra = depth.ndim - np.ndim(camera.max_radius)
-
-    def spread(value: Any) -> Any:  # batch axes of the camera to the front
-        return xp.reshape(value, np.shape(value) + (1,) * extra)
-
-    fx, fy, cx, cy = (spread(camera.intrinsics[..., i]) for i in range(4))
-    k1, k2, p1, p2, k3 = (spread(camera.distortion[..., i]) for i in range(5))
-    x, y = points_cam[..., 0] / depth, points_cam[..., 1] / depth
-    square = x * x + y * y
-    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
-    x_seen = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-    y_seen = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-    # Past the fold the polynomial brings points back into the image: leave them out.
-    folds = square > spread(camera.max_radius) ** 2
-    x_seen, y_seen = xp.where(folds, x * 1e3, x_seen), xp.where(folds, y * 1e3, y_seen)
-    return xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
-
-
 def _fold_radius(distortion: np.ndarray) -> float:
     """Smallest radius at which the radial distortion stops growing; large for none."""
     k1, k2, _, _, k3 = distortion
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
     return math.sqrt(real.min()) if real.size else 1e6
-
-
-def _box_corners(boxes: np.ndarray) -> np.ndarray:
-    """Corners `[N, 8, 3]` of boxes `[N, 7]`."""
-    local = _UNIT_CORNERS * boxes[:, None, 3:6]
-    sin, cos = np.sin(boxes[:, 6:7]), np.cos(boxes[:, 6:7])
-    x = local[..., 0] * cos - local[..., 1] * sin
-    y = local[..., 0] * sin + local[..., 1] * cos
-    return np.stack([x, y, local[..., 2]], -1) + boxes[:, None, :3]
 
 
 def _rotation(axis: int, angle: float) -> np.ndarray:
@@ -412,8 +310,3 @@ def _choose(name: str, **options: Any) -> Any:
     if name not in options:
         raise UserError(f"image must be one of {', '.join(options)}, got {name!r}")
     return options[name]
-
-
-def _array_module(*values: Any) -> Any:
-    on_host = all(isinstance(v, np.ndarray | np.generic | float | int) for v in values)
-    return np if on_host else jnp

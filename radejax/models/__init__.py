@@ -12,7 +12,7 @@ from radejax.errors import UserError
 
 _MODULES = {
     "radenet": "radejax.models.radenet",
-    "dinorade": "radejax.models.dinorade",
+    "dinorade": "radejax.models.dinorade_config",
 }
 
 

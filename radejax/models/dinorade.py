@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from radejax.errors import UserError
-from radejax.geometry.camera import Camera
+from radejax.geometry.camera_projection import Camera
 from radejax.models import radenet
 from radejax.models.backbone import Backbone
 from radejax.models.camera_neck import CameraNeck
@@ -23,7 +23,6 @@ from radejax.models.fusion import Fusion
 from radejax.models.heads import Heads
 from radejax.models.image import normalize
 from radejax.models.lifting import (
-    MARGIN_PX,
     LiftingAxes,
     ReferencePoints,
     reference_points,
@@ -224,144 +223,6 @@ def _check_projection(projection: jax.Array, radar: radenet.RadeNet) -> None:
             f"projection must be [B, R, A, {channels}] with {radar.doppler_bins} "
             f"Doppler and {radar.elevation_bins} elevation channels, got "
             f"{projection.shape}"
-        )
-
-
-# Config ------------------------------------------------------------------------------
-
-FUSION_FIELDS = (
-    "num_heads",
-    "num_points",
-    "num_elevation",
-    "weighting",
-    "gate",
-    "invalid",
-    "necks",
-    "dropout",
-    "chunk_size",
-)
-"""Fields of `config.model.fusion`."""
-
-IMAGE_FIELDS = (
-    "kind",
-    "size",
-    "freeze",
-    "standardize",
-    "hidden_size",
-    "num_layers",
-    "num_heads",
-    "mlp_dim",
-    "patch_size",
-    "num_registers",
-    "gated_mlp",
-    "layer_scale",
-    "attention",
-    "resnet_width",
-)
-"""Fields of `config.model.image`."""
-
-AXES_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
-"""Fields of `config.model.axes`."""
-
-FIELDS = (*radenet.FIELDS, "image", "fusion", "axes")
-"""Fields of a model config beside `name`."""
-
-_CHOICES = {
-    "image.kind": ("vit", "resnet50"),
-    "image.attention": ("auto", "blocked", "xla", "cudnn"),
-    "fusion.weighting": ("mlp", "cnn", "off"),
-    "fusion.gate": ("channel", "bin"),
-    "fusion.invalid": ("drop", "official"),
-}
-
-
-def from_config(config: Mapping[str, Any]) -> DinoRade:
-    """DinoRADE as a config describes it.
-
-    Args:
-        config: Exactly the keys `name` and `FIELDS`; RADE-Net's keys describe the radar
-            branch, `image`, `fusion` and `axes` are mappings with exactly their fields.
-
-    Raises:
-        UserError: A key is missing or unknown, or a value is not possible.
-    """
-    fields = {key: config[key] for key in config if key != "name"}
-    radenet.check_keys(fields, FIELDS, "model")
-    sections = {"image": IMAGE_FIELDS, "fusion": FUSION_FIELDS, "axes": AXES_FIELDS}
-    image, fusion, axes = (
-        dict(_section(fields, name, keys)) for name, keys in sections.items()
-    )
-    for key, choices in _CHOICES.items():
-        section, name = key.split(".")
-        if fields[section][name] not in choices:
-            raise UserError(
-                f"config.model.{key} is {fields[section][name]!r}, expected one of "
-                f"{choices}"
-            )
-    if image["kind"] == "resnet50" and not image["freeze"]:
-        raise UserError(
-            "config.model.image.freeze is False, but the ResNet's first stages have "
-            "fixed batch statistics and are not to be trained (its last stage is)"
-        )
-    radar = {k: fields[k] for k in radenet.FIELDS}
-    model = DinoRade(
-        radar=radenet.from_config({"name": "radenet"} | radar),
-        vit=_vit(image) if image["kind"] == "vit" else None,
-        fusion=fusion,
-        axes=LiftingAxes(
-            **{k: tuple(float(v) for v in axes[k]) for k in AXES_FIELDS},
-            num_elevation=fusion["num_elevation"],
-        ),
-        image_size=tuple(image["size"]),
-        freeze=image["freeze"],
-        resnet_width=image["resnet_width"],
-        standardize_image=image["standardize"],
-    )
-    _check_sizes(model)
-    return model
-
-
-def _section(
-    fields: Mapping[str, Any], name: str, keys: tuple[str, ...]
-) -> Mapping[str, Any]:
-    section = fields[name]
-    if not isinstance(section, Mapping) and not hasattr(section, "keys"):
-        raise UserError(f"config.model.{name} must be a mapping, got {section!r}")
-    radenet.check_keys(dict(section), keys, f"model.{name}")
-    return section
-
-
-def _vit(image: Mapping[str, Any]) -> ViT:
-    names = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
-    names += ("num_registers", "gated_mlp", "layer_scale", "attention")
-    activation = "silu" if image["gated_mlp"] else "gelu"
-    return ViT(**{n: image[n] for n in names}, activation=activation)
-
-
-def _check_sizes(model: DinoRade) -> None:
-    stride = STRIDE if model.vit is None else model.vit.patch_size
-    if any(n < stride or n % stride for n in model.image_size):
-        raise UserError(
-            f"config.model.image.size is {model.image_size}; height and width must be "
-            f"multiples of {stride}"
-        )
-    if model.vit is not None:
-        heads, hidden = model.vit.num_heads, model.vit.hidden_size
-        if hidden % heads or (hidden // heads) % 4:
-            raise UserError(
-                f"config.model.image: {hidden} channels in {heads} heads; each head "
-                "needs a multiple of 4"
-            )
-    if model.fusion["invalid"] == "official" and model.image_size[1] <= 2 * MARGIN_PX:
-        raise UserError(
-            f"config.model.fusion.invalid='official' leaves out {MARGIN_PX} pixels left "
-            f"and right, but config.model.image.size is {model.image_size}"
-        )
-    width, heads = model.radar.decoder_width, model.fusion["num_heads"]
-    if width % heads:
-        raise UserError(
-            f"config.model: fusion.num_heads = {heads} does not divide decoder_width = "
-            f"{width}"
         )
 
 

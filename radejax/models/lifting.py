@@ -21,7 +21,8 @@ import numpy as np
 from flax import struct
 
 from radejax.errors import UserError
-from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, project
+from radejax.geometry.camera import CameraCalibration, ImageKind
+from radejax.geometry.camera_projection import Camera, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
 

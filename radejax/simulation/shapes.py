@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from radejax.geometry.camera import CameraCalibration, project
+from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.camera_projection import project
 from radejax.simulation import details, lens
 
 # A block in units of the half extents: x, y, z ranges; colour role; share kept of the

@@ -14,7 +14,8 @@ from radejax.data.augment import (
 )
 from radejax.data.encoding import decode, encode
 from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration, project
+from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.camera_projection import project
 from radejax.geometry.radar_grid import RadarGrid
 
 GRID = RadarGrid.reduced(num_doppler=6, num_range=16, num_elevation=5, num_azimuth=12)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.camera_projection import stack_cameras
 from radejax.models import build, dinorade, lifting
 from radejax.models.lifting import ReferencePoints
 from radejax.models.radenet import RadeNet

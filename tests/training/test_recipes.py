@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from radejax import experiment, models
-from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.camera_projection import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import radenet_torch
 from radejax.structures import Batch
