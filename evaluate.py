@@ -15,7 +15,7 @@ import sys
 
 from absl import app, flags
 
-from radejax import entry
+from radejax.cli import entry
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "Folder of a run of train.py.")
 _CHECKPOINT = flags.DEFINE_string(
@@ -96,7 +96,7 @@ _BY_CONFIG = (
 def main(argv: list[str]) -> None:
     """Chooses between a run, files and a comparison."""
     with entry.exit_codes(debug=_DEBUG.value):
-        from radejax.errors import UserError
+        from radejax.core.errors import UserError
 
         modes = [f for f in (_WORKDIR, _PREDICTIONS, _COMPARE) if f.value is not None]
         if len(modes) != 1:
@@ -120,9 +120,9 @@ def main(argv: list[str]) -> None:
 def evaluate_workdir() -> None:
     """Runs the detector of a run over a split; the config of the run has the options."""
     entry.set_up_jax()
-    from radejax.data_paths import OtherData
-    from radejax.errors import UserError
-    from radejax.evaluate_run import evaluate_run
+    from radejax.core.errors import UserError
+    from radejax.runs.data import OtherData
+    from radejax.runs.evaluate import evaluate_run
 
     step = _CHECKPOINT.value
     if step is not None and step != "best":
@@ -150,7 +150,7 @@ def evaluate_files() -> None:
     """Evaluates predictions in files."""
     import pathlib
 
-    from radejax import evaluate_files as commands
+    from radejax.evaluation.report import compare as commands
 
     path = pathlib.Path(_PREDICTIONS.value)
     out = _OUT.value or path.with_name(f"{path.stem}_evaluation")
@@ -160,8 +160,8 @@ def evaluate_files() -> None:
 
 def compare(paths: list[str]) -> None:
     """Compares runs with the first of them."""
-    from radejax import evaluate_files as commands
-    from radejax.errors import UserError
+    from radejax.core.errors import UserError
+    from radejax.evaluation.report import compare as commands
 
     if _BOOTSTRAP.value == 0:
         raise UserError("--bootstrap=0: a comparison needs resamples")
@@ -176,7 +176,7 @@ def compare(paths: list[str]) -> None:
 
 
 def _source() -> object:
-    from radejax.evaluate_files import Source
+    from radejax.evaluation.report.compare import Source
 
     return Source(
         data=tuple(_DATA.value),
@@ -189,8 +189,8 @@ def _source() -> object:
 
 
 def _options(name: str) -> object:
-    from radejax.errors import UserError
-    from radejax.evaluation.measure import Options
+    from radejax.core.errors import UserError
+    from radejax.evaluation.report.measure import Options
 
     try:
         thresholds = tuple(float(value) for value in _IOU.value)

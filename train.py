@@ -11,7 +11,7 @@ start it once on each, with --distributed (docs/training.md, examples/slurm.sh).
 from absl import app, flags
 from ml_collections import config_flags
 
-from radejax import entry
+from radejax.cli import entry
 
 _CONFIG = config_flags.DEFINE_config_file("config", None, "Config file, with :words.")
 _WORKDIR = flags.DEFINE_string(
@@ -66,7 +66,7 @@ def main(_: list[str]) -> None:
         place = _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
         if _DISTRIBUTED.value or place != (None,) * 3:
             entry.join_processes(*place)
-        from radejax import experiment
+        from radejax.runs import experiment
 
         experiment.run(
             _CONFIG.value,

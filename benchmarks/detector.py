@@ -10,7 +10,7 @@ import argparse
 import json
 import pathlib
 
-from radejax.benchmark import as_table, measure, untrained
+from radejax.inference.benchmark import as_table, measure, untrained
 
 CONFIG = pathlib.Path(__file__).resolve().parents[1] / "configs" / "radenet.py"
 

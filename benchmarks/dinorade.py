@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from tabulate import tabulate
 
-from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.calibration import CameraCalibration
 from radejax.models import build
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import static_reference_points

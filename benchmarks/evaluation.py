@@ -15,10 +15,10 @@ import time
 
 import numpy as np
 
+from radejax.core.structures import CLASSES
 from radejax.evaluation.average_precision import EvaluationSet
-from radejax.evaluation.measure import Options, measure
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.structures import CLASSES
+from radejax.evaluation.report.measure import Options, measure
 
 WEATHERS = (
     "normal",

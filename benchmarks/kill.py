@@ -25,14 +25,15 @@ import time
 import jax
 import numpy as np
 
-from radejax import entry, experiment
+from radejax.cli import entry
+from radejax.runs import experiment
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
 # Every start is a new process that has the modules already: imports are not tested.
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
-    ["radejax.entry", "radejax.evaluate_run", "radejax.simulation.dataset"]
+    ["radejax.cli.entry", "radejax.runs.evaluate", "radejax.simulation.dataset"]
 )
 
 

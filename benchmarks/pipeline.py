@@ -22,8 +22,8 @@ import numpy as np
 from absl import flags
 
 from radejax.data.pipeline import make_loader
-from radejax.data.record_files import RecordFileWriter, file_name
-from radejax.data.records import Manifest, RecordSource, write_manifest
+from radejax.data.records.files import RecordFileWriter, file_name
+from radejax.data.records.projections import Manifest, RecordSource, write_manifest
 from radejax.geometry.radar_grid import RadarGrid
 
 FRAMES_PER_FILE = 64

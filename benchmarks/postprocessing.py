@@ -19,10 +19,10 @@ import numpy as np
 import shapely
 from tabulate import tabulate
 
+from radejax.core.structures import DetectionMaps
 from radejax.detection.decode import decode
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import DetectionMaps
 
 GRID = RadarGrid.kradar().padded(8)
 SHAPE = (GRID.num_range, GRID.num_azimuth, 5)

@@ -18,7 +18,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.io
 
-from radejax.data.kradar_write import write_tesseract
+from radejax.data.kradar.write import write_tesseract
 from radejax.data.projection import project, project_plain
 from radejax.data.tesseract import project_file
 

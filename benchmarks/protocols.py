@@ -12,7 +12,7 @@ import pathlib
 import numpy as np
 
 from radejax.evaluation.average_precision import PROTOCOLS, EvaluationSet, mean_ap
-from radejax.evaluation.layouts import Table, number
+from radejax.evaluation.report.tables import Table, number
 
 
 def load(folder: pathlib.Path) -> tuple[EvaluationSet, np.ndarray]:

@@ -23,13 +23,13 @@ import optax
 from tabulate import tabulate
 
 from radejax import models
-from radejax.config import base_config
+from radejax.core.config import base_config
+from radejax.core.structures import Batch
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import radenet_torch
 from radejax.losses.detection import detection_loss
 from radejax.models.summary import summarize
-from radejax.structures import Batch
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 try:

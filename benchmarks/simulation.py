@@ -25,13 +25,13 @@ import time
 import jax
 import numpy as np
 
-from radejax.data import kradar_write
-from radejax.simulation import radar
-from radejax.simulation.camera import CameraRenderer, stereo_calibration
+from radejax.data.kradar import write as kradar_write
+from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
 from radejax.simulation.dataset import encode_png, simulate_dataset
+from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import SequenceSimulator
-from radejax.simulation.traffic import make_sequence
+from radejax.simulation.world.traffic import make_sequence
 
 PIECES = ("tree", "tesseract", "fused", "parts")
 
@@ -101,7 +101,7 @@ class Bench:
         grid, parameters = self.simulator.grid, self.simulator.parameters
 
         def one(scatterers, noise, key):
-            return radar.simulate(
+            return tensor.simulate(
                 scatterers, noise, key, grid=grid, parameters=parameters,
                 rows_per_step=self.rows,
             )  # fmt: skip

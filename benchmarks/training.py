@@ -25,11 +25,11 @@ import numpy as np
 from tabulate import tabulate
 
 from radejax import models
-from radejax.config import base_config
+from radejax.core.config import base_config
+from radejax.core.structures import Batch
 from radejax.data.pipeline import make_loader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.radenet import REMAT
-from radejax.structures import Batch
 from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step, map_grid

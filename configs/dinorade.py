@@ -29,7 +29,7 @@ import types
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
-from radejax.config import base_config, parse_words
+from radejax.core.config import base_config, parse_words
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 

@@ -11,7 +11,7 @@ that everything works.
 
 from ml_collections import ConfigDict
 
-from radejax.config import base_config, parse_words
+from radejax.core.config import base_config, parse_words
 from radejax.simulation.config import default_config
 
 

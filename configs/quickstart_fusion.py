@@ -17,7 +17,7 @@ import types
 
 from ml_collections import ConfigDict
 
-from radejax.config import base_config, parse_words
+from radejax.core.config import base_config, parse_words
 from radejax.models.lifting import LiftingAxes
 from radejax.simulation.config import SimulationConfig, default_config
 

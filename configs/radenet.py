@@ -22,7 +22,7 @@ of 17,458 frames.
 
 from ml_collections import ConfigDict
 
-from radejax.config import base_config, parse_words
+from radejax.core.config import base_config, parse_words
 
 _OFF = {"cbam": "off", "neck": "plain", "heads": "default"}
 

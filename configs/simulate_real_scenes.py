@@ -10,7 +10,7 @@ has the numbers to expect, beside those of a classical detector (CFAR).
 
 from ml_collections import ConfigDict
 
-from radejax.config import base_config, parse_words
+from radejax.core.config import base_config, parse_words
 from radejax.simulation.config import default_config
 
 

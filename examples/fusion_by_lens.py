@@ -18,20 +18,22 @@ import click
 import numpy as np
 from tabulate import tabulate
 
-from radejax import camera_share, entry, files
-from radejax.data.records import RecordSource
-from radejax.data_paths import OtherData
-from radejax.errors import UserError
-from radejax.evaluate_files import Source, load
-from radejax.evaluate_run import with_other_data
-from radejax.evaluation import bootstrap
+from radejax.cli import entry
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.data.records.projections import RecordSource
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.measure import repair_sizes
-from radejax.evaluation.predictions_io import frame_keys
+from radejax.evaluation.files.predictions import frame_keys
+from radejax.evaluation.report import bootstrap
+from radejax.evaluation.report.compare import Source, load
+from radejax.evaluation.report.measure import repair_sizes
+from radejax.runs import camera_share
+from radejax.runs.data import OtherData
+from radejax.runs.evaluate import with_other_data
+from radejax.runs.workdir import load_run
+from radejax.simulation.camera.lens import cover_level
 from radejax.simulation.dataset import MARKER
-from radejax.simulation.lens import cover_level
 from radejax.visualize.camera_share import mean_share
-from radejax.workdir import load_run
 
 GROUPS = {
     "all": lambda weather, lens: True,

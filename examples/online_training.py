@@ -12,8 +12,8 @@ import pathlib
 
 import click
 
-from radejax import entry
-from radejax.config import load_config
+from radejax.cli import entry
+from radejax.core.config import load_config
 from radejax.online_training import train_online
 
 

@@ -3,17 +3,17 @@
 import importlib
 from typing import Any
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 
 __version__ = "0.1.0"
 
 # On first use: reading labels or evaluating files should not load the models.
 _LAZY = {
-    "Batch": "radejax.structures",
-    "CLASSES": "radejax.structures",
-    "DetectionMaps": "radejax.structures",
-    "Detections": "radejax.structures",
-    "Detector": "radejax.detector",
+    "Batch": "radejax.core.structures",
+    "CLASSES": "radejax.core.structures",
+    "DetectionMaps": "radejax.core.structures",
+    "Detections": "radejax.core.structures",
+    "Detector": "radejax.inference.detector",
 }
 
 __all__ = [

@@ -14,14 +14,15 @@ from typing import Any
 import jax
 from ml_collections import ConfigDict
 
-from radejax import camera_inputs, models
-from radejax.errors import UserError
+from radejax import models
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES
+from radejax.interop import image_backbone
+from radejax.runs.workdir import checkpoint_info, claim_workdir, lock_workdir
 from radejax.simulation.config import plain
 from radejax.simulation.online import OnlineBatches
-from radejax.structures import CLASSES
 from radejax.training import loop, sharding
 from radejax.training.step import map_grid
-from radejax.workdir import checkpoint_info, claim_workdir, lock_workdir
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -56,7 +57,7 @@ def train_online(
     for is_wrong, text in (
         (not simulation, "the config has no `simulation` section"),
         (simulation.get("scenes") != "procedural", "scenes must be procedural"),
-        (camera_inputs.has_camera(config), "the model takes a camera"),
+        (image_backbone.has_camera(config), "the model takes a camera"),
         (tuple(config.classes) != CLASSES, f"classes must be {CLASSES}"),
         (jax.process_count() > 1, "one process only"),
     ):

@@ -10,9 +10,9 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from radejax import Detector, models
-from radejax.config import base_config
-from radejax.geometry.camera import CameraCalibration
-from radejax.geometry.camera_projection import stack_cameras
+from radejax.core.config import base_config
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"

@@ -18,8 +18,8 @@ import click.testing
 import numpy as np
 import pytest
 
-from radejax import cli
-from radejax.config import load_config
+from radejax.cli import main
+from radejax.core.config import load_config
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -130,7 +130,7 @@ def _without_placeholders(arguments: list[str]) -> list[str]:
 
 def _check_radejax(arguments: list[str]) -> None:
     """Options exist and no required parameter is missing, as click would say it."""
-    command = cli.main
+    command = main.main
     while isinstance(command, click.Group):
         name = arguments[0]
         assert name in command.commands, f"no command {name!r}"
@@ -224,7 +224,7 @@ def _kind(command: str) -> str | None:
 
 def test_every_kind_of_command_is_run_by_a_test() -> None:
     kinds = {_kind(command) for _, command in COMMANDS} - {None}
-    kinds |= {f"radejax {name}" for name in cli.main.commands}
+    kinds |= {f"radejax {name}" for name in main.main.commands}
     assert kinds - set(RUN_IN) == set()
     assert {kind for kind in RUN_IN if "/" in kind} >= {
         str(path.relative_to(ROOT)) for path in (ROOT / "examples").glob("*.py")
@@ -252,7 +252,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     config = folder / "tiny.py"
     quickstart = ROOT / "configs" / "quickstart.py"
     config.write_text(
-        "from radejax.config import load_config\n"
+        "from radejax.core.config import load_config\n"
         "def get_config():\n"
         f"    config = load_config({str(quickstart)!r})\n"
         "    config.simulation.update(train_sequences=1, test_sequences=0)\n"
@@ -265,7 +265,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 def _run(*arguments: object) -> click.testing.Result:
     words = [str(argument) for argument in arguments]
-    result = click.testing.CliRunner().invoke(cli.main, words)
+    result = click.testing.CliRunner().invoke(main.main, words)
     assert result.exit_code == 0, result.output
     return result
 

@@ -11,8 +11,8 @@ import pytest
 
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
-from radejax.data.projection_job import project_dataset
-from radejax.data.records import RecordSource
+from radejax.data.records.job import project_dataset
+from radejax.data.records.projections import RecordSource
 from radejax.simulation.baseline import detect
 from radejax.simulation.dataset import default_config, simulate_dataset
 

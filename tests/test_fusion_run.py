@@ -12,17 +12,19 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax import camera_inputs, embed, experiment
-from radejax.cli import main
-from radejax.config import load_config
+from radejax.cli.main import main
+from radejax.core.config import load_config
+from radejax.core.errors import DataError, UserError
 from radejax.data.frame_table import make_table
-from radejax.data.records import RecordSource
-from radejax.data_paths import OtherData
-from radejax.detect_files import detect_files, output_name
-from radejax.detector import Detector
-from radejax.errors import DataError, UserError
-from radejax.evaluate_run import evaluate_run, predict_dataset
+from radejax.data.records.projections import RecordSource
+from radejax.inference import embed
+from radejax.inference.detect_files import detect_files, output_name
+from radejax.inference.detector import Detector
+from radejax.interop import image_backbone
 from radejax.models import build
+from radejax.runs import experiment
+from radejax.runs.data import OtherData
+from radejax.runs.evaluate import evaluate_run, predict_dataset
 from radejax.training import sharding
 
 pytestmark = pytest.mark.slow  # several programs to compile
@@ -100,7 +102,7 @@ def embeddings(data, from_images, tmp_path_factory):
     out = tmp_path_factory.mktemp("embeddings")
     config = small_config()
     model = build(config.model)
-    variables = camera_inputs.load_image_backbone(data.backbone, config)
+    variables = image_backbone.load_image_backbone(data.backbone, config)
     frames = experiment.load_run(from_images).paths.open(config, None)
     arguments = (model, variables, config.model.image, frames, out)
     counts = embed.embed_dataset(*arguments, frames_per_file=5, progress=False)
@@ -113,7 +115,7 @@ def embeddings(data, from_images, tmp_path_factory):
 def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
     config = small_config()
     run = experiment.load_run(from_images)
-    given = camera_inputs.load_image_backbone(data.backbone, config)
+    given = image_backbone.load_image_backbone(data.backbone, config)
     backbone = run.variables["params"]["image_backbone"]
     for found, wanted in zip(
         jax.tree.leaves(backbone),
@@ -187,7 +189,7 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
     frames = list(run.paths.open(run.config, "test"))
     records = RecordSource(run.paths.records)
     other = [dataclasses.replace(frames[0], name="99999_99999"), *frames[1:]]
-    inputs = camera_inputs.loader_arguments(run.config, other, embeddings)
+    inputs = image_backbone.loader_arguments(run.config, other, embeddings)
     with pytest.raises(
         UserError, match=r"1 of 4 frames have an image that .* `radejax embed`"
     ):
@@ -200,11 +202,11 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
         )
     # Embedded images need no files.
     gone = [dataclasses.replace(frame, camera_path=None) for frame in frames]
-    inputs = camera_inputs.loader_arguments(run.config, gone, embeddings)
+    inputs = image_backbone.loader_arguments(run.config, gone, embeddings)
     assert all(camera.is_valid for camera in inputs["cameras"])
-    inputs = camera_inputs.loader_arguments(run.config, gone)
+    inputs = image_backbone.loader_arguments(run.config, gone)
     with pytest.raises(UserError, match=r"\(4\) can use the camera: 4 have no front"):
-        camera_inputs.require_images(gone, inputs)
+        image_backbone.require_images(gone, inputs)
 
 
 class _Renamed:
@@ -227,11 +229,11 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
     config = small_config()
     config.data.mirror_probability = 0.5
     with pytest.raises(UserError, match="cannot be mirrored"):
-        camera_inputs.loader_arguments(config, [], embeddings)
+        image_backbone.loader_arguments(config, [], embeddings)
     config = small_config()
     config.model.image.freeze = False
     with pytest.raises(UserError, match="freeze is False"):
-        camera_inputs.loader_arguments(config, [], embeddings)
+        image_backbone.loader_arguments(config, [], embeddings)
     with pytest.raises(FileNotFoundError, match="radejax embed"):
         embed.open_embeddings(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
@@ -242,16 +244,16 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
 def test_weights_that_do_not_fit_are_refused(data, tmp_path):
     config = small_config()
     with pytest.raises(UserError, match="--image_backbone FOLDER"):
-        camera_inputs.load_image_backbone(None, config)
+        image_backbone.load_image_backbone(None, config)
     with pytest.raises(FileNotFoundError, match=r"lacks config.json"):
-        camera_inputs.load_image_backbone(tmp_path, config)
+        image_backbone.load_image_backbone(tmp_path, config)
     config.model.image.num_layers = 12
     with pytest.raises(UserError, match=r"num_layers = 3, .* is 12"):
-        camera_inputs.load_image_backbone(data.backbone, config)
+        image_backbone.load_image_backbone(data.backbone, config)
     radar = load_config(f"{CONFIG}:radar")
     with pytest.raises(UserError, match="has no camera"):
-        camera_inputs.load_image_backbone(data.backbone, radar)
-    assert camera_inputs.load_image_backbone(None, radar) is None
+        image_backbone.load_image_backbone(data.backbone, radar)
+    assert image_backbone.load_image_backbone(None, radar) is None
 
 
 def test_frames_without_image_are_counted_and_predicted_by_radar(
@@ -265,7 +267,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     )
 
     def boxes(frames):
-        inputs = camera_inputs.loader_arguments(run.config, frames)
+        inputs = image_backbone.loader_arguments(run.config, frames)
         found = predict_dataset(detector, records, frames, 4, inputs=inputs)
         return {i: found["box"][found["frame"] == i] for i in range(len(frames))}
 
@@ -281,7 +283,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
 
     run.config.data.camera.allow_missing = False
     with pytest.raises(UserError, match="1 of 4 frames"):
-        camera_inputs.loader_arguments(run.config, blind)
+        image_backbone.loader_arguments(run.config, blind)
 
 
 def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):

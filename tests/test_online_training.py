@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from radejax import Detector
-from radejax.config import load_config
-from radejax.data_paths import OtherData
-from radejax.errors import UserError
-from radejax.evaluate_run import evaluate_run
+from radejax.core.config import load_config
+from radejax.core.errors import UserError
 from radejax.online_training import train_online
+from radejax.runs.data import OtherData
+from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import sharding
 

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax import checkpoint_files
+from radejax.inference import packed
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
@@ -99,7 +99,12 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
         timeout=600,
     )
     assert _metrics(folder) == first
-    command = [sys.executable, "-c", "from radejax.cli import main; main()", "detect"]
+    command = [
+        sys.executable,
+        "-c",
+        "from radejax.cli.main import main; main()",
+        "detect",
+    ]
     command += [str(folder / "data" / "3"), "--workdir", str(folder / "run")]
     command += ["--out", str(folder / "boxes"), "--score-threshold", "0", "--json"]
     done = subprocess.run(
@@ -150,10 +155,10 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
 @pytest.mark.timeout(900)
 def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
     run = undisturbed[0] / "run"
-    expected = checkpoint_files.load(run)
+    expected = packed.load(run)
     newest = max((run / "checkpoints").glob("[0-9]*"), key=lambda p: int(p.name))
     for path in (run / "checkpoints", newest):
-        found = checkpoint_files.load(path)
+        found = packed.load(path)
         assert found.model == expected.model
         assert found.grid == expected.grid
         assert found.settings == expected.settings

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax.config import load_config
+from radejax.core.config import load_config
 from radejax.models import build
 from radejax.models.lifting import ReferencePoints
 

@@ -12,7 +12,7 @@ import chex
 import numpy as np
 import pytest
 
-from radejax.workdir import load_run
+from radejax.runs.workdir import load_run
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [

@@ -9,14 +9,14 @@ import pathlib
 import numpy as np
 from matplotlib.lines import Line2D
 
+from radejax.core.structures import CLASSES
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.camera import CameraRenderer, stereo_calibration
-from radejax.simulation.radar import RadarParameters
+from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
+from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator
-from radejax.simulation.traffic import make_sequence
-from radejax.structures import CLASSES
+from radejax.simulation.world.traffic import make_sequence
 from radejax.visualize.canvas import COLOR_MAP, footprints, halo, new_figure
-from radejax.visualize.labels import draw_labels
+from radejax.visualize.label_placement import draw_labels
 
 SCENES = (
     ("normal", "urban", "day", 4),

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from radejax.core.errors import UserError
 from radejax.data.encoding import decode, encode
 from radejax.data.projection import LOG_SCALE_DB
-from radejax.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 
 Sample = dict[str, Any]

@@ -8,10 +8,10 @@ from collections.abc import Container, Sequence
 
 import numpy as np
 
-from radejax.data.frame import Frame
-from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration, ImageKind
-from radejax.geometry.camera_projection import Camera
+from radejax.core.errors import UserError
+from radejax.data.kradar.frame import Frame
+from radejax.geometry.calibration import CameraCalibration, ImageKind
+from radejax.geometry.camera import Camera
 
 _log = logging.getLogger(__name__)
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from radejax.core.errors import UserError
 from radejax.data.projection import LOG_SCALE_DB
-from radejax.errors import UserError
 
 if TYPE_CHECKING:
     import jax

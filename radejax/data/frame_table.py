@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from radejax.data.array_records import ArrayRecords
-from radejax.data.frame import Frame
-from radejax.data.records import RecordSource
-from radejax.errors import DataError, UserError
-from radejax.structures import CLASSES
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import CLASSES
+from radejax.data.kradar.frame import Frame
+from radejax.data.records.arrays import ArrayRecords
+from radejax.data.records.projections import RecordSource
 
 IMAGE_SIZE = (720, 1280)
 """Height and width of the left half of K-Radar's 2560 x 720 stereo images."""

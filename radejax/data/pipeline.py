@@ -12,8 +12,8 @@ from typing import Any
 import grain
 import numpy as np
 
-from radejax.data.array_records import ArrayRecords
-from radejax.data.frame import Frame
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES, Batch
 from radejax.data.frame_table import (
     IMAGE_SIZE,
     FrameTable,
@@ -21,10 +21,10 @@ from radejax.data.frame_table import (
     make_table,
     read_left_image,
 )
-from radejax.data.records import RecordSource
-from radejax.errors import UserError
-from radejax.geometry.camera_projection import stack_cameras
-from radejax.structures import CLASSES, Batch
+from radejax.data.kradar.frame import Frame
+from radejax.data.records.arrays import ArrayRecords
+from radejax.data.records.projections import RecordSource
+from radejax.geometry.camera import stack_cameras
 
 __all__ = [
     "FrameTable",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 
 if TYPE_CHECKING:
     import jax

@@ -13,8 +13,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from radejax.core.errors import DataError
 from radejax.data.projection import project, project_columns
-from radejax.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"

@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from radejax.core.structures import CLASSES
 from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS, RECOMMENDED
-from radejax.evaluation.results import SPACES, Result, mean_ap
-from radejax.structures import CLASSES
+from radejax.evaluation.result import SPACES, Result, mean_ap
 
 __all__ = [
     "PROTOCOLS",

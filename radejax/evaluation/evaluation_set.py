@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from radejax.errors import UserError
-from radejax.evaluation import matching, overlap, protocols, tables
-from radejax.evaluation.results import SPACES, Result
-from radejax.structures import CLASSES
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES
+from radejax.evaluation import columns as tables
+from radejax.evaluation import matching, overlap, protocols
+from radejax.evaluation.result import SPACES, Result
 
 PROTOCOL_DEFAULT = "protocol"
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 
 SkipEmpty = Literal["class", "frame"] | None
 EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.interop import dinov3_hf, radenet_torch, resnet_torch, torch_file
 from radejax.interop.state_dict import StateDictReader, to_numpy
 from radejax.models.dinorade import DinoRade

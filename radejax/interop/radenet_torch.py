@@ -13,7 +13,7 @@ import flax
 import numpy as np
 import safetensors.numpy
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.interop import torch_file
 from radejax.interop.radenet_names import (
     from_torch_layout,

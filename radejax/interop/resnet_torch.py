@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from radejax.errors import DataError
+from radejax.core.errors import DataError
 from radejax.interop import torch_file
 from radejax.interop.state_dict import StateDictReader
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from radejax.errors import DataError
+from radejax.core.errors import DataError
 
 _SHOWN = 20
 

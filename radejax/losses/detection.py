@@ -7,12 +7,12 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import boxes_at, find_peaks, suppress
 from radejax.detection.matching import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import Sigma, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Root, Transform, gwd_loss
-from radejax.structures import Batch, DetectionMaps
 
 Matching = Literal["center", "nms"]
 

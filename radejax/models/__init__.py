@@ -8,7 +8,7 @@ from typing import Any
 
 import flax.linen as nn
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 
 _MODULES = {
     "radenet": "radejax.models.radenet",

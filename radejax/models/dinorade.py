@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from radejax.errors import UserError
-from radejax.geometry.camera_projection import Camera
+from radejax.core.errors import UserError
+from radejax.core.structures import DetectionMaps
+from radejax.geometry.camera import Camera
 from radejax.models import radenet
 from radejax.models.backbone import Backbone
 from radejax.models.camera_neck import CameraNeck
@@ -30,7 +31,6 @@ from radejax.models.lifting import (
 from radejax.models.neck import Neck
 from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
 from radejax.models.vit import ViT
-from radejax.structures import DetectionMaps
 
 IMAGE_BACKBONE = "image_backbone"
 """Key of the image backbone in the parameters: what is frozen, and what published

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.models import radenet
 from radejax.models.dinorade import DinoRade
 from radejax.models.lifting import MARGIN_PX, LiftingAxes

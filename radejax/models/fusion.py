@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.layers import Dense
 from radejax.models.lifting import (

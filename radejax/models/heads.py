@@ -15,8 +15,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from radejax.core.structures import DetectionMaps
 from radejax.models.layers import Conv, ConvGNSiLU
-from radejax.structures import DetectionMaps
 
 HeadKind = Literal["expanded", "default"]
 

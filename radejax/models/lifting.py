@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration, ImageKind
-from radejax.geometry.camera_projection import Camera, project
+from radejax.core.errors import UserError
+from radejax.geometry.calibration import CameraCalibration, ImageKind
+from radejax.geometry.camera import Camera, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
 

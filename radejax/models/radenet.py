@@ -13,12 +13,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
+from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import Backbone
 from radejax.models.cbam import CBAMKind
 from radejax.models.heads import HeadKind, Heads
 from radejax.models.neck import Neck, NeckKind
-from radejax.structures import DetectionMaps
 
 DTYPES = ("float32", "bfloat16")
 

@@ -19,8 +19,8 @@ from absl import app, flags
 from ml_collections import config_flags
 from tabulate import tabulate
 
-from radejax import entry
-from radejax.errors import UserError
+from radejax.cli import entry
+from radejax.core.errors import UserError
 from radejax.models import build
 from radejax.models.radenet import RadeNet
 

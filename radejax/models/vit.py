@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.models.image import check_image
 
 AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]

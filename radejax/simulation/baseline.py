@@ -19,10 +19,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from radejax.core.structures import CLASSES
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar import TPM_OFFSET_DB, TPM_SPAN_DB, RadarParameters
-from radejax.simulation.traffic import SIZES
-from radejax.structures import CLASSES
+from radejax.simulation.radar.tensor import TPM_OFFSET_DB, TPM_SPAN_DB, RadarParameters
+from radejax.simulation.world.traffic import SIZES
 
 
 @dataclasses.dataclass(frozen=True)

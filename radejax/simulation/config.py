@@ -8,11 +8,11 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar import RadarParameters
-from radejax.simulation.traffic import ENVIRONMENTS
-from radejax.simulation.weather import WEATHERS
+from radejax.simulation.radar.tensor import RadarParameters
+from radejax.simulation.radar.weather import WEATHERS
+from radejax.simulation.world.traffic import ENVIRONMENTS
 
 SIMULATOR_VERSION = 3
 """Raised whenever the same config gives other files than before."""

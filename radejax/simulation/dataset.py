@@ -18,10 +18,10 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from radejax import files
-from radejax.data import kradar_write
-from radejax.errors import UserError
-from radejax.simulation.camera import CameraRenderer, stereo_calibration
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.data.kradar import write as kradar_write
+from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.sources import FrameSpec, SceneSource, make_source

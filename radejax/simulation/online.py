@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from radejax.core.structures import Batch
 from radejax.geometry.boxes import boxes8_from_7
-from radejax.simulation import radar
 from radejax.simulation.config import SimulationConfig
+from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import RadarInput, SequenceSimulator
 from radejax.simulation.sources import make_source
-from radejax.structures import Batch
 
 _CACHED_SEQUENCES = 64
 
@@ -124,7 +124,7 @@ class OnlineBatches:
         visible = simulator.is_radar_visible(frame, given)
         boxes = frame.boxes[visible].copy()
         boxes[:, 2] -= self._config.lidar_to_radar_m[2]  # z as readers of files have it
-        key = radar.frame_key(self._seed, step, row)
+        key = tensor.frame_key(self._seed, step, row)
         return index, given, key, boxes, frame.cls[visible]
 
     def _assemble(self, frames: list) -> Batch:
@@ -162,7 +162,7 @@ def _simulate_batch(scatterers, noise, keys, grid, parameters, rows_per_step):
     """`[B, R, A, D+E]` projections of a batch."""
 
     def one(scatterers, noise, key):
-        return radar.simulate(
+        return tensor.simulate(
             scatterers,
             noise,
             key,
@@ -174,7 +174,7 @@ def _simulate_batch(scatterers, noise, keys, grid, parameters, rows_per_step):
     return jax.vmap(one)(scatterers, noise, keys)
 
 
-def _stack(inputs: list[RadarInput]) -> tuple[radar.Scatterers, np.ndarray]:
+def _stack(inputs: list[RadarInput]) -> tuple[tensor.Scatterers, np.ndarray]:
     """Inputs of one batch, padded to the longest, in steps that bound recompiling."""
     capacity = max(given.scatterers.range_m.shape[0] for given in inputs)
     capacity = -(-capacity // 1024) * 1024

@@ -6,10 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from radejax.data.labels import Label
+from radejax.data.kradar.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation import radar, road, scattering, surroundings, weather
-from radejax.simulation.scene import REFLECTOR_KINDS, SceneFrame, Sequence
+from radejax.simulation.radar import scattering, tensor, two_ray, weather
+from radejax.simulation.world import surroundings
+from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame, Sequence
 
 MIN_SNR_DB = 10.0
 """An object is visible to the radar from this ratio of its power to the noise on."""
@@ -30,7 +31,7 @@ class RadarInput:
         lit: `[N]` part of each box's power that no other box blocks.
     """
 
-    scatterers: radar.Scatterers
+    scatterers: tensor.Scatterers
     noise_power: np.ndarray
     key: np.ndarray
     snr_db: np.ndarray
@@ -54,7 +55,7 @@ class SequenceSimulator:
         self,
         sequence: Sequence,
         grid: RadarGrid,
-        parameters: radar.RadarParameters,
+        parameters: tensor.RadarParameters,
         seed: int,
     ) -> None:
         self.sequence, self.grid = sequence, grid
@@ -93,7 +94,7 @@ class SequenceSimulator:
             noise_power=weather.noise_profile(
                 sequence.weather, self.grid, parameters, frame.ego_velocity_mps
             ),
-            key=radar.frame_key(self.seed, sequence.name, index),
+            key=tensor.frame_key(self.seed, sequence.name, index),
             snr_db=10.0 * np.log10(power + 1e-30) - parameters.noise_db,
             lit=lit,
         )
@@ -110,10 +111,10 @@ class SequenceSimulator:
         """
         sequence = self.sequence
         distance = np.linalg.norm(part.position_m, axis=1)
-        bounce = road.bounce(
+        bounce = two_ray.bounce(
             part.position_m,
             sequence.ground_m,
-            road.SURFACES[sequence.weather],
+            two_ray.SURFACES[sequence.weather],
             self.parameters.wavelength_m,
         )
         bounce = np.where(mirrored, bounce, 1.0)
@@ -126,7 +127,7 @@ class SequenceSimulator:
         )
 
     def radar_frame(
-        self, index: int, output: radar.Output = "projection", rows_per_step: int = 1
+        self, index: int, output: tensor.Output = "projection", rows_per_step: int = 1
     ) -> np.ndarray:
         """One frame of the radar; see `radar.simulate`."""
         return self.run(self.radar_input(index), output, rows_per_step)
@@ -134,7 +135,7 @@ class SequenceSimulator:
     def run(
         self,
         given: RadarInput,
-        output: radar.Output = "projection",
+        output: tensor.Output = "projection",
         rows_per_step: int = 1,
     ) -> np.ndarray:
         """The radar frame of an input; see `radar.simulate`.
@@ -142,7 +143,7 @@ class SequenceSimulator:
         A tesseract comes as a view of the rows that the device made, without a copy.
         """
         result = np.asarray(
-            radar.simulate(
+            tensor.simulate(
                 given.scatterers,
                 given.noise_power,
                 given.key,
@@ -153,7 +154,7 @@ class SequenceSimulator:
             )
         )
         if output == "tesseract":
-            return result.transpose(radar.TESSERACT_OF_ROWS)
+            return result.transpose(tensor.TESSERACT_OF_ROWS)
         return result
 
     def is_radar_visible(self, frame: SceneFrame, given: RadarInput) -> np.ndarray:

@@ -11,13 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
-from radejax.data import sequences
-from radejax.data.kradar import Frame, KRadar
-from radejax.errors import UserError
+from radejax.core.errors import UserError
+from radejax.data.kradar import Frame, KRadar, sequences
 from radejax.simulation.config import SimulationConfig
-from radejax.simulation.real_scenes import make_real_sequence
-from radejax.simulation.scene import FRAME_PERIOD_S, Sequence
-from radejax.simulation.traffic import make_sequence
+from radejax.simulation.world.real_scenes import make_real_sequence
+from radejax.simulation.world.scene import FRAME_PERIOD_S, Sequence
+from radejax.simulation.world.traffic import make_sequence
 
 _FIRST_TIMESTAMP_S = 1.65e9
 

@@ -19,8 +19,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
-from radejax import files
-from radejax.errors import DataError, DiskFullError
+from radejax.core import files
+from radejax.core.errors import DataError, DiskFullError
 from radejax.training import processes, sharding
 
 _log = logging.getLogger(__name__)

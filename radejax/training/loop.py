@@ -17,9 +17,9 @@ import flax.linen as nn
 import jax
 import numpy as np
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import Batch
 from radejax.training import processes, sharding
 from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
 from radejax.training.clock import Trace, seconds_since_start

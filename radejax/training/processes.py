@@ -12,7 +12,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jax.experimental import multihost_utils
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.training import sharding
 
 T = TypeVar("T")

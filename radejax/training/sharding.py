@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 
 DATA_AXIS = "data"
 

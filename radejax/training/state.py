@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 
 
 @struct.dataclass

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from radejax.core.structures import Batch
 from radejax.data.encoding import to_float
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
-from radejax.structures import Batch
 from radejax.training.state import TrainState, merge_parameters
 
 Metrics = dict[str, jax.Array]

@@ -14,8 +14,8 @@ import numpy as np
 import tensorboardX
 import tqdm
 
-from radejax import files
-from radejax.errors import DiskFullError, UserError
+from radejax.core import files
+from radejax.core.errors import DiskFullError, UserError
 from radejax.training.clock import StepClock
 
 

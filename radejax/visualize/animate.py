@@ -14,8 +14,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from radejax.errors import UserError
-from radejax.files import atomic_path
+from radejax.core.errors import UserError
+from radejax.core.files import atomic_path
 from radejax.visualize.canvas import (
     COLOR_MAP,
     GROUND_TRUTH_COLOR,

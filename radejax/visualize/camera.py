@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.geometry.boxes import corners
-from radejax.geometry.camera import CameraCalibration, ImageKind
+from radejax.geometry.calibration import CameraCalibration, ImageKind
 from radejax.visualize.canvas import (
     GROUND_TRUTH_COLOR,
     PREDICTION_COLOR,
@@ -24,7 +24,7 @@ from radejax.visualize.canvas import (
     label_texts,
     new_figure,
 )
-from radejax.visualize.labels import draw_labels
+from radejax.visualize.label_placement import draw_labels
 from radejax.visualize.overlays import both_sets
 
 if TYPE_CHECKING:

@@ -18,10 +18,10 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
-from radejax.errors import UserError
-from radejax.files import atomic_path
+from radejax.core.errors import UserError
+from radejax.core.files import atomic_path
+from radejax.core.structures import CLASSES
 from radejax.geometry.boxes import bev_corners
-from radejax.structures import CLASSES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.visualize.canvas import SERIES_COLORS, new_figure
 
 if TYPE_CHECKING:

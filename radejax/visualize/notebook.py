@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.visualize.animate import make_palette, render
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from radejax.visualize.canvas import (
     heading_marks,
     label_texts,
 )
-from radejax.visualize.labels import draw_labels
+from radejax.visualize.label_placement import draw_labels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.canvas import COLOR_MAP, color_limits_of, new_figure
 

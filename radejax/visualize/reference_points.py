@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from radejax.geometry.camera import CameraCalibration, ImageKind
+from radejax.geometry.calibration import CameraCalibration, ImageKind
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

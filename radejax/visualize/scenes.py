@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import bev
 from radejax.visualize.canvas import COLOR_MAP, new_figure

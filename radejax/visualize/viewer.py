@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from radejax.errors import UserError
-from radejax.files import atomic_path
+from radejax.core.errors import UserError
+from radejax.core.files import atomic_path
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.canvas import COLOR_MAP, Objects, color_limits_of, label_texts
 from radejax.visualize.overlays import both_sets
 from radejax.visualize.projections import check_projection, range_azimuth
 
 if TYPE_CHECKING:
-    from radejax.geometry.camera import CameraCalibration
+    from radejax.geometry.calibration import CameraCalibration
 
 _GROUND_TRUTH_RGB = (255, 255, 255)
 _PREDICTION_RGB = (255, 77, 64)

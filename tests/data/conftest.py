@@ -5,8 +5,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from radejax.data import kradar_write
-from radejax.data.labels import LABEL_CLASSES, Label
+from radejax.data.kradar import write
+from radejax.data.kradar.labels import LABEL_CLASSES, Label
 from radejax.geometry.radar_grid import RadarGrid
 
 GRID = RadarGrid.reduced(num_doppler=6, num_range=16, num_elevation=5, num_azimuth=12)
@@ -29,31 +29,29 @@ def write_kradar(
 ) -> None:
     """Sequences with labels, tesseracts, calibration, description and splits."""
     rng = np.random.default_rng(seed)
-    kradar_write.write_grid(root, grid)
+    write.write_grid(root, grid)
     splits = {"train": [], "test": []}
     for sequence in sequences:
         folder = root / str(sequence)
-        kradar_write.write_calibration(
+        write.write_calibration(
             folder / "info_calib/calib_radar_lidar.txt", 3, -2.5, 0.25
         )
-        kradar_write.write_description(
-            folder / "description.txt", "urban", "day", "fog"
-        )
+        write.write_description(folder / "description.txt", "urban", "day", "fog")
         for lidar in range(1, num_frames + 1):
             name = f"{lidar + 3:05d}_{lidar:05d}"
-            kradar_write.write_labels(
+            write.write_labels(
                 folder / f"info_label/{name}.txt",
                 (lidar + 3, lidar, 2 * lidar, lidar, 2 * lidar + 1),
                 1643292946.5 + lidar / 10,
                 make_labels(rng, int(rng.integers(0, 5))),
             )
-            kradar_write.write_tesseract(
+            write.write_tesseract(
                 folder / f"radar_tesseract/tesseract_{lidar + 3:05d}.mat",
                 (10 ** rng.uniform(3, 15, grid.shape_drea)).astype(np.float32),
             )
             split = "train" if (lidar - 1) * 4 // num_frames % 2 == 0 else "test"
             splits[split].append((sequence, name))
-    kradar_write.write_splits(root / "split", splits["train"], splits["test"])
+    write.write_splits(root / "split", splits["train"], splits["test"])
 
 
 @pytest.fixture(scope="session")

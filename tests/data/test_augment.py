@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from radejax.core.errors import UserError
 from radejax.data.augment import (
     Augmentation,
     add_range_gain,
@@ -13,9 +14,8 @@ from radejax.data.augment import (
     mirror_camera,
 )
 from radejax.data.encoding import decode, encode
-from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration
-from radejax.geometry.camera_projection import project
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import project
 from radejax.geometry.radar_grid import RadarGrid
 
 GRID = RadarGrid.reduced(num_doppler=6, num_range=16, num_elevation=5, num_azimuth=12)

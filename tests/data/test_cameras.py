@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from radejax.core.errors import UserError
 from radejax.data.cameras import frame_cameras
-from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.calibration import CameraCalibration
 
 CALIBRATION = CameraCalibration.from_angles(
     intrinsics=(60.0, 58.0, 32.0, 16.0),

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from radejax.core.errors import UserError
 from radejax.data.encoding import (
     ENCODINGS,
     MAX_ERROR_DB,
@@ -16,7 +17,6 @@ from radejax.data.encoding import (
     num_clipped,
     to_float,
 )
-from radejax.errors import UserError
 
 
 def test_eight_bits_by_hand():

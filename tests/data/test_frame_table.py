@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from radejax.core.errors import DataError, UserError
 from radejax.data.frame_table import (
     IMAGE_SIZE,
     frames_with_records,
@@ -11,9 +12,8 @@ from radejax.data.frame_table import (
     read_left_image,
 )
 from radejax.data.kradar import KRadar
-from radejax.data.projection_job import project_dataset
-from radejax.data.records import RecordSource
-from radejax.errors import DataError, UserError
+from radejax.data.records.job import project_dataset
+from radejax.data.records.projections import RecordSource
 
 
 def frame(key, boxes=(), classes=(), camera_path=None):

@@ -10,15 +10,15 @@ import orbax.checkpoint as ocp
 import pytest
 from PIL import Image
 
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import Batch
 from radejax.data import frame_table
 from radejax.data.augment import Augmentation
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import make_loader, steps_per_epoch
-from radejax.data.projection_job import project_dataset
-from radejax.data.records import RecordSource
-from radejax.errors import DataError, UserError
-from radejax.geometry.camera import CameraCalibration
-from radejax.structures import Batch
+from radejax.data.records.job import project_dataset
+from radejax.data.records.projections import RecordSource
+from radejax.geometry.calibration import CameraCalibration
 
 OPTIONS = {
     "batch_size": 3,

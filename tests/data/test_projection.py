@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from radejax.core.errors import UserError
 from radejax.data.projection import (
     project,
     project_columns,
@@ -12,7 +13,6 @@ from radejax.data.projection import (
     project_plain,
     to_log_scale,
 )
-from radejax.errors import UserError
 
 SHAPE = (4, 6, 3, 5)  # D, R, E, A
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from radejax.data.kradar_write import write_tesseract
+from radejax.core.errors import DataError
+from radejax.data.kradar.write import write_tesseract
 from radejax.data.projection import project
 from radejax.data.tesseract import (
     _read_slabs,
@@ -14,7 +15,6 @@ from radejax.data.tesseract import (
     read_projection_npy,
     read_tesseract,
 )
-from radejax.errors import DataError
 
 SHAPE = (4, 6, 3, 5)
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import WIDE_ROI, DetectionMaps
 
 KRADAR = RadarGrid.kradar()
 OFFICIAL = {112: KRADAR.padded(8, "stretched"), 107: KRADAR.padded(1, "stretched")}

@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import CLASSES
 from radejax.evaluation.average_precision import (
     PROTOCOLS,
     EvaluationSet,
     evaluate,
     mean_ap,
 )
-from radejax.structures import CLASSES
 
 TWO = ("Sedan", "Bus or Truck")
 METHODS = {

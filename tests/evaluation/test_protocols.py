@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.evaluation import protocols
 
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import DataError, UserError
-from radejax.geometry.camera import CameraCalibration
+from radejax.core.errors import DataError, UserError
+from radejax.geometry.calibration import CameraCalibration
 from radejax.interop import dinorade_torch
 from radejax.interop.state_dict import StateDictReader
 from radejax.models.camera_neck import CameraNeck

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.interop import dinov3_hf
 
 TOLERANCE = 5e-5

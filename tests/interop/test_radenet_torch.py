@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.interop import radenet_torch
 from radejax.interop.radenet_names import torch_names, torch_shapes
 from radejax.models.radenet import from_config

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import DataError
+from radejax.core.errors import DataError
 from radejax.interop import resnet_torch, torch_file
 from radejax.models.resnet import ResNetNeck, ResNetTrunk
 

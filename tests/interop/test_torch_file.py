@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from radejax.errors import DataError
+from radejax.core.errors import DataError
 from radejax.interop import torch_file
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import optax
 import pytest
 
+from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss, smooth_l1
 from radejax.losses.focal import gaussian_heatmap
 from radejax.losses.gwd import gwd_loss
-from radejax.structures import Batch, DetectionMaps
 
 STRETCHED = RadarGrid.kradar().padded(8, "stretched")
 CASES = (

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration
-from radejax.geometry.camera_projection import stack_cameras
+from radejax.core.errors import UserError
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import stack_cameras
 from radejax.models import build, dinorade, lifting
 from radejax.models.lifting import ReferencePoints
 from radejax.models.radenet import RadeNet

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import ReferencePoints

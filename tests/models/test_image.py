@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.models import image as image_lib
 
 

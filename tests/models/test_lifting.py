@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
-from radejax.geometry.camera import CameraCalibration
-from radejax.geometry.camera_projection import Camera, stack_cameras
+from radejax.core.errors import UserError
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import Camera, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
 from radejax.models.lifting import LiftingAxes, WeightingNetwork

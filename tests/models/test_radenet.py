@@ -8,8 +8,8 @@ import pytest
 from ml_collections import ConfigDict
 
 from radejax import models
-from radejax.config import base_config
-from radejax.errors import UserError
+from radejax.core.config import base_config
+from radejax.core.errors import UserError
 from radejax.models.radenet import FIELDS, pad_to_multiple
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.models import vit
 from radejax.models.vit import ViT
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation import baseline, radar
-from radejax.simulation.radar import RadarParameters
+from radejax.simulation import baseline
+from radejax.simulation.radar import tensor
+from radejax.simulation.radar.tensor import RadarParameters
 
 GRID = RadarGrid.reduced(
     num_doppler=8, num_range=64, num_elevation=5, num_azimuth=56, max_range_m=75.6
@@ -20,14 +21,14 @@ def projection_of(*targets):
     power_db = PARAMETERS.gain_db + rcs_db - 40.0 * np.log10(range_m)
     amplitude = 10.0 ** (power_db / 20.0)
     zero = np.zeros_like(range_m)
-    scatterers = radar.Scatterers(
+    scatterers = tensor.Scatterers(
         *(v.astype(np.float32) for v in (range_m, azimuth, zero, zero)),
         np.stack([amplitude, zero], 1).astype(np.float32),
     )
     noise = np.full((64, 8), 10 ** (PARAMETERS.noise_db / 10), np.float32)
     return np.asarray(
-        radar.simulate(
-            scatterers, noise, radar.frame_key(3), grid=GRID, parameters=PARAMETERS
+        tensor.simulate(
+            scatterers, noise, tensor.frame_key(3), grid=GRID, parameters=PARAMETERS
         )
     )
 

@@ -5,14 +5,14 @@ import json
 import ml_collections
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.simulation.config import (
     CONDITIONS,
     SimulationConfig,
     default_config,
 )
-from radejax.simulation.traffic import ENVIRONMENTS
-from radejax.simulation.weather import WEATHERS
+from radejax.simulation.radar.weather import WEATHERS
+from radejax.simulation.world.traffic import ENVIRONMENTS
 
 
 def test_default_has_every_weather_in_training_and_several_held_out():

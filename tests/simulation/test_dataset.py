@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar, read_labels
-from radejax.errors import UserError
 from radejax.simulation import dataset
 from radejax.simulation.dataset import default_config, simulate_dataset
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar import RadarParameters
+from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator
-from radejax.simulation.traffic import make_sequence
+from radejax.simulation.world.traffic import make_sequence
 
 GRID = RadarGrid.reduced(
     num_doppler=16, num_range=64, num_elevation=9, num_azimuth=56, max_range_m=75.6

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import base_config
+from radejax.core.config import base_config
+from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.structures import Batch
 from radejax.training.step import map_grid
 
 NUM_FRAMES = 16

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import DataError, DiskFullError
+from radejax.core.errors import DataError, DiskFullError
 from radejax.training import sharding
 from radejax.training.checkpoints import Checkpoints, abstract_state
 

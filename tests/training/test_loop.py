@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.training import loop, processes, sharding
 from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
 from radejax.training.watch import Scores

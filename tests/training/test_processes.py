@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.training import processes
 
 

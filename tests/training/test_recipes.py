@@ -9,12 +9,13 @@ import jax
 import numpy as np
 import pytest
 
-from radejax import experiment, models
-from radejax.geometry.camera import CameraCalibration
-from radejax.geometry.camera_projection import stack_cameras
+from radejax import models
+from radejax.core.structures import Batch
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import radenet_torch
-from radejax.structures import Batch
+from radejax.runs import experiment
 from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step, map_grid

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.training import sharding
 
 

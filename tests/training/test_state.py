@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.training.state import (
     create_state,
     make_optimizer,

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from radejax.errors import DiskFullError, UserError
+from radejax.core.errors import DiskFullError, UserError
 from radejax.training.watch import Scores, Watch
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.visualize import animate
 from radejax.visualize.canvas import PREDICTION_COLOR, new_figure
 

@@ -3,8 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
-from radejax.structures import Detections
+from radejax.core.errors import UserError
+from radejax.core.structures import Detections
 from radejax.visualize import canvas
 
 BOXES = np.arange(14.0).reshape(2, 7)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radejax.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError
 from radejax.visualize import curves
 
 

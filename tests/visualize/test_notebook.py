@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.visualize.canvas import new_figure
 from radejax.visualize.notebook import show
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import projections
 

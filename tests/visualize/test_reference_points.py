@@ -4,7 +4,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.calibration import CameraCalibration
 from radejax.visualize.reference_points import draw_reference_points
 
 matplotlib.use("agg")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import QuadMesh
 
-from radejax.errors import UserError
+from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.animate import render
 from radejax.visualize.scenes import ZOOM_COLOR, Scene, draw_scenes

@@ -1,0 +1,173 @@
+"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pathlib
+import socket
+import sys
+from collections.abc import Iterator, Sequence
+
+import jax
+from absl import flags
+from absl import logging as absl_logging
+
+from radejax.core.errors import DataError, DiskFullError, UserError
+from radejax.core.files import is_no_space
+
+FAILED = 1
+WRONG_USE = 2
+
+_WRONG_PATH = (
+    FileNotFoundError,
+    NotADirectoryError,
+    IsADirectoryError,
+    PermissionError,
+)
+
+
+@contextlib.contextmanager
+def exit_codes(*, debug: bool = False) -> Iterator[None]:
+    """Ends the program with one line instead of a traceback for the user's errors.
+
+    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk.
+
+    Args:
+        debug: Let the traceback through.
+    """
+    try:
+        yield
+    except (DataError, DiskFullError) as error:
+        _fail(error, FAILED, debug)
+    except (UserError, *_WRONG_PATH) as error:
+        _fail(error, WRONG_USE, debug)
+    except OSError as error:
+        if not is_no_space(error):
+            raise
+        _fail(error, FAILED, debug)
+
+
+def _fail(error: Exception, code: int, debug: bool) -> None:
+    if debug:
+        raise error
+    message = str(error)
+    if isinstance(error, OSError) and error.filename is not None:
+        message = f"{error.strerror}: {error.filename}"
+        if isinstance(error, FileNotFoundError):
+            message = f"no such file or folder: {error.filename}"
+    sys.stderr.write(f"error: {message}\n")
+    raise SystemExit(code)
+
+
+def parse_flags(argv: Sequence[str]) -> list[str]:
+    """Parses absl flags and the config; an unknown field is one line and exit code 2.
+
+    For `app.run(main, flags_parser=parse_flags)`.
+    """
+    try:
+        with exit_codes():
+            _check_config_file(argv)
+            return flags.FLAGS(argv)
+    except (flags.Error, AttributeError, KeyError, ValueError, TypeError) as error:
+        # ml_collections reports unknown fields by AttributeError or KeyError, whose
+        # text names the nearest field, and values of a wrong type by the other two.
+        text = str(error.args[0] if error.args else error)
+        # An error inside get_config comes as the text of its traceback.
+        text = text.rsplit(f"{UserError.__name__}: ", 1)[-1]
+        text = text.replace("\\n", " ").replace("\\'", "'")
+        if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"":
+            text = text[1:-1]
+        sys.stderr.write("error: " + " ".join(text.split()) + "\n")
+        raise SystemExit(WRONG_USE) from None
+
+
+def _check_config_file(argv: Sequence[str]) -> None:
+    """`UserError` for a config file that is not there, which absl reports too late."""
+    for flag, following in zip(argv, [*argv[1:], ""], strict=True):
+        name, _, value = flag.partition("=")
+        if name.lstrip("-") == "config" and name.startswith("-"):
+            path = (value or following).partition(":")[0]
+            if not pathlib.Path(path).is_file():
+                raise UserError(f"no such config file: {path}")
+
+
+def join_processes(
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
+) -> None:
+    """Joins the other processes of a run; to be called before anything uses JAX.
+
+    Under Slurm, Open MPI, Kubernetes and on TPU pods JAX finds the arguments itself.
+
+    Args:
+        coordinator: "host:port" of process 0, with a port that is free there.
+        num_processes: Of the run.
+        process_id: Of this process, from 0.
+
+    Raises:
+        UserError: JAX finds no cluster, and not all arguments are given; or the
+            coordinator's port is taken or not reached.
+    """
+    given = [coordinator, num_processes, process_id]
+    if None in given and given != [None] * 3:
+        raise UserError("give --coordinator, --num_processes and --process_id together")
+    if process_id == 0:
+        _check_port(coordinator)
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        jax.distributed.initialize(*given)
+    except ValueError as error:
+        raise UserError(
+            f"--distributed finds no cluster to join ({error}); without Slurm, Open MPI "
+            "or a TPU pod give --coordinator HOST:PORT, --num_processes and --process_id"
+        ) from error
+    except RuntimeError as error:  # of its service, without a class of their own
+        line = str(error).strip().split("\n")[0]
+        where = coordinator or "the coordinator that the cluster names"
+        raise UserError(f"cannot join the processes at {where}: {line}") from error
+    if jax.process_index():
+        logging.getLogger("radejax").setLevel(logging.ERROR)
+        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
+
+
+def _check_port(coordinator: str) -> None:
+    """`UserError` unless process 0 can listen there; JAX's service would crash."""
+    host, _, port = coordinator.rpartition(":")
+    if not host or not port.isdigit():
+        raise UserError(f"--coordinator must be HOST:PORT, got {coordinator}")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", int(port)))
+        except (OSError, OverflowError) as error:
+            raise UserError(
+                f"process 0 cannot listen on port {port} of --coordinator: {error}"
+            ) from error
+
+
+def set_up_jax(*, cache: bool = True) -> None:
+    """Logging at level info without noise, and a compilation cache that persists.
+
+    Args:
+        cache: Keep compiled programs in the folder that the environment variable
+            JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
+    """
+    log = logging.getLogger("radejax")
+    if not log.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(message)s"))
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
+        log.propagate = False
+    absl_logging.set_verbosity(absl_logging.WARNING)  # orbax tells every step it takes
+    if not cache:
+        return
+    home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
+    folder = os.environ.get(
+        "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(home) / "radejax" / "jax")
+    )
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)

@@ -1,0 +1,140 @@
+"""The containers that travel between the rooms: all are JAX pytrees of fixed shape.
+
+B frames, R range bins, A azimuth bins, D Doppler and E elevation bins, N padded
+ground-truth boxes, K padded detections, C classes. Boxes live in the radar-centred
+ego frame: x forward, y left, z up, metres; yaw counter-clockwise from x, radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from flax import struct
+
+CLASSES = ("Sedan", "Bus or Truck", "Pedestrian", "Motorcycle", "Bicycle")
+"""K-Radar's five detection classes in the order of every class axis."""
+
+BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
+"""Names of the numbers of a box, metres and radians."""
+
+NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
+"""K-Radar's benchmark region: x, y, z from and to, metres, ego frame."""
+
+WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
+"""K-Radar's wide region: x, y, z from and to, metres, ego frame."""
+
+
+@struct.dataclass
+class Batch:
+    """One batch of frames as the pipeline delivers it and the losses consume it.
+
+    Attributes:
+        projection: `[B, R, A, D+E]` normalised projections, Doppler channels first.
+        boxes: `[B, N, 8]` x, y, z, l, w, h, sin yaw, cos yaw; full extents.
+        classes: `[B, N]` int32 class indices; any value where not `is_valid`.
+        is_valid: `[B, N]` bool, True where a box is an object and not padding.
+        frame: `[B]` int32 index of the frame in its data set.
+        image: `[B, H, W, 3]` uint8 left front camera image, or None.
+        camera: Pytree of `[B, ...]` arrays that describe the camera, or None.
+    """
+
+    projection: jax.Array
+    boxes: jax.Array
+    classes: jax.Array
+    is_valid: jax.Array
+    frame: jax.Array
+    image: jax.Array | None = None
+    camera: object | None = None
+
+
+@struct.dataclass
+class DetectionMaps:
+    """What a detector predicts for every range-azimuth bin.
+
+    Attributes:
+        heatmap_logits: `[B, R, A, C]` center-point logits, before the sigmoid.
+        box_params: `[B, R, A, 8]` raw dx, dy, dz, l, w, h, sin yaw, cos yaw.
+    """
+
+    heatmap_logits: jax.Array
+    box_params: jax.Array
+
+
+@struct.dataclass
+class Detections:
+    """Boxes of a batch, by descending score, padded to a fixed number K.
+
+    Attributes:
+        boxes: `[B, K, 7]` x, y, z, l, w, h, yaw.
+        scores: `[B, K]` in [0, 1]; 0 where not `is_valid`.
+        classes: `[B, K]` int32 class indices; -1 where not `is_valid`.
+        is_valid: `[B, K]` bool, True where a row is a detection.
+        num_cut: `[B]` int32 peaks above the score threshold that did not fit in K.
+        class_names: Names of the class indices, the detector's; static under `jit`.
+            The methods take others in their place.
+    """
+
+    boxes: jax.Array
+    scores: jax.Array
+    classes: jax.Array
+    is_valid: jax.Array
+    num_cut: jax.Array
+    class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
+
+    def to_columns(self, classes: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """The valid rows of all frames as plain columns, as evaluation takes them.
+
+        Returns:
+            "frame" `[N]` position in the batch, "box" `[N, 7]`, "cls" `[N]` names,
+            "score" `[N]`; by frame, then by descending score.
+        """
+        names = self.class_names if classes is None else classes
+        frame, row = np.nonzero(np.asarray(self.is_valid))
+        indices = np.asarray(self.classes)[frame, row]
+        return {
+            "frame": frame,
+            "box": np.asarray(self.boxes, np.float64)[frame, row],
+            "cls": np.asarray(names, object)[indices].astype(str),
+            "score": np.asarray(self.scores, np.float64)[frame, row],
+        }
+
+    def to_list(
+        self, classes: Sequence[str] | None = None
+    ) -> list[list[dict[str, Any]]]:
+        """One list a frame of dictionaries: cls, score and the seven box numbers."""
+        columns = self.to_columns(classes)
+        frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
+        for frame, box, cls, score in zip(
+            columns["frame"],
+            columns["box"].tolist(),
+            columns["cls"].tolist(),
+            columns["score"].tolist(),
+            strict=True,
+        ):
+            values = dict(zip(BOX_FIELDS, box, strict=True))
+            frames[frame].append({"cls": cls, "score": score, **values})
+        return frames
+
+    def to_pandas(self, classes: Sequence[str] | None = None) -> Any:
+        """One row a detection, as a `pandas.DataFrame` (extra "notebook")."""
+        import pandas
+
+        columns = self.to_columns(classes)
+        boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
+        return pandas.DataFrame({**columns, **boxes})
+
+    def to_kitti(self, classes: Sequence[str] | None = None) -> list[str]:
+        """One text a frame as K-Radar's tools write predictions, without a final newline.
+
+        Raises:
+            UserError: K-Radar has no key for a class.
+
+        References:
+            `radejax.evaluation.files.kitti` describes the lines.
+        """
+        from radejax.evaluation.files.kitti import prediction_texts
+
+        return prediction_texts(self.to_columns(classes), self.is_valid.shape[0])

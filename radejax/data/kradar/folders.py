@@ -1,0 +1,221 @@
+"""Where things are in K-Radar's folders: sequences over several disks, label sources.
+
+A sequence is a folder named by its number. One sequence may have folders under several
+roots (tesseracts on one disk, images on another); each file is taken from the first
+root that has it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import re
+import zipfile
+from collections.abc import Iterator, Sequence
+
+from radejax.core.errors import DataError, UserError
+from radejax.geometry.radar_grid import RadarGrid
+
+_OWN_LABEL_FOLDERS = {
+    "v1.0": ("info_label_v1_0", "info_label"),
+    "v1.1": ("info_label_v1_1", "info_label"),
+    "v2.0": ("info_label_v2_0", "info_label_v2", "info_label"),
+    "v2.1": ("info_label_v2_1", "info_label"),
+}
+_SEQUENCE_NAME = re.compile(r"(\d{1,6})(?:_info_label_revised)?")
+_LABEL_NAME = re.compile(r"\d+_\d+\.txt")
+
+
+class SequenceFolder:
+    """All folders of one sequence, seen as one.
+
+    Listings are read once: asking for a thousand frames costs one directory scan.
+    """
+
+    def __init__(self, folders: Sequence[pathlib.Path]) -> None:
+        self.folders = tuple(folders)
+        self._listings: dict[str, dict[str, pathlib.Path]] = {}
+
+    def listing(self, subfolder: str) -> dict[str, pathlib.Path]:
+        """Files of a subfolder by name, the first root winning."""
+        if subfolder not in self._listings:
+            files: dict[str, pathlib.Path] = {}
+            for folder in self.folders:
+                try:
+                    names = sorted(os.listdir(folder / subfolder))
+                except (FileNotFoundError, NotADirectoryError):
+                    continue
+                for name in names:
+                    files.setdefault(name, folder / subfolder / name)
+            self._listings[subfolder] = files
+        return self._listings[subfolder]
+
+    def find(self, subfolder: str, name: str) -> pathlib.Path | None:
+        """Path of a file, None where no root has it."""
+        return self.listing(subfolder).get(name)
+
+
+def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
+    """Every sequence under the roots, by number.
+
+    Raises:
+        FileNotFoundError: A root does not exist.
+    """
+    found: dict[int, list[pathlib.Path]] = {}
+    for root in roots:
+        if not root.is_dir():
+            raise FileNotFoundError(f"{root}: no such folder, expected a K-Radar root")
+        for folder in sorted(root.iterdir()):
+            if folder.name.isdecimal() and folder.is_dir():
+                found.setdefault(int(folder.name), []).append(folder)
+    return {number: SequenceFolder(found[number]) for number in sorted(found)}
+
+
+class LabelSource:
+    """Label files by (sequence, frame name), wherever they come from.
+
+    Args:
+        files: What opens each label file: a path, or a member of `archive`.
+        archive: Zip file that the members are in, None for plain files.
+        description: Names the source in messages.
+    """
+
+    def __init__(
+        self,
+        files: dict[tuple[int, str], pathlib.Path | str],
+        archive: pathlib.Path | None,
+        description: str,
+    ) -> None:
+        self.files = dict(sorted(files.items()))
+        self.archive = archive
+        self.description = description
+
+    def where(self, key: tuple[int, str]) -> str:
+        """How messages name a label file."""
+        path = self.files[key]
+        return str(path) if self.archive is None else f"{self.archive}/{path}"
+
+    def read(
+        self, keys: Sequence[tuple[int, str]]
+    ) -> Iterator[tuple[tuple[int, str], bytes]]:
+        """Contents of label files; the archive is opened once."""
+        if self.archive is None:
+            for key in keys:
+                yield key, pathlib.Path(self.files[key]).read_bytes()
+            return
+        with zipfile.ZipFile(self.archive) as archive:
+            for key in keys:
+                try:
+                    yield key, archive.read(str(self.files[key]))
+                except (zipfile.BadZipFile, OSError) as error:
+                    raise DataError(f"{self.where(key)}: damaged: {error}") from None
+
+
+def own_labels(sequences: dict[int, SequenceFolder], version: str) -> LabelSource:
+    """Labels from the sequences' own folders, as the data set is delivered."""
+    files = {}
+    for number, folder in sequences.items():
+        for subfolder in _OWN_LABEL_FOLDERS[version]:
+            listing = folder.listing(subfolder)
+            names = [name for name in listing if _LABEL_NAME.fullmatch(name)]
+            if names:
+                files.update(
+                    {(number, n.removesuffix(".txt")): listing[n] for n in names}
+                )
+                break
+    return LabelSource(files, None, "the sequences' own folders")
+
+
+def labels_from(path: pathlib.Path) -> LabelSource:
+    """Labels from a revision folder or zip: `<sequence>/<radar>_<lidar>.txt` below it.
+
+    Raises:
+        FileNotFoundError: There is no such folder or file.
+        UserError: It is neither a folder nor a zip, or holds no label files.
+    """
+    if path.is_dir():
+        relative = [file.relative_to(path) for file in path.rglob("*.txt")]
+        members = {_label_key(name): path / name for name in relative}
+        archive = None
+    elif not path.exists():
+        raise FileNotFoundError(f"{path}: no such labels, expected a folder or a zip")
+    elif zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as file:
+            names = file.namelist()
+        members = {_label_key(pathlib.PurePosixPath(name)): name for name in names}
+        archive = path
+    else:
+        raise UserError(f"{path}: labels must be a folder or a zip file")
+    files = {key: member for key, member in members.items() if key is not None}
+    if not files:
+        raise UserError(
+            f"{path}: no label files in it, expected <sequence>/<radar>_<lidar>.txt "
+            "such as 1/00033_00001.txt"
+        )
+    return LabelSource(files, archive, str(path))
+
+
+def _label_key(path: pathlib.PurePath) -> tuple[int, str] | None:
+    """Sequence and frame name of a label file, None for any other file.
+
+    The sequence is the nearest folder above that is named like one: `1/...`,
+    `1/info_label/...` or `1_info_label_revised/...`.
+    """
+    if not _LABEL_NAME.fullmatch(path.name):
+        return None
+    for folder in reversed(path.parts[:-1]):
+        if match := _SEQUENCE_NAME.fullmatch(folder):
+            return int(match[1]), path.stem
+    return None
+
+
+def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | None:
+    """`split/<name>.txt` in or beside the given folders, None where there is none."""
+    for folder in near:
+        for candidate in ("split", "resources/split", "."):
+            path = folder / candidate / f"{split}.txt"
+            if path.is_file():
+                return path
+    return None
+
+
+def find_camera_calibration(
+    folders: Sequence[pathlib.Path], sequence: int
+) -> tuple[pathlib.Path | None, bool]:
+    """Calibration of the left front camera: of the sequence, else the common one.
+
+    Returns:
+        The file, None where there is none, and whether it is the sequence's own.
+    """
+    own = f"seq_{sequence:02d}/cam_1.yml"
+    of_sequence = (f"calib_seq_v2/{own}", own)
+    common = ("common/cam_front0.yml", "cam_front0.yml")
+    for names, is_own in ((of_sequence, True), (common, False)):
+        for folder in folders:
+            for name in names:
+                if (folder / name).is_file():
+                    return folder / name, is_own
+    return None, False
+
+
+def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
+    """Sensor axes of a data set: `radar_grid.json` in a root, else K-Radar's.
+
+    Raises:
+        DataError: The file is malformed, or two roots have different axes.
+    """
+    found: dict[pathlib.Path, RadarGrid] = {}
+    for root in roots:
+        path = root / "radar_grid.json"
+        if path.is_file():
+            try:
+                found[path] = RadarGrid.from_dict(json.loads(path.read_bytes()))
+            except (ValueError, KeyError, TypeError) as error:
+                raise DataError(f"{path}: no radar grid: {error!r}") from None
+    if len(set(found.values())) > 1:
+        raise DataError(
+            f"different sensor axes in {', '.join(map(str, found))}; data sets of "
+            "different sensors cannot be read as one"
+        )
+    return next(iter(found.values()), RadarGrid.kradar())

@@ -1,0 +1,53 @@
+"""One labelled frame of a data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from radejax.data.kradar.labels import Label, LabelHeader
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One labelled frame.
+
+    Attributes:
+        sequence: Number of the sequence.
+        name: Radar and LiDAR frame numbers, such as `"00033_00001"`.
+        header: Frame numbers of all sensors and the time stamp.
+        environment, time, weather: Conditions of the sequence.
+        labels: Every object of the file, in the LiDAR frame, unfiltered.
+        boxes: `[N, 7]` float64 x, y, z, l, w, h, yaw in the radar frame, of the
+            objects that the filters of the data set keep.
+        classes: `[N]` class names of `boxes`.
+        visibility: `[N]` availability flags of `boxes`.
+        radar_from_lidar_m: Offset that was added to LiDAR positions: x, y, z.
+        tesseract_path: The tesseract, None where it is missing.
+        projection_path: An official `.npy` projection, None where there is none.
+        camera_path: Front image (stereo pair), None where it is missing.
+        camera_calibration_path: Calibration of the left front camera, or None.
+    """
+
+    sequence: int
+    name: str
+    header: LabelHeader
+    environment: str
+    time: str
+    weather: str
+    labels: tuple[Label, ...]
+    boxes: np.ndarray
+    classes: np.ndarray
+    visibility: np.ndarray
+    radar_from_lidar_m: tuple[float, float, float]
+    tesseract_path: pathlib.Path | None
+    projection_path: pathlib.Path | None
+    camera_path: pathlib.Path | None
+    camera_calibration_path: pathlib.Path | None
+
+    @property
+    def key(self) -> str:
+        """Name that is unique in a data set: `"1/00033_00001"`."""
+        return f"{self.sequence}/{self.name}"

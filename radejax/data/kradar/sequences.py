@@ -1,0 +1,177 @@
+"""What K-Radar says about whole sequences: conditions, calibration, splits.
+
+Facts of the published data set that its folders do not always carry (conditions of
+the 58 sequences, LiDAR offset, split rule) are built in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import pathlib
+import re
+from collections.abc import Iterable, Mapping
+
+from radejax.core.errors import DataError
+
+DEFAULT_RADAR_FROM_LIDAR_M = (-2.54, 0.3)
+"""Metres to add to LiDAR x and y: the same on every K-Radar sequence."""
+
+WEATHERS = ("normal", "overcast", "fog", "rain", "sleet", "lightsnow", "heavysnow")
+
+# Sequences 1 to 58, as published by K-Radar; environment, time, weather: sequences.
+_CONDITIONS = {
+    ("urban", "night", "normal"): (1, 6),
+    ("highway", "night", "normal"): (2, 3, 4),
+    ("urban", "day", "normal"): (5, 14, 15, 18, 20),
+    ("alleyway", "night", "normal"): (7,),
+    ("university", "night", "normal"): (8,),
+    ("highway", "day", "normal"): (9, 10, 11, 12),
+    ("highway", "day", "overcast"): (13,),
+    ("university", "day", "normal"): (16, 17),
+    ("alleyway", "day", "normal"): (19,),
+    ("alleyway", "night", "rain"): (21,),
+    ("urban", "night", "overcast"): (22,),
+    ("urban", "night", "rain"): (23, 24, 25),
+    ("countryside", "day", "rain"): (26, 32, 33),
+    ("countryside", "day", "sleet"): (27, 31),
+    ("mountain", "day", "sleet"): (28, 29),
+    ("parkinglots", "day", "sleet"): (30,),
+    ("countryside", "night", "rain"): (34,),
+    ("parkinglots", "night", "sleet"): (35, 36),
+    ("countryside", "night", "sleet"): (37,),
+    ("mountain", "day", "fog"): (38, 39, 40, 41),
+    ("urban", "day", "lightsnow"): (42, 43),
+    ("shoulder", "day", "fog"): (44, 45),
+    ("highway", "night", "heavysnow"): (46, 47),
+    ("highway", "night", "lightsnow"): (48, 49),
+    ("highway", "night", "sleet"): (50, 51, 52),
+    ("highway", "day", "sleet"): (53,),
+    ("urban", "day", "heavysnow"): (54, 55, 56, 57, 58),
+}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Conditions:
+    """Circumstances of a sequence, as in its `description.txt`."""
+
+    environment: str
+    time: str
+    weather: str
+
+
+UNKNOWN_CONDITIONS = Conditions("unknown", "unknown", "unknown")
+KRADAR_CONDITIONS: Mapping[int, Conditions] = {
+    sequence: Conditions(*names)
+    for names, sequences in _CONDITIONS.items()
+    for sequence in sequences
+}
+"""Conditions of K-Radar's sequences 1 to 58."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RadarCalibration:
+    """From the LiDAR to the radar of one sequence.
+
+    Attributes:
+        frame_difference: Radar frame number minus LiDAR frame number.
+        dx_m: Metres to add to a LiDAR x.
+        dy_m: Metres to add to a LiDAR y.
+    """
+
+    frame_difference: int
+    dx_m: float
+    dy_m: float
+
+
+def read_calibration(path: str | os.PathLike) -> RadarCalibration:
+    """Reads `info_calib/calib_radar_lidar.txt`: a header line and three numbers.
+
+    Raises:
+        DataError: The file is malformed; the message names file and line.
+    """
+    lines = _read_lines(path)
+    if len(lines) < 2:
+        raise DataError(
+            f"{path}:{len(lines) + 1}: the file ends here, expected a header line and "
+            "'frame difference,x,y' as three numbers"
+        )
+    try:
+        difference, dx_m, dy_m = map(float, lines[1].split(","))
+    except ValueError:
+        difference = dx_m = dy_m = math.nan
+    if not all(map(math.isfinite, (difference, dx_m, dy_m))) or difference % 1:
+        raise DataError(
+            f"{path}:2: {lines[1][:80]!r}, expected three numbers: frame difference "
+            "(whole), x, y, such as 32,-2.54,0.3"
+        )
+    return RadarCalibration(int(difference), dx_m, dy_m)
+
+
+def read_description(path: str | os.PathLike) -> Conditions:
+    """Reads `description.txt`: environment, time and weather on one line.
+
+    Raises:
+        DataError: The file is malformed; the message names file and line.
+    """
+    lines = _read_lines(path)
+    fields = [field.strip().lower() for field in lines[0].split(",")] if lines else []
+    if len(fields) != 3 or not all(fields):
+        raise DataError(
+            f"{path}:1: {lines[0][:80] if lines else ''!r}, expected "
+            "'environment,time,weather', such as urban,night,normal"
+        )
+    return Conditions(*fields)
+
+
+def read_split(path: str | os.PathLike) -> list[tuple[int, str]]:
+    """Reads a split file: lines `sequence,label file`.
+
+    Returns:
+        Pairs of sequence and frame name, such as `(1, "00033_00001")`.
+
+    Raises:
+        DataError: A line is malformed; the message names file and line.
+    """
+    frames = []
+    for number, line in enumerate(_read_lines(path), start=1):
+        if not line.strip():
+            continue
+        match = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+_\d+)(?:\.txt)?\s*", line)
+        if match is None:
+            raise DataError(
+                f"{path}:{number}: {line[:80]!r}, expected 'sequence,label file', such "
+                "as 1,00033_00001.txt"
+            )
+        frames.append((int(match[1]), match[2]))
+    return frames
+
+
+def split_by_rule(names: Iterable[str], split: str) -> list[str]:
+    """K-Radar's split of one sequence: quarters 1 and 3 train, quarters 2 and 4 test.
+
+    Args:
+        names: Names of every labelled frame of the sequence.
+        split: "train" or "test".
+
+    Returns:
+        The names of the split, sorted. On complete sequences they equal the official
+        split files.
+    """
+    names = sorted(names)
+    cuts = [int(len(names) * quarter / 4) for quarter in range(5)]
+    first = 0 if split == "train" else 1
+    return [
+        name
+        for quarter in (first, first + 2)
+        for name in names[cuts[quarter] : cuts[quarter + 1]]
+    ]
+
+
+def _read_lines(path: str | os.PathLike) -> list[str]:
+    """Lines of a small text file; `DataError` if it is none."""
+    try:
+        return pathlib.Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise DataError(f"{path}:1: not a UTF-8 text file") from None

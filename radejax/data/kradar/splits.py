@@ -1,0 +1,95 @@
+"""Which frames belong to a split: from its file, or by K-Radar's rule."""
+
+from __future__ import annotations
+
+import collections
+import os
+import pathlib
+from collections.abc import Collection, Iterable, Sequence
+
+from radejax.core.errors import UserError
+from radejax.data.kradar import folders, sequences
+from radejax.data.kradar.findings import Findings
+from radejax.data.kradar.folders import LabelSource
+
+Key = tuple[int, str]
+"""Sequence number and frame name."""
+
+
+def select_frames(
+    source: LabelSource,
+    findings: Findings,
+    *,
+    split: str | os.PathLike | None,
+    near: Sequence[pathlib.Path],
+    sequence_numbers: Iterable[int] | None,
+) -> list[Key]:
+    """Keys of the label files to read, sorted.
+
+    Args:
+        source: The labels that there are.
+        findings: Where label files are reported that the split names in vain.
+        split: "train", "test", a split file, or None for every frame.
+        near: Folders in which split files are looked for.
+        sequence_numbers: Only these sequences; None for all.
+
+    Raises:
+        UserError: An unknown split, or a sequence without labels.
+    """
+    present = {sequence for sequence, _ in source.files}
+    wanted = present if sequence_numbers is None else set(sequence_numbers)
+    if wanted - present:
+        raise UserError(
+            f"no labels of sequences {sorted(wanted - present)} in "
+            f"{source.description}; there are {sorted(present)}"
+        )
+    keys = [key for key in source.files if key[0] in wanted]
+    if split is None:
+        return keys
+    entries = read_split_entries(split, near, keys, findings)
+    for sequence, name in sorted(entries - set(keys)):
+        if sequence in wanted:
+            findings.report(
+                "label file missing",
+                f"{sequence}/{name}",
+                f"in split {split} but not among the labels of {source.description}",
+                error=FileNotFoundError,
+            )
+        elif sequence_numbers is None:
+            findings.counts["split entries of sequences that are not here"] += 1
+    return [key for key in keys if key in entries]
+
+
+def read_split_entries(
+    split: str | os.PathLike,
+    near: Sequence[pathlib.Path],
+    keys: Collection[Key],
+    findings: Findings,
+) -> set[Key]:
+    """Frames of a split, from its file or by rule; arguments as in `select_frames`.
+
+    Args:
+        split: "train", "test" or a split file.
+        near: Folders in which split files are looked for.
+        keys: All labelled frames, which the rule divides.
+        findings: Where the use of the rule is noted.
+    """
+    if pathlib.Path(split).is_file():
+        return set(sequences.read_split(split))
+    if str(split) not in ("train", "test"):
+        raise UserError(
+            f"split {str(split)!r} is neither 'train', 'test', None nor a split file"
+        )
+    if path := folders.find_split_file(str(split), near):
+        return set(sequences.read_split(path))
+    findings.notes.append(
+        f"no split/{split}.txt found: split by K-Radar's rule, alternating quarters"
+    )
+    names = collections.defaultdict(list)
+    for sequence, name in keys:
+        names[sequence].append(name)
+    return {
+        (sequence, name)
+        for sequence in names
+        for name in sequences.split_by_rule(names[sequence], str(split))
+    }

@@ -1,0 +1,137 @@
+"""Writers of K-Radar's files: what `kradar` and `projection` read, byte for byte.
+
+The simulator writes its data sets with these. Every file appears under its name only
+when it is complete: writers write beside it and rename.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from radejax.core.errors import UserError
+from radejax.core.files import atomic_write
+from radejax.data.kradar.labels import Label, normalise_version
+
+if TYPE_CHECKING:
+    from radejax.geometry.radar_grid import RadarGrid
+
+_SENSORS = "tesseract_os2-64_cam-front_os1-128_cam-lrr"
+_MAT_TEXT = b"MATLAB 5.0 MAT-file, written by radejax"
+
+
+def write_labels(
+    path: str | os.PathLike,
+    indices: Sequence[int],
+    timestamp_s: float | str,
+    labels: Iterable[Label],
+    version: str = "v2.1",
+) -> None:
+    """Writes one label file, the inverse of `labels.read_labels`.
+
+    Args:
+        path: Label file, `<radar index>_<lidar index>.txt`.
+        indices: Frame numbers of radar, LiDAR OS2-64, front camera, LiDAR OS1-128 and
+            the other cameras.
+        timestamp_s: Unix time of the LiDAR scan.
+        labels: Objects in the LiDAR frame, full extents, radians.
+        version: Label version; v1.0 and v2.0 cannot keep the visibility.
+
+    Raises:
+        UserError: There are not five indices, or no such version.
+    """
+    version = normalise_version(version)
+    if len(indices) != 5:
+        raise UserError(f"a label header has five frame numbers, got {list(indices)}")
+    if not isinstance(timestamp_s, str):
+        timestamp_s = f"{timestamp_s:.9f}"
+    numbers = "_".join(f"{int(index):05d}" for index in indices)
+    lines = [f"* idx({_SENSORS})={numbers}, timestamp={timestamp_s}"]
+    lines += [_object_line(label, version) for label in labels]
+    with atomic_write(path) as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+
+
+def write_calibration(
+    path: str | os.PathLike, frame_difference: int, dx_m: float, dy_m: float
+) -> None:
+    """Writes `info_calib/calib_radar_lidar.txt`: metres to add to LiDAR positions."""
+    text = f"frame difference,x,y\n{int(frame_difference)},{float(dx_m)!r},{float(dy_m)!r}\n"
+    with atomic_write(path) as file:
+        file.write(text.encode("ascii"))
+
+
+def write_description(
+    path: str | os.PathLike, environment: str, time: str, weather: str
+) -> None:
+    """Writes `description.txt`: the conditions of one sequence on one line."""
+    with atomic_write(path) as file:
+        file.write(f"{environment},{time},{weather}\n".encode("ascii"))
+
+
+def write_splits(
+    folder: str | os.PathLike,
+    train: Iterable[tuple[int | str, str]],
+    test: Iterable[tuple[int | str, str]],
+) -> None:
+    """Writes `train.txt` and `test.txt` into a folder.
+
+    Args:
+        folder: Where to write, normally `<root>/split`.
+        train: Pairs of sequence and frame name, such as `(1, "00033_00001")`.
+        test: The same for the test split.
+    """
+    for name, frames in (("train", train), ("test", test)):
+        lines = [
+            f"{seq},{str(frame).removesuffix('.txt')}.txt" for seq, frame in frames
+        ]
+        with atomic_write(pathlib.Path(folder) / f"{name}.txt") as file:
+            file.write("\n".join(lines).encode("ascii"))
+
+
+def write_tesseract(
+    path: str | os.PathLike, tesseract: np.ndarray, *, compress: bool = False
+) -> None:
+    """Writes a tesseract as K-Radar does: MATLAB v5, `arrDREA`, column-major.
+
+    Equal tensors give equal bytes: MATLAB's creation date is left out.
+
+    Args:
+        path: `radar_tesseract/tesseract_<radar index>.mat`.
+        tesseract: `[D, R, E, A]` linear power; float32 stays float32.
+        compress: zlib-compress, 10 times slower to read.
+    """
+    import scipy.io  # loads slowly, and label writers do not need it
+
+    tesseract = np.asarray(tesseract)
+    if tesseract.ndim != 4:
+        raise UserError(f"a tesseract has 4 axes, got shape {tesseract.shape}")
+    with atomic_write(path) as file:
+        scipy.io.savemat(file, {"arrDREA": tesseract}, do_compression=compress)
+        file.seek(0)
+        file.write(_MAT_TEXT.ljust(116))
+
+
+def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
+    """Writes `radar_grid.json` at the root of a data set of another sensor grid."""
+    with atomic_write(pathlib.Path(root) / "radar_grid.json") as file:
+        file.write(json.dumps(grid.to_dict()).encode("ascii"))
+
+
+def _object_line(label: Label, version: str) -> str:
+    x, y, z, length, width, height, yaw = map(float, label.box)
+    previous = -1 if label.previous_track_id is None else label.previous_track_id
+    leading = {
+        "v1.0": [label.track_id, previous],
+        "v1.1": [label.visibility, label.track_id, previous],
+        "v2.0": [label.track_id],
+        "v2.1": [label.visibility, label.track_id],
+    }[version]
+    numbers = [x, y, z, math.degrees(yaw), length / 2, width / 2, height / 2]
+    return ", ".join(["*", *map(str, leading), label.cls, *map(repr, numbers)])

@@ -1,0 +1,390 @@
+"""Projecting a data set: parallel, sharded over machines, resumable after a kill.
+
+The frames are cut into files of records. A file is one task: a worker projects its
+frames, writes under a temporary name, renames, and writes the file's manifest. Running
+the same command again does only the files that are not there. Whoever finishes the last
+file writes the manifest of the folder.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import pathlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
+
+from radejax.core.errors import DataError, UserError
+from radejax.core.files import atomic_write
+from radejax.data.encoding import check_encoding, encode, num_clipped
+from radejax.data.records import files
+from radejax.data.tesseract import project_file, read_projection_npy
+
+if TYPE_CHECKING:
+    from radejax.data.kradar import Frame, KRadar
+    from radejax.geometry.radar_grid import RadarGrid
+
+PLAN = "plan.json"
+
+_SMALL_JOB_CELLS = 3e9  # some 50 of K-Radar's tesseracts, a few seconds
+
+
+@dataclasses.dataclass
+class ProjectionReport:
+    """What one run of `project_dataset` did.
+
+    Attributes:
+        num_frames: Frames of this shard of the job.
+        num_found: Of these, finished by earlier runs.
+        num_projected: Projected by this run.
+        skipped: Frames left out, by this or earlier runs: key to reason.
+        seconds: Wall time.
+        reading_share: Part of the workers' time spent in reading files.
+        is_complete: True when every file of every shard is there.
+    """
+
+    num_frames: int
+    num_found: int = 0
+    num_projected: int = 0
+    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
+    seconds: float = 0.0
+    reading_share: float = 0.0
+    is_complete: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return dataclasses.asdict(self)
+
+    def to_text(self) -> str:
+        """Lines for a terminal."""
+        rate = self.num_projected / self.seconds if self.seconds else 0.0
+        lines = [
+            f"{self.num_frames:,} frames: {self.num_projected:,} projected, "
+            f"{self.num_found:,} found finished, {len(self.skipped):,} left out",
+            f"{self.seconds:.1f} s, {rate:.1f} frames/s, "
+            f"{100 * self.reading_share:.0f} % of the workers' time in reading",
+        ]
+        lines += [f"left out: {key}: {why}" for key, why in self.skipped.items()]
+        if not self.is_complete:
+            lines.append("other shards are not finished: no manifest.json yet")
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """One file of records: picklable, without boxes and labels."""
+
+    folder: pathlib.Path
+    name: str
+    frames: tuple[tuple[str, pathlib.Path | None, pathlib.Path | None], ...]
+    shape_drea: tuple[int, ...]
+    projection_shape: tuple[int, ...]
+    encoding: str
+    skip_bad: bool
+
+
+def project_dataset(
+    frames: KRadar | Sequence[Frame],
+    out_dir: str | os.PathLike,
+    *,
+    grid: RadarGrid | None = None,
+    dtype: str = "float16",
+    shard: str | tuple[int, int] = (0, 1),
+    num_workers: int | None = None,
+    frames_per_file: int = 64,
+    skip_bad: bool = False,
+    progress: bool = True,
+) -> ProjectionReport:
+    """Projects the tesseracts of a data set into a folder of records.
+
+    Args:
+        frames: Frames to project, normally a `KRadar` without a split: records serve
+            every split and label revision. The records are in their order.
+        out_dir: Folder of the records; made if needed.
+        grid: Sensor axes; None takes those of `frames`.
+        dtype: Type of the records: "float16", "uint8" or "float32".
+        shard: `(i, n)` or `"i/n"`, i from 0: this run does every n-th file.
+        num_workers: Processes; 0: this one; None: one a core, or for a job that is done
+            before they have started, this one.
+        frames_per_file: Frames of one file of records (64 of K-Radar: 350 MB).
+        skip_bad: Leave out frames whose tesseract is missing or damaged, and report
+            them. Otherwise the first one raises.
+        progress: Show a progress bar with rate and time left.
+
+    Returns:
+        What was done.
+
+    Raises:
+        UserError: The folder holds another projection, a wrong shard, or a full disk.
+        DataError: A tesseract is missing or damaged, and not `skip_bad`.
+    """
+    began = time.perf_counter()
+    grid = _grid_of(frames, grid)
+    index, count = parse_shard(shard)
+    out_dir = pathlib.Path(out_dir)
+    sources = [(f.key, f.tesseract_path, f.projection_path) for f in frames]
+    if not sources:
+        raise UserError("no frames to project")
+    if frames_per_file < 1:
+        raise UserError(f"frames_per_file must be at least 1, got {frames_per_file}")
+    chunks = [
+        tuple(sources[start : start + frames_per_file])
+        for start in range(0, len(sources), frames_per_file)
+    ]
+    names = [files.file_name(i, len(chunks)) for i in range(len(chunks))]
+    plan = _plan([key for key, *_ in sources], frames_per_file, grid, dtype)
+    _agree_on_plan(out_dir, plan)
+    shapes = (tuple(grid.shape_drea), tuple(grid.projection_shape))
+    tasks = [
+        _Task(out_dir, name, chunk, *shapes, plan["dtype"], skip_bad)
+        for name, chunk in list(zip(names, chunks, strict=True))[index::count]
+    ]
+    report = ProjectionReport(num_frames=sum(len(task.frames) for task in tasks))
+    todo = [task for task in tasks if not _count_finished(task, report)]
+    _run(todo, report, num_workers, progress)
+    report.is_complete = _finish(out_dir, names, grid, plan["dtype"], sources)
+    report.seconds = time.perf_counter() - began
+    return report
+
+
+def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
+    """`(i, n)` of "i/n"; `UserError` unless 0 <= i < n."""
+    try:
+        index, count = shard.split("/") if isinstance(shard, str) else shard
+        index, count = int(index), int(count)
+    except (TypeError, ValueError):
+        raise UserError(f"shard {shard!r}, expected i/n such as 0/8") from None
+    if not 0 <= index < count:
+        raise UserError(f"shard {index}/{count}: i must be from 0 to n - 1")
+    return index, count
+
+
+def _grid_of(frames: Any, grid: RadarGrid | None) -> RadarGrid:
+    """The given grid, or that of the data set."""
+    own = getattr(frames, "grid", None)
+    if grid is None and own is None:
+        raise UserError("a plain list of frames has no grid: give grid=")
+    return grid if grid is not None else own
+
+
+def _plan(keys: list[str], frames_per_file: int, grid: RadarGrid, dtype: str) -> dict:
+    """What runs that share a folder must agree on."""
+    return {
+        "dtype": check_encoding(dtype),
+        "num_frames": len(keys),
+        "frames_per_file": frames_per_file,
+        "frames_sha256": hashlib.sha256("\n".join(keys).encode()).hexdigest(),
+        "grid": grid.to_dict(),
+    }
+
+
+def _agree_on_plan(out_dir: pathlib.Path, plan: dict) -> None:
+    """Writes the plan of a new folder; `UserError` if the folder has another one."""
+    path = out_dir / PLAN
+    try:
+        found = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        with atomic_write(path) as file:
+            file.write(json.dumps(plan).encode("ascii"))
+        return
+    except ValueError:
+        raise DataError(f"{path}: damaged plan; delete it") from None
+    except NotADirectoryError:
+        raise UserError(
+            f"{out_dir}: is a file, expected a folder for records"
+        ) from None
+    differing = [key for key in plan if found.get(key) != plan[key]]
+    if differing:
+        key = differing[0]
+        values = "" if key == "grid" else f": {found.get(key)} there, {plan[key]} now"
+        raise UserError(
+            f"{out_dir} holds another projection ({key} differs{values}); choose another "
+            "folder, or delete that one"
+        )
+
+
+def _count_finished(task: _Task, report: ProjectionReport) -> bool:
+    """True if an earlier run finished the file; its frames are then counted."""
+    entry = files.read_manifest_of(task.folder, task.name)
+    if entry is None or (entry.skipped and not task.skip_bad):
+        return False
+    report.num_found += len(entry.frames)
+    report.skipped.update(entry.skipped)
+    return True
+
+
+# Workers -----------------------------------------------------------------------------
+
+
+def _run(
+    tasks: list[_Task],
+    report: ProjectionReport,
+    num_workers: int | None,
+    progress: bool,
+) -> None:
+    """Does the tasks and adds them up in the report."""
+    total = sum(len(task.frames) for task in tasks)
+    bar = tqdm(total=total, unit="frame", desc="project", disable=not progress)
+    if num_workers is None:
+        cells = sum(len(task.frames) * math.prod(task.shape_drea) for task in tasks)
+        num_workers = (os.cpu_count() or 1) if cells > _SMALL_JOB_CELLS else 0
+    reading = working = 0.0
+    with bar:
+        if num_workers == 0:
+            results: Iterator = (_project_task(task, bar.update) for task in tasks)
+        else:
+            results = _run_in_processes(tasks, num_workers, bar)
+        for entry, read_s, work_s in results:
+            report.num_projected += len(entry.frames)
+            report.skipped.update(entry.skipped)
+            reading, working = reading + read_s, working + work_s
+    report.reading_share = reading / working if working else 0.0
+
+
+def _run_in_processes(tasks: list[_Task], num_workers: int, bar: tqdm) -> Iterator:
+    """Results in the order in which they come; the bar moves with every frame."""
+    context = multiprocessing.get_context("spawn")
+    # Without locks: a killed worker could hold one for ever. Each slot has one writer.
+    done, stop = context.RawArray("q", max(len(tasks), 1)), context.RawValue("b", 0)
+    pool = concurrent.futures.ProcessPoolExecutor(
+        min(num_workers, max(len(tasks), 1)),
+        mp_context=context,
+        initializer=_start_worker,
+        initargs=(done, stop),
+    )
+    with pool:
+        pending = {
+            pool.submit(_project_in_worker, task, slot)
+            for slot, task in enumerate(tasks)
+        }
+        try:
+            while pending:
+                finished, pending = concurrent.futures.wait(
+                    pending, 0.2, concurrent.futures.FIRST_COMPLETED
+                )
+                bar.update(sum(done) - bar.n)
+                for future in finished:
+                    yield future.result()
+        except concurrent.futures.process.BrokenProcessPool:
+            raise UserError(
+                "a worker process was killed, perhaps for want of memory; run the same "
+                "command again to continue, with fewer workers"
+            ) from None
+        except BaseException:
+            stop.value = 1  # the others need not finish their files first
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+class _StoppedError(Exception):
+    """Another worker failed: this one's file is given up."""
+
+
+_done: Any = None
+_stop: Any = None
+
+
+def _start_worker(done: Any, stop: Any) -> None:
+    """Shares the counters of frames, and ends this process when its parent dies."""
+    global _done, _stop
+    _done, _stop = done, stop
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _project_in_worker(task: _Task, slot: int) -> tuple:
+    """`_project_task` that moves the parent's progress bar and can be stopped by it."""
+
+    def count_frame(number: int) -> None:
+        if _stop.value:
+            raise _StoppedError
+        _done[slot] += number
+
+    return _project_task(task, count_frame)
+
+
+def _project_task(
+    task: _Task, count_frame: Callable[[int], Any]
+) -> tuple[files.RecordFile, float, float]:
+    """Projects one file of records; returns its manifest, reading and working time."""
+    began = time.perf_counter()
+    timings = {"reading": 0.0}
+    writer = files.RecordFileWriter(task.folder, task.name)
+    try:
+        for key, tesseract_path, projection_path in task.frames:
+            try:
+                projection = _projection(
+                    key, tesseract_path, projection_path, task, timings
+                )
+            except (DataError, FileNotFoundError, OSError) as error:
+                if not task.skip_bad:
+                    raise DataError(
+                        f"frame {key}: {error} (skip_bad leaves such frames out)"
+                    ) from None
+                writer.skipped[key] = str(error)
+            else:
+                writer.num_clipped += num_clipped(projection, task.encoding)
+                writer.write(key, encode(projection, task.encoding))
+            count_frame(1)
+        entry = writer.commit()
+    except BaseException:
+        writer.discard()
+        raise
+    return entry, timings["reading"], time.perf_counter() - began
+
+
+def _projection(
+    key: str,
+    tesseract_path: pathlib.Path | None,
+    projection_path: pathlib.Path | None,
+    task: _Task,
+    timings: dict[str, float],
+) -> Any:
+    """The projection of one frame, from its tesseract or, without one, from `.npy`."""
+    if tesseract_path is not None:
+        return project_file(tesseract_path, shape_drea=task.shape_drea, timings=timings)
+    if projection_path is not None:
+        return read_projection_npy(
+            projection_path, projection_shape=task.projection_shape
+        )
+    raise FileNotFoundError("no tesseract in any root")
+
+
+def _finish(
+    out_dir: pathlib.Path,
+    names: list[str],
+    grid: RadarGrid,
+    dtype: str,
+    sources: list[tuple[str, pathlib.Path | None, pathlib.Path | None]],
+) -> bool:
+    """Writes the manifest of the folder if every file is there."""
+    from radejax.data.records.projections import Manifest, write_manifest
+
+    entries = [files.read_manifest_of(out_dir, name) for name in names]
+    if any(entry is None for entry in entries):
+        return False
+    described = {
+        "tesseracts": sum(tesseract is not None for _, tesseract, _ in sources),
+        "released_projections": sum(
+            tesseract is None and npy is not None for _, tesseract, npy in sources
+        ),
+        "folders": sorted(
+            {str(p.parents[2]) for _, *paths in sources for p in paths if p}
+        ),
+    }
+    write_manifest(out_dir, Manifest(grid, dtype, described, entries))
+    return True

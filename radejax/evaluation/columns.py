@@ -1,0 +1,242 @@
+"""Column tables of frames, ground truth and predictions: checked once, then trusted.
+
+Everything downstream works on `Objects`: frames and classes as dense indices, boxes
+in float64, rows sorted by (frame, class) with the caller's order kept inside a frame,
+because that order decides ties in K-Radar's protocol.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import CLASSES, NARROW_ROI, WIDE_ROI
+
+KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
+"""Class names that may occur in K-Radar's labels; those not asked for are ignored."""
+
+ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
+"""Regions of interest: x, y, z bounds in metres, inclusive, for box centers (ego)."""
+
+BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
+
+
+@dataclasses.dataclass(frozen=True)
+class Objects:
+    """Boxes of many frames, sorted by frame, then class, then the caller's order.
+
+    Attributes:
+        frame: `[N]` index into the frame table.
+        box: `[N, 7]` x, y, z, l, w, h, yaw in metres and radians, ego frame.
+        cls: `[N]` index into the evaluated classes.
+        score: `[N]`, zeros for ground truth.
+        row: `[N]` row in the caller's table.
+    """
+
+    frame: np.ndarray
+    box: np.ndarray
+    cls: np.ndarray
+    score: np.ndarray
+    row: np.ndarray
+
+    def __len__(self) -> int:
+        return self.frame.size
+
+    def take(self, index: np.ndarray) -> Objects:
+        """The rows that `index` (positions or mask) selects."""
+        return Objects(
+            *(getattr(self, field.name)[index] for field in dataclasses.fields(self))
+        )
+
+
+def roi_bounds(roi: str | Sequence[float] | None) -> tuple[float, ...] | None:
+    """Bounds (x0, x1, y0, y1, z0, z1) of a named or given region of interest.
+
+    Raises:
+        UserError: An unknown name, or not six increasing bounds.
+    """
+    if roi is None:
+        return None
+    if isinstance(roi, str):
+        if roi not in ROIS:
+            raise UserError(f"unknown roi {roi!r}; known: {', '.join(ROIS)}")
+        return ROIS[roi]
+    bounds = np.asarray(roi, np.float64).reshape(-1)
+    if bounds.size != 6 or not np.all(bounds[::2] < bounds[1::2]):
+        raise UserError(
+            f"roi must be (x0, x1, y0, y1, z0, z1) with increasing bounds, got {roi}"
+        )
+    return tuple(bounds.tolist())
+
+
+def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
+    """`[N]` bool: box centers inside the region, bounds included."""
+    bounds = roi_bounds(roi)
+    if bounds is None:
+        return np.ones(len(box), bool)
+    low, high = np.array(bounds[::2]), np.array(bounds[1::2])
+    return ((box[:, :3] >= low) & (box[:, :3] <= high)).all(axis=1)
+
+
+def roi_name(roi: str | Sequence[float] | None) -> str:
+    """A short name of a region for labels and file names."""
+    if roi is None:
+        return "none"
+    if isinstance(roi, str):
+        return roi
+    bounds = tuple(float(value) for value in np.asarray(roi).reshape(-1))
+    for name, known in ROIS.items():
+        if bounds == known:
+            return name
+    return ",".join(f"{value:g}" for value in bounds)
+
+
+def frame_ids(frames: Mapping[str, np.ndarray]) -> np.ndarray:
+    """`[F]` ids of a frame table, checked to be integers without repetition."""
+    if "frame" not in frames:
+        raise UserError(f"frames need a column 'frame', found {sorted(frames)}")
+    ids = _integers(frames["frame"], "frames")
+    values, count = np.unique(ids, return_counts=True)
+    if (count > 1).any():
+        twice = values[count > 1][0]
+        rows = np.flatnonzero(ids == twice)[:2].tolist()
+        raise DataError(f"frames: frame {twice} occurs twice, in rows {rows}")
+    for name, column in frames.items():
+        if np.shape(column)[:1] != ids.shape:
+            raise UserError(
+                f"frames: column {name!r} has {np.shape(column)} entries for"
+                f" {ids.size} frames"
+            )
+    return ids
+
+
+def read_columns(
+    table: Mapping[str, np.ndarray], *, name: str, scored: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frame `[N]`, box `[N, 7]`, class name `[N]`, score `[N]` of a column table.
+
+    Raises:
+        UserError: A column is missing or has the wrong shape or type.
+        DataError: A value no box may have, named by frame and row: not finite, a size
+            that is not positive, a score outside [0, 1].
+    """
+    wanted = ("frame", "box", "cls", "score") if scored else ("frame", "box", "cls")
+    missing = [column for column in wanted if column not in table]
+    if missing:
+        raise UserError(f"{name} lack the columns {missing}; found {sorted(table)}")
+    frame = _integers(table["frame"], name)
+    num = frame.size
+    box = np.asarray(table["box"], np.float64)
+    box = box.reshape(0, 7) if num == 0 else box
+    if box.shape != (num, 7):
+        raise UserError(
+            f"{name}: column 'box' has shape {box.shape}, expected ({num}, 7):"
+            " x, y, z, l, w, h, yaw"
+        )
+    cls = np.asarray(table["cls"])
+    if num and cls.dtype.kind not in "UO":
+        raise UserError(
+            f"{name}: column 'cls' holds {cls.dtype}, expected class names as strings"
+        )
+    cls = cls.astype(str)
+    score = np.asarray(table["score"], np.float64) if scored else np.zeros(num)
+    for column, values in (("cls", cls), ("score", score)):
+        if values.shape != (num,):
+            raise UserError(
+                f"{name}: column {column!r} has shape {values.shape}, expected ({num},)"
+            )
+    _check_values(frame, box, score, name, scored)
+    return frame, box, cls, score
+
+
+def _check_values(
+    frame: np.ndarray, box: np.ndarray, score: np.ndarray, name: str, scored: bool
+) -> None:
+    """Raise for the first row with a value that no box may have."""
+    bad = ~np.isfinite(box)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise DataError(
+            f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[column]} of the box is"
+            f" {box[row, column]}, expected a finite number"
+        )
+    bad = box[:, 3:6] <= 0
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise DataError(
+            f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[3 + column]} of the box"
+            f" is {box[row, 3 + column]:g} m, expected a size above 0"
+        )
+    bad = ~((score >= 0) & (score <= 1))
+    if scored and bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise DataError(
+            f"{name}: frame {frame[row]}, row {row}: score {score[row]} is outside [0, 1]"
+        )
+
+
+def _integers(column: np.ndarray, name: str) -> np.ndarray:
+    """A column of frame ids as int64."""
+    values = np.asarray(column)
+    if values.ndim != 1:
+        raise UserError(
+            f"{name}: column 'frame' has shape {values.shape}, expected [N]"
+        )
+    if values.size == 0:
+        return values.astype(np.int64)
+    if values.dtype.kind == "f" and np.all(values == np.floor(values)):
+        values = values.astype(np.int64)
+    if values.dtype.kind not in "iu":
+        raise UserError(
+            f"{name}: column 'frame' holds {values.dtype}, expected integer frame ids"
+        )
+    return values.astype(np.int64)
+
+
+def class_indices(
+    cls: np.ndarray, frame: np.ndarray, classes: Sequence[str], *, name: str
+) -> np.ndarray:
+    """`[N]` index into `classes`, -1 for known classes that were not asked for.
+
+    Raises:
+        DataError: A class name that is neither asked for nor one of K-Radar's.
+    """
+    names, inverse = np.unique(cls, return_inverse=True)
+    index = np.array(
+        [
+            classes.index(n) if n in classes else -1 if n in KNOWN_CLASSES else -2
+            for n in names.tolist()
+        ],
+        np.int64,
+    )
+    index = index[inverse] if names.size else np.zeros(0, np.int64)
+    if (index == -2).any():
+        row = int(np.flatnonzero(index == -2)[0])
+        known = ", ".join(dict.fromkeys((*classes, *KNOWN_CLASSES)))
+        raise DataError(
+            f"{name}: frame {frame[row]}, row {row}: unknown class {str(cls[row])!r};"
+            f" known: {known}"
+        )
+    return index
+
+
+def dense_frames(frame: np.ndarray, ids: np.ndarray, *, name: str) -> np.ndarray:
+    """`[N]` positions of `frame` in the table of ids.
+
+    Raises:
+        DataError: A frame that the table does not have.
+    """
+    order = np.argsort(ids, kind="stable")
+    position = np.searchsorted(ids[order], frame)
+    position = np.minimum(position, max(ids.size - 1, 0))
+    known = ids[order][position] == frame if ids.size else np.zeros(frame.size, bool)
+    if not known.all():
+        row = int(np.flatnonzero(~known)[0])
+        raise DataError(
+            f"{name}: frame {frame[row]}, row {row}: no such frame among the"
+            f" {ids.size} frames that are evaluated"
+        )
+    return order[position]

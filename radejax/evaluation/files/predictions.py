@@ -1,0 +1,292 @@
+"""Predictions and ground truth in files: NPZ, JSON and CSV, read and written.
+
+Every format holds the columns frame, cls, x, y, z, l, w, h, yaw and, for predictions,
+score. A frame is named by its id in the frame table (an integer) or by its key
+"sequence/name", such as "1/00033_00001" (K-Radar's label file, with or without .txt).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from radejax.core import files
+from radejax.core.errors import DataError, UserError
+from radejax.evaluation.columns import BOX_FIELDS
+
+Columns = dict[str, np.ndarray]
+
+
+def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:
+    """Ground truth and frame table of a data set such as `radejax.data.kradar.dataset.KRadar`.
+
+    Args:
+        frames: Objects with sequence, name, weather, environment, time, boxes `[N, 7]`
+            (radar frame) and classes `[N]` (names).
+
+    Returns:
+        Ground-truth columns and frame columns; the frame id is the position.
+    """
+    frames = list(frames)
+    counts = [len(frame.boxes) for frame in frames]
+    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
+    cls = [str(name) for frame in frames for name in frame.classes]
+    ground_truth = {
+        "frame": np.repeat(np.arange(len(frames)), counts),
+        "box": np.concatenate(box) if box else np.zeros((0, 7)),
+        "cls": np.array(cls, dtype=str),
+    }
+    table = {"frame": np.arange(len(frames))}
+    for column in ("sequence", "name", "weather", "environment", "time"):
+        table[column] = np.array([getattr(frame, column) for frame in frames])
+    return ground_truth, table
+
+
+def frame_keys(frames: Mapping[str, np.ndarray]) -> list[str]:
+    """Key "sequence/name" of every frame; the id where these are not known."""
+    if "name" not in frames:
+        return [str(frame) for frame in np.asarray(frames["frame"]).tolist()]
+    names = [_strip(str(name)) for name in np.asarray(frames["name"]).tolist()]
+    if "sequence" not in frames:
+        return names
+    sequences = np.asarray(frames["sequence"]).tolist()
+    return [
+        name if "/" in name else f"{sequence}/{name}"
+        for name, sequence in zip(names, sequences, strict=True)
+    ]
+
+
+def _strip(name: str) -> str:
+    return name.removesuffix(".txt")
+
+
+def read_table(
+    path: str | pathlib.Path,
+    frames: Mapping[str, np.ndarray] | None = None,
+    *,
+    scored: bool = True,
+) -> Columns:
+    """Reads predictions (or, not `scored`, ground truth) from .npz, .json or .csv.
+
+    Args:
+        path: The file.
+        frames: Frame table to look frames up in; None leaves integer ids as they are.
+        scored: Whether a score is expected.
+
+    Returns:
+        Columns frame, box, cls and score, as `average_precision.evaluate` takes them.
+
+    Raises:
+        FileNotFoundError: Names the file.
+        UserError: An unknown kind of file.
+        DataError: Missing columns, a value that is no number, an unknown frame; the
+            message names the file and the row.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(2, "no such file", str(path))
+    readers = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
+    if path.suffix not in readers:
+        raise UserError(
+            f"{path}: cannot read '{path.suffix}'; known: {', '.join(readers)}"
+            " and folders in KITTI's layout"
+        )
+    columns = readers[path.suffix](path)
+    wanted = ("frame", "box", "cls", "score") if scored else ("frame", "box", "cls")
+    missing = [name for name in wanted if name not in columns]
+    if missing:
+        raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
+    table = {name: columns[name] for name in wanted}
+    if table["frame"].size == 0:  # an empty list has neither type nor width
+        table.update(cls=np.zeros(0, str), box=np.zeros((0, 7)))
+    table["frame"] = find_frames(columns["frame"], frames, where=str(path))
+    return table
+
+
+def find_frames(
+    named: np.ndarray | Sequence[Any],
+    frames: Mapping[str, np.ndarray] | None,
+    *,
+    where: str,
+) -> np.ndarray:
+    """Ids of frames that are named by id or by key.
+
+    Raises:
+        DataError: A frame that the table does not have, or names without a table.
+    """
+    named = np.asarray(named)
+    if named.size == 0:
+        return np.zeros(0, np.int64)
+    if named.dtype.kind in "iu":
+        return named.astype(np.int64)
+    text = [_strip(str(name)) for name in named.tolist()]
+    if all(name.lstrip("-").isdigit() for name in text):
+        return np.array([int(name) for name in text], np.int64)
+    if frames is None:
+        raise DataError(f"{where}: frames are named ({text[0]!r}), but none are known")
+    ids = np.asarray(frames["frame"]).tolist()
+    known = dict(zip(frame_keys(frames), ids, strict=True))
+    for row, name in enumerate(text):
+        if name not in known:
+            raise DataError(
+                f"{where}: row {row}: no frame {name!r} among the {len(known)} frames"
+                f" that are evaluated (such as {next(iter(known), '-')!r})"
+            )
+    return np.array([known[name] for name in text], np.int64)
+
+
+def _read_npz(path: pathlib.Path) -> Columns:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            columns = {name: file[name] for name in file.files}
+    except (ValueError, OSError, EOFError) as error:
+        raise DataError(f"{path} is not a readable .npz file: {error}") from error
+    if "class_names" in columns and columns.get("cls", np.zeros(0)).dtype.kind in "iu":
+        columns["cls"] = columns["class_names"][columns["cls"]]
+    return columns
+
+
+def _read_json(path: pathlib.Path) -> Columns:
+    content = files.read_json(path)
+    if isinstance(content, dict) and isinstance(content.get("frame"), list):
+        columns = content
+    else:
+        columns = _columns_of_records(_records(content, path), path)
+    try:
+        return {
+            name: np.asarray(values)
+            if name in ("frame", "cls")
+            else np.asarray(values, np.float64)
+            for name, values in columns.items()
+            if name in ("frame", "box", "cls", "score")
+        }
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{path}: a box or score is not a number: {error}") from error
+
+
+def _records(content: Any, path: pathlib.Path) -> list[dict]:
+    """Flat records of a list of records or of a mapping frame -> list of records."""
+    if isinstance(content, dict):
+        return [
+            {"frame": frame, **record}
+            for frame, listed in content.items()
+            for record in _as_list(listed, f"{path}: frame {frame!r}")
+        ]
+    return _as_list(content, str(path))
+
+
+def _as_list(value: Any, where: str) -> list[dict]:
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise DataError(
+            f"{where}: expected a list of objects with frame, cls, box and score"
+        )
+    return value
+
+
+def _columns_of_records(records: list[dict], path: pathlib.Path) -> dict[str, list]:
+    columns: dict[str, list] = {"frame": [], "cls": [], "box": [], "score": []}
+    for row, record in enumerate(records):
+        box = record.get("box", [record.get(name) for name in BOX_FIELDS])
+        if not isinstance(box, list) or len(box) != 7 or None in box:
+            raise DataError(
+                f"{path}: row {row}, frame {record.get('frame')}: box is {box}, expected"
+                f" 7 numbers {', '.join(BOX_FIELDS)}"
+            )
+        for name in ("frame", "cls"):
+            if name not in record:
+                raise DataError(f"{path}: row {row}: lacks {name!r}")
+            columns[name].append(str(record[name]))
+        columns["box"].append(box)
+        columns["score"].append(record.get("score"))
+    lacking = [row for row, score in enumerate(columns["score"]) if score is None]
+    if lacking and len(lacking) < len(records):
+        raise DataError(f"{path}: row {lacking[0]}: lacks 'score'")
+    if lacking:
+        del columns["score"]
+    return columns
+
+
+def _read_csv(path: pathlib.Path) -> Columns:
+    with open(path, encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file, skipinitialspace=True)
+        header = reader.fieldnames or []
+        missing = [n for n in ("frame", "cls", *BOX_FIELDS) if n not in header]
+        if missing:
+            raise DataError(f"{path}: line 1: lacks columns {missing}; found {header}")
+        numbers = [n for n in (*BOX_FIELDS, "score") if n in header]
+        frame, cls, values = [], [], []
+        for line in reader:
+            frame.append(line["frame"])
+            cls.append(line["cls"])
+            values.append([_number(line[n], n, path, reader.line_num) for n in numbers])
+    table = np.array(values, np.float64).reshape(-1, len(numbers))
+    columns = {"frame": np.array(frame), "cls": np.array(cls, str), "box": table[:, :7]}
+    if "score" in numbers:
+        columns["score"] = table[:, 7]
+    return columns
+
+
+def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float:
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        raise DataError(
+            f"{path}: line {line}: {name} is {text!r}, expected a number"
+        ) from None
+
+
+def write_table(
+    path: str | pathlib.Path,
+    table: Mapping[str, np.ndarray],
+    frames: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Writes columns as .npz, .json or .csv; `read_table` gives the same back.
+
+    Args:
+        path: The file; its suffix chooses the format. Written whole or not at all.
+        table: Columns frame, box, cls and, for predictions, score.
+        frames: Frame table; with it frames are written by key, which survives another
+            selection or order of frames, and without it by id.
+    """
+    path = pathlib.Path(path)
+    frame = np.asarray(table["frame"], np.int64)
+    if frames is not None:
+        ids = np.asarray(frames["frame"]).tolist()
+        keys = dict(zip(ids, frame_keys(frames), strict=True))
+        frame = np.array([keys[i] for i in frame.tolist()], dtype=str)
+    columns = {
+        "frame": frame,
+        "cls": np.asarray(table["cls"], dtype=str),
+        "box": np.asarray(table["box"], np.float64).reshape(-1, 7),
+    }
+    if "score" in table:
+        columns["score"] = np.asarray(table["score"], np.float64)
+    if path.suffix == ".npz":
+        with files.atomic_path(path) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, **columns)
+    elif path.suffix == ".json":
+        files.write_text(path, json.dumps({k: v.tolist() for k, v in columns.items()}))
+    elif path.suffix == ".csv":
+        files.write_text(path, _csv_text(columns))
+    else:
+        raise UserError(f"{path}: cannot write '{path.suffix}'; known: .npz .json .csv")
+
+
+def _csv_text(columns: Columns) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    scored = "score" in columns
+    writer.writerow(["frame", "cls", *BOX_FIELDS, *(["score"] * scored)])
+    rows = zip(columns["frame"].tolist(), columns["cls"].tolist(), strict=True)
+    for index, (frame, cls) in enumerate(rows):
+        numbers = [repr(value) for value in columns["box"][index].tolist()]
+        if scored:
+            numbers.append(repr(float(columns["score"][index])))
+        writer.writerow([frame, cls, *numbers])
+    return buffer.getvalue()

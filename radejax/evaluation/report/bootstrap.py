@@ -1,0 +1,277 @@
+"""How sure a number is: resampling whole sequences.
+
+Frames of one sequence show the same few cars, so they are not independent; sequences
+are. A resample draws as many sequences as there are, with replacement, and every frame
+counts as often as its sequence was drawn, which all protocols handle exactly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from radejax.core.errors import DataError, UserError
+from radejax.evaluation import protocols
+from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.result import SPACES
+
+LEVEL = 0.95
+
+
+def sequence_weights(sequence: np.ndarray, *, resamples: int, seed: int) -> np.ndarray:
+    """`[B, F]` int16: how often each frame counts in each resample.
+
+    Args:
+        sequence: `[F]` sequence of every frame.
+        resamples: Number of resamples B.
+        seed: Of the drawing; the same seed draws the same sequences.
+
+    Raises:
+        UserError: Fewer than two sequences: there is nothing to resample.
+    """
+    names, inverse = np.unique(np.asarray(sequence), return_inverse=True)
+    if names.size < 2:
+        raise UserError(
+            f"intervals need at least 2 sequences to resample, found {names.size}"
+        )
+    rng = np.random.default_rng(seed)
+    drawn = rng.multinomial(names.size, np.full(names.size, 1 / names.size), resamples)
+    return drawn.astype(np.int16)[:, inverse]
+
+
+def resample(
+    data: EvaluationSet,
+    weights: np.ndarray,
+    protocol: str,
+    space: str,
+    iou: float,
+    *,
+    skip_empty: str | None = PROTOCOL_DEFAULT,
+    score_threshold: float = 0.0,
+) -> np.ndarray:
+    """`[B, C + 1]` AP of every class, then their mean, in every resample.
+
+    NaN where a resample has no object of a class; the mean is over classes that occur.
+    """
+    chosen = protocols.get_protocol(protocol)
+    skip = chosen.skip_empty if skip_empty == PROTOCOL_DEFAULT else skip_empty
+    num_classes = len(data.classes)
+    among = weights.any(axis=0)
+    ap = np.full((len(weights), num_classes + 1), np.nan)
+    for row, weight in enumerate(weights):
+        by_class = data.frame_weights(skip, weight)
+        for cls in range(num_classes):
+            curve = data.curve(
+                chosen, space, iou, cls, by_class[:, cls], score_threshold, among
+            )
+            if curve.num_gt:
+                ap[row, cls] = curve.ap
+        present = ap[row, :num_classes]
+        present = present[~np.isnan(present)]
+        ap[row, num_classes] = present.mean() if present.size else np.nan
+    return ap
+
+
+def interval(samples: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
+    """Percentile interval of `[B]` samples; NaN if fewer than half of them exist."""
+    samples = samples[~np.isnan(samples)]
+    if samples.size < 1:
+        return float("nan"), float("nan")
+    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Run B against run A in one metric.
+
+    Attributes:
+        cls: Class name or "mean".
+        space: "bev" or "3d".
+        iou: IoU threshold.
+        protocol: Name of the protocol.
+        ap_a: AP of run A, all frames.
+        ap_b: AP of run B.
+        difference: B minus A.
+        low: Lower end of the 95 % interval of the difference.
+        high: Upper end.
+        p_value: Two-sided, from the share of resamples in which the sign turns.
+        p_adjusted: The same after Holm's correction over all rows compared together.
+        is_real: Whether `p_adjusted` is below 0.05.
+    """
+
+    cls: str
+    space: str
+    iou: float
+    protocol: str
+    ap_a: float
+    ap_b: float
+    difference: float
+    low: float
+    high: float
+    p_value: float
+    p_adjusted: float
+    is_real: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return dataclasses.asdict(self)
+
+
+def compare(
+    data_a: EvaluationSet,
+    data_b: EvaluationSet,
+    sequence: np.ndarray,
+    *,
+    protocol_names: Sequence[str] = (protocols.RECOMMENDED, "kradar_r40"),
+    iou_thresholds: Sequence[float] = (0.3,),
+    spaces: Sequence[str] = SPACES,
+    score_threshold: float = 0.0,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> list[Comparison]:
+    """Paired comparison of two runs: both see the same resampled sequences.
+
+    Args:
+        data_a: Run A.
+        data_b: Run B on the same ground truth and frames.
+        sequence: `[F]` sequence of every frame.
+        protocol_names: Protocols to compare in.
+        iou_thresholds: IoU thresholds.
+        spaces: "bev", "3d".
+        score_threshold: Score cut of both.
+        resamples: Number of resamples.
+        seed: Of the resampling.
+
+    Raises:
+        UserError: The runs differ in classes, frames or ground truth.
+    """
+    check_same_truth(data_a, data_b)
+    weights = sequence_weights(sequence, resamples=resamples, seed=seed)
+    everything = np.ones((1, len(sequence)), np.int16)
+    raw = []
+    for protocol in protocol_names:
+        for space in spaces:
+            for iou in iou_thresholds:
+                terms = (protocol, space, float(iou))
+                options = {"score_threshold": score_threshold}
+                whole = [
+                    resample(data, everything, *terms, **options)[0]
+                    for data in (data_a, data_b)
+                ]
+                samples = [
+                    resample(data, weights, *terms, **options)
+                    for data in (data_a, data_b)
+                ]
+                raw += _compare_classes(data_a.classes, terms, whole, samples)
+    return _holm(raw)
+
+
+def _compare_classes(
+    classes: Sequence[str], terms: tuple, whole: list, samples: list
+) -> list[Comparison]:
+    """One comparison per class that occurs, and for the mean."""
+    protocol, space, iou = terms
+    result = []
+    for index, name in enumerate((*classes, "mean")):
+        ap_a, ap_b = float(whole[0][index]), float(whole[1][index])
+        if np.isnan(ap_a):
+            continue
+        gaps = samples[1][:, index] - samples[0][:, index]
+        gaps = gaps[~np.isnan(gaps)]
+        low, high = interval(gaps)
+        # One is added so that no finite number of resamples claims certainty.
+        below, above = (
+            (side.sum() + 1) / (gaps.size + 1) for side in (gaps <= 0, gaps >= 0)
+        )
+        p_value = float(min(1.0, 2 * min(below, above)))
+        result.append(
+            Comparison(
+                name, space, iou, protocol, ap_a, ap_b, ap_b - ap_a, low, high,
+                p_value, p_value, False,
+            )
+        )  # fmt: skip
+    return result
+
+
+def _holm(rows: list[Comparison]) -> list[Comparison]:
+    """Adjusts p-values for the number of rows (Holm's step-down)."""
+    order = np.argsort([row.p_value for row in rows], kind="stable")
+    adjusted = 0.0
+    result = list(rows)
+    for rank, position in enumerate(order.tolist()):
+        row = rows[position]
+        adjusted = max(adjusted, min(1.0, (len(rows) - rank) * row.p_value))
+        result[position] = dataclasses.replace(
+            row, p_adjusted=adjusted, is_real=adjusted < 1 - LEVEL
+        )
+    return result
+
+
+def check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
+    """Raises unless two sets have the same classes, frames and ground truth."""
+    if data_a.classes != data_b.classes:
+        raise UserError(
+            f"the runs are of different classes: {data_a.classes} and {data_b.classes}"
+        )
+    for name, one, other in (
+        ("frames", data_a.frame, data_b.frame),
+        ("objects", data_a.gt.box, data_b.gt.box),
+        ("classes of objects", data_a.gt.cls, data_b.gt.cls),
+    ):
+        if one.shape != other.shape:
+            raise UserError(
+                f"the runs have different {name}: {len(one)} and {len(other)}"
+            )
+        if not np.array_equal(one, other):
+            row = int(np.flatnonzero((one != other).reshape(len(one), -1).any(1))[0])
+            raise DataError(f"the runs have different {name}, first in row {row}")
+
+
+def add_intervals(
+    data: EvaluationSet,
+    frames: Mapping[str, np.ndarray],
+    terms: Sequence[tuple[str, str, float]],
+    *,
+    resamples: int,
+    seed: int,
+    masks: Mapping[str, np.ndarray] | None = None,
+    skip_empty: str | None = PROTOCOL_DEFAULT,
+    score_threshold: float = 0.0,
+) -> dict[tuple[str, str, str, str, float], tuple[float, float]]:
+    """95 % intervals by (protocol, condition, class, space, IoU).
+
+    Args:
+        data: The evaluation set.
+        frames: Frame table with a column sequence.
+        terms: (protocol, space, IoU) to resample.
+        resamples: Number of resamples.
+        seed: Of the resampling.
+        masks: `[F]` masks by condition, resampled within the condition's sequences.
+            Conditions of a single sequence get no interval.
+        skip_empty: Frame rule.
+        score_threshold: Score cut.
+    """
+    if "sequence" not in frames:
+        raise UserError("intervals need a column 'sequence' in the frame table")
+    sequence = np.asarray(frames["sequence"])
+    everything = {"all": np.ones(sequence.size, bool), **(masks or {})}
+    found = {}
+    for condition, mask in everything.items():
+        if np.unique(sequence[mask]).size < 2:
+            continue
+        weights = np.zeros((resamples, sequence.size), np.int16)
+        weights[:, mask] = sequence_weights(
+            sequence[mask], resamples=resamples, seed=seed
+        )
+        for protocol, space, iou in terms:
+            ap = resample(
+                data, weights, protocol, space, iou,
+                skip_empty=skip_empty, score_threshold=score_threshold,
+            )  # fmt: skip
+            for index, name in enumerate((*data.classes, "mean")):
+                found[protocol, condition, name, space, iou] = interval(ap[:, index])
+    return found

@@ -1,0 +1,276 @@
+"""Where a detector is good and where it fails: slices, errors, calibration, confusion.
+
+All of it uses the recommended protocol's matches (every prediction, by falling score,
+takes the best free object of its class) at one IoU threshold and one space.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from radejax.evaluation import matching, overlap, protocols
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.result import SPACES
+from radejax.visualize.curves import calibration_bins
+
+DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Slice:
+    """Numbers of one class in one slice of the data.
+
+    Attributes:
+        ap: Exact AP, 0 to 100, NaN without objects.
+        precision: Share of predictions above the operating score that are right.
+        recall: Share of objects they find.
+        num_gt: Objects in the slice.
+        num_det: Predictions above the operating score in the slice.
+    """
+
+    ap: float
+    precision: float
+    recall: float
+    num_gt: int
+    num_det: int
+
+
+def matched_objects(data: EvaluationSet, space: str, iou: float) -> np.ndarray:
+    """`[M]` ground truth that each prediction found, or -1 (recommended protocol)."""
+    return data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
+
+
+def slice_numbers(
+    data: EvaluationSet,
+    cls: int,
+    gt_mask: np.ndarray,
+    pred_mask: np.ndarray,
+    match: np.ndarray,
+    operating_score: float,
+) -> Slice:
+    """AP, precision and recall of one class over chosen objects and predictions.
+
+    Args:
+        data: The evaluation set.
+        cls: Class index.
+        gt_mask: `[N]` objects in the slice.
+        pred_mask: `[M]` predictions in the slice.
+        match: `[M]` from `matched_objects`.
+        operating_score: Precision and recall are of predictions above this score.
+    """
+    order = np.lexsort((data.pred.row, -data.pred.score))
+    order = order[(data.pred.cls[order] == cls) & pred_mask[order]]
+    score, is_tp = data.pred.score[order], match[order] >= 0
+    num_gt = int((gt_mask & (data.gt.cls == cls)).sum())
+    curve = protocols.pooled_curve(
+        score=score,
+        is_tp=is_tp,
+        weight=np.ones(order.size, np.int64),
+        num_gt=num_gt,
+        curve="exact",
+    )
+    above = score > operating_score
+    num_det, found = int(above.sum()), int(is_tp[above].sum())
+    return Slice(
+        curve.ap,
+        found / num_det if num_det else float("nan"),
+        found / num_gt if num_gt else float("nan"),
+        num_gt,
+        num_det,
+    )
+
+
+def by_distance(
+    data: EvaluationSet,
+    space: str,
+    iou: float,
+    *,
+    edges_m: tuple[float, ...] = DISTANCES_M,
+    operating_score: float = 0.3,
+) -> dict[tuple[str, str], Slice]:
+    """Numbers by (distance band, class); bands are of ground distance sqrt(x^2 + y^2).
+
+    A prediction that found an object belongs to the object's band, any other to its own:
+    a detection does not become a false positive for lying just across a border.
+    """
+    match = matched_objects(data, space, iou)
+    far_gt = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
+    far = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
+    if far_gt.size:
+        far = np.where(match >= 0, far_gt[match], far)
+    result = {}
+    for low, high in itertools.pairwise(edges_m):
+        in_gt, in_pred = ((d >= low) & (d < high) for d in (far_gt, far))
+        band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
+        for cls, name in enumerate(data.classes):
+            result[band, name] = slice_numbers(
+                data, cls, in_gt, in_pred, match, operating_score
+            )
+    return result
+
+
+def by_condition(
+    data: EvaluationSet,
+    conditions: dict[str, np.ndarray],
+    space: str,
+    iou: float,
+    *,
+    operating_score: float = 0.3,
+) -> dict[tuple[str, str], Slice]:
+    """Numbers by (condition, class); a condition is a `[F]` mask of frames."""
+    match = matched_objects(data, space, iou)
+    return {
+        (condition, name): slice_numbers(
+            data,
+            cls,
+            mask[data.gt.frame],
+            mask[data.pred.frame],
+            match,
+            operating_score,
+        )
+        for condition, mask in conditions.items()
+        for cls, name in enumerate(data.classes)
+    }
+
+
+def calibration(
+    data: EvaluationSet, space: str, iou: float, *, num_bins: int = 10
+) -> dict[str, dict[str, list]]:
+    """How often predictions of a score are right, per class and for "all".
+
+    Returns:
+        Per class: "low" and "high" edges of the score bins, "count", mean "score" and
+        "precision" per bin (NaN where empty), and "error", the mean of
+        |precision - score| weighted by count (expected calibration error).
+    """
+    is_match = matched_objects(data, space, iou) >= 0
+    edges = np.linspace(0, 1, num_bins + 1)
+    result = {}
+    for cls, name in [(None, "all"), *enumerate(data.classes)]:
+        rows = np.ones(len(data.pred), bool) if cls is None else data.pred.cls == cls
+        score, precision, count = calibration_bins(
+            data.pred.score[rows], is_match[rows], num_bins
+        )
+        total = int(count.sum())
+        error = float(np.nansum(np.abs(precision - score) * count))
+        result[name] = {
+            "low": edges[:-1].tolist(),
+            "high": edges[1:].tolist(),
+            "count": count.tolist(),
+            "score": score.tolist(),
+            "precision": precision.tolist(),
+            "error": error / total if total else float("nan"),
+        }
+    return result
+
+
+def box_errors(
+    data: EvaluationSet, space: str, iou: float, *, operating_score: float = 0.0
+) -> dict[str, dict[str, float]]:
+    """Errors of matched boxes per class: medians and means over the matches.
+
+    Returns:
+        Per class "count" and, as "<what>_mean" and "<what>_median": center_m (distance in
+        the ground plane), z_m (absolute), length_m, width_m, height_m (absolute),
+        heading_deg (absolute, 0 to 180), axis_deg (heading up to a half turn, 0 to 90),
+        and "reversed", the share of headings off by more than 90 degrees. NaN without
+        matches.
+    """
+    match = matched_objects(data, space, iou)
+    rows = np.flatnonzero((match >= 0) & (data.pred.score > operating_score))
+    found, truth = data.pred.box[rows], data.gt.box[match[rows]]
+    turn = np.abs(np.angle(np.exp(1j * (found[:, 6] - truth[:, 6]))))
+    gap = np.abs(found - truth)
+    errors = {
+        "center_m": np.hypot(gap[:, 0], gap[:, 1]),
+        "z_m": gap[:, 2],
+        "length_m": gap[:, 3],
+        "width_m": gap[:, 4],
+        "height_m": gap[:, 5],
+        "heading_deg": np.rad2deg(turn),
+        "axis_deg": np.rad2deg(np.minimum(turn, np.pi - turn)),
+    }
+    result = {}
+    for cls, name in enumerate(data.classes):
+        mine = data.pred.cls[rows] == cls
+        count = int(mine.sum())
+        numbers: dict[str, float] = {"count": count}
+        for what, values in errors.items():
+            numbers[f"{what}_mean"] = float(values[mine].mean()) if count else np.nan
+            numbers[f"{what}_median"] = (
+                float(np.median(values[mine])) if count else np.nan
+            )
+        numbers["reversed"] = (
+            float((turn[mine] > np.pi / 2).mean()) if count else np.nan
+        )
+        result[name] = numbers
+    return result
+
+
+def confusion(
+    data: EvaluationSet, space: str, iou: float, *, operating_score: float = 0.3
+) -> np.ndarray:
+    """`[C + 1, C + 1]` counts: true class by predicted class, last row and column "none".
+
+    Predictions above the operating score are matched to objects of any class, by falling
+    score to the best free object. Row C counts predictions on nothing, column C objects
+    that were not found.
+    """
+    num_classes = len(data.classes)
+    rows = np.flatnonzero(data.pred.score > operating_score)
+    pred = data.pred.take(rows)
+    first, second = overlap.candidate_pairs(
+        pred.frame, data.gt.frame, pred.box, data.gt.box
+    )
+    iou_pairs = overlap.pair_iou(pred.box[first], data.gt.box[second])
+    values = iou_pairs[SPACES.index(space)]
+    match = matching.match_free(
+        first, second, values, pred.score, pred.frame, len(data.gt), iou
+    )
+    table = np.zeros((num_classes + 1, num_classes + 1), np.int64)
+    hit = match >= 0
+    np.add.at(table, (data.gt.cls[match[hit]], pred.cls[hit]), 1)
+    np.add.at(table, (num_classes, pred.cls[~hit]), 1)
+    missed = np.ones(len(data.gt), bool)
+    missed[match[hit]] = False
+    np.add.at(table, (data.gt.cls[missed], num_classes), 1)
+    return table
+
+
+def worst_frames(
+    data: EvaluationSet,
+    space: str,
+    iou: float,
+    *,
+    count: int = 10,
+    operating_score: float = 0.3,
+) -> list[dict[str, float]]:
+    """Frames with the most mistakes above the operating score.
+
+    Returns:
+        Up to `count` entries, worst first: "index" in the frame table, "frame" id,
+        "missed" objects, "false" predictions, "found". Ties: more missed first, then the
+        order of the frame table. Frames without a mistake are never listed.
+    """
+    match = matched_objects(data, space, iou)
+    above = data.pred.score > operating_score
+    num = data.frame.size
+    objects = np.bincount(data.gt.frame, minlength=num)
+    found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)
+    false = np.bincount(data.pred.frame[above & (match < 0)], minlength=num)
+    missed = objects - found
+    order = np.lexsort((np.arange(num), -missed, -(missed + false)))[:count]
+    return [
+        {
+            "index": int(i),
+            "frame": int(data.frame[i]),
+            "missed": int(missed[i]),
+            "false": int(false[i]),
+            "found": int(found[i]),
+        }
+        for i in order
+        if missed[i] + false[i] > 0
+    ]

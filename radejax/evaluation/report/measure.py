@@ -1,0 +1,251 @@
+"""All numbers of one run: every protocol, condition, class, space and IoU threshold."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES
+from radejax.evaluation import protocols
+from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.result import Result, mean_ap
+
+ORDER = {
+    "weather": (
+        "normal",
+        "overcast",
+        "fog",
+        "rain",
+        "sleet",
+        "lightsnow",
+        "heavysnow",
+    ),
+    "environment": (
+        "urban",
+        "highway",
+        "countryside",
+        "alleyway",
+        "parkinglots",
+        "shoulder",
+        "mountain",
+        "university",
+    ),
+    "time": ("day", "night"),
+}
+"""K-Radar's tags in the order of its papers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a report contains; everything that changes a number is here.
+
+    Attributes:
+        run: Name of the run in tables.
+        classes: Classes evaluated.
+        iou_thresholds: IoU thresholds.
+        protocols: Names of protocols.
+        paper_protocol: Protocol of the rows that stand beside published ones.
+        score_threshold: Score cut of all APs.
+        skip_empty: Frame rule; "protocol" takes each protocol's own.
+        roi: Region of interest for both sides.
+        label_version: Label revision of the ground truth.
+        operating_score: Precision, recall, confusion and worst frames are of predictions
+            above this score.
+        bootstrap: Number of resamples of sequences for intervals; 0 for none.
+        seed: Of the resampling.
+        worst_frames: How many of the worst frames to list.
+        plots: Draw curves.
+        invalid_sizes: "error", or "false_positive": predicted boxes with a size that is
+            not positive overlap nothing but still count.
+        left_out_before: Counts of what loading left out already, to be printed.
+        draw_frame: Called with (frame id, path of a picture to write) for each of the
+            worst frames, or None.
+    """
+
+    run: str = "ours"
+    classes: tuple[str, ...] = CLASSES
+    iou_thresholds: tuple[float, ...] = (0.3, 0.5, 0.7)
+    protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
+    paper_protocol: str = "coco101"
+    score_threshold: float = 0.0
+    skip_empty: str | None = PROTOCOL_DEFAULT
+    roi: str | Sequence[float] | None = "narrow"
+    label_version: str | None = None
+    operating_score: float = 0.3
+    bootstrap: int = 0
+    seed: int = 0
+    worst_frames: int = 10
+    plots: bool = True
+    invalid_sizes: str = "error"
+    left_out_before: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    draw_frame: Callable[[int, Any], None] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for a report, without callbacks."""
+        values = dataclasses.asdict(dataclasses.replace(self, draw_frame=None))
+        del values["draw_frame"]
+        return values
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A result, the condition it holds for and the official number.
+
+    Attributes:
+        kind: "all", or the column of the frame table: "weather".
+        condition: "all" or a value of that column.
+        result: The result without its curve.
+        low: Lower end of the 95 % bootstrap interval, or None.
+        high: Upper end.
+    """
+
+    kind: str
+    condition: str
+    result: Result
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def shown(self) -> float | None:
+        """AP, or None where the class does not occur, whatever the protocol says."""
+        return self.result.ap if self.result.is_defined else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """A row of metrics.json and metrics.csv."""
+        result = self.result
+        return {
+            "name": f"{result.cls}/{self.condition}/{result.metric}",
+            "protocol": result.protocol,
+            "kind": self.kind,
+            "condition": self.condition,
+            "cls": result.cls,
+            "space": result.space,
+            "iou": result.iou,
+            "ap": self.shown,
+            "ap_low": self.low,
+            "ap_high": self.high,
+            "ap_official": None if math.isnan(result.ap) else result.ap,
+            "num_gt": result.num_gt,
+            "num_det": result.num_det,
+            "num_frames": result.num_frames,
+            "score_threshold": result.score_threshold,
+            "skip_empty": result.skip_empty,
+            "roi": result.roi,
+            "label_version": result.label_version,
+        }
+
+
+def condition_masks(
+    frames: Mapping[str, np.ndarray], kind: str
+) -> dict[str, np.ndarray]:
+    """`[F]` masks by value of a column of the frame table, K-Radar's values first."""
+    if kind not in frames:
+        return {}
+    column = np.asarray(frames[kind]).astype(str)
+    present = set(np.unique(column).tolist())
+    known = [name for name in ORDER.get(kind, ()) if name in present]
+    return {
+        name: column == name for name in [*known, *sorted(present.difference(known))]
+    }
+
+
+def measure(
+    data: EvaluationSet,
+    frames: Mapping[str, np.ndarray],
+    options: Options,
+    *,
+    kinds: Sequence[str] = ("weather",),
+) -> list[Measured]:
+    """Results over all frames and over every condition, in every chosen protocol.
+
+    The last class of every group is "mean": the mean over the classes that occur.
+    """
+    conditions = [("all", "all", None)]
+    for kind in kinds:
+        masks = condition_masks(frames, kind)
+        conditions += [(kind, name, mask) for name, mask in masks.items()]
+    rows = []
+    for protocol in options.protocols:
+        for kind, name, mask in conditions:
+            results = data.results(
+                protocol,
+                iou_thresholds=options.iou_thresholds,
+                skip_empty=options.skip_empty,
+                score_threshold=options.score_threshold,
+                weights=mask,
+                curves=False,
+            )
+            rows += [
+                Measured(kind, name, result) for result in with_means(results, data)
+            ]
+    return rows
+
+
+def with_means(results: Sequence[Result], data: EvaluationSet) -> list[Result]:
+    """Results with a row "mean" after the classes of each space and IoU threshold."""
+    step = len(data.classes)
+    rows: list[Result] = []
+    for start in range(0, len(results), step):
+        group = list(results[start : start + step])
+        mean = dataclasses.replace(
+            group[0],
+            cls="mean",
+            ap=mean_ap(group),
+            num_gt=sum(result.num_gt for result in group),
+            num_det=sum(result.num_det for result in group),
+            num_frames=max(result.num_frames for result in group),
+            precision=np.zeros(0),
+            recall=np.zeros(0),
+            score=np.zeros(0),
+        )
+        rows += [*group, mean]
+    return rows
+
+
+def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
+    """What the numbers do not see, and why, in words and counts."""
+    counts = {**options.left_out_before, **data.left_out}
+    low = data.pred.score <= options.score_threshold
+    counts[f"predictions: score not above {options.score_threshold:g}"] = int(low.sum())
+    has_object = data.gt_count.sum(axis=1) > 0
+    empty = ~has_object
+    counts["frames: without ground truth (left out by skip=frame)"] = int(empty.sum())
+    counts["predictions: in frames without ground truth (left out by skip=frame)"] = (
+        int((empty[data.pred.frame] & ~low).sum())
+    )
+    other = data.gt_count[data.pred.frame, data.pred.cls] == 0
+    counts["predictions: in frames without their class (left out by skip=class)"] = int(
+        (other & ~low).sum()
+    )
+    return counts
+
+
+def repair_sizes(
+    predictions: Mapping[str, np.ndarray], rule: str
+) -> tuple[Mapping[str, np.ndarray], int]:
+    """Predictions with sizes that an untrained network may produce made harmless.
+
+    Args:
+        predictions: Columns as in `average_precision.evaluate`.
+        rule: "error" leaves them as they are; "false_positive" shrinks boxes with a size
+            that is not positive to a micrometre: they match nothing but still count.
+
+    Returns:
+        The predictions and how many boxes were changed.
+    """
+    if rule not in ("error", "false_positive"):
+        raise UserError(
+            f'invalid_sizes must be "error" or "false_positive", got {rule!r}'
+        )
+    box = np.asarray(predictions["box"], np.float64).reshape(-1, 7)
+    bad = (box[:, 3:6] <= 0).any(axis=1)
+    if rule == "error" or not bad.any():
+        return predictions, 0
+    box = box.copy()
+    box[bad, 3:6] = 1e-6
+    return {**predictions, "box": box}, int(bad.sum())

@@ -1,0 +1,167 @@
+"""Time from a tensor in host memory to boxes, and what each stage takes of it."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from tabulate import tabulate
+
+from radejax import models
+from radejax.core.config import load_config
+from radejax.data.projection import project_jax
+from radejax.detection.decode import decode
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.detector import Detector
+from radejax.inference.inputs import placeholder
+from radejax.training.step import map_grid
+
+STAGES = ("transfer", "projection", "network", "decode + NMS")
+
+
+def untrained(config: Any, **overrides: Any) -> Detector:
+    """Detector with random weights of a config, on the sensor that it is made for.
+
+    Args:
+        config: A config or the name of its file, ":words" included.
+        **overrides: Arguments of `Detector`.
+    """
+    if isinstance(config, str):
+        config = load_config(config)
+    grid = RadarGrid.kradar()
+    if "simulation" in config:
+        from radejax.simulation.config import SimulationConfig
+
+        grid = SimulationConfig.from_mapping(config.simulation).make_grid()
+    model = models.build(config.model)
+    inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
+    if hasattr(model, "image_size"):
+        inputs += placeholder(1, model)
+    # Shapes alone: to compile the initialisation takes longer than to measure.
+    shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
+    rng = np.random.default_rng(0)
+    variables = jax.tree.map(
+        lambda x: 0.05 * rng.standard_normal(x.shape, x.dtype), shapes
+    )
+    return Detector.from_config(config, variables, grid, **overrides)
+
+
+def measure(
+    detector: Detector,
+    batch_sizes: Sequence[int] = (1, 10),
+    *,
+    repeats: int = 5,
+    tesseract: bool = True,
+    seed: int = 0,
+) -> list[dict[str, Any]]:
+    """Times calls of a detector on random tensors, and its stages one by one.
+
+    Stages are timed apart, each until its result is there; the whole is one call of the
+    detector, whose compiler and dispatch may join what the stages do in turn. All take
+    turns in every repeat; the best of the repeats counts.
+
+    Args:
+        detector: Of any kind; a radar-camera model gets black images, transferred and
+            looked at as real ones are.
+        batch_sizes: Frames at once.
+        repeats: Of each measurement, after one that compiles.
+        tesseract: From tesseracts; else from projections, without their stage.
+        seed: Of the tensors.
+
+    Returns:
+        One dictionary a batch size: batch, input, seconds of every stage ("stages"), of
+        their sum and of the whole call, frames_per_s of the whole, device, and jax's
+        version.
+    """
+    return [_measure(detector, n, repeats, tesseract, seed) for n in batch_sizes]
+
+
+def _measure(
+    detector: Detector, batch: int, repeats: int, tesseract: bool, seed: int
+) -> dict[str, Any]:
+    grid, device = detector.grid, detector.device
+    shape = grid.shape_drea if tesseract else grid.projection_shape
+    rng = np.random.default_rng(seed)
+    frames = rng.standard_exponential((batch, *shape), np.float32)
+    frames *= 1e9 if tesseract else 0.3
+    extra: tuple[Any, ...] = ()
+    if detector.takes_camera:
+        image, camera = placeholder(batch, detector.model)
+        extra = image, camera.replace(is_valid=np.ones(batch, bool))
+    sized = detector.with_batch_sizes((batch,))  # no padding to another size
+
+    map_function = jax.jit(
+        lambda variables, *inputs: detector.model.apply(variables, *inputs, train=False)
+    )
+    decode_function = jax.jit(
+        functools.partial(
+            decode,
+            grid=map_grid(grid, detector.model, detector.azimuth_mapping),
+            score_threshold=detector.score_threshold,
+            nms_iou=detector.nms_iou,
+            **detector.decode_options,
+        )
+    )
+    put = functools.partial(jax.device_put, device=device)
+    project = jax.jit(project_jax)
+    on_device = put((frames, *extra))
+    projected = project(on_device[0]) if tesseract else on_device[0]
+    inputs = projected, *on_device[1:]
+    maps = map_function(detector.variables, *inputs)
+    functions: dict[str, Callable[[], Any]] = {
+        "transfer": lambda: put((frames, *extra)),
+        "projection": lambda: project(on_device[0]),
+        "network": lambda: map_function(detector.variables, *inputs),
+        "decode + NMS": lambda: decode_function(maps),
+        "whole": lambda: sized(frames, *extra),
+    }
+    if not tesseract:
+        del functions["projection"]
+    times = _best(functions, repeats)
+    whole = times.pop("whole")
+    return {
+        "batch": batch,
+        "input": "tesseract" if tesseract else "projection",
+        "stages": times,
+        "sum_s": sum(times.values()),
+        "whole_s": whole,
+        "frames_per_s": batch / whole,
+        "device": device.device_kind,
+        "jax": jax.__version__,
+    }
+
+
+def _best(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Shortest time of each, in turns, after one call that compiles."""
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    for repeat in range(repeats + 1):
+        for name, function in functions.items():
+            start = time.perf_counter()
+            jax.block_until_ready(function())
+            if repeat:
+                times[name].append(time.perf_counter() - start)
+    return {name: min(values) for name, values in times.items()}
+
+
+def as_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Milliseconds of every stage with its share of their sum, one column a batch."""
+    names = [n for n in STAGES if any(n in row["stages"] for row in rows)]
+    header = ["from " + rows[0]["input"], *(f"batch {r['batch']}" for r in rows)]
+    table = [
+        [name]
+        + [
+            f"{1000 * row['stages'][name]:.2f} ms "
+            f"({100 * row['stages'][name] / row['sum_s']:.1f} %)"
+            for row in rows
+        ]
+        for name in names
+    ]
+    table.append(["sum of stages", *(f"{1000 * r['sum_s']:.2f} ms" for r in rows)])
+    table.append(["one call", *(f"{1000 * r['whole_s']:.2f} ms" for r in rows)])
+    table.append(["frames / s", *(f"{r['frames_per_s']:.2f}" for r in rows)])
+    title = f"{rows[0]['device']}, jax {rows[0]['jax']}; best times"
+    return f"{title}\n{tabulate(table, header, disable_numparse=True)}"

@@ -1,0 +1,253 @@
+"""Images through the frozen image backbone once, into records to train from.
+
+A folder of embeddings has a `manifest.json` like one of projections: which backbone
+made them (configuration and a checksum of its weights), their shape, and its files.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import hashlib
+import json
+import os
+import pathlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from radejax.core.errors import DataError, UserError
+from radejax.core.files import read_json, write_json
+from radejax.data.frame_table import read_left_image
+from radejax.data.kradar.frame import Frame
+from radejax.data.records import files as record_files
+from radejax.data.records.arrays import MANIFEST, ArrayRecords
+from radejax.models.dinorade import IMAGE_BACKBONE
+
+FORMAT = "radejax-embeddings"
+FORMAT_VERSION = 1
+DTYPES = ("float32", "float16")
+
+# Fields of `config.model.image` that do not change what comes out.
+_IRRELEVANT = ("freeze", "attention", "layer_scale")
+
+
+def embed_dataset(
+    model: nn.Module,
+    variables: Mapping[str, Any],
+    image_config: Mapping[str, Any],
+    frames: Sequence[Frame],
+    out_dir: str | os.PathLike,
+    *,
+    dtype: str = "float32",
+    resize: bool = False,
+    batch_size: int = 8,
+    frames_per_file: int = 64,
+    num_threads: int = 2,
+    progress: bool = True,
+) -> dict[str, int]:
+    """Writes the backbone's features of every front image; finished files are kept.
+
+    Args:
+        model: A `DinoRade`.
+        variables: With the backbone's parameters, `params/image_backbone`.
+        image_config: `config.model.image`, kept with the embeddings.
+        frames: Of a data set, normally without a split.
+        out_dir: Folder of the embeddings; made if needed.
+        dtype: "float32", with which training is the same as from images, or "float16",
+            half the size.
+        resize: Resize images of another size than the model's.
+        batch_size: Images at once.
+        frames_per_file: Frames of one file of records.
+        num_threads: Threads that read images.
+        progress: Show a progress bar.
+
+    Returns:
+        Counts: "frames", "embedded", "found", "missing" (frames without an image).
+
+    Raises:
+        UserError: The folder holds embeddings of another backbone or data set, a full
+            disk, or an unknown dtype.
+        DataError: An image is damaged or of another size.
+    """
+    if dtype not in DTYPES:
+        raise UserError(f"dtype is {dtype!r}, expected one of {DTYPES}")
+    if not len(frames):
+        raise UserError("no frames to embed")
+    out_dir = pathlib.Path(out_dir)
+    params = variables["params"][IMAGE_BACKBONE]
+    plan = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "image": _relevant(image_config),
+        "weights_sha256": weights_sha256(params),
+        "shape": list(model.feature_shape),
+        "dtype": dtype,
+        "frames_per_file": frames_per_file,
+        "num_frames": len(frames),
+        "frames_sha256": _sha256("\n".join(f.key for f in frames).encode()),
+    }
+    _agree_on_plan(out_dir, plan)
+    embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
+    params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
+    chunks = [
+        frames[start : start + frames_per_file]
+        for start in range(0, len(frames), frames_per_file)
+    ]
+    counts = {"frames": len(frames), "embedded": 0, "found": 0, "missing": 0}
+    entries = []
+    bar = tqdm(total=len(frames), unit="frame", desc="embed", disable=not progress)
+    with bar, concurrent.futures.ThreadPoolExecutor(num_threads) as pool:
+        reader = _Reader(pool, model.image_size, resize, batch_size)
+        for number, chunk in enumerate(chunks):
+            name = record_files.file_name(number, len(chunks), "embeddings")
+            entry = record_files.read_manifest_of(out_dir, name)
+            if entry is None:
+                batches = reader(chunk)
+                run = ((keys, embed(params, images)) for keys, images in batches)
+                entry = _write_file(out_dir, name, chunk, run, dtype, bar)
+                counts["embedded"] += len(entry.frames)
+            else:
+                counts["found"] += len(entry.frames)
+                bar.update(len(chunk))
+            counts["missing"] += len(entry.skipped)
+            entries.append(entry)
+    files = [dataclasses.asdict(entry) for entry in entries]
+    write_json(out_dir / MANIFEST, {**plan, "counts": counts, "files": files})
+    return counts
+
+
+def open_embeddings(
+    folder: str | os.PathLike, model_config: Mapping[str, Any] | None = None
+) -> ArrayRecords:
+    """Features `[h, w, C]` of a folder, by record; `index_of()` maps frame keys to them.
+
+    Args:
+        folder: What `radejax embed` wrote.
+        model_config: `config.model` that they must fit, or None.
+
+    Raises:
+        FileNotFoundError: There is no such folder, or it is not finished.
+        DataError: The manifest is damaged or of another version.
+        UserError: They come from another backbone.
+    """
+    path = pathlib.Path(folder) / MANIFEST
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
+        )
+    try:
+        manifest = read_json(path)
+        version = manifest["format"], manifest["version"]
+        if version != (FORMAT, FORMAT_VERSION):
+            raise DataError(
+                f"{path}: {version[0]} {version[1]}, this radejax reads {FORMAT} "
+                f"{FORMAT_VERSION}"
+            )
+        files = [record_files.RecordFile.from_dict(f) for f in manifest["files"]]
+        shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
+    except DataError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: damaged manifest ({error!r})") from None
+    if model_config is not None:
+        wanted = _relevant(model_config["image"])
+        for name, value in wanted.items():
+            if manifest["image"].get(name) != value:
+                raise UserError(
+                    f"{folder}: embeddings of a backbone with {name} = "
+                    f"{manifest['image'].get(name)}, config.model.image.{name} is "
+                    f"{value}"
+                )
+    return ArrayRecords(folder, files, shape, dtype)
+
+
+def embeddings_sha256(folder: str | os.PathLike) -> str:
+    """Checksum of the weights that embeddings were made with."""
+    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
+
+
+def weights_sha256(params: Mapping[str, Any]) -> str:
+    """Checksum of a tree of weights: names, shapes and values."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf, np.float32).tobytes())
+    return digest.hexdigest()
+
+
+@dataclasses.dataclass
+class _Reader:
+    """Batches of images of one size, read ahead by threads; the last is filled up."""
+
+    pool: concurrent.futures.Executor
+    size: tuple[int, int]
+    resize: bool
+    batch_size: int
+
+    def __call__(self, frames: Sequence[Frame]) -> Iterator[tuple[list, np.ndarray]]:
+        frames = [frame for frame in frames if frame.camera_path is not None]
+        images = self.pool.map(self._read, frames)  # in order, ahead of use
+        for start in range(0, len(frames), self.batch_size):
+            part = frames[start : start + self.batch_size]
+            batch = np.zeros((self.batch_size, *self.size, 3), np.uint8)
+            for row, _ in enumerate(part):
+                batch[row] = next(images)
+            yield [frame.key for frame in part], batch
+
+    def _read(self, frame: Frame) -> np.ndarray:
+        return read_left_image(frame.camera_path, self.size, resize=self.resize)
+
+
+def _write_file(
+    folder: pathlib.Path,
+    name: str,
+    frames: Sequence[Frame],
+    batches: Iterator[tuple[list[str], jax.Array]],
+    dtype: str,
+    bar: tqdm,
+) -> record_files.RecordFile:
+    writer = record_files.RecordFileWriter(folder, name)
+    try:
+        for frame in frames:
+            if frame.camera_path is None:
+                writer.skipped[frame.key] = "no front image"
+        bar.update(len(writer.skipped))
+        for keys, features in batches:
+            stored = np.asarray(features).astype(dtype)
+            for key, row in zip(keys, stored, strict=False):  # the batch may be padded
+                writer.write(key, row)
+            bar.update(len(keys))
+        return writer.commit()
+    except BaseException:
+        writer.discard()
+        raise
+
+
+def _agree_on_plan(out_dir: pathlib.Path, plan: Mapping[str, Any]) -> None:
+    """Writes the plan of a new folder; `UserError` if the folder has another one."""
+    path = out_dir / "plan.json"
+    if not path.exists():
+        out_dir.mkdir(parents=True, exist_ok=True)
+        write_json(path, dict(plan))
+        return
+    found = read_json(path)
+    for key, value in plan.items():
+        if found.get(key) != value:
+            raise UserError(
+                f"{out_dir} holds other embeddings ({key} is {found.get(key)} there, "
+                f"{value} now); choose another folder, or delete that one"
+            )
+
+
+def _relevant(image_config: Mapping[str, Any]) -> dict[str, Any]:
+    plain = {k: v for k, v in dict(image_config).items() if k not in _IRRELEVANT}
+    return json.loads(json.dumps(plain))
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

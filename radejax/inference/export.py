@@ -1,0 +1,260 @@
+"""Models as folders that need nothing of this package: StableHLO, or Hugging Face's files.
+
+Both formats hold `config.json` and `model.safetensors`, which
+`Detector.from_checkpoint` reads back.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import pathlib
+import shutil
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.export  # not a part of `import jax`
+import jax.numpy as jnp
+from flax import traverse_util
+
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.geometry.camera import Camera
+from radejax.inference import exported_loader, packed
+from radejax.inference.detector import Detector
+from radejax.inference.packed import BACKBONE
+
+PLATFORMS = ("cpu", "cuda", "tpu")
+KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
+FORMATS = ("stablehlo", "huggingface")
+PROGRAM_FILE = "detector.stablehlo"
+
+CAMERA_SHAPES = {
+    "cam_from_ego": (3, 4),
+    "intrinsics": (4,),
+    "distortion": (5,),
+    "max_radius": (),
+    "size_px": (2,),
+}
+"""Float fields of `radejax.geometry.calibration.Camera`, beside the bool `is_valid`."""
+
+
+def export(
+    detector: Detector,
+    folder: str | pathlib.Path,
+    *,
+    kind: str = "stablehlo",
+    platforms: Sequence[str] = PLATFORMS,
+    training_config: Mapping[str, Any] | None = None,
+    with_backbone: bool = False,
+) -> dict[str, Any]:
+    """Writes a folder with the model; existing files of the same names are replaced.
+
+    Args:
+        detector: What to export, with its thresholds as defaults.
+        folder: Made if missing.
+        kind: "stablehlo": program, weights and `load.py`, which needs jax and numpy
+            alone; "huggingface": weights, config and model card.
+        platforms: That the program shall run on: of `KNOWN_PLATFORMS`; "gpu" is CUDA.
+        training_config: Kept in `config.json`.
+        with_backbone: Keep the image transformer's weights, see `write_packed`.
+
+    Returns:
+        "kind", "folder", "bytes" and "left_out".
+
+    Raises:
+        UserError: An unknown kind or platform; or a program would need an image
+            backbone that is left out.
+    """
+    if kind not in FORMATS:
+        raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
+    platforms = _checked_platforms(platforms)
+    folder = pathlib.Path(folder)
+    if kind == "stablehlo":
+        program = stablehlo(detector, platforms, with_backbone=with_backbone)
+    content = packed.write_packed(
+        folder, detector, training_config=training_config, with_backbone=with_backbone
+    )
+    if kind == "stablehlo":
+        with files.atomic_write(folder / PROGRAM_FILE) as file:
+            file.write(program)
+        _copy_loader(folder)
+        files.write_text(folder / "README.md", _program_readme(detector, platforms))
+    else:
+        files.write_text(folder / "README.md", _model_card(detector, content))
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return {
+        "kind": kind,
+        "folder": str(folder),
+        "bytes": size,
+        "left_out": content["left_out"],
+    }
+
+
+def _checked_platforms(platforms: Sequence[str]) -> tuple[str, ...]:
+    names = ["cuda" if p.strip() == "gpu" else p.strip() for p in platforms]
+    for name in names:
+        if name not in KNOWN_PLATFORMS:
+            known = ", ".join(KNOWN_PLATFORMS)
+            raise UserError(f"platform is {name!r}, expected some of {known}")
+    return tuple(dict.fromkeys(names))
+
+
+def stablehlo(
+    detector: Detector,
+    platforms: Sequence[str] = PLATFORMS,
+    *,
+    with_backbone: bool = False,
+) -> bytes:
+    """The serialised program: weights, inputs, thresholds -> dictionary of arrays.
+
+    Inputs are projections `[B, R, A, D+E]`, and for a radar-camera model also images
+    and a dictionary of the camera's fields. B is symbolic. Without the backbone the
+    images are embedded ones.
+
+    Raises:
+        UserError: Weights that are not float32.
+    """
+    variables = {name: dict(tree) for name, tree in detector.variables.items()}
+    is_embedded = detector.takes_camera and not (
+        with_backbone or detector.model.vit is None
+    )
+    if is_embedded:
+        variables["params"].pop(BACKBONE, None)
+    flat = traverse_util.flatten_dict(variables, sep="/")
+    if odd := sorted(name for name, x in flat.items() if x.dtype != jnp.float32):
+        raise UserError(f"weights must be float32 to be exported; {odd[0]} is not")
+    function = detector.detect_function()
+
+    def program(
+        weights: Mapping[str, Any], inputs: tuple[Any, ...], *settings: Any
+    ) -> dict[str, jax.Array]:
+        projection, *rest = inputs
+        image, camera = rest if rest else (None, None)
+        if camera is not None:
+            camera = Camera(**camera)
+        tree = traverse_util.unflatten_dict(weights, sep="/")
+        found = function(tree, projection, image, camera, *settings, is_tesseract=False)
+        names = ("boxes", "scores", "classes", "is_valid", "num_cut")
+        return {name: getattr(found, name) for name in names}
+
+    (batch,) = jax.export.symbolic_shape("b")
+
+    def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(shape, dtype)
+
+    inputs: tuple[Any, ...] = (array(batch, *detector.grid.projection_shape),)
+    if detector.takes_camera:
+        model = detector.model
+        image = array(batch, *model.image_size, 3, dtype=jnp.uint8)
+        if is_embedded:
+            image = array(batch, *model.feature_shape)
+        camera = {name: array(batch, *s) for name, s in CAMERA_SHAPES.items()}
+        inputs += image, camera | {"is_valid": array(batch, dtype=jnp.bool_)}
+    weights = {name: array(*x.shape) for name, x in flat.items()}
+    exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
+        weights, inputs, array(), array(), array(6)
+    )
+    return bytes(exported.serialize())
+
+
+def _copy_loader(folder: pathlib.Path) -> None:
+    """`load.py`, and the pure-Python library that `jax.export` reads files with."""
+    files.write_text(
+        folder / "load.py", pathlib.Path(exported_loader.__file__).read_text()
+    )
+    spec = importlib.util.find_spec("flatbuffers")
+    source = pathlib.Path(spec.origin).parent
+    target = folder / "third_party" / "flatbuffers"
+    target.mkdir(parents=True, exist_ok=True)
+    for path in source.glob("*.py"):
+        shutil.copyfile(path, target / path.name)
+
+
+def _program_readme(detector: Detector, platforms: Sequence[str]) -> str:
+    grid = detector.grid
+    shape = ", ".join(map(str, grid.projection_shape))
+    return f"""# A radar detector as a program
+
+`detector.stablehlo` goes from radar projections to boxes, network, decoding and rotated
+NMS included, for any batch size, on {", ".join(platforms)}. It needs `jax` and `numpy`:
+
+```python
+from load import load
+detect = load()
+found = detect(projection)   # [B, {shape}] float32
+```
+
+`found` is a dictionary of arrays with {detector.decode_options["max_detections"]} rows a
+frame: `boxes` [B, K, 7] (x, y, z, l, w, h, yaw; metres and radians, x forward, y left, z
+up, seen from the radar), `scores` [B, K], `classes` [B, K] (indices into `classes` of
+`config.json`), `is_valid` [B, K] (True where a row is a detection) and `num_cut` [B]
+(peaks that found no row). `detect` also takes `score_threshold`, `nms_iou` and `roi`
+(x0, x1, y0, y1, z0, z1 in metres).
+
+A projection is the maximum of the power over elevation ({grid.num_doppler} Doppler
+channels) and over Doppler ({grid.num_elevation} elevation channels), on a logarithmic
+scale: `radejax.data.projection.project`. The sensor's axes are in `config.json` under
+`grid`.
+{_camera_text(detector)}
+| file | content |
+|---|---|
+| `detector.stablehlo` | the program, written by `jax.export` |
+| `model.safetensors` | its weights, float32 |
+| `config.json` | model, grid, classes, thresholds, training config |
+| `load.py` | the loader |
+| `third_party/flatbuffers` | pure Python, Apache-2.0; jax reads the program with it |
+
+`radejax.Detector.from_checkpoint(folder)` reads the same folder.
+"""
+
+
+def _camera_text(detector: Detector) -> str:
+    if not detector.takes_camera:
+        return ""
+    size = detector.model.image_size
+    return f"""
+The model takes a camera: `detect(projection, image, camera)` with images
+[B, {size[0]}, {size[1]}, 3] uint8, or what the image backbone made of them
+[B, {", ".join(map(str, detector.model.feature_shape))}] float32 if `config.json` lists it
+under `left_out`, and `camera` a dictionary of arrays: `cam_from_ego` [B, 3, 4],
+`intrinsics` [B, 4], `distortion` [B, 5], `max_radius` [B], `size_px` [B, 2] (float32) and
+`is_valid` [B] (bool, False: no image, radar alone), the fields of
+`radejax.geometry.calibration.Camera`.
+"""
+
+
+def _model_card(detector: Detector, content: Mapping[str, Any]) -> str:
+    name = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}[content["model"]["name"]]
+    left_out = ""
+    if content["left_out"]:
+        left_out = """
+The frozen DINOv3 weights are not part of this repository: their licence restricts passing
+them on. Download them from their owner and name the folder:
+
+```python
+detector = radejax.Detector.from_checkpoint("this folder", image_backbone="dinov3 folder")
+```
+"""
+    return f"""---
+library_name: radejax
+pipeline_tag: object-detection
+tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
+---
+
+# {name}
+
+3D object detection in 4D radar tensors. Classes: {", ".join(detector.classes)}.
+
+```python
+import radejax
+detector = radejax.Detector.from_checkpoint("this folder")
+detector(projection).to_list()   # [B, {", ".join(map(str, detector.grid.projection_shape))}]
+```
+{left_out}
+`config.json` holds the model, the sensor's grid, the decoding thresholds and the training
+config; `model.safetensors` the weights, float32, by their names in Flax.
+
+Before publishing, check the licence of the data that the weights were trained on (K-Radar:
+CC BY-NC-ND).
+"""

@@ -1,0 +1,275 @@
+"""Frames, images and calibrations as people hold them, made into a model's arrays.
+
+What comes out is what `data.pipeline` puts into `Batch.image` and `Batch.camera`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from radejax.core.errors import UserError
+from radejax.data.cameras import no_camera
+from radejax.data.frame_table import read_left_image
+from radejax.data.tesseract import read_frame
+from radejax.geometry.calibration import CameraCalibration, ImageKind
+from radejax.geometry.camera import Camera, stack_cameras
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.lifting import ReferencePoints
+
+PathLike = str | pathlib.Path
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraOptions:
+    """How calibrations are used; `config.data.camera` states the same.
+
+    Attributes:
+        projection: "raw", "rectified" or "pinhole", see `CameraCalibration.camera`.
+        ego_from_lidar_m: Shift from LiDAR to radar in place of the calibrations' own,
+            or None.
+        resize: Image files of another size than the model's are resized.
+        allow_missing: Frames without an image are predicted from the radar alone and
+            counted; otherwise they are an error.
+    """
+
+    projection: ImageKind = "raw"
+    ego_from_lidar_m: tuple[float, float, float] | None = None
+    resize: bool = False
+    allow_missing: bool = True
+
+    @classmethod
+    def of_config(cls, data: Mapping[str, Any]) -> CameraOptions:
+        """Options of `config.data`; the defaults where it has no camera."""
+        if "camera" not in data:
+            return cls()
+        fields = dict(data["camera"])
+        if fields.get("ego_from_lidar_m") is not None:
+            fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: fields[name] for name in names if name in fields})
+
+
+def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
+    """Radar frames as one array with a leading axis of B.
+
+    Args:
+        frames: Projections or tesseracts, one array or a list of them, or the path of
+            a file or several; see `Detector`.
+        grid: Of the sensor.
+
+    Returns:
+        `[B, R, A, D+E]` or `[B, D, R, E, A]`, and whether they are tesseracts.
+
+    Raises:
+        UserError: The shape fits neither, a list is empty, or its shapes differ.
+    """
+    if isinstance(frames, PathLike):
+        frames = [frames]
+    if isinstance(frames, Sequence):
+        frames = _stack_frames(frames, grid)
+    shape = tuple(np.shape(frames))
+    projection, tesseract = grid.projection_shape, grid.shape_drea
+    for expected, is_tesseract in ((projection, False), (tesseract, True)):
+        if shape[-len(expected) :] == expected and len(shape) - len(expected) < 2:
+            is_batch = len(shape) > len(expected)
+            return frames if is_batch else frames[None], is_tesseract
+    raise UserError(
+        f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
+        f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
+        f"[B, {', '.join(map(str, tesseract))}]"
+    )
+
+
+def _stack_frames(frames: Sequence[Any], grid: RadarGrid) -> np.ndarray:
+    """One array of the frames of a list: paths or arrays."""
+    arrays = [
+        read_frame(frame, grid) if isinstance(frame, PathLike) else np.asarray(frame)
+        for frame in frames
+    ]
+    if not arrays:
+        raise UserError("no frames: the list is empty")
+    shapes = {array.shape: i for i, array in reversed(list(enumerate(arrays)))}
+    if len(shapes) > 1:
+        first, *_, other = sorted(shapes, key=shapes.__getitem__)
+        raise UserError(
+            f"frames of one call must have one shape: frame 0 has {list(first)}, "
+            f"frame {shapes[other]} has {list(other)}"
+        )
+    return np.stack(arrays)
+
+
+def prepare(
+    image: Any,
+    camera: Any,
+    num_frames: int,
+    model: Any,
+    options: CameraOptions,
+) -> tuple[Any, Any, int]:
+    """Arrays for a radar-camera model, and how many frames have no image.
+
+    Args:
+        image: `[B, H, W, 3]` uint8 (or `[H, W, 3]` of the only frame), what
+            `model.embed` made of it, or a list with one image, path or None a frame.
+        camera: One calibration for all frames or a list with one (or None) a frame:
+            `CameraCalibration`, path of K-Radar's file of one, or `Camera`. Also a
+            batch of `Camera`, or `ReferencePoints`.
+        num_frames: B.
+        model: Has `image_size` and `feature_shape`.
+        options: How calibrations are used.
+
+    Returns:
+        Images `[B, ...]`, a `Camera` or `ReferencePoints` with leading axes of B, and
+        the number of frames without an image. Without any image both are None.
+
+    Raises:
+        UserError: A size or number is not what was expected, image or camera is given
+            alone, or an image is missing where that is not allowed.
+    """
+    if (image is None) != (camera is None):
+        given, lacking = ("image", "camera") if camera is None else ("camera", "image")
+        raise UserError(f"{given} is given without {lacking}: give both or none")
+    if image is None:
+        _check_missing(np.ones(num_frames, bool), options)
+        return None, None, num_frames
+    image, has_image = _images(image, num_frames, model, options.resize)
+    camera = _cameras(camera, num_frames, model, options)
+    if isinstance(camera, ReferencePoints):
+        has_image = has_image & _host(camera.has_image, num_frames)
+        camera = camera.replace(has_image=has_image)
+    else:
+        has_image = has_image & _host(camera.is_valid, num_frames)
+        camera = camera.replace(is_valid=has_image)
+    _check_missing(~has_image, options)
+    return image, camera, int((~has_image).sum())
+
+
+def placeholder(num_frames: int, model: Any) -> tuple[np.ndarray, Camera]:
+    """Black images and a camera that looks nowhere, of the shapes of real ones."""
+    image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
+    return image, stack_cameras([no_camera(model.image_size)] * num_frames)
+
+
+def check_backbone(image: Any, variables: Mapping[str, Any]) -> None:
+    """`UserError` for images themselves where variables lack the backbone's weights.
+
+    Args:
+        image: `[B, H, W, 3]`, what the backbone made of it, or None.
+        variables: Of a model.
+    """
+    is_raw = image is not None and image.shape[-1] == 3
+    if is_raw and IMAGE_BACKBONE not in variables["params"]:
+        raise UserError(
+            "these weights are without the image backbone: give "
+            "image_backbone=FOLDER with DINOv3's, or embedded images"
+        )
+
+
+def _check_missing(is_missing: np.ndarray, options: CameraOptions) -> None:
+    if is_missing.any() and not options.allow_missing:
+        raise UserError(
+            f"{int(is_missing.sum())} of {is_missing.size} frames have no image or "
+            f"calibration, the first is frame {int(is_missing.argmax())} of the batch; "
+            "config.data.camera.allow_missing takes the radar alone instead"
+        )
+
+
+def _host(mask: Any, num_frames: int) -> np.ndarray:
+    """`[B]` bool on the host; None is True for all."""
+    if mask is None:
+        return np.ones(num_frames, bool)
+    return np.asarray(mask, bool).reshape(num_frames)
+
+
+def _images(
+    image: Any, num_frames: int, model: Any, resize: bool
+) -> tuple[Any, np.ndarray]:
+    has_image = np.ones(num_frames, bool)
+    if isinstance(image, PathLike):
+        image = [image]
+    if isinstance(image, Sequence):
+        _check_count("images", len(image), num_frames)
+        images = [
+            read_left_image(pathlib.Path(one), model.image_size, resize=resize)
+            if isinstance(one, PathLike)
+            else one
+            for one in image
+        ]
+        has_image = np.array([one is not None for one in images])
+        if not has_image.any():
+            return placeholder(num_frames, model)[0], has_image
+        like = np.asarray(images[int(has_image.argmax())])
+        images = [np.zeros_like(like) if one is None else one for one in images]
+        if shapes := {np.shape(one) for one in images} - {like.shape}:
+            raise UserError(
+                f"images of different sizes: {like.shape} and {shapes.pop()}"
+            )
+        image = np.stack(images)
+    if np.ndim(image) == 3:
+        image = image[None]
+    possible = ((*model.image_size, 3), model.feature_shape)
+    if np.ndim(image) != 4 or tuple(image.shape[1:]) not in possible:
+        expected = " or embedded ".join(str(["B", *shape]) for shape in possible)
+        raise UserError(
+            f"image has shape {list(np.shape(image))}, expected {expected}".replace(
+                "'", ""
+            )
+        )
+    _check_count("images", image.shape[0], num_frames)
+    is_float = np.issubdtype(image.dtype, np.floating) or image.dtype == "bfloat16"
+    if image.dtype != np.uint8 and not is_float:
+        raise UserError(f"image has dtype {image.dtype}, expected uint8")
+    return image, has_image
+
+
+def _cameras(
+    camera: Any, num_frames: int, model: Any, options: CameraOptions
+) -> Camera | ReferencePoints:
+    """A batch of cameras or reference points with leading axes B."""
+    if isinstance(camera, ReferencePoints):
+        if camera.is_valid.shape[0] == num_frames:
+            return camera
+        _check_count("reference points", camera.is_valid.shape[0], 1)
+        return jax.tree.map(
+            lambda x: np.broadcast_to(x, (num_frames, *x.shape[1:])), camera
+        )
+    if isinstance(camera, Camera) and np.ndim(camera.max_radius) == 1:
+        _check_count("cameras", np.shape(camera.max_radius)[0], num_frames)
+        return camera
+    if not isinstance(camera, list | tuple):
+        camera = [camera] * num_frames
+    _check_count("cameras", len(camera), num_frames)
+    return stack_cameras(
+        [
+            no_camera(model.image_size) if one is None else _one_camera(one, options)
+            for one in camera
+        ]
+    )
+
+
+def _one_camera(camera: Any, options: CameraOptions) -> Camera:
+    if isinstance(camera, PathLike):
+        camera = CameraCalibration.from_kradar(camera)
+    if isinstance(camera, CameraCalibration):
+        if options.ego_from_lidar_m is not None:
+            camera = dataclasses.replace(
+                camera, ego_from_lidar_m=np.asarray(options.ego_from_lidar_m)
+            )
+        return camera.camera(options.projection)
+    if isinstance(camera, Camera) and np.ndim(camera.max_radius) == 0:
+        return camera
+    raise UserError(
+        f"camera is a {type(camera).__name__}, expected a CameraCalibration, a Camera, "
+        "the path of K-Radar's cam_*.yml or None, one for all frames or one a frame"
+    )
+
+
+def _check_count(what: str, found: int, expected: int) -> None:
+    if found != expected:
+        raise UserError(f"{found} {what} for {expected} frames")

@@ -1,0 +1,310 @@
+"""Folders that hold a model: packed ones, and the checkpoints of a run.
+
+A packed folder has the files that the Hugging Face Hub expects:
+
+    config.json          model, grid, classes, decoding, and the config it was trained with
+    model.safetensors    variables by name, "params/backbone/..."
+
+DINOv3's weights are never in it: their licence restricts passing them on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import numpy as np
+import safetensors.numpy
+from flax import traverse_util
+from ml_collections import ConfigDict
+
+import radejax
+from radejax import models
+from radejax.core import files
+from radejax.core.errors import DataError, UserError
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.inputs import CameraOptions
+from radejax.interop import image_backbone as camera_inputs
+from radejax.models import radenet
+from radejax.models.dinorade import IMAGE_BACKBONE as BACKBONE
+
+CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+FORMAT = "radejax-1"
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedModel:
+    """What `Detector` needs.
+
+    Attributes:
+        model: Without parameters.
+        variables: Its parameters and other collections.
+        grid: Of the sensor.
+        settings: Keyword arguments of `Detector`.
+        config: The training config as plain values, or None.
+        labels: Label revision of the run's data, or None.
+    """
+
+    model: nn.Module
+    variables: Mapping[str, Any]
+    grid: RadarGrid
+    settings: Mapping[str, Any]
+    config: Mapping[str, Any] | None = None
+    labels: str | None = None
+
+
+def load(
+    path: str | pathlib.Path,
+    *,
+    image_backbone: str | pathlib.Path | None = None,
+    step: int | str | None = None,
+) -> LoadedModel:
+    """Model of a packed folder, of a folder of checkpoints, of one of them, or of a run.
+
+    Args:
+        path: The folder.
+        image_backbone: DINOv3's folder from Hugging Face (torchvision's file for a
+            ResNet) where the folder is without the weights.
+        step: Of a run or of a folder of checkpoints: a number, or "best" by the run's
+            metric; the newest if None.
+
+    Raises:
+        FileNotFoundError: There is no model in the folder, or no such checkpoint.
+        UserError: A step of a folder with only one model.
+        DataError: A file is damaged, or config and weights do not fit.
+    """
+    path = pathlib.Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(f"no such folder: {path}")
+    if (path / WEIGHTS_FILE).is_file() and (path / CONFIG_FILE).is_file():
+        check_no_step(path, step)
+        loaded = read_packed(path)
+    elif (path / "checkpoints").is_dir():
+        return _of_run(path, image_backbone, step)
+    elif path.name.isdigit() and _has_checkpoint(path):
+        check_no_step(path, step)
+        loaded = _of_checkpoint(path.parent, int(path.name))
+    elif any(_has_checkpoint(child) for child in path.iterdir()):
+        loaded = _of_checkpoint(path, step)
+    else:
+        raise FileNotFoundError(
+            f"no model in {path}: expected {CONFIG_FILE} and {WEIGHTS_FILE}, the work "
+            "folder of a run, its checkpoints, or one of them"
+        )
+    if image_backbone is None:
+        return loaded
+    config = ConfigDict({"model": model_config(loaded.model)}, convert_dict=True)
+    part = camera_inputs.load_image_backbone(image_backbone, config)
+    frozen = {BACKBONE: part["params"][BACKBONE]}
+    variables = {
+        **loaded.variables,
+        "params": {**loaded.variables["params"], **frozen},
+    }
+    return dataclasses.replace(loaded, variables=variables)
+
+
+def check_no_step(path: pathlib.Path, step: int | str | None) -> None:
+    """`UserError` if a step is asked of what holds one model."""
+    if step is not None:
+        raise UserError(f"step {step} of {path}, which holds one model: give none")
+
+
+def settings_of_config(config: Any) -> dict[str, Any]:
+    """Keyword arguments of `Detector` that a config states."""
+    decode = dict(config["decode"])
+    return {
+        "classes": tuple(config["classes"]),
+        "azimuth_mapping": config["data"]["azimuth_mapping"],
+        "score_threshold": decode.pop("score_threshold"),
+        "nms_iou": decode.pop("nms_iou"),
+        "decode_options": decode,
+        "camera_options": CameraOptions.of_config(config["data"]),
+    }
+
+
+# Packed ------------------------------------------------------------------------------
+
+
+def write_packed(
+    folder: str | pathlib.Path,
+    detector: Any,
+    *,
+    training_config: Mapping[str, Any] | None = None,
+    with_backbone: bool = False,
+) -> dict[str, Any]:
+    """Writes `config.json` and `model.safetensors`.
+
+    Args:
+        folder: Made if missing.
+        detector: A `Detector`.
+        training_config: Kept in `config.json` to be read.
+        with_backbone: Keep the image transformer's weights. DINOv3's are for own
+            machines and not to be passed on.
+
+    Returns:
+        The content of `config.json`.
+
+    Raises:
+        UserError: The image transformer was trained along: without its weights the
+            model is not the same.
+    """
+    folder = pathlib.Path(folder)
+    left_out = []
+    variables = {k: dict(v) for k, v in detector.variables.items()}
+    is_vit = getattr(detector.model, "vit", None) is not None
+    if is_vit and not with_backbone and BACKBONE in variables["params"]:
+        if not detector.model.freeze:
+            raise UserError(
+                "the image transformer was trained along. Fine-tuned from DINOv3, its "
+                "licence restricts passing it on; trained from scratch, keep it by "
+                "with_backbone (--with-backbone)"
+            )
+        del variables["params"][BACKBONE]
+    if is_vit and BACKBONE not in variables["params"]:
+        left_out = [f"params/{BACKBONE}"]
+    content = {
+        "format": FORMAT,
+        "radejax": radejax.__version__,
+        "model": model_config(detector.model),
+        "classes": list(detector.classes),
+        "decode": {
+            "score_threshold": detector.score_threshold,
+            "nms_iou": detector.nms_iou,
+            **detector.decode_options,
+        },
+        "azimuth_mapping": detector.azimuth_mapping,
+        "camera": dataclasses.asdict(detector.camera_options),
+        "grid": detector.grid.to_dict(),
+        "left_out": left_out,
+        "training_config": training_config,
+    }
+    arrays = {
+        name: np.ascontiguousarray(value)
+        for name, value in traverse_util.flatten_dict(variables, sep="/").items()
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    with files.atomic_path(folder / WEIGHTS_FILE) as temporary:
+        safetensors.numpy.save_file(arrays, temporary, {"format": "jax"})
+    files.write_json(folder / CONFIG_FILE, content)
+    return content
+
+
+def read_packed(folder: str | pathlib.Path) -> LoadedModel:
+    """Inverse of `write_packed`.
+
+    Raises:
+        DataError: A file is damaged, or of another format.
+    """
+    folder = pathlib.Path(folder)
+    content = files.read_json(folder / CONFIG_FILE)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else None
+        raise DataError(
+            f"{folder / CONFIG_FILE}: format is {found!r}, expected {FORMAT!r}"
+        )
+    try:
+        arrays = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
+    except Exception as error:  # the library's own class is not exported
+        raise DataError(f"{folder / WEIGHTS_FILE} is damaged: {error}") from error
+    decode = dict(content["decode"])
+    camera = content["camera"]
+    if camera["ego_from_lidar_m"] is not None:
+        camera["ego_from_lidar_m"] = tuple(camera["ego_from_lidar_m"])
+    return LoadedModel(
+        models.build(content["model"]),
+        traverse_util.unflatten_dict(arrays, sep="/"),
+        RadarGrid.from_dict(content["grid"]),
+        {
+            "classes": tuple(content["classes"]),
+            "azimuth_mapping": content["azimuth_mapping"],
+            "score_threshold": decode.pop("score_threshold"),
+            "nms_iou": decode.pop("nms_iou"),
+            "decode_options": decode,
+            "camera_options": CameraOptions(**camera),
+        },
+        content["training_config"],
+    )
+
+
+def model_config(model: nn.Module) -> dict[str, Any]:
+    """`config.model` of a model: `models.build` makes the same one again.
+
+    Raises:
+        UserError: It has fields that no config states.
+    """
+    radar = getattr(model, "radar", model)
+    config = {name: getattr(radar, name) for name in radenet.FIELDS}
+    config["cbam"] = config["cbam"] or "off"
+    config["name"] = "radenet"
+    if radar is not model:
+        config |= {"name": "dinorade", **_camera_fields(model)}
+    config = json.loads(json.dumps(config))
+    again = models.build(config)
+    if again != model:
+        raise UserError(f"no config describes this model: {again} is not {model}")
+    return config
+
+
+def _camera_fields(model: Any) -> dict[str, Any]:
+    from radejax.models import dinorade_config
+    from radejax.models.vit import ViT
+
+    vit = model.vit or ViT()
+    image = {
+        "kind": "resnet50" if model.vit is None else "vit",
+        "size": model.image_size,
+        "freeze": model.freeze,
+        "standardize": model.standardize_image,
+        "resnet_width": model.resnet_width,
+    }
+    image |= {
+        k: getattr(vit, k) for k in dinorade_config.IMAGE_FIELDS if k not in image
+    }
+    axes = {name: getattr(model.axes, name) for name in dinorade_config.AXES_FIELDS}
+    return {"image": image, "fusion": dict(model.fusion), "axes": axes}
+
+
+# Runs --------------------------------------------------------------------------------
+
+
+def _has_checkpoint(path: pathlib.Path) -> bool:
+    return path.name.isdigit() and (path / "state").is_dir()
+
+
+def _of_run(
+    path: pathlib.Path, image_backbone: Any, step: int | str | None
+) -> LoadedModel:
+    from radejax.runs.workdir import load_run  # training's rooms: not for packed models
+
+    run = load_run(path, step, image_backbone)
+    return LoadedModel(
+        models.build(run.config.model),
+        run.variables,
+        run.grid,
+        settings_of_config(run.config),
+        json.loads(run.config.to_json()),
+        run.paths and run.paths.labels,
+    )
+
+
+def _of_checkpoint(folder: pathlib.Path, step: int | str | None) -> LoadedModel:
+    """A checkpoint without its run: it carries config and grid itself."""
+    from radejax.training.checkpoints import BEST, Checkpoints
+
+    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
+        if step == "best":
+            step = checkpoints.best_step()
+        state, info, _ = checkpoints.restore_variables(step)
+    config = ConfigDict(info["config"], convert_dict=True)
+    params = state["ema_params"] if state.get("ema_params") else state["params"]
+    return LoadedModel(
+        models.build(config.model),
+        {"params": params, **(state.get("model_state") or {})},
+        RadarGrid.from_dict(info["grid"]),
+        settings_of_config(config),
+        info["config"],
+    )

@@ -1,0 +1,202 @@
+"""Detections on whole data sets, on all devices of all processes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import numpy as np
+import tqdm
+
+from radejax import models
+from radejax.core.errors import UserError
+from radejax.core.structures import Batch, Detections
+from radejax.data.kradar import KRadar
+from radejax.data.pipeline import make_loader
+from radejax.data.records.projections import RecordSource
+from radejax.detection.decode import decode
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference import inputs as detector_inputs
+from radejax.inference.detector import Detector
+from radejax.training import processes, sharding
+from radejax.training.step import map_grid, model_inputs
+
+
+class Predictor:
+    """A model with decoding and NMS, compiled once for the devices of a mesh.
+
+    Args:
+        config: Of the run: `model`, `classes`, `decode`, `data.azimuth_mapping`.
+        variables: Of the model; `update` takes others.
+        grid: Of the sensor.
+        score_threshold: Detections below are left out; `decode.score_threshold` if
+            None.
+        mesh: All devices if None.
+        model: What `config.model` describes, where it is at hand.
+    """
+
+    def __init__(
+        self,
+        config: Any,
+        variables: Mapping[str, Any],
+        grid: RadarGrid,
+        *,
+        score_threshold: float | None = None,
+        mesh: jax.sharding.Mesh | None = None,
+        model: nn.Module | None = None,
+    ) -> None:
+        model = models.build(config.model) if model is None else model
+        self.mesh = sharding.make_mesh() if mesh is None else mesh
+        self.classes = tuple(config.classes)
+        options = dict(config.decode)
+        if score_threshold is not None:
+            options["score_threshold"] = score_threshold
+        self.update(variables)
+        self._run = jax.jit(
+            functools.partial(
+                _predict,
+                model,
+                map_grid(grid, model, config.data.azimuth_mapping),
+                options,
+            ),
+            # Every process gets all detections: they are small.
+            out_shardings=sharding.replicated(self.mesh),
+        )
+
+    def update(self, variables: Mapping[str, Any]) -> None:
+        """Takes other variables of the same shapes; nothing is compiled again."""
+        self._variables = jax.device_put(variables, sharding.replicated(self.mesh))
+
+    def rows(self, batch_size: int) -> int:
+        """Frames that one process reads for a batch of at least `batch_size`."""
+        devices = self.mesh.devices.size
+        return -(-batch_size // devices) * devices // jax.process_count()
+
+    def __call__(self, batch: Batch) -> tuple[Detections, jax.Array]:
+        """Detections of a global batch, of which each process gives its rows.
+
+        Args:
+            batch: NumPy arrays `[rows, ...]`.
+
+        Returns:
+            Detections and `[B]` int32 `Batch.frame`, of the rows of all processes.
+
+        Raises:
+            UserError: Images are given, and the variables are without the weights of
+                the image backbone.
+        """
+        detector_inputs.check_backbone(batch.image, self._variables)
+        # Ground truth is not looked at; its shapes must not make it compile again.
+        none = np.zeros((len(batch.frame), 0), np.float32)
+        batch = batch.replace(boxes=none, classes=none, is_valid=none)
+        batch = sharding.put_batch(batch, self.mesh)
+        with jax.transfer_guard("disallow"):
+            found = self._run(self._variables, batch)
+        if jax.default_backend() == "cpu" and self.mesh.devices.size > 1:
+            # Devices that share cores miss each other where batches pile up.
+            jax.block_until_ready(found)
+        return found
+
+
+def _predict(
+    model: nn.Module,
+    grid: RadarGrid,
+    options: Mapping[str, Any],
+    variables: Any,
+    batch: Batch,
+) -> tuple[Detections, jax.Array]:
+    maps = model.apply(variables, *model_inputs(batch), train=False)
+    return decode(maps, grid, **options), batch.frame
+
+
+def predict_dataset(
+    detector: Predictor | Detector,
+    records: RecordSource,
+    frames: KRadar,
+    batch_size: int = 8,
+    *,
+    inputs: Mapping[str, Any] | None = None,
+    progress: bool = True,
+    should_stop: Callable[[], bool] | None = None,
+) -> dict[str, np.ndarray]:
+    """Detections on every frame of a data set; the same on every process.
+
+    Args:
+        detector: A `Predictor` works on all devices, a `Detector` on its own one.
+        records: Projections of the frames.
+        frames: Which frames, in which order.
+        batch_size: Frames at once; rounded up to a multiple of the devices.
+        inputs: Further arguments of `make_loader`, see `camera_inputs`.
+        progress: Show a bar.
+        should_stop: Asked before every batch.
+
+    Returns:
+        Columns "frame" (position in `frames`), "box", "cls", "score", by frame and
+        falling score.
+
+    Raises:
+        UserError: There are no frames.
+        processes.Stopped: `should_stop` said so.
+    """
+    if not len(frames):
+        raise UserError("no frames to detect objects in")
+    on_mesh = isinstance(detector, Predictor)
+    loader = make_loader(
+        records,
+        frames,
+        batch_size=detector.rows(batch_size) if on_mesh else batch_size,
+        max_objects=max(len(frame.boxes) for frame in frames) or 1,
+        classes=detector.classes,
+        shuffle=False,
+        num_epochs=1,
+        drop_remainder=False,
+        pad_remainder=on_mesh,  # a `Detector` does it itself
+        process_index=None if on_mesh else 0,
+        process_count=None if on_mesh else 1,
+        **(inputs or {}),
+    )
+
+    def detect(batch: Batch) -> tuple[Detections, Any]:
+        if on_mesh:
+            return detector(batch)
+        return detector(batch.projection, batch.image, batch.camera), batch.frame
+
+    parts: list[dict[str, np.ndarray]] = []
+    with tqdm.tqdm(
+        total=len(frames),
+        desc="detect",
+        unit="frame",
+        disable=not (progress and processes.is_main()),
+    ) as bar:
+        pending = None
+        for batch in loader:
+            if should_stop is not None and should_stop():
+                raise processes.Stopped
+            started = detect(batch)
+            # The devices work on this batch while the one before is taken apart.
+            if pending is not None:
+                bar.update(_collect(parts, *pending, detector.classes))
+            pending = started
+        bar.update(_collect(parts, *pending, detector.classes))
+    return {
+        name: np.concatenate([part[name] for part in parts])
+        for name in ("frame", "box", "cls", "score")
+    }
+
+
+def _collect(
+    parts: list[dict[str, np.ndarray]],
+    detections: Detections,
+    frame: jax.Array,
+    classes: Sequence[str],
+) -> int:
+    """Adds the columns of a batch; returns its number of real frames."""
+    frame = np.asarray(frame)  # -1 where a batch was filled up
+    columns = detections.to_columns(classes)
+    columns["frame"] = frame[columns["frame"]]
+    is_real = columns["frame"] >= 0
+    parts.append({name: column[is_real] for name, column in columns.items()})
+    return int((frame >= 0).sum())

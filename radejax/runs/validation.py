@@ -1,0 +1,159 @@
+"""Evaluation while a run trains: metrics and pictures of the test split."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+import tempfile
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from radejax.core.errors import UserError
+from radejax.data.records.projections import RecordSource
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.evaluation.report.measure import measure, repair_sizes
+from radejax.inference.predict import Predictor, predict_dataset
+from radejax.interop import image_backbone
+from radejax.runs.data import DataPaths
+from radejax.runs.evaluate import FrameDrawer, report_options
+from radejax.training import processes
+from radejax.training.state import TrainState
+from radejax.training.watch import Scores
+
+
+class Validation:
+    """Called by the training loop with a state and its step.
+
+    Every process takes part in the predictions and comes to the same numbers.
+
+    Args:
+        config: Of the run; `evaluation`, `decode`, `watch` and `train.best_metric` are
+            read.
+        paths: Its data.
+        mesh: All devices if None.
+
+    Raises:
+        UserError: No frames of the test split, or no such metric as
+            `train.best_metric`.
+    """
+
+    def __init__(
+        self, config: Any, paths: DataPaths, mesh: jax.sharding.Mesh | None = None
+    ) -> None:
+        self._config = config
+        self._mesh = mesh
+        self._records = RecordSource(paths.records)
+        self._frames = paths.open(config, "test")
+        if not len(self._frames):
+            raise UserError(
+                "no frames of the test split to evaluate on during training; set "
+                "train.evaluate_every_epochs=0"
+            )
+        self._inputs = image_backbone.loader_arguments(
+            config, self._frames, paths.embeddings
+        )
+        self._ground_truth, self._table = tables_from_frames(self._frames)
+        self._options = report_options(config, "training")
+        self._predictor: Predictor | None = None
+        _check_best(config.train.best_metric, self._options)
+
+    def __call__(
+        self,
+        state: TrainState,
+        step: int,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> Scores:
+        """Scores of the state's (averaged) parameters on the test split.
+
+        Raises:
+            processes.Stopped: `should_stop`, asked at every batch, said so.
+        """
+        predictions = self._predict(state.eval_variables, should_stop)
+        predictions, _ = repair_sizes(predictions, self._options.invalid_sizes)
+        data = EvaluationSet(
+            self._ground_truth,
+            predictions,
+            classes=self._options.classes,
+            frames=self._table,
+            roi=self._options.roi,
+            label_version=self._options.label_version,
+        )
+        values, best = {}, None
+        for row in measure(data, self._table, self._options, kinds=()):
+            result = row.result
+            if not result.is_defined:
+                continue
+            if result.cls == "mean":
+                values[f"validation/m{result.metric}"] = result.ap
+            else:
+                values[f"validation/{result.metric}/{result.cls}"] = result.ap
+            if self._is_best_metric(result) and not math.isnan(result.ap):
+                best = result.ap
+        pictures = processes.main_only(lambda: self._draw(predictions)) or {}
+        return Scores(values, best, pictures)
+
+    def _predict(
+        self, variables: Mapping[str, Any], should_stop: Callable[[], bool] | None
+    ) -> dict[str, np.ndarray]:
+        if self._predictor is None:
+            self._predictor = Predictor(
+                self._config,
+                variables,
+                self._records.grid,
+                score_threshold=self._options.score_threshold,
+                mesh=self._mesh,
+            )
+        self._predictor.update(variables)
+        try:
+            return predict_dataset(
+                self._predictor,
+                self._records,
+                self._frames,
+                self._config.evaluation.batch_size,
+                inputs=self._inputs,
+                progress=False,
+                should_stop=should_stop,
+            )
+        finally:
+            self._predictor.update(None)  # the state's own arrays go on to be donated
+
+    def _is_best_metric(self, result: Any) -> bool:
+        name = result.metric.split("/")[0]
+        return (
+            result.cls == "mean"
+            and result.protocol == self._options.protocols[0]
+            and f"m{name}" == self._config.train.best_metric
+        )
+
+    def _draw(self, predictions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Always the same frames, spread over the split."""
+        count = self._config.watch.num_pictures
+        if not count:
+            return {}
+        from PIL import Image
+
+        drawer = FrameDrawer(self._records, self._frames, predictions, self._config)
+        pictures = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for path in drawer.draw_spread(pathlib.Path(folder), count):
+                with Image.open(path) as image:
+                    pixels = np.asarray(image.convert("RGB"))
+                pictures[f"validation/{path.stem}"] = pixels
+        return pictures
+
+
+def _check_best(name: str, options: Any) -> None:
+    known = [
+        f"map_{space}_iou{100 * iou:.4g}"
+        for space in ("bev", "3d")
+        for iou in options.iou_thresholds
+    ]
+    if name not in known:
+        raise UserError(
+            f"train.best_metric is {name!r}; with these evaluation.iou_thresholds it "
+            f"can be one of {', '.join(known)}"
+        )

@@ -1,0 +1,279 @@
+"""The front stereo camera's image of a scene, drawn through the calibration.
+
+Ground and sky are computed per pixel from the viewing rays; objects are boxes of
+simple parts (`shapes`), painted from far to near. It is a drawing, not a photograph:
+enough for a network to find vehicles and people at the pixels the labels say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from radejax.core.structures import CLASSES
+from radejax.geometry.calibration import CameraCalibration
+from radejax.simulation.camera import lens, scenery, shapes
+from radejax.simulation.radar.scattering import is_blocked
+from radejax.simulation.world.scene import SceneFrame, Sequence
+
+# K-Radar's values for the pair (see the calibration files of the data set).
+_INTRINSICS = (567.7208, 577.2137, 628.7208, 369.3069)
+_DISTORTION = (-0.028874, 0.000602, 0.003957, -0.005047, 0.0)
+_ANGLES = {"yaw_deg": 88.6, "pitch_deg": 0.6, "roll_deg": 89.6}
+_TRANSLATIONS = ((0.18, -0.13, 0.0), (0.06, -0.13, 0.0))
+
+_SKY = {"day": np.array([168, 196, 226.0]), "night": np.array([14, 16, 26.0])}
+_GREY_SKY = {"day": np.array([196, 199, 203.0]), "night": np.array([22, 23, 28.0])}
+_ASPHALT = np.array([86, 88, 92.0])
+_VERGE = {
+    "urban": np.array([142, 138, 130.0]),
+    "alleyway": np.array([132, 128, 122.0]),
+    "parkinglots": np.array([100, 102, 105.0]),
+}
+_GRASS = np.array([96, 112, 66.0])
+_WITH_LAMPS = [CLASSES.index(name) for name in ("Sedan", "Bus or Truck", "Motorcycle")]
+_SNOW = np.array([214, 218, 222.0])
+_MARKING = np.array([226, 226, 220.0])
+
+
+def stereo_calibration(
+    lidar_to_radar_m: tuple[float, float, float], width: int = 1280, height: int = 720
+) -> tuple[CameraCalibration, CameraCalibration]:
+    """Left and right front camera with K-Radar's intrinsics, scaled to an image size.
+
+    Args:
+        lidar_to_radar_m: Metres to add to LiDAR positions to get radar positions.
+        width: Width of one of the two images.
+        height: Height.
+    """
+    return tuple(
+        CameraCalibration.from_angles(
+            intrinsics=_INTRINSICS,
+            distortion=_DISTORTION,
+            translation_m=translation,
+            ego_from_lidar_m=np.array(lidar_to_radar_m),
+            **_ANGLES,
+        ).resized(width, height)
+        for translation in _TRANSLATIONS
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Ground:
+    """Viewing rays of a camera where they meet the ground.
+
+    Attributes:
+        hits: `[H, W]` bool, pixels that show ground; P of them.
+        x_m: `[P]` forward in the radar's frame.
+        y_m: `[P]` left.
+        depth_m: `[P]` distance.
+        up: `[H, W]` vertical component of the unit ray (the sky's gradient).
+    """
+
+    hits: np.ndarray
+    x_m: np.ndarray
+    y_m: np.ndarray
+    depth_m: np.ndarray
+    up: np.ndarray
+
+
+def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
+    """Where every pixel's ray meets the ground plane `z = ground_m` (radar frame)."""
+    fx, fy, cx, cy = calibration.intrinsics
+    u, v = np.meshgrid(
+        np.arange(calibration.width) + 0.5, np.arange(calibration.height) + 0.5
+    )
+    seen = np.stack([(u - cx) / fx, (v - cy) / fy], -1)
+    ideal = undistort(seen, calibration.distortion)
+    rays = np.concatenate([ideal, np.ones_like(u)[..., None]], -1)
+    rays = rays @ calibration.rotation  # camera to ego axes: R^T p
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    origin = shapes.camera_position(calibration)
+    hits = rays[..., 2] < -1e-3
+    down = rays[hits]
+    distance = (ground_m - origin[2]) / down[:, 2]
+    return Ground(
+        hits=hits,
+        x_m=origin[0] + distance * down[:, 0],
+        y_m=origin[1] + distance * down[:, 1],
+        depth_m=distance,
+        up=rays[..., 2],
+    )
+
+
+def undistort(seen: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Inverse of the lens model by fixed-point iteration; normalised coordinates."""
+    k1, k2, p1, p2, k3 = distortion
+    ideal = seen.copy()
+    for _ in range(12):
+        x, y = ideal[..., 0], ideal[..., 1]
+        square = x * x + y * y
+        radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+        shift_x = 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        shift_y = p1 * (square + 2 * y * y) + 2 * p2 * x * y
+        ideal = (seen - np.stack([shift_x, shift_y], -1)) / radial[..., None]
+    return ideal
+
+
+class CameraRenderer:
+    """Draws the front stereo image of frames of one sequence.
+
+    Args:
+        sequence: Scene; its conditions choose light, colours and weather.
+        calibrations: Left and right camera.
+        seed: Colours of the objects, drops and flakes.
+        cover_lens: Let bad weather cover the lens at times.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        calibrations: tuple[CameraCalibration, CameraCalibration],
+        seed: int,
+        *,
+        cover_lens: bool = True,
+    ) -> None:
+        self.sequence = sequence
+        self.calibrations = calibrations
+        self.cover_lens, self.seed = cover_lens, seed
+        self.grounds = [trace_ground(c, sequence.ground_m) for c in calibrations]
+        rng = np.random.default_rng([seed, sequence.name, 7])
+        self.colors = shapes.object_colors(sequence.tracks.cls, rng)
+        self.air = lens.AIR[sequence.weather]
+        clear = sequence.weather == "normal"
+        self.sky = (_SKY if clear else _GREY_SKY)[sequence.time]
+        is_night = sequence.time == "night"
+        self.light = shapes.Light(
+            ambient=0.22 if is_night else 1.0,
+            veil=self.sky,
+            extinction_per_m=self.air.extinction_per_m,
+            headlights=is_night,
+        )
+
+    def level(self, frame: SceneFrame) -> str:
+        """State of the lens, one of `lens.LEVELS`."""
+        if not self.cover_lens:
+            return "clear"
+        return lens.cover_level(
+            self.seed, self.sequence.name, frame.index, self.sequence.weather
+        )
+
+    def render(self, frame: SceneFrame) -> np.ndarray:
+        """`[H, 2 W, 3]` uint8 image of the pair, left half first."""
+        return np.concatenate([self._one(frame, side) for side in (0, 1)], axis=1)
+
+    def object_mask(self, frame: SceneFrame, side: int = 0) -> np.ndarray:
+        """`[H, W]` int32: which box of the frame each pixel shows, -1 for none."""
+        calibration = self.calibrations[side]
+        canvas = Image.new("I", (calibration.width, calibration.height), -1)
+        draw = ImageDraw.Draw(canvas)
+        for polygon in self._polygons(frame, calibration):
+            draw.polygon(polygon.points, fill=int(polygon.box))
+        return np.asarray(canvas)
+
+    def _one(self, frame: SceneFrame, side: int) -> np.ndarray:
+        """`[H, W, 3]` image of one camera."""
+        calibration = self.calibrations[side]
+        canvas = Image.fromarray(self._background(frame, self.grounds[side]))
+        draw = ImageDraw.Draw(canvas)
+        for polygon in self._polygons(frame, calibration):
+            draw.polygon(polygon.points, fill=polygon.color)
+        if self.light.headlights:
+            self._lamps(frame, calibration, draw)
+        numbers = [self.seed, self.sequence.name, side]
+        rng = np.random.default_rng([*numbers, frame.index, 5])
+        brightness = 0.45 if self.light.headlights else 1.0
+        canvas = lens.add_precipitation(canvas, self.air, brightness, rng)
+        block = np.random.default_rng([*numbers, frame.index // lens.BLOCK_FRAMES, 6])
+        level = self.level(frame)
+        is_snow = self.air.is_snow
+        return np.asarray(lens.cover_lens(canvas, level, is_snow, brightness, block))
+
+    def _polygons(self, frame, calibration) -> list[shapes.Polygon]:
+        panels = scenery.make_panels(
+            frame,
+            shapes.camera_position(calibration),
+            self.sequence.ground_m,
+            self.air.white,
+        )
+        return shapes.visible_polygons(
+            frame.boxes,
+            [CLASSES[c] for c in frame.cls],
+            self.colors[frame.track],
+            calibration,
+            self.light,
+            panels=panels,
+        )
+
+    def _lamps(self, frame, calibration, draw) -> None:
+        """Rear lights and headlights of vehicles by night, where nothing hides them."""
+        vehicles = np.flatnonzero(np.isin(frame.cls, _WITH_LAMPS))
+        box = frame.boxes[np.repeat(vehicles, 2)]  # two lamps each
+        cos, sin = np.cos(box[:, 6]), np.sin(box[:, 6])
+        end = np.where(box[:, 0] * cos + box[:, 1] * sin < 0, 1.0, -1.0)
+        along = end * box[:, 3] / 2.0
+        across = np.tile([-0.75, 0.75], len(vehicles)) * box[:, 4] / 2.0
+        lamps = box[:, :3] + np.stack(
+            [along * cos - across * sin, along * sin + across * cos, -0.15 * box[:, 5]],
+            axis=1,
+        )
+        origin = shapes.camera_position(calibration)
+        obstacles = frame.boxes - np.r_[origin, np.zeros(4)]
+        hidden = is_blocked(lamps - origin, obstacles, np.repeat(vehicles, 2))
+        pixels, depth = calibration.project_ego(lamps)
+        shown = calibration.in_image(pixels, depth) & (depth < 90.0) & ~hidden
+        for i in np.flatnonzero(shown):
+            is_front = end[i] > 0
+            size = 0.16 if is_front else 0.05
+            radius = calibration.intrinsics[0] * size / (depth[i] + 2.0) + 0.4
+            u, v = pixels[i].tolist()
+            color = (255, 250, 225) if is_front else (230, 40, 30)
+            draw.ellipse((u - radius, v - radius, u + radius, v + radius), fill=color)
+
+    def _background(self, frame: SceneFrame, ground: Ground) -> np.ndarray:
+        """`[H, W, 3]` uint8 ground, road with markings, and sky."""
+        fade = np.clip(ground.up * 2.5, 0.0, 1.0)[..., None]
+        image = self.sky * (1.0 - 0.35 * fade)
+        hits = ground.hits
+        image[hits] = self._ground_color(frame, ground)
+        return np.clip(image, 0, 255).astype(np.uint8)
+
+    def _ground_color(self, frame: SceneFrame, ground: Ground) -> np.ndarray:
+        """`[P, 3]` colours of the pixels that show ground."""
+        sequence, lanes = self.sequence, self.sequence.lanes_m
+        x, y, depth = ground.x_m, ground.y_m, ground.depth_m
+        verge = _VERGE.get(sequence.environment, _GRASS)
+        verge = verge + self.air.white * (_SNOW - verge)
+        left = y - 0.5 * sequence.road.curvature_per_m * x * x + sequence.ego_left_m
+        along = x + frame.ego_along_m
+        grain = _hash_noise(np.floor(along * 3.0), np.floor(left * 3.0)) - 0.5
+        color = np.broadcast_to(verge, (x.size, 3)) + 24.0 * grain[:, None]
+        if lanes:
+            on_road = (left > min(lanes) - 0.4) & (left < max(lanes) + 0.4)
+            tracks = 0.5 + 0.5 * np.cos(left * 2.0 * np.pi / 1.7)  # swept by tyres
+            snow = (self.air.white * (0.35 + 0.65 * tracks))[:, None]
+            asphalt = _ASPHALT * (1.0 - 0.3 * self.air.wetness)
+            asphalt = asphalt + 14.0 * grain[:, None]
+            color = np.where(
+                on_road[:, None], asphalt + snow * (_SNOW - asphalt), color
+            )
+            dashed = np.mod(along, 12.0) < 5.0
+            width = 0.09 + depth * 0.0012  # at least a pixel far away
+            on_line = np.zeros(x.size, bool)
+            for border in lanes:
+                is_edge = border in (min(lanes), max(lanes))
+                on_line |= (np.abs(left - border) < width) & (dashed | is_edge)
+            paint = _MARKING * (1.0 - 0.5 * self.air.white)
+            color = np.where(on_line[:, None], paint + self.air.white * 100.0, color)
+        return self.light.apply(color, x, y, depth)
+
+
+def _hash_noise(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Uniform numbers in [0, 1) that depend on two integers only."""
+    bits = (
+        i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
+    ) & 0xFFFFFFFF
+    bits = ((bits ^ (bits >> 13)) * 1274126177) & 0xFFFFFFFF
+    return ((bits ^ (bits >> 16)) & 0xFFFF) / 65536.0

@@ -1,0 +1,298 @@
+"""Vehicles and people as a few flat faces each, in the frame of their box."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import project
+from radejax.simulation.camera import details, lens
+
+# A block in units of the half extents: x, y, z ranges; colour role; share kept of the
+# length and width at its top (a taper).
+_Block = tuple[
+    tuple[float, float],
+    tuple[float, float],
+    tuple[float, float],
+    str,
+    tuple[float, float],
+]
+
+_STRAIGHT = (1.0, 1.0)
+BLOCKS: dict[str, tuple[_Block, ...]] = {
+    "Sedan": (
+        ((-0.96, 0.96), (-0.92, 0.92), (-1.0, -0.72), "dark", _STRAIGHT),
+        ((-1.0, 1.0), (-1.0, 1.0), (-0.72, 0.12), "body", (0.98, 0.97)),
+        ((-0.82, 0.42), (-0.9, 0.9), (0.12, 1.0), "body", (0.72, 0.86)),
+    ),
+    "Bus or Truck": (
+        ((-0.98, 0.98), (-0.95, 0.95), (-1.0, -0.78), "dark", _STRAIGHT),
+        ((-1.0, 0.62), (-1.0, 1.0), (-0.78, 1.0), "body", _STRAIGHT),
+        ((0.64, 1.0), (-0.97, 0.97), (-0.78, 0.62), "cabin", (0.9, 0.98)),
+    ),
+    "Pedestrian": (
+        ((-0.45, 0.45), (-0.6, -0.05), (-1.0, -0.1), "legs", _STRAIGHT),
+        ((-0.45, 0.45), (0.05, 0.6), (-1.0, -0.1), "legs", _STRAIGHT),
+        ((-0.7, 0.7), (-1.0, 1.0), (-0.1, 0.68), "body", (0.8, 0.8)),
+        ((-0.4, 0.4), (-0.35, 0.35), (0.7, 1.0), "skin", (0.7, 0.7)),
+    ),
+    "Motorcycle": (
+        ((0.4, 1.0), (-0.16, 0.16), (-1.0, -0.3), "dark", _STRAIGHT),
+        ((-1.0, -0.4), (-0.16, 0.16), (-1.0, -0.3), "dark", _STRAIGHT),
+        ((-0.75, 0.75), (-0.45, 0.45), (-0.6, 0.0), "body", (0.8, 0.7)),
+        ((-0.35, 0.15), (-1.0, 1.0), (0.0, 0.66), "legs", (0.8, 0.8)),
+        ((-0.2, 0.1), (-0.35, 0.35), (0.68, 1.0), "dark", (0.8, 0.8)),
+    ),
+    "Bicycle": (
+        ((0.3, 1.0), (-0.1, 0.1), (-1.0, -0.25), "dark", (0.6, 1.0)),
+        ((-1.0, -0.3), (-0.1, 0.1), (-1.0, -0.25), "dark", (0.6, 1.0)),
+        ((-0.5, 0.5), (-0.15, 0.15), (-0.5, -0.1), "body", _STRAIGHT),
+        ((-0.35, 0.2), (-1.0, 1.0), (-0.1, 0.66), "legs", (0.8, 0.8)),
+        ((-0.15, 0.15), (-0.35, 0.35), (0.68, 1.0), "skin", (0.7, 0.7)),
+    ),
+}
+
+_ROLE_COLORS = {
+    "dark": (34.0, 34.0, 38.0),
+    "cabin": (52.0, 60.0, 72.0),
+    "skin": (196.0, 160.0, 136.0),
+}
+_PAINT = np.array(
+    [(236, 236, 236), (40, 42, 46), (126, 130, 136), (178, 182, 188), (150, 32, 34),
+     (36, 62, 120), (58, 92, 66), (206, 178, 92)], float,
+)  # fmt: skip
+_CLOTHES = np.array(
+    [(40, 44, 60), (120, 30, 40), (60, 90, 130), (190, 190, 186), (200, 140, 40)], float
+)
+_FACES = (
+    ((0, 3, 7, 4), (1.0, 0.0, 0.0)),  # front
+    ((2, 1, 5, 6), (-1.0, 0.0, 0.0)),  # rear
+    ((1, 0, 4, 5), (0.0, 1.0, 0.0)),  # left
+    ((3, 2, 6, 7), (0.0, -1.0, 0.0)),  # right
+    ((4, 7, 6, 5), (0.0, 0.0, 1.0)),  # top
+)
+_EDGE_PARTS = 3
+_DETAIL_M = 60.0
+"""Farther objects show no details: a plate is two pixels wide there."""
+_SUN = np.array([0.35, 0.45, 0.82])
+
+
+@dataclasses.dataclass(frozen=True)
+class Polygon:
+    """A face on the image.
+
+    Attributes:
+        points: Pixels (u, v) in order.
+        color: Red, green, blue.
+        depth_m: Distance of its object; `visible_polygons` sorts by it.
+        box: Index of its box in the frame.
+    """
+
+    points: list[tuple[float, float]]
+    color: tuple[int, int, int]
+    depth_m: float
+    box: int
+
+
+def object_colors(cls: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """`[N, 2, 3]` body colour and second colour (legs) of objects by class index."""
+    paint = _PAINT[rng.integers(len(_PAINT), size=len(cls))]
+    clothes = _CLOTHES[rng.integers(len(_CLOTHES), size=len(cls))]
+    paint = paint * rng.uniform(0.82, 1.08, (len(cls), 1))
+    is_person = np.asarray(cls)[:, None] == 2
+    return np.stack([np.where(is_person, clothes, paint), clothes * 0.7], 1)
+
+
+def blocks_of(cls: str) -> np.ndarray:
+    """`[K, 8, 3]` corners of a class's blocks in half extents: 4 below, 4 above."""
+    corners = []
+    for (x0, x1), (y0, y1), (z0, z1), _, (keep_x, keep_y) in BLOCKS[cls]:
+        cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
+        flat = np.array([(x1, y1), (x0, y1), (x0, y0), (x1, y0)])
+        top = (flat - (cx, cy)) * (keep_x, keep_y) + (cx, cy)
+        corners.append(
+            np.concatenate([np.c_[flat, np.full(4, z0)], np.c_[top, np.full(4, z1)]])
+        )
+    return np.stack(corners)
+
+
+@dataclasses.dataclass(frozen=True)
+class Light:
+    """How bright and how hazy the scene is.
+
+    Attributes:
+        ambient: Brightness, 1 by day.
+        veil: `[3]` colour of the haze.
+        extinction_per_m: Density of the haze.
+        headlights: True if the ego vehicle lights up what is ahead.
+    """
+
+    ambient: float
+    veil: np.ndarray
+    extinction_per_m: float
+    headlights: bool
+
+    def apply(self, color: np.ndarray, x_m, y_m, depth_m) -> np.ndarray:
+        """Colours `[N, 3]` of surfaces at positions as they appear."""
+        brightness = np.full(np.shape(depth_m), self.ambient)
+        if self.headlights:
+            beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
+            brightness = brightness + 0.75 * beam * np.exp(-np.abs(x_m) / 28.0)
+        return lens.haze(
+            color * brightness[..., None], depth_m, self.veil, self.extinction_per_m
+        )
+
+
+def visible_polygons(
+    boxes: np.ndarray,
+    classes: list[str],
+    colors: np.ndarray,
+    calibration: CameraCalibration,
+    light: Light,
+    *,
+    panels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    near_m: float = 0.3,
+) -> list[Polygon]:
+    """Faces that look at the camera, far objects first.
+
+    Args:
+        boxes: `[N, 7]` in the radar's frame.
+        classes: Names, one a box.
+        colors: `[N, 2, 3]` of `object_colors`.
+        calibration: The camera.
+        light: Brightness and haze.
+        panels: Surroundings of `scenery.make_panels`.
+        near_m: Faces nearer than this are cut away.
+    """
+    origin = camera_position(calibration)
+    faces, normals, depth, block_depth, owner, rgb = _faces(
+        boxes, classes, colors, origin
+    )
+    shown = ((faces.mean(1) - origin) * normals).sum(1) < 0
+    rgb = rgb * (0.62 + 0.38 * np.maximum(normals @ _SUN, 0.0))[:, None]
+    if panels is not None:
+        corners, panel_depth, panel_rgb = panels
+        faces, rgb = np.concatenate([faces, corners]), np.concatenate([rgb, panel_rgb])
+        depth = np.concatenate([depth, panel_depth])
+        block_depth = np.concatenate([block_depth, panel_depth])
+        owner = np.concatenate([owner, np.full(len(corners), -1)])
+        shown = np.concatenate([shown, np.ones(len(corners), bool)])
+    chosen = np.flatnonzero(shown)
+    if not len(chosen):
+        return []
+    chosen = chosen[np.lexsort((-block_depth[chosen], -depth[chosen]))]
+    center = faces[chosen].mean(1)
+    rgb = light.apply(rgb[chosen], center[:, 0], center[:, 1], depth[chosen])
+    rgb = np.clip(rgb, 0, 255).astype(int).tolist()
+    outlines = _project_faces(faces[chosen], calibration, near_m)
+    return [
+        Polygon(points, tuple(color), float(depth[face]), int(owner[face]))
+        for points, color, face in zip(outlines, rgb, chosen, strict=True)
+        if points
+    ]
+
+
+def camera_position(calibration: CameraCalibration) -> np.ndarray:
+    """`[3]` of the camera in the radar's frame."""
+    return calibration.ego_from_lidar_m - (
+        calibration.rotation.T @ calibration.translation_m
+    )
+
+
+def _faces(boxes, classes, colors, origin):
+    """All faces of all objects in front of the camera.
+
+    Returns:
+        Corners `[F, 4, 3]`, normals `[F, 3]`, distance of the object `[F]`, distance
+        of the block `[F]`, index of the box `[F]`, colours `[F, 3]`.
+    """
+    parts = [[np.zeros((0, 4, 3))], [np.zeros((0, 3))], [], [], [], [np.zeros((0, 3))]]
+    vertices = np.array([v for v, _ in _FACES])
+    normals = np.array([n for _, n in _FACES])
+    for index in np.flatnonzero(boxes[:, 0] > -3.0):
+        box, cls = boxes[index], classes[index]
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+        corners = _BLOCK_CORNERS[cls] * box[3:6] / 2.0 @ turn.T + box[:3]  # [K, 8, 3]
+        depth = np.linalg.norm(box[:3] - origin)
+        block = np.repeat(np.arange(len(corners)), len(_FACES))
+        face = np.tile(np.arange(len(_FACES)), len(corners))
+        quads = corners[:, vertices].reshape(-1, 4, 3)
+        rgb = np.array(
+            [_role_color(role, colors[index]) for *_, role, _ in BLOCKS[cls]]
+        )[block]
+        if depth < _DETAIL_M:  # after their blocks, so that they are painted on them
+            d = _DETAIL_TABLES[cls]
+            chosen = quads[d.block * len(_FACES) + d.face]
+            quads = np.concatenate([quads, details.on_faces(chosen, d.u, d.v)])
+            block, face = np.r_[block, d.block], np.r_[face, d.face]
+            rgb = np.concatenate([rgb, d.color])
+        block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)
+        parts[0].append(quads)
+        parts[1].append(normals[face] @ turn.T)
+        parts[2].append(np.full(len(quads), depth))
+        parts[3].append(block_depth[block])
+        parts[4].append(np.full(len(quads), index))
+        parts[5].append(rgb)
+    return [np.concatenate(p) if p else np.zeros(0) for p in parts]
+
+
+def _role_color(role: str, colors: np.ndarray) -> np.ndarray:
+    """Colour of a block: the object's own two, or a fixed one."""
+    own = {"body": colors[0], "legs": colors[1]}
+    return np.asarray(own.get(role, _ROLE_COLORS.get(role)), float)
+
+
+def _project_faces(faces, calibration, near_m) -> list[list[tuple[float, float]]]:
+    """Pixels of faces `[F, 4, 3]` cut at the near plane; edges bend with the lens.
+
+    A face wholly nearer than the plane gives an empty list.
+    """
+    camera = calibration.camera("raw")
+    following = np.roll(faces, -1, axis=1)
+    part = np.linspace(0.0, 1.0, _EDGE_PARTS, endpoint=False)[:, None]
+    outline = faces[:, :, None] + part * (following - faces)[:, :, None]
+    outline = outline.reshape(len(faces), -1, 3)
+    pixels, depth = project(outline, camera)
+    size = np.array([calibration.width, calibration.height], float)
+    result = []
+    for i in range(len(faces)):
+        points = pixels[i]
+        if depth[i].min() < near_m:
+            if depth[i].max() < near_m:
+                result.append([])
+                continue
+            points, _ = project(_cut_near(outline[i], depth[i], near_m), camera)
+        if (points.max(0) < 0).any() or (points.min(0) > size).any():
+            result.append([])  # off the image
+            continue
+        points = np.clip(points, -2.0 * size, 3.0 * size)
+        result.append(list(map(tuple, points.tolist())))
+    return result
+
+
+def _cut_near(outline, depth, near_m) -> np.ndarray:
+    """Polygon `[P, 3]` cut at a depth (Sutherland and Hodgman)."""
+    kept = []
+    for i in range(len(outline)):
+        j = (i + 1) % len(outline)
+        if depth[i] >= near_m:
+            kept.append(outline[i])
+        if (depth[i] >= near_m) != (depth[j] >= near_m):
+            part = (near_m - depth[i]) / (depth[j] - depth[i])
+            kept.append(outline[i] + part * (outline[j] - outline[i]))
+    return np.array(kept)
+
+
+_BLOCK_CORNERS = {name: blocks_of(name) for name in BLOCKS}
+_DETAIL_TABLES = {
+    name: details.Detail(
+        *(
+            np.array([getattr(detail, f.name) for detail in details.DETAILS[name]])
+            for f in dataclasses.fields(details.Detail)
+        )
+    )
+    for name in BLOCKS
+}

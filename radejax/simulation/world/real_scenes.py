@@ -1,0 +1,201 @@
+"""Sequences from real label files: the objects of K-Radar, moving as they moved.
+
+Labels hold positions relative to the ego vehicle; their change from frame to frame is
+the relative velocity, which is all that the radar's range rate needs. The ego's own
+speed, needed for the surroundings, is inferred from the tracks; surroundings are
+procedural, in the style of the sequence's road type.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from radejax.data.kradar import Frame
+from radejax.simulation.world import traffic
+from radejax.simulation.world.scene import (
+    FRAME_PERIOD_S,
+    Road,
+    Sequence,
+    Tracks,
+    class_index,
+)
+from radejax.simulation.world.surroundings import make_surroundings
+
+MAX_SPEED_MPS = 60.0
+"""Faster relative motion is taken for a swap of identities."""
+
+
+def make_real_sequence(
+    frames: list[Frame],
+    *,
+    lidar_to_radar_m: tuple[float, float, float],
+    rng: np.random.Generator,
+) -> Sequence:
+    """A scene from the labels of one sequence.
+
+    Args:
+        frames: Consecutive frames of one sequence in order, with all their labels.
+        lidar_to_radar_m: Metres to add to LiDAR positions to get radar positions.
+        rng: Source of the surroundings and of what labels do not tell.
+
+    Returns:
+        Scene whose objects have the labels' boxes, frame by frame.
+    """
+    tracks = collect_tracks(frames, lidar_to_radar_m)
+    clock = np.array([f.header.timestamp_s for f in frames])
+    relative = relative_velocity(tracks, clock)
+    environment = frames[0].environment
+    law = traffic.ENVIRONMENTS.get(environment, traffic.ENVIRONMENTS["urban"])
+    speed = infer_ego_speed(tracks, relative, law.speed_mps)
+    periods = np.diff(clock, append=clock[-1] + FRAME_PERIOD_S).clip(0.02, 1.0)
+    along = np.concatenate([[0.0], np.cumsum(speed[:-1] * periods[:-1])])
+    pose = np.stack([along, np.zeros_like(along), np.zeros_like(along)], 1)
+    ego_velocity = np.stack([speed, np.zeros_like(speed)], 1)
+    ground = _ground_height(tracks)
+    edges = _road_edges(tracks, law)
+    reflectors, mirrors = make_surroundings(
+        law, Road(), along[-1] + traffic.SIGHT_M, edges, rng, ground
+    )
+    world = tracks.position_m + pose[:, None] * (1.0, 1.0, 0.0)
+    lanes = np.arange(-law.lanes_right - 0.5, law.lanes_left + 1.0)
+    return Sequence(
+        name=frames[0].sequence,
+        environment=environment,
+        time=frames[0].time,
+        weather=frames[0].weather,
+        ego_pose=pose,
+        ego_along_m=along,
+        ego_velocity_mps=ego_velocity,
+        tracks=dataclasses.replace(
+            tracks,
+            position_m=world,
+            velocity_mps=relative + ego_velocity[:, None],
+        ),
+        reflectors=reflectors,
+        road=Road(),
+        lanes_m=tuple((lanes * law.lane_width_m).tolist()),
+        ego_left_m=0.0,
+        ground_m=ground,
+        mirrors_m=mirrors,
+    )
+
+
+def collect_tracks(
+    frames: list[Frame], lidar_to_radar_m: tuple[float, float, float]
+) -> Tracks:
+    """Labels of all frames as tracks, positions in the radar's frame.
+
+    Identity is the label's id together with its class. Labels without an id (-1), and
+    a second label of the same identity in one frame, become tracks of one frame.
+    """
+    columns: dict[tuple, dict[int, tuple]] = {}
+    for index, frame in enumerate(frames):
+        for number, label in enumerate(frame.labels):
+            key = (label.cls, label.track_id)
+            if label.track_id < 0 or index in columns.get(key, {}):
+                key = (label.cls, label.track_id, index, number)
+            columns.setdefault(key, {})[index] = label.box
+    count, total = len(frames), len(columns)
+    boxes = np.zeros((count, total, 7))
+    present = np.zeros((count, total), bool)
+    for n, track in enumerate(columns.values()):
+        for index, box in track.items():
+            boxes[index, n], present[index, n] = box, True
+        first = next(iter(track.values()))
+        boxes[~present[:, n], n, 3:6] = first[3:6]
+    boxes[..., :3] += lidar_to_radar_m
+    return Tracks(
+        position_m=boxes[..., :3],
+        yaw_rad=boxes[..., 6],
+        velocity_mps=np.zeros((count, total, 2)),
+        is_present=present,
+        size_m=boxes[..., 3:6],
+        cls=np.array([class_index(key[0]) for key in columns], int),
+        track_id=np.array([key[1] for key in columns], int),
+        label_cls=tuple(key[0] for key in columns),
+    )
+
+
+def relative_velocity(tracks: Tracks, clock: np.ndarray) -> np.ndarray:
+    """`[F, N, 2]` velocities in the radar's frame from the labels' motion.
+
+    Central differences over neighbouring frames where the track is present on both
+    sides, one-sided at its ends, zero for tracks of one frame. Labels jitter by some
+    centimetres, so three velocities in a row are averaged.
+    """
+    flat = tracks.position_m[..., :2]
+    count, present = len(clock), tracks.is_present
+    before = np.maximum(np.arange(count) - 1, 0)
+    after = np.minimum(np.arange(count) + 1, count - 1)
+    here = np.arange(count)[:, None]
+    first = np.where(present[before], before[:, None], here)  # [F, N]
+    last = np.where(present[after], after[:, None], here)
+    column = np.arange(flat.shape[1])[None]
+    period = clock[last] - clock[first]
+    step = flat[last, column] - flat[first, column]
+    usable = present & (period > 1e-3)
+    velocity = np.where(
+        usable[..., None], step / np.where(usable, period, 1.0)[..., None], 0.0
+    )
+    too_fast = np.hypot(velocity[..., 0], velocity[..., 1]) > MAX_SPEED_MPS
+    velocity[too_fast] = 0.0
+    weight = (usable & ~too_fast).astype(float)[..., None]
+    pad = ((1, 1), (0, 0), (0, 0))
+    summed, weights = np.pad(velocity * weight, pad), np.pad(weight, pad)
+    summed = summed[:-2] + summed[1:-1] + summed[2:]
+    weights = weights[:-2] + weights[1:-1] + weights[2:]
+    smooth = summed / np.maximum(weights, 1.0)
+    return np.where(weight > 0, smooth, 0.0)
+
+
+def infer_ego_speed(
+    tracks: Tracks, relative: np.ndarray, prior_mps: tuple[float, float]
+) -> np.ndarray:
+    """`[F]` speed of the ego vehicle that the tracks suggest.
+
+    Traffic of our direction never drives backward, so the ego is at least as fast as
+    the fastest approach of a vehicle that heads our way (parked ones reach the bound),
+    and oncoming traffic approaches at least as fast as the ego drives. Where nothing
+    tells, the road type's usual speed stands in. Medians over two seconds.
+    """
+    heading = np.cos(tracks.yaw_rad)
+    seen = tracks.is_present & (np.abs(relative).sum(-1) > 0)
+    approach = -relative[..., 0]
+    lower = np.where(seen & (heading > 0.9), approach, -np.inf).max(1, initial=-np.inf)
+    upper = np.where(seen & (heading < -0.9), approach, np.inf).min(1, initial=np.inf)
+    usual = float(np.mean(prior_mps))
+    known = lower > 0.3 * usual  # slow vehicles ahead alone say little
+    speed = np.where(known, lower, usual)
+    speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
+    half = 10
+    padded = np.pad(speed, half, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
+    return np.median(windows, axis=1)
+
+
+def _ground_height(tracks: Tracks) -> float:
+    """Height of the ground under the boxes near the ego, in the radar's frame.
+
+    Few boxes on a slope mislead: it stays near the height the radar is mounted at.
+    """
+    bottom = tracks.position_m[..., 2] - tracks.size_m[..., 2] / 2.0
+    near = tracks.is_present & (
+        np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1]) < 30.0
+    )
+    if not near.any():
+        return traffic.GROUND_M
+    return float(np.clip(np.median(bottom[near]), -1.4, -0.4))
+
+
+def _road_edges(tracks: Tracks, law: traffic.Environment) -> tuple[float, float]:
+    """Lateral bounds of the labelled objects near the road, right and left."""
+    left = tracks.position_m[..., 1][tracks.is_present]
+    left = left[np.abs(left) < 18.0]
+    right_edge = -(law.lanes_right + 0.5) * law.lane_width_m - 1.0
+    left_edge = (law.lanes_left + 0.5) * law.lane_width_m + 1.0
+    if left.size:
+        low, high = np.percentile(left, (2.0, 98.0))
+        right_edge, left_edge = min(right_edge, low - 2.0), max(left_edge, high + 2.0)
+    return right_edge, left_edge

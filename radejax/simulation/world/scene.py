@@ -1,0 +1,230 @@
+"""What stands and moves around the ego vehicle in one sequence.
+
+A `Sequence` is a list of tracks (boxes that keep their identity, moving or parked) and
+of static reflectors in a fixed world frame, and the path of the ego vehicle through
+it; `Sequence.frame` gives what the sensors see at one instant, in the ego frame.
+Procedural worlds (`traffic`) and real labels (`real_scenes`) both end here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from radejax.core.structures import CLASSES
+
+FRAME_PERIOD_S = 0.1
+"""K-Radar records 10 frames a second."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Road:
+    """Centerline of a road: a circle arc that starts at the origin along x.
+
+    Attributes:
+        curvature_per_m: Inverse radius, positive turns left; 0 is straight.
+    """
+
+    curvature_per_m: float = 0.0
+
+    def position(self, along_m: Any, left_m: Any) -> tuple[Any, Any, Any]:
+        """World x, y and heading of a point given along and left of the centerline."""
+        along_m = np.asarray(along_m, np.float64)
+        k = self.curvature_per_m
+        heading = k * along_m
+        if abs(k) < 1e-9:
+            x, y = along_m, np.zeros_like(along_m)
+        else:
+            x, y = np.sin(heading) / k, (1.0 - np.cos(heading)) / k
+        return x - left_m * np.sin(heading), y + left_m * np.cos(heading), heading
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracks:
+    """Every object of a sequence at every frame, in the world frame.
+
+    Attributes:
+        position_m: `[F, N, 3]` box centers.
+        yaw_rad: `[F, N]` headings.
+        velocity_mps: `[F, N, 2]` over ground.
+        is_present: `[F, N]` bool.
+        size_m: `[F, N, 3]` length, width, height.
+        cls: `[N]` index into `CLASSES`.
+        track_id: `[N]` identity written to the labels.
+        label_cls: Class names written to the labels.
+    """
+
+    position_m: np.ndarray
+    yaw_rad: np.ndarray
+    velocity_mps: np.ndarray
+    is_present: np.ndarray
+    size_m: np.ndarray
+    cls: np.ndarray
+    track_id: np.ndarray
+    label_cls: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reflectors:
+    """Static scatterers of the surroundings in the world frame.
+
+    Attributes:
+        position_m: `[M, 3]`.
+        rcs_dbsm: `[M]`.
+        normal_rad: `[M]` direction of the surface's normal in the ground plane, NaN
+            where the reflector looks the same from everywhere.
+        kind: `[M]` index into `REFLECTOR_KINDS`.
+    """
+
+    position_m: np.ndarray
+    rcs_dbsm: np.ndarray
+    normal_rad: np.ndarray
+    kind: np.ndarray
+
+
+REFLECTOR_KINDS = ("ground", "rail", "wall", "pole", "tree")
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFrame:
+    """One instant, seen from the radar: x forward, y left, z up from the radar.
+
+    Attributes:
+        boxes: `[N, 7]` x, y, z, l, w, h, yaw.
+        velocity_mps: `[N, 2]` over ground, along the ego axes.
+        cls: `[N]` index into `CLASSES`.
+        track: `[N]` index into the tracks of the sequence.
+        track_id: `[N]` identity written to the labels.
+        ego_velocity_mps: `[2]` of the radar over ground, along its own axes.
+        reflectors: Static surroundings near the ego, in this frame.
+        reflector_idx: `[M]` which reflectors of the sequence these are.
+        index: Of the frame in its sequence.
+        time_s: Since the start of the sequence.
+        ego_along_m: Position of the ego along its road (for drawing the road).
+    """
+
+    boxes: np.ndarray
+    velocity_mps: np.ndarray
+    cls: np.ndarray
+    track: np.ndarray
+    track_id: np.ndarray
+    ego_velocity_mps: np.ndarray
+    reflectors: Reflectors
+    reflector_idx: np.ndarray
+    index: int
+    time_s: float
+    ego_along_m: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """A whole sequence: conditions, ego path, objects and surroundings.
+
+    Attributes:
+        name: Number of the sequence.
+        environment: K-Radar's road type.
+        time: "day" or "night".
+        weather: One of K-Radar's seven.
+        ego_pose: `[F, 3]` world x, y and heading of the radar.
+        ego_along_m: `[F]` position along the road.
+        ego_velocity_mps: `[F, 2]` in the radar's own axes.
+        tracks: Objects.
+        reflectors: Static surroundings.
+        road: Centerline; the ego drives at `ego_left_m` of it.
+        lanes_m: Borders of the lanes, metres left of the centerline.
+        ego_left_m: Lateral position of the ego on its road.
+        ground_m: Height of the ground in the radar's frame (negative).
+        mirrors_m: Rails and walls that reflect like mirrors: metres left of the
+            centerline.
+    """
+
+    name: int
+    environment: str
+    time: str
+    weather: str
+    ego_pose: np.ndarray
+    ego_along_m: np.ndarray
+    ego_velocity_mps: np.ndarray
+    tracks: Tracks
+    reflectors: Reflectors
+    road: Road
+    lanes_m: tuple[float, ...]
+    ego_left_m: float
+    ground_m: float
+    mirrors_m: tuple[float, ...] = ()
+
+    @property
+    def num_frames(self) -> int:
+        return self.ego_pose.shape[0]
+
+    def frame(self, index: int, max_distance_m: float = 150.0) -> SceneFrame:
+        """What surrounds the radar at frame `index`, up to a distance."""
+        pose, tracks, fixed = self.ego_pose[index], self.tracks, self.reflectors
+        ego = _to_ego(tracks.position_m[index], pose)
+        is_near = tracks.is_present[index] & (
+            np.hypot(ego[:, 0], ego[:, 1]) < max_distance_m
+        )
+        chosen = np.flatnonzero(is_near)
+        yaw = wrap_angle(tracks.yaw_rad[index] - pose[2])
+        boxes = np.concatenate([ego, tracks.size_m[index], yaw[:, None]], 1)[chosen]
+        velocity = _rotate(tracks.velocity_mps[index, chosen], -pose[2])
+
+        points = _to_ego(fixed.position_m, pose)
+        distance = np.hypot(points[:, 0], points[:, 1])
+        # Behind the radar its own vehicle shields; two metres off nothing stands.
+        seen = np.flatnonzero(
+            (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
+        )
+        reflectors = Reflectors(
+            position_m=points[seen],
+            rcs_dbsm=fixed.rcs_dbsm[seen],
+            normal_rad=fixed.normal_rad[seen] - pose[2],
+            kind=fixed.kind[seen],
+        )
+        return SceneFrame(
+            boxes=boxes,
+            velocity_mps=velocity,
+            cls=tracks.cls[chosen],
+            track=chosen,
+            track_id=tracks.track_id[chosen],
+            ego_velocity_mps=self.ego_velocity_mps[index],
+            reflectors=reflectors,
+            reflector_idx=seen,
+            index=index,
+            time_s=index * FRAME_PERIOD_S,
+            ego_along_m=float(self.ego_along_m[index]),
+        )
+
+
+def class_index(name: str) -> int:
+    """Index of a class name; K-Radar's groups count as their single class.
+
+    Raises:
+        ValueError: There is no such class.
+    """
+    single = name.removesuffix(" Group")
+    if single not in CLASSES:
+        raise ValueError(f"class {name!r} is none of {', '.join(CLASSES)}")
+    return CLASSES.index(single)
+
+
+def wrap_angle(angle_rad: Any) -> Any:
+    """The same angle in [-pi, pi)."""
+    return np.mod(np.asarray(angle_rad) + np.pi, 2.0 * np.pi) - np.pi
+
+
+def _rotate(vectors: np.ndarray, angle_rad: float) -> np.ndarray:
+    """`[N, 2]` vectors turned counter-clockwise."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.stack(
+        [c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]],
+        1,
+    )
+
+
+def _to_ego(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """`[N, 3]` world points in the frame of the radar at `pose` (x, y, heading)."""
+    flat = _rotate(points[:, :2] - pose[:2], -pose[2])
+    return np.concatenate([flat, points[:, 2:]], 1)

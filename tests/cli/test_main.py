@@ -1,0 +1,165 @@
+"""The command line: help with examples, JSON, exit codes, no tracebacks."""
+
+import json
+import pathlib
+
+import click.testing
+import numpy as np
+import pytest
+
+from radejax.cli import main
+from radejax.data.kradar import write
+from radejax.data.kradar.labels import Label
+from radejax.evaluation.files import kitti
+from radejax.inference import packed as checkpoint_files
+
+from .. import small_models
+
+
+def _run(*arguments: object) -> click.testing.Result:
+    return click.testing.CliRunner().invoke(main.main, [str(a) for a in arguments])
+
+
+def _commands() -> list[list[str]]:
+    found = []
+    for name, command in main.main.commands.items():
+        if isinstance(command, click.Group):
+            found += [[name, sub] for sub in command.commands]
+        else:
+            found.append([name])
+    return found
+
+
+@pytest.mark.parametrize("command", _commands(), ids=" ".join)
+def test_help_shows_an_example(command: list[str]) -> None:
+    result = _run(*command, "--help")
+    assert result.exit_code == 0
+    assert "Example: radejax " + " ".join(command) in " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["detect", "/nowhere", "--workdir", "/nowhere", "--out", "x"], "'/nowhere'"),
+        (["simulate", "--config", "nowhere.py", "--out", "x"], "nowhere.py"),
+        (["simulate", "--sequences", "5", "--out", "x"], "real labels"),
+        (["simulate", "--sequences", "5-6", "--out", "x"], "expected 1,5,58"),
+        (["fly"], "No such command 'fly'"),
+        (["project", ".", "--out", "x", "--shard", "3/2"], "3/2"),
+        (["project", ".", "--out", "x", "--workers", "0"], "0 is not in the range"),
+        (["simulate", "--out", "x", "--threads", "0"], "0 is not in the range"),
+        (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
+        (["benchmark", "--config", "x", "--batch-size", "0"], "0 is not in the range"),
+        (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),
+        (["overlay", "1", "--data", ".", "--out", "."], "'.' is a directory"),
+        (["export", ".", "--out", __file__], "is a file"),
+        (["detect", ".", "--model", ".", "--out", __file__], "is a file"),
+        (
+            ["detect", ".", "--model", ".", "--out", "x", "--step", "last"],
+            "'last' is neither a number nor \"best\"",
+        ),
+    ],
+)
+def test_wrong_use_is_exit_code_2_and_a_clear_line(
+    arguments: list[str], message: str, tmp_path: pathlib.Path
+) -> None:
+    result = _run(*arguments)
+    assert result.exit_code == 2
+    assert message in result.output
+    assert "Traceback" not in result.output
+
+
+@pytest.fixture
+def root(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A K-Radar root with one label and nothing else."""
+    label = Label("Sedan", (10.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0), "R", 1)
+    path = tmp_path / "kradar" / "1" / "info_label_v2_1" / "00033_00001.txt"
+    write.write_labels(path, (33, 1, 2, 1, 4), 1.0, [label])
+    return tmp_path / "kradar"
+
+
+def test_check_reports_as_text_and_as_json(root: pathlib.Path) -> None:
+    text = _run("data", "check", root)
+    assert text.exit_code == 1, text.output  # the tesseract is missing
+    assert "tesseract" in text.output
+    values = _run("data", "check", root, "--json")
+    assert isinstance(json.loads(values.output), dict)
+
+
+def test_a_folder_without_frames_says_what_was_looked_for(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    result = _run("detect", root, "--workdir", tmp_path, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "tesseract_*.mat" in result.output
+
+
+def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
+    arguments = ("export", tmp_path, "--out", tmp_path / "out")
+    plain = _run(*arguments)
+    assert plain.exit_code == 2
+    assert plain.output.startswith(f"error: no model in {tmp_path}")
+    assert isinstance(_run("--debug", *arguments).exception, FileNotFoundError)
+
+
+def test_evaluate_and_benchmark_want_one_source() -> None:
+    for command in ("evaluate", "benchmark"):
+        result = _run(command)
+        assert result.exit_code == 2
+        assert "error: give one of" in result.output
+
+
+def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> None:
+    packed = tmp_path / "packed"
+    checkpoint_files.write_packed(packed, small_models.detector())
+    done = _run(
+        "export", packed, "--out", tmp_path / "hub", "--format", "huggingface", "--json"
+    )
+    assert json.loads(done.output)["kind"] == "huggingface"
+    for name in ("model.safetensors", "config.json"):
+        written = (tmp_path / "hub" / name).read_bytes()
+        assert written == (packed / name).read_bytes()
+    for platform in ("foo", "gpu,foo"):
+        wrong = _run("export", packed, "--out", tmp_path / "x", "--platforms", platform)
+        assert wrong.exit_code == 2
+        assert "error: platform is 'foo', expected some of cpu, cuda" in wrong.output
+    timed = _run("benchmark", packed, "--batch-size", 1, "--repeats", 1, "--json")
+    (row,) = json.loads(timed.output)
+    assert row["batch"] == 1
+    assert row["whole_s"] > 0
+
+
+def test_evaluate_scores_predictions_in_files(tmp_path: pathlib.Path) -> None:
+    box = np.array([[20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [30, 3, 0, 4, 2, 1.5, 0.1]])
+    truth = {"frame": np.arange(2), "box": box, "cls": np.array(["Sedan"] * 2)}
+    found = {**truth, "score": np.array([0.9, 0.8])}
+    kitti.write_kitti(tmp_path / "kitti", truth, found, {"frame": np.arange(2)})
+    arguments = (
+        "evaluate",
+        "--predictions",
+        tmp_path / "kitti",
+        "--out",
+        tmp_path / "out",
+    )
+    text = _run(*arguments)
+    assert text.exit_code == 0, text.output
+    assert "100.0" in text.output
+    assert (tmp_path / "out" / "metrics.json").is_file()
+    assert json.loads(_run(*arguments, "--json").stdout)
+
+
+def test_simulate_works_anywhere(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the repository's configs: the package has a small one of its own."""
+    from radejax.simulation import dataset
+
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    monkeypatch.setattr(
+        dataset, "simulate_dataset", lambda *a, **kw: seen.append((a, kw))
+    )
+    assert _run("simulate", "--out", "data", "--frames", 3).exit_code == 0
+    (((config, out), _),) = seen
+    assert config == dataset.default_config() | {"frames_per_sequence": 3}
+    assert out == pathlib.Path("data")

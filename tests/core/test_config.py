@@ -1,0 +1,84 @@
+"""Configs: words, presets, the rows of the papers' tables; every one can be built."""
+
+import importlib.util
+import pathlib
+from typing import Any
+
+import jax
+import pytest
+
+from radejax import models
+from radejax.core.config import base_config, parse_words
+from radejax.core.errors import UserError
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
+RADENET = ("base", "cbam", "cbam_heads", "model", "no_cbam", "stem", "expand")
+
+
+def _get(name: str, words: str | None = None) -> Any:
+    spec = importlib.util.spec_from_file_location(name, CONFIGS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.get_config(words)
+
+
+def _fields(config: Any) -> set[str]:
+    flat = config.to_dict()
+    return {f"{s}.{f}" for s, v in flat.items() if isinstance(v, dict) for f in v}
+
+
+@pytest.mark.parametrize(
+    "words", [*RADENET, "paper", "official", "official,sedan,stem"]
+)
+def test_every_radenet_config_builds_and_has_the_same_fields(words: str) -> None:
+    config = _get("radenet", words)
+    assert _fields(config) == _fields(base_config())
+    model = models.build(config.model)
+    assert model.num_classes == len(config.classes)
+
+
+def test_parameters_of_the_papers_model() -> None:
+    model = models.build(_get("radenet").model)
+    projection = jax.ShapeDtypeStruct((1, 256, 107, 101), "float32")
+    shapes = jax.eval_shape(model.init, jax.random.key(0), projection)
+    assert sum(x.size for x in jax.tree.leaves(shapes)) == 28_336_878
+
+
+def test_presets_are_the_two_worlds() -> None:
+    paper, official = _get("radenet", "paper"), _get("radenet", "official")
+    assert (paper.model.cbam, official.model.cbam) == ("paper", "official")
+    assert (paper.loss.matching, official.loss.matching) == ("nms", "center")
+    assert (paper.loss.gwd_transform, official.loss.gwd_transform) == ("sqrt", "none")
+    assert official.data.azimuth_mapping == "stretched"
+    assert paper.train.final_learning_rate == 1e-4
+    assert official.train.final_learning_rate == 1e-5
+
+
+def test_the_base_row_has_no_attention_in_either_world() -> None:
+    for preset in ("paper", "official"):
+        assert _get("radenet", f"base,{preset}").model.cbam == "off"
+
+
+@pytest.mark.parametrize("words", [None, "short"])
+def test_the_quickstart_fits_its_own_sensor(words: str | None) -> None:
+    config = _get("quickstart", words)
+    grid = config.simulation.grid
+    assert config.model.doppler_bins == grid.num_doppler
+    assert config.model.elevation_bins == grid.num_elevation
+    assert _fields(config) >= _fields(base_config())
+
+
+@pytest.mark.parametrize("words", ["r", "rc", "rcw", "rcw_resnet50", "official"])
+def test_every_dinorade_config_builds(words: str) -> None:
+    config = _get("dinorade", words)
+    models.build(config.model)
+    assert config.loss.sigma_cells == (3.0 if words == "official" else 0.75)
+
+
+def test_words_that_do_not_go_together_are_refused() -> None:
+    with pytest.raises(UserError, match="'base' and 'stem' exclude each other"):
+        _get("radenet", "base,stem")
+    with pytest.raises(UserError, match=r"unknown config argument 'big'; available"):
+        _get("radenet", "big")
+    assert parse_words("b, a", ("a",), ("b", "c")) == ["a", "b"]
+    assert parse_words(None, ("a",)) == [None]

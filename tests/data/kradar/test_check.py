@@ -1,0 +1,108 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.data.kradar import KRadar, write
+from radejax.data.kradar.check import check_dataset
+from radejax.geometry.radar_grid import RadarGrid
+
+
+@pytest.fixture
+def root(kradar_root, tmp_path):
+    return shutil.copytree(kradar_root, tmp_path / "kradar")
+
+
+def test_healthy_copy(root):
+    report = check_dataset(root)
+    assert report.num_problems == 0
+    assert "no problems" in report.to_text()
+    row = report.sequences[1]
+    assert (row.sequence, row.weather, row.labels, row.train, row.test) == (
+        *(2, "fog", 6),
+        *(4, 2),
+    )
+    assert (row.tesseracts, row.tesseracts_missing, row.tesseracts_damaged) == (6, 0, 0)
+    assert row.calibration == "-2.5, 0.25"
+    counts = KRadar(root, split="train").class_counts()
+    for cls, number in counts.items():
+        assert report.class_counts.get(("train", "fog", cls), 0) == number
+    plain = json.loads(json.dumps(report.to_dict()))
+    assert plain["num_problems"] == 0
+    assert len(plain["sequences"]) == 2
+
+
+def test_everything_that_is_wrong_is_named(root):
+    tesseracts = root / "1/radar_tesseract"
+    path = tesseracts / "tesseract_00005.mat"
+    path.write_bytes(path.read_bytes()[:-5])
+    (tesseracts / "tesseract_00006.mat").unlink()
+    write.write_tesseract(
+        tesseracts / "tesseract_00007.mat", np.ones((2, 3, 4, 5), np.float32)
+    )
+    (root / "1/info_label/00008_00005.txt").write_text("nothing")
+    write.write_calibration(root / "2/info_calib/calib_radar_lidar.txt", 9, -2.5, 0.25)
+    write.write_splits(
+        root / "split",
+        [(1, f"{i + 3:05d}_{i:05d}") for i in range(1, 7)],
+        [(1, "00004_00001"), (1, "00099_00096")],
+    )
+    report = check_dataset([root])
+    assert report.summary.problem_counts() == {
+        "label file": 1,
+        "tesseract missing": 1,
+        "split": 7,  # one frame in both, all of sequence 2 in none
+        "label file missing": 2,
+        "tesseract damaged": 2,
+        "calibration": 1,
+    }
+    text = report.to_text()
+    assert "tesseract_00005.mat: truncated" in text
+    assert "tesseract_00007.mat: arrDREA has shape (2, 3, 4, 5), the sensor's" in text
+    assert "frame difference 9, but radar minus LiDAR" in text
+    assert "1/00004_00001: in both train and test" in text
+    assert report.sequences[0].tesseracts_damaged == 2
+    assert f"{report.num_problems} problems" in text
+
+
+def test_deep_reads_what_the_head_does_not_say(root):
+    path = root / "1/radar_tesseract/tesseract_00005.mat"
+    tesseract = np.ones((6, 16, 5, 12), np.float32)
+    tesseract[0, 0, 0, 0] = np.nan
+    write.write_tesseract(path, tesseract)
+    assert check_dataset(root).num_problems == 0
+    report = check_dataset(root, deep=True)
+    assert report.summary.problem_counts() == {"tesseract damaged": 1}
+
+
+def test_labels_of_another_version_are_read_as_what_they_are(root):
+    report = check_dataset(root, version="v1.0")
+    assert report.version == "v2.1"
+    assert "note: the labels are v2.1, not v1.0" in report.to_text()
+
+
+def test_disk_without_labels(tmp_path):
+    write.write_tesseract(
+        tmp_path / "3/radar_tesseract/tesseract_00001.mat",
+        np.zeros((1, 1, 1, 2), np.float32),
+    )
+    report = check_dataset(tmp_path)
+    assert report.summary.problem_counts() == {
+        "labels missing": 1,
+        "tesseract damaged": 1,  # not K-Radar's shape
+    }
+    assert report.sequences[0].weather == "normal"
+    with pytest.raises(UserError, match="no sequence folders"):
+        check_dataset(tmp_path / "3")
+
+
+def test_conditions_that_contradict_the_published_ones(root):
+    (root / "radar_grid.json").unlink()
+    notes = check_dataset(root).summary.notes
+    assert len(notes) == 2
+    assert (
+        "urban,day,fog; K-Radar published urban,night,normal for sequence 1" in notes[0]
+    )
+    assert RadarGrid.kradar().shape_drea == (64, 256, 37, 107)

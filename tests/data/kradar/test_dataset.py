@@ -1,0 +1,310 @@
+import json
+import math
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import CLASSES
+from radejax.data.kradar import KRadar, write
+from radejax.data.kradar.labels import LABEL_CLASSES, Label, normalise_version
+
+NAME = "00004_00001"
+INDICES = (4, 1, 2, 1, 3)
+
+
+def write_frame(root, labels, version="v2.1", sequence=1, name=NAME):
+    path = root / f"{sequence}/info_label/{name}.txt"
+    write.write_labels(path, INDICES, 0.5, labels, version)
+
+
+def sedan(x, y, visibility="R", cls="Sedan"):
+    return Label(cls, (x, y, 0.5, 4.0, 2.0, 1.5, 0.25), visibility, 0)
+
+
+# Numbers worked out by hand --------------------------------------------------------
+
+
+def test_offset_and_filters(tmp_path):
+    write_frame(
+        tmp_path,
+        [
+            sedan(10.0, 1.0),
+            sedan(20.0, 1.0, "L"),
+            sedan(30.0, 1.0, "LL"),
+            sedan(2.0, 1.0),  # x = -0.5 in the radar frame
+            sedan(12.5, 20.0),  # 63 degrees to the left
+            sedan(120.5, 0.0),  # 118.0003 m away
+            sedan(40.0, 1.0, cls="Pedestrian Group"),
+            sedan(50.0, -2.0, cls="Bicycle"),
+        ],
+    )
+    path = tmp_path / "1/info_calib/calib_radar_lidar.txt"
+    write.write_calibration(path, 3, -2.5, 0.25)
+    data = KRadar(tmp_path, z_offset_m=0.7)
+    (frame,) = data
+    np.testing.assert_allclose(
+        frame.boxes,
+        [[7.5, 1.25, 1.2, 4, 2, 1.5, 0.25], [47.5, -1.75, 1.2, 4, 2, 1.5, 0.25]],
+        rtol=1e-15,
+    )
+    assert frame.boxes.dtype == np.float64
+    assert frame.classes.tolist() == ["Sedan", "Bicycle"]
+    assert frame.radar_from_lidar_m == (-2.5, 0.25, 0.7)
+    assert len(frame.labels) == 8
+    counts = data.counts
+    assert counts["objects left out by class"] == 1
+    assert counts["objects left out by visibility"] == 2
+    assert counts["objects left out by field of view"] == 3
+    assert counts["objects with an odd availability flag"] == 1
+    assert counts["objects kept"] == 2
+    assert data.class_counts() == {
+        "Sedan": 1,
+        "Bus or Truck": 0,
+        "Pedestrian": 0,
+        "Motorcycle": 0,
+        "Bicycle": 1,
+    }
+
+
+def test_filters_can_be_changed(tmp_path):
+    write_frame(tmp_path, [sedan(2.0, 1.0, "L1"), sedan(9, 0, cls="Bicycle Group")])
+    everything = KRadar(
+        tmp_path, visibility=None, classes=LABEL_CLASSES, field_of_view=False
+    )
+    assert len(everything[0].boxes) == 2
+    assert everything[0].visibility.tolist() == ["L1", "R"]
+    shifted = KRadar(tmp_path, visibility=("L1",), radar_from_lidar=(5.0, -1.0))
+    np.testing.assert_allclose(shifted[0].boxes[:, :3], [[7.0, 0.0, 0.5]])
+
+
+def test_frame_knows_its_files(kradar_root):
+    data = KRadar(kradar_root, split="train", camera_calibration=kradar_root)
+    assert len(data) == 8
+    frame = data[4]
+    assert frame.key == "2/00004_00001"
+    assert (frame.environment, frame.time, frame.weather) == ("urban", "day", "fog")
+    folder = kradar_root / "2/radar_tesseract"
+    assert frame.tesseract_path == folder / "tesseract_00004.mat"
+    assert frame.camera_path is None
+    assert frame.camera_calibration_path is None
+    assert data.grid.shape_drea == (6, 16, 5, 12)
+    assert [f.key for f in data[:2]] == ["1/00004_00001", "1/00005_00002"]
+    assert data.counts["frames without front image"] == 8
+    assert not data.summary().problems
+
+
+def test_camera_frame_number_comes_from_the_header(tmp_path):
+    write_frame(tmp_path, [])
+    image = tmp_path / "1/cam-front/cam-front_00002.png"
+    image.parent.mkdir()
+    image.write_bytes(b"")
+    npy = tmp_path / "1/DERA_tesseract/DERA_tesseract_00004.npy"
+    npy.parent.mkdir()
+    npy.write_bytes(b"")
+    (frame,) = KRadar(tmp_path)
+    assert frame.camera_path == image
+    assert frame.projection_path == npy
+
+
+# Splits ------------------------------------------------------------------------------
+
+
+def test_splits_cover_everything_once(kradar_root):
+    keys = {s: [f.key for f in KRadar(kradar_root, split=s)] for s in ("train", "test")}
+    everything = [f.key for f in KRadar(kradar_root)]
+    assert sorted(keys["train"] + keys["test"]) == everything
+    assert keys["train"] == [
+        f.key for f in KRadar(kradar_root, split=kradar_root / "split/train.txt")
+    ]
+    one = KRadar(kradar_root, split="test", sequence_numbers=[2])
+    assert [f.key for f in one] == [key for key in keys["test"] if key[0] == "2"]
+
+
+def test_split_by_rule_is_noted(tmp_path, kradar_writer):
+    kradar_writer(tmp_path, sequences=(1,), num_frames=8)
+    shutil.rmtree(tmp_path / "split")
+    data = KRadar(tmp_path, split="test")
+    assert [frame.header.lidar for frame in data] == [3, 4, 7, 8]
+    assert "K-Radar's rule" in data.summary().to_text()
+
+
+def test_split_entries_without_labels(tmp_path, kradar_writer):
+    kradar_writer(tmp_path, sequences=(1,), num_frames=4)
+    write.write_splits(
+        tmp_path / "split", [(1, NAME), (1, "00099_00096"), (7, NAME)], []
+    )
+    data = KRadar(tmp_path, split="train")
+    assert len(data) == 1
+    assert data.counts["split entries of sequences that are not here"] == 1
+    assert data.summary().problem_counts() == {"label file missing": 1}
+    with pytest.raises(FileNotFoundError, match="1/00099_00096: in split train but"):
+        KRadar(tmp_path, split="train", strict=True)
+
+
+# What is missing or malformed -------------------------------------------------------
+
+
+@pytest.fixture
+def damaged(tmp_path, kradar_writer):
+    kradar_writer(tmp_path, sequences=(1,), num_frames=6)
+    labels = tmp_path / "1/info_label"
+    (labels / "00005_00002.txt").write_text("")
+    with open(labels / "00006_00003.txt", "a") as file:
+        file.write("*, R, 9, Sedan, 1, 2\n")
+    (tmp_path / "1/radar_tesseract/tesseract_00007.mat").unlink()
+    (tmp_path / "1/info_calib/calib_radar_lidar.txt").write_text("x\n1\n")
+    (tmp_path / "1/description.txt").write_text("fog")
+    return tmp_path
+
+
+def test_problems_are_counted_and_named(damaged):
+    data = KRadar(damaged)
+    summary = data.summary()
+    assert len(data) == 5
+    assert summary.problem_counts() == {
+        "label file": 1,
+        "label line": 1,
+        "calibration": 1,
+        "description": 1,
+        "tesseract missing": 1,
+    }
+    text = summary.to_text()
+    assert "00005_00002.txt:1: the file is empty" in text
+    assert "00006_00003.txt:" in text
+    assert "calib_radar_lidar.txt:2: '1', expected three numbers" in text
+    assert "no radar_tesseract/tesseract_00007.mat in" in text
+    assert data[0].radar_from_lidar_m == (-2.54, 0.3, 0.0)
+    assert (data[0].time, data[0].weather) == (
+        "night",
+        "normal",
+    )  # K-Radar's sequence 1
+    assert json.loads(json.dumps(summary.to_dict()))["counts"]["frames"] == 5
+    assert data[3].tesseract_path is not None
+    assert data[2].tesseract_path is None
+
+
+def test_strict_raises_on_the_first(damaged):
+    with pytest.raises(DataError, match=r"00005_00002\.txt:1: the file is empty"):
+        KRadar(damaged, strict=True)
+    (damaged / "1/info_label/00005_00002.txt").unlink()
+    with pytest.raises(DataError, match=r"00006_00003\.txt:\d: 6 fields"):
+        KRadar(damaged, strict=True)
+    (damaged / "1/info_label/00006_00003.txt").unlink()
+    with pytest.raises(DataError, match=r"calib_radar_lidar\.txt:2"):
+        KRadar(damaged, strict=True)
+    (damaged / "1/info_calib/calib_radar_lidar.txt").unlink()
+    with pytest.raises(FileNotFoundError, match="sequence 1: no info_calib"):
+        KRadar(damaged, strict=True)
+    write.write_calibration(
+        damaged / "1/info_calib/calib_radar_lidar.txt", 3, -2.5, 0.3
+    )
+    with pytest.raises(DataError, match=r"description\.txt:1: 'fog'"):
+        KRadar(damaged, strict=True)
+    (damaged / "1/description.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"1/00007_00004: no radar_tess"):
+        KRadar(damaged, strict=True)
+
+
+def test_labels_of_another_version_are_one_error(tmp_path):
+    write_frame(tmp_path, [sedan(10, 0), sedan(20, 0)], "v2.0")
+    with pytest.raises(UserError, match=r"layout of v1\.0 labels.*say the version"):
+        KRadar(tmp_path, version="v2.1")
+    assert len(KRadar(tmp_path, version="v2.0")[0].boxes) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"root": None}, "give a K-Radar root, or labels"),
+        ({"version": "v9"}, "version 'v9' does not exist"),
+        ({"split": "validation"}, "'validation' is neither 'train', 'test'"),
+        ({"visibility": "R"}, r"sequence of flags, such as \('R',\)"),
+        ({"classes": ("Car",)}, r"classes \['Car'\], expected some of Sedan"),
+        ({"classes": ()}, "classes are empty"),
+        ({"sequence_numbers": [9]}, r"no labels of sequences \[9\] in .*\[1, 2\]"),
+    ],
+)
+def test_wrong_arguments(kradar_root, arguments, message):
+    with pytest.raises(UserError, match=message):
+        KRadar(**{"root": kradar_root, **arguments})
+
+
+def test_nothing_to_read(tmp_path):
+    with pytest.raises(UserError, match="no sequence folders"):
+        KRadar(tmp_path)
+    (tmp_path / "1").mkdir()
+    with pytest.raises(UserError, match=r"no v2\.1 labels in the sequence folders"):
+        KRadar([tmp_path])
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        KRadar(tmp_path / "none")
+
+
+# The reference data -----------------------------------------------------------------
+
+
+def test_parsed_objects_equal_the_reference(shared, tmp_path):
+    folder = shared / "fixtures/ground_truth"
+    fixture = json.loads((folder / "label_parsing.json").read_text())
+    calibration = (folder / fixture["calib_file"]).read_bytes()
+    for number, case in enumerate(fixture["cases"]):
+        root = tmp_path / str(number)
+        (root / "1/info_label").mkdir(parents=True)
+        (root / "1/info_calib").mkdir()
+        (root / "1/info_calib/calib_radar_lidar.txt").write_bytes(calibration)
+        shutil.copy(folder / case["file"], root / "1/info_label/00033_00001.txt")
+        (frame,) = KRadar(
+            root,
+            version=case["version"],
+            visibility=("R",) if case["radar_only"] else ("R", "L"),
+            radar_from_lidar=None if case["calibrated"] else (0.0, 0.0),
+        )
+        boxes, classes, flags = frame.boxes, frame.classes, frame.visibility
+        if case["narrow_roi_filter"]:
+            x, y, z = boxes[:, :3].T
+            rows = (x >= 0) & (x <= 72) & (abs(y) <= 6.4) & (z >= -2) & (z <= 6)
+            boxes, classes, flags = boxes[rows], classes[rows], flags[rows]
+        wanted = case["objects"]
+        assert classes.tolist() == [o["class"] for o in wanted]
+        assert flags.tolist() == [o["avail"] for o in wanted]
+        values = np.array([o["values"] for o in wanted]).reshape(-1, 7)
+        np.testing.assert_array_equal(boxes[:, [0, 1, 2, 6, 3, 4, 5]], values)
+    assert normalise_version("v2_1") == "v2.1"
+
+
+def test_published_counts_of_the_training_split(shared):
+    began = time.perf_counter()
+    data = KRadar(labels=shared / "data/kradar/labels_v2_1.zip", split="train")
+    assert time.perf_counter() - began < 30
+    assert len(data) == 17458
+    assert list(data.class_counts().values()) == [28074, 5800, 2318, 190, 586]
+    boxes = np.concatenate([frame.boxes for frame in data])
+    classes = np.concatenate([frame.classes for frame in data])
+    x, y, z = boxes[:, :3].T
+    ahead = (x >= 0) & (x <= 72)
+    narrow = ahead & (abs(y) <= 6.4) & (z >= -2) & (z <= 6)
+    wide = ahead & (abs(y) <= 16) & (z >= -2) & (z <= 7.6)
+    for region, counts in (
+        (narrow, [19782, 4177, 1813, 160, 565]),
+        (wide, [25089, 5154, 2304, 190, 586]),
+    ):
+        assert [int((classes[region] == cls).sum()) for cls in CLASSES] == counts
+    assert sum(len(frame.boxes) > 0 for frame in data) == 14593
+    assert data.counts["sequences with the default calibration"] == 58
+    assert not data.summary().problems
+
+
+def test_all_real_label_files_are_read(shared):
+    everything = {"visibility": None, "classes": LABEL_CLASSES, "field_of_view": False}
+    data = KRadar(labels=shared / "data/kradar/labels_v2_1.zip", **everything)
+    assert len(data) == 34994
+    assert data.counts["frames without objects"] == 4307
+    assert data.counts["objects with an odd availability flag"] == 3
+    assert data.counts["files named unlike their header"] == 0
+    assert max(len(frame.boxes) for frame in data) == 25
+    boxes = np.concatenate([frame.boxes for frame in data])
+    assert int((boxes[:, 0] < 0).sum()) == 8580
+    assert int((boxes[:, 3] < boxes[:, 4]).sum()) == 2405
+    assert int((np.abs(boxes[:, 6]) > math.pi).sum()) == 3218

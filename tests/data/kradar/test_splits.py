@@ -1,0 +1,61 @@
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.data.kradar import write
+from radejax.data.kradar.findings import Findings
+from radejax.data.kradar.folders import LabelSource
+from radejax.data.kradar.splits import read_split_entries, select_frames
+
+KEYS = [(1, f"{i:05d}_{i:05d}") for i in range(8)] + [(2, "00000_00000")]
+
+
+def select(tmp_path, strict=False, split=None, sequence_numbers=None):
+    findings = Findings(strict=strict)
+    source = LabelSource(dict.fromkeys(reversed(KEYS), "x"), None, "here")
+    keys = select_frames(
+        source,
+        findings,
+        split=split,
+        near=[tmp_path],
+        sequence_numbers=sequence_numbers,
+    )
+    return keys, findings
+
+
+def test_everything_sorted(tmp_path):
+    assert select(tmp_path)[0] == KEYS
+    assert select(tmp_path, sequence_numbers=[2])[0] == KEYS[8:]
+
+
+def test_rule_and_file(tmp_path):
+    keys, findings = select(tmp_path, split="train")
+    assert keys == [KEYS[i] for i in (0, 1, 4, 5)]
+    assert len(findings.notes) == 1
+    # A file in `split/` takes precedence over the rule.
+    write.write_splits(tmp_path / "split", [KEYS[7], KEYS[3]], [])
+    keys, findings = select(tmp_path, split="train")
+    assert keys == [KEYS[3], KEYS[7]]
+    assert not findings.notes
+    assert select(tmp_path, split="test")[0] == []
+    own = tmp_path / "own.txt"
+    own.write_text("2,00000_00000.txt\n")
+    assert select(tmp_path, split=own)[0] == KEYS[8:]
+
+
+def test_errors(tmp_path):
+    with pytest.raises(UserError, match="'val' is neither"):
+        select(tmp_path, split="val")
+    with pytest.raises(UserError, match=r"no labels of sequences \[3\] in here"):
+        select(tmp_path, sequence_numbers=[1, 3])
+    (tmp_path / "train.txt").write_text("1 2\n")
+    with pytest.raises(
+        DataError, match=r"train\.txt:1: '1 2', expected 'sequence,label"
+    ):
+        read_split_entries("train", [tmp_path], KEYS, Findings(strict=False))
+    (tmp_path / "train.txt").write_text("1,00099_00099.txt\n9,00099_00099.txt\n")
+    keys, findings = select(tmp_path, split="train")
+    assert keys == []
+    assert findings.summary().problem_counts() == {"label file missing": 1}
+    assert findings.counts["split entries of sequences that are not here"] == 1
+    with pytest.raises(FileNotFoundError, match="1/00099_00099: in split train"):
+        select(tmp_path, strict=True, split="train")

@@ -1,0 +1,132 @@
+import errno
+import json
+import math
+
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.data.kradar import sequences, write
+from radejax.data.kradar.labels import (
+    LABEL_CLASSES,
+    VERSIONS,
+    Label,
+    read_label_file,
+    read_labels,
+)
+from radejax.geometry.radar_grid import RadarGrid
+
+position = st.floats(-200, 200)
+extent = st.floats(1e-3, 40)
+labels = st.builds(
+    Label,
+    st.sampled_from(LABEL_CLASSES),
+    st.tuples(
+        position, position, position, extent, extent, extent, st.floats(-8.0, 8.0)
+    ),
+    st.sampled_from(["R", "L", "L1", "LL"]),
+    st.integers(-1, 500),
+    st.integers(-1, 500),
+)
+
+
+@settings(deadline=None, max_examples=60)
+@given(objects=st.lists(labels, max_size=4), version=st.sampled_from(VERSIONS))
+def test_labels_survive_writing_and_reading(tmp_path_factory, objects, version):
+    path = tmp_path_factory.getbasetemp() / "round_trip" / "00033_00001.txt"
+    write.write_labels(path, (33, 1, 2, 3, 4), 1643292946.71, objects, version)
+    file = read_label_file(path, version)
+    assert (file.header.radar, file.header.camera_lrr) == (33, 4)
+    assert file.header.timestamp_s == pytest.approx(1643292946.71, abs=1e-6)
+    assert len(file.labels) == len(objects)
+    for found, wanted in zip(file.labels, objects, strict=True):
+        assert found.cls == wanted.cls
+        assert found.box[:6] == wanted.box[:6]  # halving and doubling are exact
+        assert found.box[6] == pytest.approx(wanted.box[6], abs=1e-14)
+        assert found.track_id == wanted.track_id
+        if version in ("v1.1", "v2.1"):
+            assert found.visibility == wanted.visibility
+        if version.startswith("v1"):
+            assert found.previous_track_id == wanted.previous_track_id
+
+
+def test_calibration_description_and_splits_survive(tmp_path):
+    write.write_calibration(tmp_path / "c.txt", 32, -2.54, np.float64(0.3))
+    assert sequences.read_calibration(tmp_path / "c.txt") == sequences.RadarCalibration(
+        32, -2.54, 0.3
+    )
+    write.write_description(tmp_path / "d.txt", "urban", "night", "heavysnow")
+    assert sequences.read_description(tmp_path / "d.txt") == sequences.Conditions(
+        "urban", "night", "heavysnow"
+    )
+    write.write_splits(tmp_path, [(1, "00033_00001")], [("2", "00034_00002.txt")])
+    assert sequences.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
+    assert sequences.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_tesseract_is_what_matlab_writes(tmp_path, compress):
+    tesseract = np.random.default_rng(0).random((3, 4, 2, 5), np.float32)
+    path = tmp_path / "a/tesseract_00001.mat"
+    write.write_tesseract(path, tesseract, compress=compress)
+    stored = scipy.io.loadmat(path)["arrDREA"]
+    np.testing.assert_array_equal(stored, tesseract)
+    assert stored.dtype == np.float32
+    assert stored.flags.f_contiguous
+    first = path.read_bytes()
+    write.write_tesseract(path, tesseract, compress=compress)
+    assert path.read_bytes() == first  # no date in it
+
+
+def test_grid_survives(tmp_path):
+    grid = RadarGrid.reduced(
+        num_doppler=4, num_range=8, num_elevation=3, num_azimuth=7, max_azimuth_deg=41.3
+    )
+    write.write_grid(tmp_path, grid)
+    fields = json.loads((tmp_path / "radar_grid.json").read_text())
+    assert RadarGrid.from_dict(fields) == grid
+
+
+def test_failed_write_leaves_nothing(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail() -> None:
+        with files.atomic_write(path) as file:
+            file.write(b"half")
+            raise RuntimeError("in between")
+
+    with pytest.raises(RuntimeError, match="in between"):
+        fail()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_full_disk_is_the_users_to_mend(tmp_path):
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        pytest.raises(UserError, match="no space left on the disk of"),
+        files.atomic_write(tmp_path / "a.txt"),
+    ):
+        raise full
+    assert not list(tmp_path.iterdir())
+    assert files.is_no_space(RuntimeError("write(): No space left on device"))
+    assert not files.is_no_space(OSError(errno.EIO, "Input/output error"))
+
+
+def test_wrong_arguments(tmp_path):
+    with pytest.raises(UserError, match="five frame numbers, got"):
+        write.write_labels(tmp_path / "a.txt", (1, 2), 0.0, [])
+    with pytest.raises(UserError, match=r"4 axes, got shape \(2, 2\)"):
+        write.write_tesseract(tmp_path / "a.mat", np.ones((2, 2)))
+
+
+def test_unusual_yaw_is_kept(tmp_path):
+    label = Label("Sedan", (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, math.radians(457.4)))
+    write.write_labels(tmp_path / "a.txt", range(5), "1.5", [label])
+    (found,) = read_labels(tmp_path / "a.txt")
+    assert found.box[6] == pytest.approx(label.box[6], rel=1e-15)

@@ -1,0 +1,200 @@
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.evaluation.files import kitti, predictions
+from radejax.evaluation.report import compare as commands
+from radejax.evaluation.report.compare import Source
+from radejax.evaluation.report.measure import Options
+
+ROOT = pathlib.Path(__file__).resolve().parents[3]
+OPTIONS = Options(roi=None, plots=False, protocols=("exact", "kradar_r40"))
+
+
+@pytest.fixture(scope="module")
+def scene(random_scene):
+    return random_scene(8, num_frames=30, num_objects=90)
+
+
+@pytest.fixture
+def stored(scene, tmp_path):
+    """Predictions, ground truth and frames as files."""
+    truth, found, frames = scene
+    predictions.write_table(tmp_path / "found.json", found, frames)
+    predictions.write_table(tmp_path / "truth.csv", truth, frames)
+    commands.files.write_json(
+        tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
+    )
+    source = Source(
+        ground_truth=str(tmp_path / "truth.csv"), frames=str(tmp_path / "frames.json")
+    )
+    return tmp_path, source
+
+
+def ap(report):
+    return [row.shown for row in report.rows if row.condition == "all"]
+
+
+def test_every_way_in_gives_the_same_numbers(stored, scene):
+    folder, source = stored
+    one = commands.evaluate_files(folder / "found.json", folder / "a", source, OPTIONS)
+    # A report brings everything that is needed to repeat it.
+    two = commands.evaluate_files(folder / "a", folder / "b", Source(), OPTIONS)
+    assert ap(one) == ap(two)
+    kitti.write_kitti(folder / "kitti", *scene)
+    three = commands.evaluate_files(folder / "kitti", folder / "c", Source(), OPTIONS)
+    official = [
+        [
+            row.shown
+            for row in made.rows
+            if (row.result.protocol, row.condition) == ("kradar_r40", "fog")
+        ]
+        for made in (one, three)
+    ]
+    assert official[0] == official[1]
+    four = commands.evaluate_files(folder / "kitti", folder / "d", source, OPTIONS)
+    in_truth = np.isin(scene[1]["frame"], scene[0]["frame"])
+    assert four.metrics["num_predictions"] == in_truth.sum()
+
+
+def test_comparison_of_two_reports(stored, scene):
+    folder, source = stored
+    _, found, frames = scene
+    few = {k: v[::3] for k, v in found.items()}
+    predictions.write_table(folder / "few.json", few, frames)
+    for name in ("found", "few"):
+        commands.evaluate_files(folder / f"{name}.json", folder / name, source, OPTIONS)
+    text, rows = commands.compare_files(
+        [folder / "few", folder / "found"],
+        folder / "out",
+        Source(),
+        OPTIONS,
+        resamples=50,
+    )
+    sedan = next(row for row in rows if row.cls == "Sedan")
+    assert sedan.difference > 0
+    assert "B - A" in text
+    assert (folder / "out" / "comparison.txt").read_text() == text
+    assert (folder / "out" / "comparison.json").is_file()
+    again, _ = commands.compare_files(
+        [folder / "few.json", folder / "found.json"],
+        None,
+        source,
+        OPTIONS,
+        resamples=50,
+    )
+    assert again.splitlines()[3:14] == text.splitlines()[3:14]
+    three, rows = commands.compare_files(
+        [folder / "few", folder / "found", folder / "few"],
+        None,
+        Source(),
+        OPTIONS,
+        resamples=10,
+    )
+    assert three.count("B - A") == 2
+    assert "RADE-Net, Table III" in three
+    assert len(rows) % 2 == 0
+    with pytest.raises(UserError, match="at least two runs"):
+        commands.compare_files([folder / "few"], None, Source(), OPTIONS)
+
+
+def test_ground_truth_has_to_come_from_somewhere(stored, scene):
+    folder, source = stored
+    with pytest.raises(UserError, match="say where the ground truth is"):
+        commands.load(folder / "found.json", Source(), ("Sedan",))
+    with pytest.raises(FileNotFoundError, match=r"none\.json"):
+        commands.load(folder / "none.json", source, ("Sedan",))
+    (folder / "frames.json").write_text("[]")
+    with pytest.raises(UserError, match="expected an object of columns"):
+        commands.load(folder / "found.json", source, ("Sedan",))
+    kitti.write_kitti(folder / "kitti", *scene)
+    with pytest.raises(UserError, match="the frames do not say"):
+        commands.compare_files(
+            [folder / "kitti", folder / "kitti"], None, Source(), OPTIONS
+        )
+
+
+def test_ground_truth_by_id_without_a_frame_table(scene, tmp_path):
+    truth, found, _ = scene
+    predictions.write_table(tmp_path / "found.npz", found)
+    predictions.write_table(tmp_path / "truth.npz", truth)
+    source = Source(ground_truth=str(tmp_path / "truth.npz"))
+    _, _, frames, _ = commands.load(tmp_path / "found.npz", source, ("Sedan",))
+    both = np.union1d(truth["frame"], found["frame"])
+    np.testing.assert_array_equal(frames["frame"], both)
+
+
+def test_labels_of_kradar(shared, tmp_path):
+    folder = shared / "data" / "kradar"
+    source = Source(labels=str(folder / "labels_v2_1.zip"), split="test")
+    first = (folder / "split" / "test.txt").read_text().splitlines()[0]
+    header = "frame,cls,x,y,z,l,w,h,yaw,score\n"
+    line = f"{first.replace(',', '/')},Sedan,20,0,0,4,2,1.5,0,0.5\n"
+    (tmp_path / "p.csv").write_text(header + line)
+    truth, found, frames, left_out = commands.load(
+        tmp_path / "p.csv", source, ("Sedan",)
+    )
+    assert frames["frame"].size == 17536
+    assert found["frame"].tolist() == [0]
+    assert truth["frame"].size > 10000
+    assert any(name.startswith("labels: ") for name in left_out)
+
+
+def run(*arguments, **settings):
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg"}
+    return subprocess.run(
+        [sys.executable, str(ROOT / "evaluate.py"), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        **settings,
+    )
+
+
+def test_command_line(stored):
+    folder, source = stored
+    done = run(
+        "--predictions", folder / "found.json", "--ground_truth", source.ground_truth,
+        "--frames", source.frames, "--roi", "none", "--out", folder / "out",
+        "--protocols", "exact,kradar_r40", "--iou", "0.3", "--classes", "Sedan",
+        "--bootstrap", "10",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "AP 3D / BEV at IoU 0.3, exact" in done.stdout
+    assert (folder / "out" / "metrics.json").is_file()
+    compared = run(
+        "--compare", folder / "out", folder / "out", "--bootstrap", 20,
+        "--roi", "none", "--classes", "Sedan",
+    )  # fmt: skip
+    assert compared.returncode == 0, compared.stderr
+    assert "B - A" in compared.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "give one of --workdir, --predictions and --compare"),
+        (("--compare", "a"), "at least two runs"),
+        (("--predictions", "a.json", "--iou", "x"), "--iou must be numbers"),
+        (("--predictions", "none.csv", "--ground_truth", "none.csv"), "none.csv"),
+    ],
+)
+def test_wrong_use_is_one_line_and_exit_code_2(arguments, message):
+    done = run(*arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_bad_content_is_one_line_and_exit_code_1(tmp_path):
+    (tmp_path / "p.csv").write_text("frame,cls\n")
+    done = run(
+        "--predictions", tmp_path / "p.csv", "--ground_truth", tmp_path / "p.csv"
+    )
+    assert done.returncode == 1
+    assert "lacks columns" in done.stderr

@@ -1,0 +1,243 @@
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.evaluation.average_precision import evaluate
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOLS
+from radejax.evaluation.report import measure, paper_tables, report, tables
+from radejax.evaluation.report.measure import Options
+
+TERMS = {"roi": None, "plots": False}
+
+
+@pytest.fixture(scope="module")
+def scene(random_scene):
+    return random_scene(8, num_frames=30, num_objects=90)
+
+
+@pytest.fixture(scope="module")
+def written(scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report")
+    drawn = []
+
+    def draw(frame, path):
+        drawn.append(frame)
+        path.write_text("picture")
+
+    made = report.write_report(
+        *scene, out, run="mine", bootstrap=20, label_version="v2.1", draw_frame=draw,
+        worst_frames=3, **TERMS
+    )  # fmt: skip
+    return made, out, drawn
+
+
+def test_files_are_there_and_nothing_half_written(written):
+    made, out, drawn = written
+    names = {p.name for p in out.iterdir()}
+    assert names == {
+        "metrics.json", "metrics.csv", "report.txt", "tables.md", "tables.tex",
+        "predictions.npz", "ground_truth.npz", "frames.json", "worst_frames",
+    }  # fmt: skip
+    assert all(path.is_file() for path in made.files)
+    assert len(drawn) == 3
+    assert [w["frame"] for w in made.metrics["worst_frames"]] == drawn
+    assert (out / "report.txt").read_text() == made.text
+
+
+def test_json_holds_the_numbers_of_evaluate(written, scene):
+    _, out, _ = written
+    metrics = json.loads(
+        (out / "metrics.json").read_text(), parse_constant=lambda name: 1 / 0
+    )
+    rows = {row["name"]: row for row in metrics["ap"]}
+    assert len(rows) == len(metrics["ap"])  # names are unique
+    truth, found, frames = scene
+    for protocol in PROTOCOLS:
+        for result in evaluate(
+            truth,
+            found,
+            iou_thresholds=(0.3, 0.5, 0.7),
+            protocol=protocol,
+            frames=frames,
+            label_version="v2.1",
+        ):
+            row = rows[f"{result.cls}/all/{result.metric}"]
+            if result.is_defined:
+                assert row["ap"] == pytest.approx(result.ap, abs=1e-12)
+                if not result.protocol.startswith("kradar"):
+                    assert row["ap_low"] - 1e-9 <= row["ap_high"]
+            else:
+                assert row["ap"] is None
+                official = None if math.isnan(result.ap) else 0.0
+                assert row["ap_official"] == official
+            assert row["num_gt"] == result.num_gt
+    assert metrics["options"]["roi"] is None
+    assert metrics["slices"]["time"]
+    assert metrics["slices"]["environment"]
+
+
+def test_means_are_over_classes_that_occur(written):
+    made, _, _ = written
+    table = tables.index(made.rows)
+    for protocol in PROTOCOLS:
+        for condition in ("all", "fog"):
+            present = [
+                row.shown
+                for key, row in table.items()
+                if key[:2] == (protocol, condition)
+                and key[3:] == ("3d", 0.3)
+                and key[2] != "mean"
+                and row.shown is not None
+            ]
+            mean = table[protocol, condition, "mean", "3d", 0.3].shown
+            assert mean == pytest.approx(np.mean(present))
+
+
+def test_csv_is_the_same_table(written):
+    made, out, _ = written
+    with open(out / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(made.rows)
+    for row, measured in zip(rows, made.rows, strict=True):
+        shown = measured.shown
+        assert row["ap"] == ("" if shown is None else repr(shown))
+
+
+def test_a_class_that_does_not_occur_shows_a_dash(written):
+    made, out, _ = written
+    text = (out / "tables.md").read_text().split("**By ")[0]
+    lines = [line for line in text.splitlines() if line.startswith("| Motorcycle")]
+    ours = [line for line in lines if "Dino" not in line and "difference" not in line]
+    assert ours
+    for line in ours:
+        cells = [cell.strip() for cell in line.split("|")[2:-1]]
+        assert all(cell in ("-", "- / -", "mine") for cell in cells)
+    assert (
+        "0.99"
+        not in made.text.split("Left out")[0].split("Motorcycle")[1].split("\n")[0]
+    )
+
+
+def test_tables_stand_beside_the_published_rows(written):
+    _, out, _ = written
+    text = (out / "tables.md").read_text()
+    for cell in ("85.4", "77.42", "64.06", "RADE-Net, Table II", "DinoRADE, Table 1"):
+        assert cell in text
+    latex = (out / "tables.tex").read_text()
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") > 5
+
+
+def test_differences_are_ours_minus_theirs(written):
+    made, _, _ = written
+    table = tables.index(made.rows)
+    options = Options(run="mine", **TERMS)
+    built = paper_tables.table_1(table, options)
+    row = next(
+        row
+        for row in built.rows
+        if row[0] == "mine - RADE-Net"
+        and row[1] == "RADE-Net, Table I"
+        and row[3] == "3D"
+    )
+    ours = table["coco101", "all", "Sedan", "3d", 0.3].shown
+    assert float(row[4]) == pytest.approx(ours - 64.1, abs=0.0051)
+    assert row[6] == "-"  # no overcast frames here
+    three = paper_tables.table_3({"one": table, "two": table})
+    assert [row[0] for row in three.rows[-2:]] == ["one", "two"]
+    assert len(three.rows) == 7 + 4 + 2
+
+
+def test_what_was_left_out_is_counted(scene):
+    truth, found, frames = scene
+    data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
+    options = Options(score_threshold=0.3, left_out_before={"labels: of mine": 3})
+    counts = measure.left_out(data, options)
+    assert counts["labels: of mine"] == 3
+    kept = len(data.gt) + counts["ground truth: center outside the region of interest"]
+    assert kept == len(truth["frame"])
+    assert counts["predictions: score not above 0.3"] == (data.pred.score <= 0.3).sum()
+    empty = ~np.isin(np.arange(30), data.gt.frame)
+    assert (
+        counts["frames: without ground truth (left out by skip=frame)"] == empty.sum()
+    )
+    above = data.pred.score > 0.3
+    assert (
+        counts["predictions: in frames without ground truth (left out by skip=frame)"]
+        == (empty[data.pred.frame] & above).sum()
+    )
+    results = data.results("coco101", score_threshold=0.3, spaces="3d")
+    left = counts["predictions: in frames without their class (left out by skip=class)"]
+    assert sum(r.num_det for r in results) == above.sum() - left
+
+
+def test_sizes_of_an_untrained_network(scene, tmp_path):
+    truth, found, frames = scene
+    broken = {**found, "box": found["box"].copy()}
+    broken["box"][5, 3] = -0.2
+    with pytest.raises(DataError, match=r"row 5: l of the box is -0.2 m"):
+        report.write_report(truth, broken, frames, tmp_path, **TERMS)
+    assert not list(tmp_path.iterdir())
+    made = report.write_report(
+        truth,
+        broken,
+        frames,
+        tmp_path,
+        invalid_sizes="false_positive",
+        protocols=("exact",),
+        **TERMS,
+    )
+    what = "predictions: size not positive, kept as false positives"
+    assert made.metrics["left_out"][what] == 1
+    whole = evaluate(truth, found, protocol="exact", frames=frames)
+    row = made.rows[0].result
+    assert row.num_det == whole[0].num_det
+    with pytest.raises(UserError, match='"error" or "false_positive"'):
+        measure.repair_sizes(found, "drop")
+
+
+def test_conditions_are_in_the_papers_order():
+    frames = {"frame": [0] * 4, "weather": ["sleet", "martian", "normal", "fog"]}
+    masks = measure.condition_masks(frames, "weather")
+    assert list(masks) == ["normal", "fog", "sleet", "martian"]
+    assert masks["fog"].tolist() == [False, False, False, True]
+    assert measure.condition_masks(frames, "time") == {}
+
+
+def test_frames_with_ids_only(scene, tmp_path):
+    truth, found, frames = scene
+    only = {"frame": frames["frame"]}
+    made = report.evaluate_predictions(
+        truth, found, only, tmp_path, Options(protocols=("exact",), **TERMS)
+    )
+    assert {row.condition for row in made.rows} == {"all"}
+    assert "Total" in made.text
+
+
+def test_nothing_at_all(tmp_path, scene):
+    truth, found, frames = scene
+    none = {k: v[:0] for k, v in found.items()}
+    made = report.write_report(
+        {k: v[:0] for k, v in truth.items()}, none, frames, tmp_path, **TERMS
+    )
+    assert all(row.shown is None for row in made.rows)
+
+
+def test_curves_are_drawn(scene, tmp_path):
+    truth, found, frames = scene
+    made = report.write_report(
+        truth, found, frames, tmp_path, roi=None, protocols=("exact",), run="x"
+    )
+    pictures = sorted(p.name for p in made.files if p.suffix == ".png")
+    assert pictures == [
+        "calibration.png",
+        "precision_recall_3d_iou30.png",
+        "precision_recall_bev_iou30.png",
+    ]
+    for path in made.files:
+        if path.suffix == ".png":
+            assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"

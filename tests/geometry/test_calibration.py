@@ -1,0 +1,232 @@
+"""Tests of radejax.geometry.calibration."""
+
+import json
+import math
+
+import chex
+import hypothesis
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.geometry import calibration as camera_lib
+from radejax.geometry.calibration import CameraCalibration
+
+# The distortion and matrix of K-Radar's cameras.
+INTRINSICS = (567.720776478944, 577.2136917114258, 628.72078, 369.30687)
+DISTORTION = (-0.028873818, 0.0006023302, 0.0039573087, -0.0050471763, 0.0)
+
+
+def forward_camera(**fields) -> CameraCalibration:
+    """100 x 80 pixels, focal length 50, looking along x from the LiDAR."""
+    settings = {
+        "intrinsics": (50.0, 50.0, 50.0, 40.0),
+        "yaw_deg": 90.0,
+        "pitch_deg": 0.0,
+        "roll_deg": 90.0,
+        "translation_m": (0.0, 0.0, 0.0),
+        "width": 100,
+        "height": 80,
+        "ego_from_lidar_m": (0.0, 0.0, 0.0),
+    }
+    return CameraCalibration.from_angles(**(settings | fields))
+
+
+def test_a_camera_that_looks_ahead_by_hand():
+    camera = forward_camera()
+    points = np.array([[10.0, 0, 0], [10, 2, 0], [10, 0, 3], [-5, 1, 1]])
+    pixels, depth = camera.project_ego(points)
+    np.testing.assert_allclose(depth, [10, 10, 10, -5], atol=1e-12)
+    # Left is towards smaller u, up towards smaller v.
+    np.testing.assert_allclose(pixels[:3], [[50, 40], [40, 40], [50, 25]], atol=1e-12)
+    np.testing.assert_array_equal(
+        camera.in_image(pixels, depth), [True, True, True, False]
+    )
+
+
+def test_image_borders_belong_to_the_left_and_top():
+    camera = forward_camera()
+    pixels = np.array([[0, 0], [-1e-9, 0], [99.999, 79.999], [100, 0], [0, 80]])
+    np.testing.assert_array_equal(
+        camera.in_image(pixels, np.ones(5)), [True, False, True, False, False]
+    )
+
+
+def test_lidar_points_are_ego_points_minus_the_shift():
+    camera = forward_camera(ego_from_lidar_m=(-2.54, 0.3, 0.7))
+    lidar = np.array([12.0, -1.0, 0.5])
+    from_lidar, _ = camera.project_lidar(lidar)
+    from_ego, _ = camera.project_ego(lidar + np.array([-2.54, 0.3, 0.7]))
+    np.testing.assert_allclose(from_lidar, [50 + 50 / 12, 40 - 25 / 12], atol=1e-12)
+    np.testing.assert_allclose(from_ego, from_lidar, atol=1e-12)
+
+
+def test_distortion_follows_the_brown_model():
+    camera = forward_camera(distortion=(0.1, 0.02, 0.003, -0.004, 0.005))
+    x, y = -0.3, -0.2  # y left 3 and z up 2 at depth 10
+    r2 = x * x + y * y
+    radial = 1 + 0.1 * r2 + 0.02 * r2**2 + 0.005 * r2**3
+    u = x * radial + 2 * 0.003 * x * y - 0.004 * (r2 + 2 * x * x)
+    v = y * radial + 0.003 * (r2 + 2 * y * y) + 2 * -0.004 * x * y
+    point = np.array([10.0, 3, 2])
+    pixel, _ = camera.project_ego(point)
+    np.testing.assert_allclose(pixel, [50 * u + 50, 50 * v + 40], atol=1e-12)
+    pixel, _ = camera.project_ego(point, "pinhole")
+    np.testing.assert_allclose(pixel, [50 * x + 50, 50 * y + 40], atol=1e-12)
+
+
+def test_points_past_the_fold_of_the_distortion_stay_outside():
+    # r (1 - 0.2 r^2) turns back at r = 1.29 and would bring r = 2.2 back to 0.07.
+    camera = forward_camera(distortion=(-0.2, 0, 0, 0, 0))
+    pixel, depth = camera.project_ego(np.array([1.0, 2.2, 0]))
+    assert not camera.in_image(pixel, depth)
+    assert camera.camera().max_radius == pytest.approx(math.sqrt(1 / 0.6))
+
+
+def test_projection_of_a_real_frame(shared):
+    folder = shared / "data" / "kradar"
+    expected = json.loads((folder / "frame_example/projection_check.json").read_text())
+    for name, case in expected.items():
+        camera = CameraCalibration.from_kradar(folder / case["yml"])
+        np.testing.assert_allclose(camera.rotation, case["R_ldr2cam"], atol=1e-9)
+        behind = 0
+        for thing in case["objects"]:
+            lidar = np.array(thing["xyz_lidar"])
+            pixels, depth = camera.project_lidar(lidar)
+            np.testing.assert_allclose(depth, thing["xyz_cam"][2], atol=1e-8)
+            if thing["uv_raw"] is None:
+                behind += 1
+                assert depth < 0
+                continue
+            np.testing.assert_allclose(pixels, thing["uv_raw"], atol=1e-6)
+            pixels, _ = camera.project_lidar(lidar, "rectified")
+            np.testing.assert_allclose(pixels, thing["uv_undistorted"], atol=1e-6)
+        assert behind == 1, name
+
+
+def test_every_calibration_of_the_data_set_can_be_read(shared):
+    folder = shared / "data" / "kradar" / "calib" / "calib_seq_v2"
+    cameras = [
+        CameraCalibration.from_kradar(folder / f"seq_{i:02d}" / "cam_1.yml")
+        for i in range(1, 59)
+    ]
+    extrinsics = {
+        np.c_[c.rotation, c.translation_m].round(9).tobytes() for c in cameras
+    }
+    assert len(extrinsics) == 37
+    for camera in cameras:
+        pixel, depth = camera.project_lidar(np.array([30.0, 0, 0]))
+        assert depth > 29
+        assert camera.in_image(pixel, depth)
+
+
+def test_kradar_text_round_trip(tmp_path):
+    camera = CameraCalibration.from_angles(
+        intrinsics=INTRINSICS,
+        distortion=DISTORTION,
+        yaw_deg=88.6,
+        pitch_deg=0.6,
+        roll_deg=89.6,
+        translation_m=(0.18, -0.13, 0.0),
+    )
+    path = tmp_path / "cam_1.yml"
+    path.write_text(camera.to_kradar_text())
+    again = CameraCalibration.from_kradar(path)
+    np.testing.assert_allclose(again.rotation, camera.rotation, atol=1e-15)
+    for name in ("intrinsics", "distortion", "translation_m", "width", "height"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(camera, name))
+
+
+def test_resized_keeps_relative_positions():
+    camera = forward_camera()
+    small = camera.resized(25, 40)
+    point = np.array([7.0, -2, 1])
+    full, _ = camera.project_ego(point)
+    pixel, _ = small.project_ego(point)
+    np.testing.assert_allclose(pixel / [25, 40], full / [100, 80], atol=1e-12)
+
+
+def test_box_edges_ahead_and_cut_at_the_near_plane():
+    camera = forward_camera()
+    ahead = np.array([10.0, 0, 0, 2, 4, 2, 0])
+    around = np.array([0.0, 2, 0, 8, 1, 1, 0])  # reaches from 4 m behind to 4 m ahead
+    behind = np.array([-10.0, 0, 0, 2, 4, 2, 0])
+    edges, is_visible = camera.project_boxes(np.stack([ahead, around, behind]))
+    chex.assert_shape(edges, (3, 12, 2, 2))
+    assert is_visible[0].all()
+    assert is_visible[1].sum() == 8  # all but the four edges of the rear face
+    assert not is_visible[2].any()
+    # The nearest face is at 9 m: half width 2 and half height 1 at focal length 50.
+    np.testing.assert_allclose(
+        edges[0].reshape(-1, 2).min(0), [50 - 100 / 9, 40 - 50 / 9]
+    )
+    np.testing.assert_allclose(
+        edges[0].reshape(-1, 2).max(0), [50 + 100 / 9, 40 + 50 / 9]
+    )
+    assert np.isfinite(edges).all()
+
+
+def test_box_edges_turn_with_yaw():
+    camera = forward_camera()
+    box = np.array([[20.0, 3, 0, 6, 2, 2, 0]])
+    turned = np.array([[20.0, 3, 0, 2, 6, 2, math.pi / 2]])
+    a, _ = camera.project_boxes(box)
+    b, _ = camera.project_boxes(turned)
+    key = lambda e: np.sort(e.reshape(-1, 2).round(9).view("f8,f8").ravel())  # noqa: E731
+    np.testing.assert_array_equal(key(a), key(b))
+
+
+@pytest.mark.parametrize("image", ["raw", "rectified", "pinhole"])
+def test_batches_of_cameras_under_jit(image):
+    rng = np.random.default_rng(0)
+    calibrations = [
+        forward_camera(yaw_deg=yaw, distortion=DISTORTION) for yaw in (88, 90, 93)
+    ]
+    points = rng.uniform([5, -3, -2], [60, 3, 2], (3, 6, 3))
+    batch = camera_lib.stack_cameras([c.camera(image) for c in calibrations])
+    chex.assert_shape(batch.cam_from_ego, (3, 3, 4))
+    pixels, depth = jax.jit(camera_lib.project)(jnp.asarray(points, jnp.float32), batch)
+    for i, calibration in enumerate(calibrations):
+        expected, expected_depth = calibration.project_ego(points[i], image)
+        np.testing.assert_allclose(pixels[i], expected, atol=2e-4)
+        np.testing.assert_allclose(depth[i], expected_depth, rtol=1e-6)
+
+
+@hypothesis.settings(deadline=None, max_examples=50)
+@hypothesis.given(
+    st.floats(-40, 40), st.floats(-10, 10), st.floats(0.5, 3.0), st.floats(0.1, 9)
+)
+def test_points_on_one_ray_share_a_pixel(azimuth_deg, elevation_deg, scale, depth):
+    camera = forward_camera(distortion=DISTORTION)
+    direction = np.array(
+        [1, math.tan(math.radians(azimuth_deg)), math.tan(math.radians(elevation_deg))]
+    )
+    near, _ = camera.project_ego(depth * direction)
+    far, _ = camera.project_ego(depth * scale * direction)
+    np.testing.assert_allclose(near, far, atol=1e-9)
+
+
+def test_calibrations_compare_by_value():
+    assert forward_camera() == forward_camera()
+    assert hash(forward_camera()) == hash(forward_camera())
+    assert forward_camera() != forward_camera(yaw_deg=89.0)
+
+
+def test_bad_calibrations(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"cam_9\.yml"):
+        CameraCalibration.from_kradar(tmp_path / "cam_9.yml")
+    path = tmp_path / "cam_1.yml"
+    text = forward_camera().to_kradar_text()
+    path.write_text(text.replace("fx: ", "fx= "))
+    with pytest.raises(DataError, match=r"cam_1\.yml:1: expected 'key: number'"):
+        CameraCalibration.from_kradar(path)
+    path.write_text("\n".join(line for line in text.splitlines() if "k3" not in line))
+    with pytest.raises(DataError, match="lacks k3"):
+        CameraCalibration.from_kradar(path)
+    with pytest.raises(UserError, match="intrinsics must be"):
+        forward_camera(intrinsics=(1.0, 2.0))
+    with pytest.raises(UserError, match="raw, rectified, pinhole"):
+        forward_camera().camera("fisheye")

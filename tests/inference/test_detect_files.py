@@ -1,0 +1,119 @@
+"""Frames in folders, their images, models of every kind, names of results."""
+
+import json
+import pathlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.inference import packed
+from radejax.inference.detect_files import (
+    detect_files,
+    find_frames,
+    front_images,
+    output_name,
+)
+from radejax.inference.inputs import CameraOptions
+from radejax.inference.open import open_detector
+from radejax.simulation.dataset import default_config, simulate_dataset
+
+from .. import small_models as small
+
+
+@pytest.fixture
+def root(tmp_path: pathlib.Path) -> pathlib.Path:
+    for name in (
+        "5/radar_tesseract/tesseract_00033.mat",
+        "5/radar_tesseract/tesseract_00034.mat",
+        "5/DERA_tesseract/DERA_tesseract_00034.npy",
+        "5/info_label/00033_00001.txt",
+        "6/radar_tesseract/tesseract_00033.mat",
+    ):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return tmp_path
+
+
+def test_every_frame_is_found_once_and_its_projection_preferred(
+    root: pathlib.Path,
+) -> None:
+    found = [path.relative_to(root).as_posix() for path in find_frames([root])]
+    assert sorted(found) == [
+        "5/DERA_tesseract/DERA_tesseract_00034.npy",
+        "5/radar_tesseract/tesseract_00033.mat",
+        "6/radar_tesseract/tesseract_00033.mat",
+    ]
+    assert find_frames([root, root / "5"]) == find_frames([root])
+
+
+def test_names_of_results_are_unique_among_sequences(root: pathlib.Path) -> None:
+    names = [output_name(path) for path in find_frames([root])]
+    assert sorted(names) == [
+        "5_tesseract_00033",
+        "5_tesseract_00034",
+        "6_tesseract_00033",
+    ]
+
+
+def test_nothing_found_and_nothing_there(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(UserError, match=r"no frames in .* looked for tesseract_\*"):
+        find_frames([tmp_path])
+    with pytest.raises(FileNotFoundError, match="no such file or folder"):
+        find_frames([tmp_path / "gone"])
+
+
+def test_a_folder_named_twice_is_one(
+    root: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(root)
+    assert len(find_frames([root, "."])) == 3
+
+
+def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
+    detector = small.detector()
+    packed.write_packed(tmp_path / "packed", detector)
+    frames = small.projections(3)
+    for i, frame in enumerate(frames):
+        path = tmp_path / "data" / "7" / "DERA_tesseract" / f"DERA_tesseract_{i:05}.npy"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.moveaxis(frame, -1, 0))
+    out = tmp_path / "out"
+    count = detect_files(tmp_path / "packed", [tmp_path / "data"], out, batch_size=2)
+    expected = detector(frames).to_list()
+    assert count == {"frames": 3, "boxes": sum(map(len, expected))}
+    for i, boxes in enumerate(expected):
+        found = json.loads((out / f"7_tesseract_{i:05}.json").read_text())
+        assert [b["cls"] for b in found] == [b["cls"] for b in boxes]
+        assert [b["x"] for b in found] == pytest.approx(
+            [b["x"] for b in boxes], abs=1e-5
+        )
+    with pytest.raises(
+        UserError, match=r"step best of .*packed, which holds one model"
+    ):
+        open_detector(tmp_path / "packed", step="best")
+
+
+def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:
+    for disk in ("a", "b"):
+        path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* 5_tesseract_00033.json"):
+        detect_files(tmp_path, [tmp_path / "a", tmp_path / "b"], tmp_path / "out")
+
+
+def test_images_of_simulated_folders_are_found(tmp_path: pathlib.Path) -> None:
+    """Their labels are in `info_label_v2_1`."""
+    config = default_config() | {"output": "projection", "frames_per_sequence": 1}
+    config.update(train_sequences=1, test_sequences=0)
+    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    (path,) = find_frames([root])
+    model = SimpleNamespace(image_size=(180, 320))
+    detector = SimpleNamespace(model=model, camera_options=CameraOptions())
+    ((found, (image, camera)),) = front_images([path], detector).items()
+    assert found == path.absolute()
+    assert image.parent.name == "cam-front"
+    assert camera.is_valid

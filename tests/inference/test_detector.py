@@ -1,0 +1,226 @@
+"""`Detector`: inputs it takes, thresholds, batches without recompiling."""
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from radejax import Detector, UserError, models
+from radejax.core.config import base_config
+from radejax.core.structures import CLASSES
+from radejax.data.kradar import write
+from radejax.data.projection import project
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.interop import dinorade_torch
+from radejax.visualize.canvas import as_objects
+
+
+@pytest.fixture(scope="module")
+def detector() -> Detector:
+    """Untrained: with this prior nearly every bin is a weak detection."""
+    grid = RadarGrid.reduced(
+        num_doppler=2, num_range=16, num_elevation=3, num_azimuth=14, max_range_m=30.0
+    )
+    config = base_config()
+    config.model.update(
+        doppler_bins=2,
+        elevation_bins=3,
+        widths=(8, 8, 8),
+        decoder_width=8,
+        num_groups=4,
+    )
+    model = models.build(config.model)
+    inputs = np.zeros((1, *grid.projection_shape), np.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), inputs)
+    return Detector.from_config(
+        config, variables, grid, score_threshold=0.3, batch_sizes=(1, 4)
+    )
+
+
+@pytest.fixture(scope="module")
+def tesseracts(detector: Detector) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    shape = (5, *detector.grid.shape_drea)
+    return (10 ** rng.uniform(5, 14, shape)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def projections(tesseracts: np.ndarray) -> np.ndarray:
+    return np.stack([project(t) for t in tesseracts])
+
+
+def _equal(a: Any, b: Any, atol: float = 1e-4) -> None:
+    assert a.is_valid.any()
+    np.testing.assert_array_equal(a.is_valid, b.is_valid)
+    np.testing.assert_array_equal(a.classes, b.classes)
+    np.testing.assert_allclose(a.scores, b.scores, atol=atol)
+    np.testing.assert_allclose(a.boxes, b.boxes, atol=10 * atol)
+
+
+def test_tesseracts_projections_and_files_agree(
+    detector: Detector,
+    tesseracts: np.ndarray,
+    projections: np.ndarray,
+    tmp_path: pathlib.Path,
+) -> None:
+    expected = detector(projections[0])
+    assert expected.boxes.shape == (1, 100, 7)
+    _equal(detector(tesseracts[0]), expected)
+    path = tmp_path / "tesseract_00001.mat"
+    write.write_tesseract(path, tesseracts[0])
+    _equal(detector(path), expected)
+    _equal(detector([path, path]), detector(projections[[0, 0]]))
+
+
+def test_any_batch_size_runs_in_the_compiled_sizes(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    whole = detector(projections)  # 5 frames: a batch of 4 and one of 1
+    assert whole.boxes.shape[0] == 5
+    for i in range(5):
+        one = detector(projections[i])
+        _equal(jax.tree.map(lambda x, i=i: x[i : i + 1], whole), one)
+    before = detector._run._cache_size()
+    detector(projections[:2])
+    detector(projections[:3])
+    assert detector._run._cache_size() == before
+
+
+def test_thresholds_and_region_change_without_compiling(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    default = detector(projections[:1])
+    before = detector._run._cache_size()
+    scores = np.asarray(default.scores)[np.asarray(default.is_valid)]
+    strict = detector(projections[:1], score_threshold=float(np.median(scores)))
+    assert 0 < strict.is_valid.sum() < default.is_valid.sum()
+    assert detector(projections[:1], nms_iou=1.0).is_valid.sum() >= scores.size
+    region = detector(projections[:1], roi=(0, 15, -5, 5, -10, 10))
+    boxes = np.asarray(region.boxes)[np.asarray(region.is_valid)]
+    assert 0 < len(boxes) < scores.size
+    assert (boxes[:, 0] <= 15).all()
+    assert (np.abs(boxes[:, 1]) <= 5).all()
+    assert detector._run._cache_size() == before
+
+
+def test_stream_gives_what_calls_give(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    streamed = list(detector.stream(iter(projections)))
+    assert len(streamed) == 5
+    for found, projection in zip(streamed, projections, strict=True):
+        _equal(found, detector(projection))
+
+
+def test_detections_as_columns_and_lists(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    found = detector(projections[:2])
+    columns = found.to_columns(detector.classes)
+    assert len(columns["score"]) == int(found.is_valid.sum())
+    assert set(columns["frame"]) == {0, 1}
+    rows = found.to_list(detector.classes)
+    assert [len(frame) for frame in rows] == found.is_valid.sum(1).tolist()
+    first = rows[0][0]
+    assert set(first) == {"cls", "score", "x", "y", "z", "l", "w", "h", "yaw"}
+    assert first["score"] == pytest.approx(float(found.scores[0, 0]))
+    assert first["x"] == pytest.approx(float(found.boxes[0, 0, 0]))
+    assert first["cls"] in detector.classes
+
+
+def test_detections_as_k_radars_text(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    found = detector(projections[:2])
+    texts = found.to_kitti(detector.classes)
+    assert [len(text.splitlines()) for text in texts] == found.is_valid.sum(1).tolist()
+    words = texts[0].splitlines()[0].split(" ")
+    assert words[0] in ("sed", "bus", "ped", "mot", "bic")
+    numbers = [float(word) for word in words[8:]]  # h w l y z x yaw score
+    expected = np.asarray(found.boxes[0, 0])[[5, 4, 3, 1, 2, 0, 6]]
+    np.testing.assert_allclose(numbers[:7], expected, rtol=1e-6)
+    assert numbers[7] == pytest.approx(float(found.scores[0, 0]))
+    nothing = detector(projections[:1], score_threshold=2.0).to_kitti(detector.classes)
+    assert nothing == ["dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"]
+
+
+def test_official_state_dicts_are_told_apart() -> None:
+    weight = np.zeros(3, np.float32)
+    nested = {"epoch": 1, "model": {"module.rad_backbone.conv.weight": weight}}
+    assert dinorade_torch.is_dinorade(nested)
+    assert not dinorade_torch.is_dinorade({"model": {"backbone.conv.weight": weight}})
+
+
+def test_a_wrong_shape_names_what_was_expected(detector: Detector) -> None:
+    with pytest.raises(
+        UserError, match=r"\[3, 16, 14, 6\]; expected projections .*\[B, 16, 14, 5\]"
+    ):
+        detector(np.zeros((3, 16, 14, 6), np.float32))
+    with pytest.raises(UserError, match="the batch is empty"):
+        detector(np.zeros((0, 16, 14, 5), np.float32))
+
+
+def test_a_run_that_is_not_there(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no run in"):
+        Detector.from_workdir(tmp_path)
+
+
+def test_memory_of_the_caller_may_be_refilled(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    """Aligned to 64 bytes, where `device_put` on CPU would share it."""
+    for count in (1, 4):  # a compiled size: nothing else copies the frames
+        shape = (count, *projections.shape[1:])
+        memory = np.zeros(4 * np.prod(shape) + 64, np.uint8)
+        start = -memory.ctypes.data % 64
+        ring = memory[start : start + 4 * np.prod(shape)].view(np.float32)
+        ring = ring.reshape(shape)
+
+        def refilled(ring: np.ndarray = ring, count: int = count) -> Any:
+            for i in range(5 - count):
+                ring[:] = projections[i : i + count]
+                yield ring
+            ring[:] = 0.0
+
+        for i, found in enumerate(detector.stream(refilled())):
+            _equal(found, detector(projections[i : i + count]))
+        ring[:] = projections[:count]
+        taken = detector._to_device(ring)
+        ring[:] = 0.0
+        np.testing.assert_array_equal(taken, projections[:count])
+
+
+def test_lists_of_arrays(
+    detector: Detector, tesseracts: np.ndarray, projections: np.ndarray
+) -> None:
+    expected = detector(projections[:2])
+    _equal(detector(list(projections[:2])), expected)
+    _equal(detector(tuple(tesseracts[:2])), expected)
+    with pytest.raises(UserError, match="the list is empty"):
+        detector([])
+    with pytest.raises(
+        UserError, match=r"frame 0 has \[16, 14, 5\], frame 1 has \[8, 14, 5\]"
+    ):
+        detector([projections[0], projections[0, :8]])
+
+
+def test_detections_carry_the_names_of_their_detector(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    names = ("Bicycle", "Motorcycle", "Pedestrian", "Bus or Truck", "Sedan")
+    turned = Detector(
+        detector.model,
+        detector.variables,
+        detector.grid,
+        classes=names,
+        score_threshold=0.3,
+        batch_sizes=(1, 4),
+    )
+    found = turned(projections)  # two chunks
+    index = int(found.classes[0, 0])
+    assert found.to_list()[0][0]["cls"] == names[index]
+    assert as_objects(jax.tree.map(lambda x: x[0], found)).names[0] == names[index]
+    assert found.to_list(CLASSES)[0][0]["cls"] == CLASSES[index]
+    assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]

@@ -1,0 +1,154 @@
+"""Exported folders give the same boxes without this package."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from radejax import Detector, UserError
+from radejax.geometry.camera import stack_cameras
+from radejax.inference import export
+
+from .. import small_models as small
+
+# jax and numpy alone: radejax cannot be imported, and flatbuffers only from the folder.
+ISOLATED = """
+import importlib.machinery, pathlib, sys
+folder, inputs, out = map(pathlib.Path, sys.argv[1:])
+class Isolate:
+    def find_spec(self, name, path=None, target=None):
+        if name in ("radejax", "flax", "safetensors"):
+            raise ImportError(name)
+        if name == "flatbuffers":
+            places = [str(folder / "third_party")]
+            return importlib.machinery.PathFinder.find_spec(name, places)
+sys.meta_path.insert(0, Isolate())
+sys.path.insert(0, str(folder))
+import numpy as np
+from load import load
+detect = load()
+with np.load(inputs) as arrays:
+    arrays = dict(arrays)
+camera = {k[7:]: v for k, v in arrays.items() if k.startswith("camera_")}
+found = {}
+for n in (1, 3):
+    args = [arrays["projection"][:n]]
+    if camera:
+        args += [arrays["image"][:n], {k: v[:n] for k, v in camera.items()}]
+    for key, value in detect(*args).items():
+        found[f"{key}_{n}"] = np.asarray(value)
+    if n == 3:
+        strict = detect(*args, score_threshold=0.5, roi=(0, 20, -5, 5, -9, 9))
+        found.update({f"{k}_strict": np.asarray(v) for k, v in strict.items()})
+np.savez(out, **found)
+"""
+
+
+def _run_elsewhere(folder: pathlib.Path, arrays: dict[str, Any]) -> dict[str, Any]:
+    inputs, out = folder.parent / "inputs.npz", folder.parent / "found.npz"
+    np.savez(inputs, **arrays)
+    unset = ("PYTHONPATH", "JAX_NUM_CPU_DEVICES")
+    environment = {k: v for k, v in os.environ.items() if k not in unset}
+    done = subprocess.run(
+        [sys.executable, "-c", ISOLATED, str(folder), str(inputs), str(out)],
+        env={**environment, "JAX_PLATFORMS": "cpu"},
+        cwd=folder.parent,
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    with np.load(out) as found:
+        return dict(found)
+
+
+def _check(found: dict[str, Any], suffix: str, expected: Any) -> None:
+    is_valid = np.asarray(expected.is_valid)
+    assert is_valid.any()
+    np.testing.assert_array_equal(found[f"is_valid_{suffix}"], is_valid)
+    np.testing.assert_array_equal(found[f"classes_{suffix}"], expected.classes)
+    for name in ("scores", "boxes"):
+        np.testing.assert_allclose(
+            found[f"{name}_{suffix}"], getattr(expected, name), atol=1e-4, rtol=1e-4
+        )
+
+
+@pytest.mark.slow
+def test_a_fresh_process_without_radejax_finds_the_same_boxes(
+    tmp_path: pathlib.Path,
+) -> None:
+    detector, projection = small.detector(), small.projections(3)
+    folder = tmp_path / "exported"
+    done = export.export(detector, folder, training_config={"seed": 1})
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "README.md",
+        "config.json",
+        "detector.stablehlo",
+        "load.py",
+        "model.safetensors",
+        "third_party",
+    }
+    assert done["bytes"] > (folder / "model.safetensors").stat().st_size
+    exported = jax.export.deserialize((folder / "detector.stablehlo").read_bytes())
+    assert exported.platforms == ("cpu", "cuda", "tpu")
+    assert str(exported.in_avals[-4].shape[0]) == "b"
+    found = _run_elsewhere(folder, {"projection": projection})
+    _check(found, "1", detector(projection[:1]))
+    _check(found, "3", detector(projection))
+    region = (0, 20, -5, 5, -9, 9)
+    strict = detector(projection, score_threshold=0.5, roi=region)
+    assert 0 < strict.is_valid.sum() < detector(projection).is_valid.sum()
+    _check(found, "strict", strict)
+    config = json.loads((folder / "config.json").read_text())
+    assert config["training_config"] == {"seed": 1}
+    again = Detector.from_checkpoint(folder, batch_sizes=(4,))
+    _check(found, "3", again(projection))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_backbone", [True, False])
+def test_a_radar_camera_model_too(with_backbone: bool, tmp_path: pathlib.Path) -> None:
+    detector = small.detector("camera")
+    projection, image = small.projections(3), small.images(3)
+    camera = stack_cameras([small.calibration().camera()] * 3)
+    folder = tmp_path / "exported"
+    done = export.export(detector, folder, with_backbone=with_backbone)
+    assert bool(done["left_out"]) is not with_backbone
+    if not with_backbone:
+        image = detector.model.apply(detector.variables, image, method="embed")
+    arrays = {"projection": projection, "image": np.asarray(image)}
+    arrays |= {f"camera_{k}": v for k, v in vars(camera).items()}
+    found = _run_elsewhere(folder, arrays)
+    _check(found, "3", detector(projection, image, camera))
+    _check(found, "1", detector(projection[:1], image[:1], small.calibration()))
+
+
+def test_huggingface_files_name_what_is_left_out(tmp_path: pathlib.Path) -> None:
+    done = export.export(small.detector("camera"), tmp_path, kind="huggingface")
+    assert done["left_out"] == ["params/image_backbone"]
+    card = (tmp_path / "README.md").read_text()
+    assert card.startswith("---\nlibrary_name: radejax\n")
+    assert "DINOv3" in card
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "README.md",
+        "config.json",
+        "model.safetensors",
+    }
+    with pytest.raises(UserError, match="format is 'onnx'"):
+        export.export(small.detector(), tmp_path, kind="onnx")
+
+
+def test_names_of_platforms(tmp_path: pathlib.Path) -> None:
+    checked = export._checked_platforms
+    assert checked(["gpu", "cpu", " cuda"]) == ("cuda", "cpu")
+    with pytest.raises(UserError, match="platform is 'foo', expected some of cpu"):
+        export.export(small.detector(), tmp_path, platforms=("cpu", "foo"))
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,158 @@
+"""Images and calibrations of every kind become the same arrays; what lacks is counted."""
+
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from radejax import Detector, UserError
+from radejax.core.structures import Batch
+from radejax.geometry.camera import stack_cameras
+from radejax.inference.inputs import CameraOptions, prepare
+from radejax.models.lifting import reference_points
+
+from .. import small_models as small
+
+
+@pytest.fixture(scope="module")
+def fusion() -> Detector:
+    return small.detector("camera")
+
+
+def _equal(a: Any, b: Any) -> None:
+    assert np.asarray(a.is_valid).any()
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), a, b)
+
+
+def _differs(a: Any, b: Any) -> bool:
+    return not np.allclose(a.scores, b.scores, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_every_form_of_a_camera_gives_the_same(
+    fusion: Detector, tmp_path: pathlib.Path
+) -> None:
+    projection, image = small.projections(2), small.images(2)
+    calibration = small.calibration()
+    path = tmp_path / "cam_front0.yml"
+    path.write_text(calibration.to_kradar_text())
+    camera = calibration.camera("raw")
+    expected = fusion(projection, image, calibration)
+    axes = fusion.model.axes
+    points = reference_points(camera, axes, 16, 16)
+    for given in (
+        path,
+        [calibration, path],
+        camera,
+        [camera, calibration],
+        stack_cameras([camera, camera]),
+        points,
+    ):
+        _equal(fusion(projection, image, given), expected)
+    _equal(
+        fusion(projection[0], image[0], camera),
+        fusion(projection[:1], image[:1], camera),
+    )
+    batch = Batch(
+        projection, None, None, None, None, image, stack_cameras([camera] * 2)
+    )
+    _equal(fusion(batch), expected)
+    assert _differs(fusion(projection, image[::-1], calibration), expected)
+    turned = small.calibration(yaw_deg=70.0)
+    assert _differs(fusion(projection, image, turned), expected)
+    assert _differs(fusion(projection), expected)
+
+
+def test_missing_images_are_predicted_from_the_radar_and_counted(
+    fusion: Detector,
+) -> None:
+    projection, image = small.projections(3), small.images(3)
+    calibration = small.calibration()
+    whole = fusion(projection, image, calibration)
+    alone = fusion(projection)
+    before = fusion.num_radar_alone
+    some = fusion(projection, [image[0], None, image[2]], calibration)
+    assert fusion.num_radar_alone == before + 1
+    other = fusion(projection, image, [calibration, None, calibration])
+    assert fusion.num_radar_alone == before + 2
+    for i, expected in enumerate((whole, alone, whole)):
+        row = jax.tree.map(lambda x, i=i: x[i], expected)
+        _equal(jax.tree.map(lambda x, i=i: x[i], some), row)
+        _equal(jax.tree.map(lambda x, i=i: x[i], other), row)
+    strict = small.detector("camera", camera_options=CameraOptions(allow_missing=False))
+    with pytest.raises(UserError, match=r"1 of 3 frames .* the first is frame 1"):
+        strict(projection, [image[0], None, image[2]], calibration)
+    with pytest.raises(UserError, match="3 of 3 frames"):
+        strict(projection)
+
+
+@pytest.mark.slow
+def test_embedded_images_and_weights_without_the_backbone(fusion: Detector) -> None:
+    projection, image = small.projections(1), small.images(1)
+    expected = fusion(projection, image, small.calibration())
+    features = fusion.model.apply(fusion.variables, image, method="embed")
+    _equal(fusion(projection, features, small.calibration()), expected)
+    params = dict(fusion.variables["params"])
+    del params["image_backbone"]
+    lean = Detector(
+        fusion.model,
+        {**fusion.variables, "params": params},
+        fusion.grid,
+        score_threshold=0.1,
+        batch_sizes=(4,),
+    )
+    _equal(lean(projection, features, small.calibration()), expected)
+    with pytest.raises(
+        UserError, match="without the image backbone: give image_backbone"
+    ):
+        lean(projection, image, small.calibration())
+
+
+def test_a_stream_of_frames_with_images(fusion: Detector) -> None:
+    projection, image = small.projections(3), small.images(3)
+    calibration = small.calibration()
+    items = [(projection[i], image[i], calibration) for i in range(3)]
+    for i, found in enumerate(fusion.stream(items)):
+        expected = fusion(projection[i], image[i], calibration)
+        _equal(found, expected)
+    fusion.warmup(1)
+    size = fusion._run._cache_size()
+    fusion(*items[0])
+    assert fusion._run._cache_size() == size
+
+
+@pytest.mark.parametrize(
+    ("image", "camera", "message"),
+    [
+        (small.images(2), None, "image is given without camera"),
+        (None, small.calibration(), "camera is given without image"),
+        (small.images(3), small.calibration(), "3 images for 2 frames"),
+        (small.images(2)[:, :8], small.calibration(), r"\[2, 8, 48, 3\], expected"),
+        (small.images(2).astype(int), small.calibration(), "dtype int64"),
+        (small.images(2), "nowhere.yml", "nowhere.yml does not exist"),
+        (small.images(2), [small.calibration()] * 3, "3 cameras for 2 frames"),
+        (small.images(2), 3.0, "camera is a float"),
+    ],
+)
+def test_what_does_not_fit_is_named(
+    image: Any, camera: Any, message: str, fusion: Detector
+) -> None:
+    with pytest.raises((UserError, FileNotFoundError), match=message):
+        prepare(image, camera, 2, fusion.model, CameraOptions())
+
+
+def test_a_radar_model_takes_no_image() -> None:
+    with pytest.raises(UserError, match="radar alone"):
+        small.detector()(small.projections(1), small.images(1), small.calibration())
+
+
+def test_the_shift_and_projection_of_a_config_are_used() -> None:
+    calibration = small.calibration(distortion=(0.1, 0, 0, 0, 0))
+    options = CameraOptions("pinhole", (-2.08, -0.13, 0.9))
+    model = small.detector("camera").model
+    _, camera, _ = prepare(small.images(1), calibration, 1, model, options)
+    assert not camera.distortion.any()
+    expected = -calibration.rotation @ np.array([-2.08, -0.13, 0.9])
+    np.testing.assert_allclose(camera.cam_from_ego[0, :, 3], expected, atol=1e-6)

@@ -1,0 +1,115 @@
+"""Packed models are read back as they were, without what may not be passed on."""
+
+import importlib.util
+import json
+import pathlib
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from radejax import Detector, UserError, models
+from radejax.core.errors import DataError
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference import packed
+
+from .. import small_models as small
+
+
+def _equal(a: Any, b: Any) -> None:
+    assert np.asarray(a.is_valid).any()
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> None:
+    detector = small.detector(nms_iou=0.2, azimuth_mapping="stretched")
+    content = packed.write_packed(tmp_path, detector, training_config={"seed": 3})
+    assert content["left_out"] == []
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "config.json",
+        "model.safetensors",
+    ]
+    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    assert loaded.model == detector.model
+    assert loaded.classes == detector.classes
+    assert (loaded.nms_iou, loaded.score_threshold) == (0.2, 0.1)
+    _equal(loaded(small.projections(3)), detector(small.projections(3)))
+    assert packed.load(tmp_path).config == {"seed": 3}
+
+
+@pytest.mark.slow
+def test_a_packed_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> None:
+    detector = small.detector("camera")
+    content = packed.write_packed(tmp_path, detector)
+    assert content["left_out"] == ["params/image_backbone"]
+    names = safetensors.numpy.load_file(tmp_path / "model.safetensors")
+    assert not any("image_backbone" in name for name in names)
+    inputs = small.projections(2), small.images(2), small.calibration()
+    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    _equal(loaded(inputs[0]), detector(inputs[0]))
+    with pytest.raises(UserError, match="give"):
+        loaded(*inputs)
+    packed.write_packed(tmp_path, detector, with_backbone=True)
+    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    _equal(loaded(*inputs), detector(*inputs))
+    assert loaded.camera_options == detector.camera_options
+    tuned = Detector(
+        detector.model.clone(freeze=False), detector.variables, detector.grid
+    )
+    with pytest.raises(UserError, match="--with-backbone"):
+        packed.write_packed(tmp_path, tuned)
+
+
+CONFIGS = [
+    ("radenet", words) for words in ("base", "paper", "official", "stem", "sedan")
+] + [("dinorade", words) for words in ("rc", "rcw", "rcw_resnet50", "official", "r")]
+
+
+@pytest.mark.parametrize(("name", "words"), CONFIGS)
+def test_the_config_of_a_model_makes_the_same_model(name: str, words: str) -> None:
+    path = small.CONFIGS / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    model = models.build(module.get_config(words).model)
+    again = models.build(packed.model_config(model))
+    assert again == model
+    assert again.clone(dtype="bfloat16") != model if name == "radenet" else True
+
+
+def test_damaged_and_absent_folders_are_named(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        Detector.from_checkpoint(tmp_path / "gone")
+    with pytest.raises(FileNotFoundError, match="no model in"):
+        Detector.from_checkpoint(tmp_path)
+    packed.write_packed(tmp_path, small.detector())
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-8])
+    with pytest.raises(DataError, match=r"model.safetensors is damaged"):
+        Detector.from_checkpoint(tmp_path)
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"format": "other"}))
+    with pytest.raises(DataError, match=r"config.json: format is 'other'"):
+        Detector.from_checkpoint(tmp_path)
+
+
+def test_bfloat16_computes_close_to_float32() -> None:
+    full, half = small.detector(), small.detector(dtype="bfloat16")
+    assert half.model.dtype == "bfloat16"
+    assert small.detector("camera", dtype="bfloat16").model.radar.dtype == "bfloat16"
+    inputs = small.projections(1)
+    a, b = (np.asarray(d(inputs).scores[0, 0]) for d in (full, half))
+    assert a != b
+    assert a == pytest.approx(b, abs=0.02)
+    leaf = jax.tree.leaves(half.variables)[0]
+    assert leaf.dtype == np.float32
+    with pytest.raises(UserError, match="dtype is 'float16'"):
+        small.detector(dtype="float16")
+
+
+def test_grid_survives_json_exactly(tmp_path: pathlib.Path) -> None:
+    packed.write_packed(tmp_path, small.detector())
+    assert packed.load(tmp_path).grid == small.small_grid()
+    assert RadarGrid.kradar() != small.small_grid()

@@ -1,0 +1,165 @@
+"""Predictions and scores of a data set: the same on one device and on eight."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from radejax import models
+from radejax.core.config import base_config
+from radejax.core.errors import UserError
+from radejax.core.structures import Batch
+from radejax.data.records.job import project_dataset
+from radejax.data.records.projections import RecordSource
+from radejax.inference import inputs as detector_inputs
+from radejax.inference.detector import Detector
+from radejax.inference.predict import Predictor, predict_dataset
+from radejax.runs.data import DataPaths
+from radejax.runs.validation import Validation
+from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.training import processes, sharding
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Five simulated frames, and a detector that was never trained."""
+    folder = tmp_path_factory.mktemp("predict")
+    simulation = default_config()
+    simulation.update(train_sequences=0, test_sequences=1, frames_per_sequence=5)
+    root = simulate_dataset(simulation, folder / "data", progress=False)
+    config = base_config()
+    config.model.update(
+        doppler_bins=simulation["grid"]["num_doppler"],
+        elevation_bins=simulation["grid"]["num_elevation"],
+        widths=(8, 8, 8),
+        decoder_width=8,
+        num_groups=4,
+        cbam="off",
+        neck="plain",
+        heads="default",
+    )
+    config.evaluation.update(score_threshold=0.45, batch_size=3)
+    config.watch.num_pictures = 1
+    paths = DataPaths((str(root),), None, str(folder / "records"))
+    frames = paths.open(config, "test")
+    project_dataset(frames, paths.records, num_workers=0, progress=False)
+    records = RecordSource(paths.records)
+    model = models.build(config.model)
+    inputs = np.zeros((1, *records.grid.projection_shape), np.float32)
+    variables = jax.jit(model.init)(jax.random.key(0), inputs)
+    return SimpleNamespace(
+        config=config, paths=paths, frames=frames, records=records, variables=variables
+    )
+
+
+def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
+    predictor = Predictor(
+        setup.config,
+        setup.variables,
+        setup.records.grid,
+        score_threshold=0.45,
+        mesh=sharding.make_mesh(num_devices),
+    )
+    return predict_dataset(predictor, setup.records, setup.frames, 3, progress=False)
+
+
+def _assert_same(actual: Any, expected: Any) -> None:
+    np.testing.assert_array_equal(actual["frame"], expected["frame"])
+    np.testing.assert_array_equal(actual["cls"], expected["cls"])
+    np.testing.assert_allclose(actual["score"], expected["score"], rtol=1e-5)
+    np.testing.assert_allclose(actual["box"], expected["box"], rtol=1e-4, atol=1e-4)
+
+
+def test_eight_devices_and_a_detector_predict_the_same_as_one(
+    setup: SimpleNamespace,
+) -> None:
+    expected = _predict(setup, 1)
+    assert set(expected["frame"]) == set(range(5))
+    assert len(expected["frame"]) > 50
+    _assert_same(_predict(setup, 8), expected)
+    detector = Detector.from_config(
+        setup.config, setup.variables, setup.records.grid, score_threshold=0.45
+    )
+    alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
+    _assert_same(alone, expected)
+
+
+def test_an_empty_split_is_said(setup: SimpleNamespace) -> None:
+    with pytest.raises(UserError, match="no frames to detect objects in"):
+        predict_dataset(None, setup.records, setup.frames[:0])
+
+
+def test_a_detector_sees_no_frames_that_are_not_there(setup: SimpleNamespace) -> None:
+    seen = []
+
+    class Spy(Detector):
+        def __call__(self, frames: Any, *inputs: Any) -> Any:
+            seen.append(len(frames))
+            return super().__call__(frames, *inputs)
+
+    spy = Spy.from_config(setup.config, setup.variables, setup.records.grid)
+    predict_dataset(spy, setup.records, setup.frames, 3, progress=False)
+    assert seen == [3, 2]
+
+
+def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
+    asked = []
+
+    def should_stop() -> bool:
+        asked.append(True)
+        return True
+
+    state = SimpleNamespace(eval_variables=setup.variables)
+    with pytest.raises(processes.Stopped):
+        Validation(setup.config, setup.paths)(state, 7, should_stop)
+    assert asked == [True]
+
+
+def test_images_need_the_weights_of_the_backbone() -> None:
+    image = np.zeros((1, 4, 4, 3), np.uint8)
+    lacking, whole = {"params": {}}, {"params": {"image_backbone": {}}}
+    with pytest.raises(UserError, match="without the image backbone"):
+        detector_inputs.check_backbone(image, lacking)
+    detector_inputs.check_backbone(image, whole)
+    detector_inputs.check_backbone(None, lacking)
+    detector_inputs.check_backbone(np.zeros((1, 4, 4, 16)), lacking)
+
+
+def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
+    predictor = Predictor(setup.config, setup.variables, setup.records.grid)
+    projection = np.zeros((8, *setup.records.grid.projection_shape), np.float16)
+    none = np.zeros((8, 0), np.float32)
+    batch = Batch(
+        projection=projection,
+        boxes=none,
+        classes=none,
+        is_valid=none,
+        frame=np.arange(8, dtype=np.int32),
+        image=np.zeros((8, 4, 4, 3), np.uint8),
+    )
+    with pytest.raises(UserError, match="without the image backbone"):
+        predictor(batch)
+
+
+def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
+    state = SimpleNamespace(eval_variables=setup.variables)
+    scores = Validation(setup.config, setup.paths)(state, 7)
+    name = "validation/map_3d_iou30/kradar_r40/score>0.45"
+    assert any(key.startswith(name) for key in scores.values)
+    assert any(key.endswith("/Sedan") for key in scores.values)
+    means = [v for k, v in scores.values.items() if k.startswith(name)]
+    assert means == [scores.best]
+    (picture,) = scores.pictures.values()
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
+    alone = Validation(setup.config, setup.paths, sharding.make_mesh(1))(state, 7)
+    assert alone.values == pytest.approx(scores.values)
+
+
+def test_a_best_metric_that_is_not_measured_is_refused(setup: SimpleNamespace) -> None:
+    config = setup.config.copy_and_resolve_references()
+    config.train.best_metric = "map_3d_iou70"
+    with pytest.raises(UserError, match=r"'map_3d_iou70'.* map_3d_iou30, "):
+        Validation(config, setup.paths)

@@ -1,0 +1,67 @@
+"""What radar-camera runs take from files, in place of real weights."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+from ml_collections import ConfigDict
+
+from radejax.core.config import load_config
+from radejax.core.errors import UserError
+from radejax.inference import embed
+from radejax.interop import dinov3_hf, image_backbone, resnet_torch
+from radejax.models import build
+
+CONFIG = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
+TRUNK = {"stem": np.arange(3.0)}
+STAGE = {"block": np.arange(2.0)}
+
+
+@pytest.fixture
+def resnet(monkeypatch: pytest.MonkeyPatch) -> ConfigDict:
+    part = {
+        "params": {"image_backbone": TRUNK, "image_neck": STAGE},
+        "batch_stats": {"image_neck": STAGE},
+    }
+    monkeypatch.setattr(resnet_torch, "load", lambda path: part)
+    return load_config(f"{CONFIG}:rcw_resnet50")
+
+
+def _write_manifest(folder, params):
+    content = {"weights_sha256": embed.weights_sha256(params)}
+    (folder / "manifest.json").write_text(json.dumps(content))
+
+
+def test_embeddings_leave_the_last_stage_to_load(resnet, tmp_path):
+    whole = image_backbone.load_image_backbone("resnet50.pth", resnet)
+    assert set(whole["params"]) == {"image_backbone", "image_neck"}
+    _write_manifest(tmp_path, TRUNK)
+    part = image_backbone.load_image_backbone("resnet50.pth", resnet, tmp_path)
+    assert set(part["params"]) == {"image_neck"}
+    assert part["batch_stats"] == whole["batch_stats"]
+    with pytest.raises(UserError, match="--image_backbone FOLDER"):
+        image_backbone.load_image_backbone(None, resnet, tmp_path)
+
+
+def test_embeddings_of_other_weights_are_refused(resnet, tmp_path):
+    _write_manifest(tmp_path, {"stem": np.arange(3.0) + 1})
+    with pytest.raises(UserError, match=r"resnet50\.pth is not the backbone that"):
+        image_backbone.load_image_backbone("resnet50.pth", resnet, tmp_path)
+
+
+def test_embeddings_stand_for_all_of_a_transformer(tmp_path):
+    config = load_config(str(CONFIG))
+    assert image_backbone.load_image_backbone(None, config, tmp_path) is None
+
+
+def test_weights_with_other_constants_are_refused(monkeypatch):
+    config = load_config(str(CONFIG))
+    found = build(config.model).vit.clone(rope_theta=10.0)
+    monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
+    with pytest.raises(UserError, match=r"rope_theta = 10\.0, the configured one"):
+        image_backbone.load_image_backbone("folder", config)
+    same = build(config.model).vit.clone(attention="xla", layer_scale=0.5)
+    monkeypatch.setattr(dinov3_hf, "load", lambda path: (same, {"params": TRUNK}))
+    loaded = image_backbone.load_image_backbone("folder", config)
+    assert loaded == {"params": {"image_backbone": TRUNK}}

@@ -1,0 +1,42 @@
+"""What is done to the frames of a run before it is evaluated."""
+
+import dataclasses
+
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.data.kradar.frame import Frame
+from radejax.runs.evaluate import with_images_exchanged
+
+
+def _frames(paths: list[str | None]) -> list[Frame]:
+    blank = {field.name: None for field in dataclasses.fields(Frame)}
+    return [
+        Frame(
+            **blank | {"name": str(i), "camera_path": p, "camera_calibration_path": p}
+        )
+        for i, p in enumerate(paths)
+    ]
+
+
+def test_every_frame_sees_another_ones_image() -> None:
+    paths = ["a", "b", None, "c", "d", "e"]
+    exchanged = with_images_exchanged(_frames(paths), seed=3)
+    found = [frame.camera_path for frame in exchanged]
+    assert [frame.name for frame in exchanged] == list("012345")
+    assert sorted(filter(None, found)) == ["a", "b", "c", "d", "e"]
+    assert found[2] is None
+    assert all(a != b for a, b in zip(found, paths, strict=True) if b is not None)
+    assert found == [frame.camera_calibration_path for frame in exchanged]
+
+    def again(seed: int) -> list[str | None]:
+        frames = with_images_exchanged(_frames(paths), seed)
+        return [frame.camera_path for frame in frames]
+
+    assert found == again(3)
+    assert any(found != again(seed) for seed in range(4, 8))
+
+
+def test_images_of_fewer_than_two_frames_cannot_be_exchanged() -> None:
+    with pytest.raises(UserError, match="1 frames have an image: none to exchange"):
+        with_images_exchanged(_frames(["a", None]), seed=0)

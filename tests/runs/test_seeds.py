@@ -1,0 +1,71 @@
+"""Several seeds in one command: who runs, and mean and spread."""
+
+import json
+import pathlib
+from typing import Any
+
+import pytest
+from absl import flags
+from ml_collections import config_flags
+
+from radejax.core.config import base_config
+from radejax.core.errors import UserError
+from radejax.runs import experiment, seeds
+
+HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
+
+
+def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    aps = {0: 50.0, 1: 53.0, 2: 59.0}
+    seen = []
+    whole = experiment.run
+
+    def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
+        if config.seeds:
+            return whole(config, workdir=workdir, **options)
+        seen.append((config.seed, pathlib.Path(workdir).name, options["data"]))
+        folder = pathlib.Path(workdir) / "evaluation"
+        folder.mkdir(parents=True)
+        (folder / "metrics.csv").write_text(
+            HEAD
+            + f"exact,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
+            + "exact,all,Bicycle,3d,0.3,,0\n"
+            + f"exact,rain,Sedan,3d,0.3,{config.seed},3\n"
+        )
+        return pathlib.Path(workdir)
+
+    monkeypatch.setattr(experiment, "run", run)
+    config = base_config()
+    config.seeds = (0, 1, 2)
+    experiment.run(config, name="x", workdir=tmp_path / "runs", data=["d"])
+    assert seen == [(i, f"seed{i}", ["d"]) for i in range(3)]
+    rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
+    assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
+    assert rows[0]["mean"] == pytest.approx(54.0)
+    assert rows[0]["std"] == pytest.approx(21**0.5)  # (16 + 1 + 25) / 2
+    assert rows[0]["values"] == {"0": 50.0, "1": 53.0, "2": 59.0}
+    text = (tmp_path / "runs" / "seeds.txt").read_text()
+    assert "54.00" in text
+    assert "4.58" in text
+    assert "rain" not in text
+
+
+def test_a_seed_twice_is_refused() -> None:
+    config = base_config()
+    config.seeds = (1, 2, 1)
+    with pytest.raises(UserError, match=r"a seed twice: \[1, 2, 1\]"):
+        seeds.run_seeds(config, name="x")
+
+
+@pytest.mark.parametrize(("text", "expected"), [("0,1,2", (0, 1, 2)), ("(4,)", (4,))])
+def test_seeds_are_given_as_a_flag(
+    text: str, expected: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    argv = ["program", f"--config.seeds={text}"]
+    monkeypatch.setattr("sys.argv", argv)  # ml_collections looks there for fields
+    holder = flags.FlagValues()
+    config_flags.DEFINE_config_dict("config", base_config(), flag_values=holder)
+    holder(argv)
+    assert holder.config.seeds == expected

@@ -1,0 +1,104 @@
+"""What a work folder keeps of a run, and weights taken from another."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+from radejax.core.config import base_config
+from radejax.core.errors import UserError
+from radejax.runs import workdir
+from radejax.runs.data import DataPaths
+
+
+def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
+    config = base_config()
+    workdir.claim_workdir(tmp_path / "run", config)
+    workdir.claim_workdir(tmp_path / "run", config)
+    loaded = workdir.load_config(tmp_path / "run")
+    assert json.loads(loaded.to_json()) == json.loads(config.to_json())
+
+
+def test_another_config_is_refused_and_the_difference_named(
+    tmp_path: pathlib.Path,
+) -> None:
+    config = base_config()
+    workdir.claim_workdir(tmp_path, config)
+    config.train.batch_size = 3
+    config.seed = 5
+    with pytest.raises(
+        UserError,
+        match=r"config\.seed is 0 there and 5 here; "
+        r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
+    ):
+        workdir.claim_workdir(tmp_path, config)
+
+
+def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "run"
+    with (
+        workdir.lock_workdir(folder),
+        pytest.raises(UserError, match=r"another training is at work in .*run: wait"),
+        workdir.lock_workdir(folder),
+    ):
+        pass
+    with workdir.lock_workdir(folder):  # let go, though the file is there
+        pass
+
+
+def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) -> None:
+    code = (
+        "import sys, fcntl, time\n"
+        "file = open(sys.argv[1], 'w')\n"
+        "fcntl.flock(file, fcntl.LOCK_EX)\n"
+        "print('held', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path / "lock")], stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(UserError), workdir.lock_workdir(tmp_path):
+            pass
+        other.kill()
+        other.wait()
+        with workdir.lock_workdir(tmp_path):
+            pass
+
+
+def test_no_run_in_a_folder(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no run in .*config\.json is missing"):
+        workdir.load_run(tmp_path)
+
+
+def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
+    paths = DataPaths(roots=("a",), labels=None, records="r")
+    info = workdir.run_info(tmp_path, paths, tmp_path / "model.pth")
+    assert info["init_from"] == str(tmp_path / "model.pth")
+    (tmp_path / "run.json").write_text(json.dumps(info))
+    again = workdir.run_info(tmp_path, paths)
+    assert again["init_from"] == info["init_from"]
+    assert again["data"]["roots"] == ("a",)
+
+
+def test_weights_of_another_run_need_the_same_model(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = base_config()
+    config.model.name = "radenet"
+    workdir.claim_workdir(tmp_path, config)
+    other = workdir.Run(
+        tmp_path, workdir.load_config(tmp_path), None, None, {"w": 1}, 3
+    )
+    monkeypatch.setattr(workdir, "load_run", lambda path: other)
+    # A config from JSON has lists where the other one has tuples.
+    config.model.widths = (8, 16)
+    other.config.model.widths = [8, 16]
+    assert workdir.initial_variables(tmp_path, config) == {"w": 1}
+    config.model.widths = (8, 32)
+    with pytest.raises(
+        UserError, match=r"widths is \[8, 16\] there and \[8, 32\] here"
+    ):
+        workdir.initial_variables(tmp_path, config)

@@ -1,0 +1,49 @@
+"""Windows, wheels and lights lie on their faces and inside their boxes."""
+
+import numpy as np
+import pytest
+
+from radejax.core.structures import CLASSES
+from radejax.simulation.camera import details, shapes
+
+
+def test_rectangle_on_a_slanted_face_by_hand():
+    # A face 4 wide below, 2 wide above, 2 high: at half height it reaches from 0.5 to 3.5.
+    face = np.array([[[0.0, 0, 0], [4, 0, 0], [3, 0, 2], [1, 0, 2]]])
+    found = details.on_faces(face, np.array([[0.0, 0.5]]), np.array([[0.5, 1.0]]))
+    expected = [[0.5, 0, 1], [2.0, 0, 1], [2.0, 0, 2], [1.0, 0, 2]]
+    np.testing.assert_allclose(found[0], expected)
+
+
+def test_the_whole_face_is_the_face():
+    face = np.random.default_rng(0).normal(size=(3, 4, 3))
+    one = np.tile([0.0, 1.0], (3, 1))
+    np.testing.assert_allclose(details.on_faces(face, one, one), face)
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_details_stay_in_the_box(cls):
+    vertices = np.array([v for v, _ in shapes._FACES])
+    corners = shapes.blocks_of(cls)
+    for detail in details.DETAILS[cls]:
+        face = corners[detail.block][vertices[detail.face]][None]
+        quad = details.on_faces(face, np.array([detail.u]), np.array([detail.v]))
+        assert np.abs(quad).max() <= 1.0 + 2e-2, detail
+
+
+@pytest.mark.parametrize("name", ["Sedan", "Bus or Truck"])
+def test_vehicles_are_the_same_on_both_sides(name):
+    vertices = np.array([v for v, _ in shapes._FACES])
+    corners = shapes.blocks_of(name)
+
+    def places(face):
+        found = []
+        for d in details.DETAILS[name]:
+            if d.face == face:
+                quad = corners[d.block][vertices[face]][None]
+                found.append(details.on_faces(quad, np.array([d.u]), np.array([d.v])))
+        return np.sort(np.abs(np.concatenate(found).mean(1)), axis=0)
+
+    np.testing.assert_allclose(
+        places(details.LEFT), places(details.RIGHT), rtol=0, atol=1e-12
+    )

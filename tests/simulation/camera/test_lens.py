@@ -1,0 +1,49 @@
+"""Covered lenses in the paper's proportions; haze by the law of Lambert and Beer."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from radejax.data.kradar.sequences import KRADAR_CONDITIONS
+from radejax.simulation.camera import lens
+from radejax.simulation.radar.weather import WEATHERS
+
+
+def test_every_weather_has_air_and_cover():
+    assert set(lens.AIR) == set(lens.COVER) == set(WEATHERS)
+    for probabilities in lens.COVER.values():
+        assert sum(probabilities) == pytest.approx(1.0)
+
+
+def test_covered_frames_of_all_of_kradar_are_as_many_as_counted(shared):
+    # DinoRADE: 7.5k partly, 4.8k heavily, 4.9k fully covered of 35k frames.
+    expected = dict.fromkeys(lens.LEVELS, 0.0)
+    drawn = dict.fromkeys(lens.LEVELS, 0)
+    with open(shared / "data" / "kradar" / "sequences.csv") as file:
+        for row in csv.DictReader(file):
+            frames, number = int(row["label_files"]), int(row["seq"])
+            weather = KRADAR_CONDITIONS[number].weather
+            for level, share in zip(lens.LEVELS, lens.COVER[weather], strict=True):
+                expected[level] += share * frames
+            for start in range(0, frames, lens.BLOCK_FRAMES):
+                level = lens.cover_level(0, number, start, weather)
+                drawn[level] += min(lens.BLOCK_FRAMES, frames - start)
+    for level, count in (("partial", 7500), ("heavy", 4800), ("full", 4900)):
+        assert expected[level] == pytest.approx(count, rel=0.03)
+        assert drawn[level] == pytest.approx(count, rel=0.15)
+
+
+def test_level_holds_for_a_block_and_good_weather_is_clear():
+    block = {lens.cover_level(1, 5, i, "sleet") for i in range(lens.BLOCK_FRAMES)}
+    assert len(block) == 1
+    assert {lens.cover_level(1, 5, i, "normal") for i in range(0, 5000, 50)} == {
+        "clear"
+    }
+
+
+def test_haze_halves_contrast_at_its_half_distance():
+    color, veil = np.array([[200.0, 100.0, 0.0]] * 2), np.full(3, 100.0)
+    half = np.log(2.0) / 0.03
+    seen = lens.haze(color, np.array([0.0, half]), veil, 0.03)
+    np.testing.assert_allclose(seen, [[200, 100, 0], [150, 100, 50]])

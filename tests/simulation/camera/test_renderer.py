@@ -1,0 +1,210 @@
+"""Drawn objects lie where labels and calibration say, to the pixel."""
+
+import numpy as np
+import pytest
+
+from radejax.core.structures import CLASSES
+from radejax.data.kradar import read_labels
+from radejax.geometry.calibration import CameraCalibration
+from radejax.simulation.camera import lens
+from radejax.simulation.camera import renderer as camera
+from radejax.simulation.simulator import SequenceSimulator
+from radejax.simulation.world.scene import Reflectors, Road, Sequence, Tracks
+from radejax.simulation.world.traffic import make_sequence
+
+OFFSET = (-2.54, 0.3, 0.7)
+PAIR = camera.stereo_calibration(OFFSET, 1280, 720)
+
+
+def make_scene(boxes, classes, *, time="day", weather="normal"):
+    """A sequence of one frame with boxes `[N, 7]` in the radar's frame."""
+    boxes = np.asarray(boxes, float)
+    count = len(boxes)
+    empty = np.zeros(0)
+    return Sequence(
+        name=1,
+        environment="highway",
+        time=time,
+        weather=weather,
+        ego_pose=np.zeros((1, 3)),
+        ego_along_m=np.zeros(1),
+        ego_velocity_mps=np.zeros((1, 2)),
+        tracks=Tracks(
+            boxes[None, :, :3],
+            boxes[None, :, 6],
+            np.zeros((1, count, 2)),
+            np.ones((1, count), bool),
+            boxes[None, :, 3:6],
+            np.array([CLASSES.index(c) for c in classes]),
+            np.arange(count),
+            tuple(classes),
+        ),
+        reflectors=Reflectors(np.zeros((0, 3)), empty, empty, empty.astype(int)),
+        road=Road(),
+        lanes_m=(-1.7, 1.7),
+        ego_left_m=0.0,
+        ground_m=-0.9,
+    )
+
+
+def bounds(pixels):
+    return np.concatenate([pixels.min(0), pixels.max(0)])
+
+
+def mask_bounds(mask, box):
+    v, u = np.nonzero(mask == box)
+    return np.array([u.min(), v.min(), u.max() + 1, v.max() + 1])
+
+
+def corners(box):
+    unit = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    local = unit * np.array(box[3:6]) / 2
+    c, s = np.cos(box[6]), np.sin(box[6])
+    return local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + box[:3]
+
+
+POSES = [
+    ("Bus or Truck", [22.0, 4.0, 0.6, 9.0, 2.5, 3.0, 0.3]),
+    ("Bus or Truck", [30.0, -6.0, 0.6, 8.0, 2.4, 3.0, 3.0]),
+    ("Sedan", [15.0, -3.0, -0.15, 4.5, 1.9, 1.5, 0.1]),
+    ("Sedan", [12.0, 3.0, -0.15, 4.5, 1.9, 1.5, -2.0]),
+    ("Pedestrian", [8.0, 1.0, -0.05, 0.6, 0.6, 1.7, 1.0]),
+    ("Motorcycle", [14.0, -2.0, -0.15, 2.1, 0.8, 1.5, 0.4]),
+    ("Bicycle", [10.0, 2.0, -0.1, 1.8, 0.6, 1.6, -0.6]),
+]
+
+
+class TestLabelsProjectOntoObjects:
+    @pytest.mark.parametrize(("cls", "box"), POSES)
+    def test_drawn_object_fills_its_projected_box(self, cls, box):
+        sequence = make_scene([box], [cls])
+        renderer = camera.CameraRenderer(sequence, PAIR, 0)
+        for side in (0, 1):
+            pixels, _ = PAIR[side].project_ego(corners(box))
+            expected = bounds(pixels)
+            drawn = mask_bounds(renderer.object_mask(sequence.frame(0), side), 0)
+            size = expected[2:] - expected[:2]
+            # Never outside, and up to the rim: rounded bodies leave at most a tenth.
+            assert (drawn[:2] >= expected[:2] - 1.5).all()
+            assert (drawn[2:] <= expected[2:] + 1.5).all()
+            assert (np.abs(drawn - expected) < 1.5 + 0.14 * np.tile(size, 2)).all()
+
+    def test_truck_to_the_pixel(self):
+        box = [25.0, 0.5, 0.6, 9.0, 2.5, 3.0, 0.0]  # its rear fills the box
+        sequence = make_scene([box], ["Bus or Truck"])
+        renderer = camera.CameraRenderer(sequence, PAIR, 0)
+        pixels, _ = PAIR[0].project_ego(corners(box))
+        drawn = mask_bounds(renderer.object_mask(sequence.frame(0)), 0)
+        np.testing.assert_allclose(drawn, bounds(pixels), atol=1.5)
+
+    def test_through_label_file_and_calibration_file(self, tmp_path):
+        from radejax.data.kradar import write
+        from radejax.geometry.radar_grid import RadarGrid
+        from radejax.simulation.radar.tensor import RadarParameters
+
+        box = [25.0, 0.5, 0.6, 9.0, 2.5, 3.0, 0.0]
+        sequence = make_scene([box], ["Bus or Truck"])
+        simulator = SequenceSimulator(
+            sequence, RadarGrid.kradar(), RadarParameters(), seed=0
+        )
+        frame = sequence.frame(0)
+        labels = simulator.labels(frame, simulator.radar_input(0), OFFSET, 100.0)
+        write.write_labels(tmp_path / "1.txt", [1] * 5, 0.0, labels)
+        (tmp_path / "cam.yml").write_text(PAIR[0].to_kradar_text())
+        calibration = CameraCalibration.from_kradar(tmp_path / "cam.yml")
+        read = read_labels(tmp_path / "1.txt")[0]
+        assert read.visibility == "R"
+        pixels, _ = calibration.project_lidar(corners(read.box))
+        mask = camera.CameraRenderer(sequence, PAIR, 0).object_mask(frame)
+        np.testing.assert_allclose(mask_bounds(mask, 0), bounds(pixels), atol=1.5)
+
+    def test_near_objects_hide_far_ones(self):
+        near = [10.0, 0.0, -0.15, 4.5, 1.9, 1.5, 0.0]
+        far = [30.0, 0.0, -0.15, 4.5, 1.9, 1.5, 0.0]
+        sequence = make_scene([far, near], ["Sedan", "Sedan"])
+        mask = camera.CameraRenderer(sequence, PAIR, 0).object_mask(sequence.frame(0))
+        pixel, _ = PAIR[0].project_ego(np.array([10.0 - 2.25, 0.0, -0.3]))
+        assert mask[int(pixel[1]), int(pixel[0])] == 1
+
+    def test_object_through_the_camera_plane_does_not_break(self):
+        box = [-2.0, 2.5, 0.6, 12.0, 2.5, 3.0, 0.0]
+        sequence = make_scene([box], ["Bus or Truck"])
+        mask = camera.CameraRenderer(sequence, PAIR, 0).object_mask(sequence.frame(0))
+        assert 0.02 < (mask == 0).mean() < 0.5
+
+
+class TestGround:
+    def test_rays_and_projection_are_inverses(self):
+        ground = camera.trace_ground(PAIR[0], -0.9)
+        index = np.arange(0, len(ground.x_m), 997)
+        near = index[ground.depth_m[index] < 60.0]
+        points = np.stack(
+            [ground.x_m[near], ground.y_m[near], np.full(len(near), -0.9)], 1
+        )
+        pixels, _ = PAIR[0].project_ego(points)
+        v, u = np.nonzero(ground.hits)
+        np.testing.assert_allclose(pixels[:, 0], u[near] + 0.5, atol=0.05)
+        np.testing.assert_allclose(pixels[:, 1], v[near] + 0.5, atol=0.05)
+
+    def test_undistort_inverts_the_lens_model(self):
+        seen = np.array([[0.3, -0.2], [-0.8, 0.5], [1.0, 0.0]])
+        ideal = camera.undistort(seen, PAIR[0].distortion)
+        k1, k2, p1, p2, k3 = PAIR[0].distortion
+        x, y = ideal.T
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        again = np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            1,
+        )
+        np.testing.assert_allclose(again, seen, atol=1e-9)
+
+
+class TestImage:
+    SMALL = camera.stereo_calibration(OFFSET, 160, 90)
+
+    def render(self, weather, time="day", **kwargs):
+        sequence = make_sequence(
+            2, environment="urban", time=time, weather=weather, num_frames=2,
+            rng=np.random.default_rng(0),
+        )  # fmt: skip
+        renderer = camera.CameraRenderer(sequence, self.SMALL, 3, **kwargs)
+        return renderer, renderer.render(sequence.frame(1)), sequence
+
+    def test_shape_and_bytes_repeat(self):
+        _, first, _ = self.render("heavysnow")
+        _, second, _ = self.render("heavysnow")
+        assert first.shape == (90, 320, 3)
+        assert first.dtype == np.uint8
+        np.testing.assert_array_equal(first, second)
+
+    def test_night_is_darker_and_fog_has_less_contrast(self):
+        _, day, _ = self.render("normal")
+        _, night, _ = self.render("normal", "night")
+        _, fog, _ = self.render("fog", cover_lens=False)
+        assert night.mean() < 0.5 * day.mean()
+        rows = slice(38, 52)  # about the horizon
+        assert fog[rows].std() < 0.85 * day[rows].std()
+
+    def test_halves_show_the_same_scene_shifted(self):
+        _, image, _ = self.render("normal")
+        left, right = image[:, :160].astype(float), image[:, 160:].astype(float)
+        assert np.abs(left - right).mean() < 25.0
+        assert (left != right).any()
+
+    @pytest.mark.parametrize("level", lens.LEVELS)
+    def test_covered_lens_hides_detail(self, level, monkeypatch):
+        monkeypatch.setattr(lens, "cover_level", lambda *a: level)
+        _, image, _ = self.render("rain")
+        _, clear, _ = self.render("rain", cover_lens=False)
+        changed = np.abs(image.astype(int) - clear.astype(int)).max(-1) > 8
+        low, high = {
+            "clear": (0.0, 0.0),
+            "partial": (0.08, 0.5),
+            "heavy": (0.5, 0.95),
+            "full": (0.8, 1.0),
+        }[level]
+        assert low <= changed.mean() <= high

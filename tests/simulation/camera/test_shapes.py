@@ -1,0 +1,71 @@
+"""Faces of drawn objects: inside their boxes, sorted, cut at the camera."""
+
+import numpy as np
+import pytest
+
+from radejax.core.structures import CLASSES
+from radejax.simulation.camera import shapes
+from radejax.simulation.camera.details import DETAILS
+from radejax.simulation.camera.renderer import stereo_calibration
+
+CALIBRATION = stereo_calibration((-2.54, 0.3, 0.7), 320, 180)[0]
+DAY = shapes.Light(1.0, np.full(3, 128.0), 0.0, False)
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_blocks_fill_the_box_and_stay_in_it(cls):
+    corners = shapes.blocks_of(cls).reshape(-1, 3)
+    assert np.abs(corners).max() <= 1.0
+    assert corners[:, 2].min() == -1.0
+    assert corners[:, 2].max() == 1.0
+    np.testing.assert_allclose(np.abs(corners[:, 1]).max(), 1.0)
+
+
+def polygons(boxes, classes):
+    colors = np.zeros((len(boxes), 2, 3)) + 100.0
+    return shapes.visible_polygons(
+        np.array(boxes, float), classes, colors, CALIBRATION, DAY
+    )
+
+
+def test_far_objects_come_first_and_hidden_faces_not_at_all():
+    near = [10.0, 0.0, -0.1, 4.5, 1.9, 1.5, 0.0]
+    far = [30.0, 1.0, -0.1, 4.5, 1.9, 1.5, 0.0]
+    found = polygons([near, far], ["Sedan", "Sedan"])
+    depth = [p.depth_m for p in found]
+    assert depth == sorted(depth, reverse=True)
+    assert {p.box for p in found} == {0, 1}
+    # Three blocks, of five faces at most three look at the camera, and their details.
+    assert len([p for p in found if p.box == 0]) <= 9 + len(DETAILS["Sedan"])
+
+
+def test_details_are_painted_on_their_blocks_and_left_out_far_away():
+    near = [12.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]  # we look at its rear
+    colors = [p.color for p in polygons([near], ["Sedan"])]
+    lamp = max(range(len(colors)), key=lambda i: colors[i][0] - colors[i][1])
+    assert colors[lamp][0] > 2 * colors[lamp][1]  # red
+    body = [i for i, c in enumerate(colors) if c[0] == c[1] == c[2]]
+    assert lamp > min(body)
+    far = [shapes._DETAIL_M + 5.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]
+    assert len(polygons([far], ["Sedan"])) <= 9
+
+
+def test_objects_behind_or_beside_the_image_are_left_out():
+    behind = [-12.0, 0.0, -0.1, 4.5, 1.9, 1.5, 0.0]
+    beside = [5.0, 60.0, -0.1, 4.5, 1.9, 1.5, 0.0]
+    assert polygons([behind, beside], ["Sedan", "Sedan"]) == []
+
+
+def test_near_plane_cuts_a_square_in_two():
+    square = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+    cut = shapes._cut_near(square, square[:, 0], 0.5)
+    np.testing.assert_allclose(
+        cut[np.lexsort(cut.T)], [[0.5, 0, 0], [2, 0, 0], [0.5, 1, 0], [2, 1, 0]]
+    )
+
+
+def test_light_by_hand():
+    night = shapes.Light(0.2, np.zeros(3), np.log(2.0) / 10.0, True)
+    color = np.full((1, 3), 100.0)
+    ahead = night.apply(color, np.zeros(1), np.zeros(1), np.full(1, 10.0))
+    np.testing.assert_allclose(ahead, 100.0 * (0.2 + 0.75) / 2.0)

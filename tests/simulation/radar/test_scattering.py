@@ -1,0 +1,189 @@
+"""Cross-sections, faces, occlusion, micro-Doppler and ghosts of objects."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from radejax.core.structures import CLASSES
+from radejax.simulation.radar import scattering
+from radejax.simulation.radar.tensor import RadarParameters
+from radejax.simulation.world.scene import Reflectors, SceneFrame
+
+PARAMETERS = RadarParameters(pattern_exponent=0.0)
+SIZES = {
+    "Sedan": (4.6, 1.9, 1.5),
+    "Bus or Truck": (9.0, 2.5, 3.0),
+    "Pedestrian": (0.6, 0.6, 1.7),
+    "Motorcycle": (2.1, 0.8, 1.5),
+    "Bicycle": (1.8, 0.6, 1.6),
+}
+
+
+def make_frame(boxes, cls, velocity=None, *, ego=(0.0, 0.0), time_s=0.0, tracks=None):
+    boxes = np.asarray(boxes, float).reshape(-1, 7)
+    count = len(boxes)
+    empty = np.zeros(0)
+    return SceneFrame(
+        boxes=boxes,
+        velocity_mps=np.zeros((count, 2)) if velocity is None else np.array(velocity),
+        cls=np.array([CLASSES.index(c) for c in cls]),
+        track=np.arange(count) if tracks is None else np.array(tracks),
+        track_id=np.arange(count),
+        ego_velocity_mps=np.array(ego, float),
+        reflectors=Reflectors(np.zeros((0, 3)), empty, empty, empty.astype(int)),
+        reflector_idx=empty.astype(int),
+        index=0,
+        time_s=time_s,
+        ego_along_m=0.0,
+    )
+
+
+def centers_of(cls, count=1, seed=0):
+    index = CLASSES.index(cls)
+    return scattering.make_object_scatterers(
+        np.full(count, index),
+        np.tile(SIZES[cls], (count, 1)),
+        np.random.default_rng(seed),
+    )
+
+
+class TestCrossSection:
+    @pytest.mark.parametrize("cls", CLASSES)
+    def test_mean_and_spread_of_a_class(self, cls):
+        law = scattering.CLASS_SCATTERING[cls]
+        count = 400
+        centers = centers_of(cls, count)
+        angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
+        cosine = centers.normal[:, :2] @ np.stack([np.cos(angle), np.sin(angle)])
+        gain = scattering.face_gain(cosine, centers.glint[:, None])
+        power = centers.power_m2 * gain.mean(1)
+        rcs = np.bincount(centers.track, power)
+        # Mean in square metres within the spread's statistical error.
+        relative = np.sqrt(np.exp((law.spread_db * np.log(10) / 10) ** 2) - 1)
+        limit = 4.0 * relative / np.sqrt(count) + 0.05
+        assert rcs.mean() / 10 ** (law.rcs_dbsm / 10) == pytest.approx(1.0, abs=limit)
+        assert np.std(10 * np.log10(rcs)) == pytest.approx(law.spread_db, rel=0.15)
+
+    def test_order_of_classes(self):
+        order = [scattering.CLASS_SCATTERING[c].rcs_dbsm for c in CLASSES]
+        truck, sedan, person = order[1], order[0], order[2]
+        assert truck > sedan > order[3] > order[4] > person
+
+    def test_flat_faces_flash_at_normal_incidence(self):
+        cosine = np.cos(np.deg2rad([0.0, 3.0, 6.0, 30.0, 60.0]))
+        gain = scattering.face_gain(cosine, np.full(5, 6.0))
+        assert gain[0] == pytest.approx(7.02)
+        assert gain[2] == pytest.approx(cosine[2] ** 2 + 6.0 / np.e + 0.02)
+        assert (np.diff(gain) < 0).all()
+
+    def test_faces_turned_away_return_next_to_nothing(self):
+        gain = scattering.face_gain(np.array([-0.01, -1.0]), np.array([6.0, 6.0]))
+        assert gain.max() < 0.03
+
+    def test_centers_lie_on_the_faces(self):
+        position = centers_of("Sedan", 5).position
+        assert np.abs(position).max() <= 1.0
+        flat = np.abs(position[:, :2]).max(1)
+        np.testing.assert_allclose(flat, 1.0)
+
+    def test_no_objects(self):
+        nothing = scattering.make_object_scatterers(
+            np.zeros(0, int), np.zeros((0, 3)), np.random.default_rng(0)
+        )
+        found, lit = scattering.scatter_objects(make_frame([], []), nothing, PARAMETERS)
+        assert len(found.power) == len(lit) == 0
+
+
+class TestOcclusion:
+    BOX = np.array([[20.0, 0.0, 0.0, 4.0, 2.0, 2.0, 0.0]])
+
+    @pytest.mark.parametrize(
+        ("point", "expected"),
+        [
+            ([40.0, 0.0, 0.0], True),  # straight behind
+            ([40.0, 3.0, 0.0], False),  # passes beside: 1.5 m off at the box
+            ([40.0, 1.7, 0.0], True),
+            ([10.0, 0.0, 0.0], False),  # in front
+            ([40.0, 0.0, 4.4], False),  # over it: 1.98 m high at 18 m, 2.4 at 22
+            ([-40.0, 0.0, 0.0], False),  # the other way
+        ],
+    )
+    def test_by_hand(self, point, expected):
+        blocked = scattering.is_blocked(np.array([point]), self.BOX, np.array([-1]))
+        assert blocked.tolist() == [expected]
+
+    def test_turned_box(self):
+        turned = self.BOX.copy()
+        turned[0, 6] = np.pi / 2  # now 4 m across: 1.7 m off centre is inside
+        point = np.array([[40.0, 3.4, 0.0]])
+        assert scattering.is_blocked(point, turned, np.array([-1]))[0]
+        assert not scattering.is_blocked(point, self.BOX, np.array([-1]))[0]
+
+    def test_own_box_does_not_block(self):
+        inside = np.array([[22.0, 0.0, 0.0]])
+        assert not scattering.is_blocked(inside, self.BOX, np.array([0]))[0]
+
+    def test_car_behind_a_truck_is_weak_and_unlit(self):
+        truck = [15.0, 0.0, 0.6, 9.0, 2.5, 3.0, 0.0]
+        car = [30.0, 0.0, -0.1, 4.6, 1.9, 1.5, 0.0]
+        index = np.array([CLASSES.index("Bus or Truck"), CLASSES.index("Sedan")])
+        centers = scattering.make_object_scatterers(
+            index,
+            np.array([SIZES["Bus or Truck"], SIZES["Sedan"]]),
+            np.random.default_rng(0),
+        )
+        both = make_frame([truck, car], ["Bus or Truck", "Sedan"])
+        alone = make_frame([car], ["Sedan"], tracks=[1])
+        hidden, lit = scattering.scatter_objects(both, centers, PARAMETERS)
+        free, lit_alone = scattering.scatter_objects(alone, centers, PARAMETERS)
+        assert lit[1] < 0.05
+        assert lit[0] == lit_alone[0] == 1.0
+        drop = hidden.power[hidden.owner == 1].sum() / free.power.sum()
+        assert 10 * np.log10(drop) == pytest.approx(scattering.OCCLUDED_DB, abs=0.5)
+
+
+class TestMotion:
+    def test_range_rate_of_a_moving_target_seen_from_a_moving_ego(self):
+        part = scattering.FrameScattering(
+            np.array([[30.0, 40.0, 0.0]]),
+            np.array([[2.0, 11.0]]),
+            np.ones(1),
+            np.zeros(1),
+            np.zeros(1, int),
+        )
+        seen = scattering.to_scatterers([part], np.array([12.0, 0.0]), PARAMETERS)
+        # (2 - 12, 11) . (0.6, 0.8) = -6 + 8.8
+        assert seen.velocity_mps[0] == pytest.approx(2.8, abs=1e-5)
+        assert seen.range_m[0] == pytest.approx(50.0)
+        assert seen.azimuth_rad[0] == pytest.approx(-np.arctan2(40, 30))
+
+    def test_amplitude_has_the_power_and_the_phase_of_the_way(self):
+        wavelength = PARAMETERS.wavelength_m
+        part = scattering.FrameScattering(
+            np.array([[20 * wavelength, 0, 0], [20.125 * wavelength, 0, 0]]),
+            np.zeros((2, 2)),
+            np.array([4.0, 4.0]),
+            np.zeros(2),
+            np.zeros(2, int),
+        )
+        seen = scattering.to_scatterers([part], np.zeros(2), PARAMETERS)
+        # An eighth of a wavelength farther: a quarter turn.
+        np.testing.assert_allclose(seen.amplitude[0], [2.0, 0.0], atol=1e-3)
+        np.testing.assert_allclose(seen.amplitude[1], [0.0, 2.0], atol=1e-3)
+        assert np.abs(seen.amplitude[2:]).max() == 0.0
+
+    def test_wheels_and_legs_spread_in_doppler_and_bodies_do_not(self):
+        centers = centers_of("Pedestrian", 40)
+        boxes = np.tile([15.0, 0.0, 0.0, 0.6, 0.6, 1.7, 0.0], (40, 1))
+        walking = make_frame(boxes, ["Pedestrian"] * 40, [[1.4, 0.0]] * 40, time_s=0.4)
+        found, _ = scattering.scatter_objects(walking, centers, PARAMETERS)
+        speed = found.velocity_mps[:, 0]
+        is_micro = centers.micro > 0
+        np.testing.assert_allclose(speed[~is_micro], 1.4)
+        assert speed[is_micro].std() > 0.3
+        assert speed.min() >= 0.0
+        assert speed.max() <= 2.8
+        still = dataclasses.replace(walking, velocity_mps=np.zeros((40, 2)))
+        found, _ = scattering.scatter_objects(still, centers, PARAMETERS)
+        assert np.abs(found.velocity_mps).max() == 0.0

@@ -1,0 +1,406 @@
+"""The radar against theory: windows, bins, R^-4, interference, aliasing, noise."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation.radar import tensor
+from radejax.simulation.radar.scattering import received_power
+
+GRID = RadarGrid.reduced(
+    num_doppler=16, num_range=32, num_elevation=9, num_azimuth=24, max_range_m=31.0
+)
+PARAMETERS = tensor.RadarParameters(azimuth_elements=20.0, elevation_elements=12.0)
+QUIET = np.zeros((32, 16), np.float32)
+
+
+def points(range_m, azimuth=0.0, elevation=0.0, velocity=0.0, amplitude=1.0):
+    """Scatterers of equal length from numbers or lists; amplitude may be complex."""
+    columns = np.broadcast_arrays(
+        *map(np.atleast_1d, (range_m, azimuth, elevation, velocity, amplitude))
+    )
+    amplitude = columns[4].astype(complex)
+    return tensor.Scatterers(
+        *(c.astype(np.float32) for c in columns[:4]),
+        np.stack([amplitude.real, amplitude.imag], -1).astype(np.float32),
+    )
+
+
+def tesseract(scatterers, *, noise=QUIET, grid=GRID, seed=(1,), **kwargs):
+    kwargs = {"parameters": PARAMETERS, **kwargs}
+    return np.asarray(
+        tensor.simulate(
+            scatterers,
+            noise,
+            tensor.frame_key(*seed),
+            grid=grid,
+            output="tesseract",
+            **kwargs,
+        ),
+        np.float64,
+    )
+
+
+def hann_by_dft(offset, num=64):
+    """Transform of a Hann window by summing it, independent of `window_response`."""
+    n = np.arange(num) - (num - 1) / 2
+    window = np.cos(np.pi * n / num) ** 2
+    phase = np.exp(-2j * np.pi * np.multiply.outer(offset, n) / num)
+    return np.abs((phase * window).sum(-1)) / window.sum()
+
+
+class TestWindow:
+    def test_is_the_transform_of_a_hann_window(self):
+        offset = np.linspace(-9.7, 9.7, 195).astype(np.float32)
+        response = tensor.window_response(offset, 0.0, 64.0)
+        np.testing.assert_allclose(np.abs(response), hann_by_dft(offset), atol=2e-6)
+
+    def test_half_and_whole_bins_by_hand(self):
+        # Hann: 1 at its peak, 1/2 one bin off, 0 from two bins on; 8/(3 pi) at 1/2.
+        x = np.array([0.0, 0.5, 1.0, 2.0, 3.0], np.float32)
+        expected = [1.0, 8.0 / (3.0 * np.pi), 0.5, 0.0, 0.0]
+        np.testing.assert_allclose(tensor.window_response(x, 0.0), expected, atol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("pedestal", "expected_db"), [(0.0, -31.47), (1.0, -13.26), (0.08, -42.7)]
+    )
+    def test_first_sidelobe(self, pedestal, expected_db):
+        # Harris 1978: Hann -31.5 dB, uniform -13.3 dB, Hamming about -42.7 dB.
+        x = np.linspace(0.0, 6.0, 6001).astype(np.float32)
+        power = np.abs(tensor.window_response(x, pedestal))
+        null = np.argmax(np.diff(np.sign(np.diff(power))) > 0) + 1
+        level = 20.0 * np.log10(power[null:].max())
+        assert level == pytest.approx(expected_db, abs=0.1)
+
+    def test_energy_of_whole_bins_does_not_depend_on_the_offset(self):
+        # Parseval: sum over bins of |H|^2 = mean of the squared window = 3/2 (Hann).
+        for offset in (0.0, 0.21, 0.5, 0.83):
+            x = (np.arange(64) - 31 + offset).astype(np.float32)
+            energy = np.sum(np.square(tensor.window_response(x, 0.0, 64.0)))
+            assert energy == pytest.approx(1.5, rel=1e-5)
+
+
+class TestPointTarget:
+    @pytest.mark.parametrize("cell", [(3, 10, 4, 11), (12, 20, 2, 5), (8, 5, 6, 18)])
+    def test_peaks_in_its_own_bin(self, cell):
+        d, r, e, a = cell
+        power = tesseract(
+            points(
+                GRID.range_m[r],
+                GRID.azimuth_rad[a],
+                GRID.elevation_rad[e],
+                GRID.doppler_mps[d],
+                3.0,
+            )
+        )
+        assert np.unravel_index(power.argmax(), power.shape) == cell
+        assert power.max() == pytest.approx(9.0, rel=1e-5)
+
+    @pytest.mark.parametrize("shift", [-0.4, -0.15, 0.1, 0.35])
+    def test_sub_bin_position_by_interpolation(self, shift):
+        # For a Hann window the ratio of the two largest bins gives the position:
+        # shift = (2 m - 1) / (m + 1), m = larger neighbour / peak (amplitudes).
+        step_d = GRID.doppler_mps[1] - GRID.doppler_mps[0]
+        power = tesseract(
+            points(
+                GRID.range_m[10] + shift * GRID.range_step_m,
+                GRID.azimuth_rad[11],
+                GRID.elevation_rad[4],
+                GRID.doppler_mps[7] + shift * step_d,
+            )
+        )
+        for axis, along in (
+            (1, np.sqrt(power[7, :, 4, 11])),
+            (0, np.sqrt(power[:, 10, 4, 11])),
+        ):
+            peak = along.argmax()
+            side = 1 if along[peak + 1] > along[peak - 1] else -1
+            ratio = along[peak + side] / along[peak]
+            estimate = peak + side * (2.0 * ratio - 1.0) / (ratio + 1.0)
+            expected = (10 if axis == 1 else 7) + shift
+            assert estimate == pytest.approx(expected, abs=0.01)
+
+    def test_sub_bin_angles_by_a_finer_look(self):
+        fine = RadarGrid.reduced(
+            num_doppler=2, num_range=2, num_elevation=121, num_azimuth=201,
+            max_range_m=1.0, max_azimuth_deg=30.0, max_elevation_deg=18.0,
+        )  # fmt: skip
+        power = tesseract(
+            points(1.0, 0.2345, -0.0987, fine.doppler_mps[1]),
+            grid=fine,
+            noise=np.zeros((2, 2), np.float32),
+        )
+        _, _, e, a = np.unravel_index(power.argmax(), power.shape)
+        assert fine.azimuth_rad[a] == pytest.approx(0.2345, abs=0.003)
+        assert fine.elevation_rad[e] == pytest.approx(-0.0987, abs=0.003)
+
+    def test_beam_widens_away_from_boresight(self):
+        fine = np.linspace(-0.9, 0.9, 3601)
+
+        def width(angle):
+            beam = tensor.angle_response(fine, np.float32([angle]), 40.0, 0.2)[:, 0]
+            return np.count_nonzero(np.square(beam) > 0.5)
+
+        assert width(0.7) / width(0.0) == pytest.approx(1.0 / np.cos(0.7), rel=0.02)
+
+
+class TestPhysics:
+    def test_twelve_db_per_doubling_of_range(self):
+        where = np.array([[20.0, 2.0, -0.3], [40.0, 4.0, -0.6]])
+        power = received_power(where, np.ones(2), PARAMETERS)
+        assert 10 * np.log10(power[0] / power[1]) == pytest.approx(12.041, abs=1e-3)
+
+    def test_radar_cross_section_is_linear_in_power(self):
+        where = np.array([[30.0, 0.0, 0.0]] * 2)
+        power = received_power(where, np.array([1.0, 100.0]), PARAMETERS)
+        assert power[1] / power[0] == pytest.approx(100.0)
+
+    @pytest.mark.parametrize(
+        ("phase", "expected"), [(0.0, 4.0), (np.pi / 2, 2.0), (np.pi, 0.0)]
+    )
+    def test_two_targets_in_one_bin_interfere(self, phase, expected):
+        both = points([10.0] * 2, amplitude=[1.0, np.exp(1j * phase)])
+        assert tesseract(both)[:, 10].max() == pytest.approx(
+            tesseract(points(10.0))[:, 10].max() * expected, abs=1e-5
+        )
+
+    @pytest.mark.parametrize("velocity", [-13.9, -2.4, 1.95, 6.0, 27.7])
+    def test_velocity_aliases_to_the_predicted_bin(self, velocity):
+        step = GRID.doppler_mps[1] - GRID.doppler_mps[0]
+        period = step * GRID.num_doppler
+        wrapped = (velocity - GRID.doppler_mps[0]) % period
+        expected = round(wrapped / step) % GRID.num_doppler
+        power = tesseract(points(10.0, velocity=velocity))
+        assert power.max((1, 2, 3)).argmax() == expected
+
+    def test_aliasing_on_the_real_doppler_axis(self):
+        grid = RadarGrid.kradar()
+        # The axis repeats every 64 x 0.0604 = 3.865 m/s: 10 m/s is -1.595 m/s.
+        response = np.abs(tensor.doppler_response(np.float32([10.0]), grid))[:, 0]
+        assert grid.doppler_mps[response.argmax()] == pytest.approx(-1.595, abs=0.031)
+
+    def test_energy_does_not_depend_on_where_in_a_cell_the_target_lies(self):
+        energy = [
+            tesseract(points(15.0 + shift, velocity=0.3 + 0.1 * shift)).sum()
+            for shift in (0.0, 0.3, 0.5, 0.77)
+        ]
+        np.testing.assert_allclose(energy, energy[0], rtol=2e-3)
+
+    def test_energy_does_not_depend_on_the_grid(self):
+        # A range axis twice as fine over the same resolution: twice the cells, so
+        # energy per metre stays.
+        fine = RadarGrid.reduced(
+            num_doppler=16, num_range=63, num_elevation=9, num_azimuth=24,
+            max_range_m=31.0,
+        )  # fmt: skip
+        sharp = dataclasses.replace(PARAMETERS, range_resolution_m=1.0)
+        coarse_energy = tesseract(points(15.3)).sum() * GRID.range_step_m
+        fine_energy = (
+            tesseract(
+                points(15.3),
+                grid=fine,
+                noise=np.zeros((63, 16), np.float32),
+                parameters=sharp,
+            ).sum()
+            * fine.range_step_m
+        )
+        assert fine_energy == pytest.approx(coarse_energy, rel=1e-3)
+
+    def test_sidelobes_of_the_array_surround_a_strong_target(self):
+        power = tesseract(points(10.0, GRID.azimuth_rad[12], 0.0, GRID.doppler_mps[8]))
+        azimuth_cut = 10 * np.log10(power[8, 10, 4] + 1e-12)
+        far = np.abs(np.arange(24) - 12) > 5
+        assert -45.0 < azimuth_cut[far].max() < -18.0
+
+
+class TestNoise:
+    POWER = np.full((32, 16), 7.0, np.float32)
+    NONE = points(10.0, amplitude=0.0)
+
+    def test_is_exponential_with_the_given_mean(self):
+        noise = tesseract(self.NONE, noise=self.POWER).ravel() / 7.0
+        assert noise.mean() == pytest.approx(1.0, abs=4.0 / np.sqrt(noise.size))
+        assert noise.std() == pytest.approx(1.0, abs=0.02)
+        # Kolmogorov and Smirnov: distance from 1 - exp(-x).
+        ranked = np.sort(noise)
+        expected = 1.0 - np.exp(-ranked)
+        distance = np.abs(np.arange(noise.size) / noise.size - expected).max()
+        assert distance < 1.63 / np.sqrt(noise.size)  # 1 % level
+
+    def test_frames_and_range_rows_are_independent(self):
+        first = tesseract(self.NONE, noise=self.POWER)
+        second = tesseract(self.NONE, noise=self.POWER, seed=(2,))
+        limit = 8.0 / np.sqrt(first.size)  # neighbours in a row are not independent
+        for a, b in ((first, second), (first[:, 1:], first[:, :-1])):
+            assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < limit
+
+    def test_neighbours_correlate_as_windows_and_arrays_say(self):
+        # Powers of complex Gaussian noise correlate by the square of the field's
+        # correlation, here summed over samples and antennas in float64.
+        noise = np.mean(
+            [
+                self.correlations(tesseract(self.NONE, noise=self.POWER, seed=(seed,)))
+                for seed in range(6)
+            ],
+            axis=0,
+        )
+
+        def field_correlation(count, pedestal, shift):
+            n = np.arange(count) - (count - 1) / 2
+            window = pedestal + (1 - pedestal) * np.cos(np.pi * n / count) ** 2
+            phase = np.exp(2j * np.pi * n * shift / count)
+            return ((window**2 * phase).sum() / (window**2).sum()).real
+
+        a, b = np.sin(GRID.azimuth_rad[11:13])
+        c, d = np.sin(GRID.elevation_rad[4:6])
+        expected = np.square(
+            [
+                field_correlation(16, 0.0, 1.0),  # Hann: 2/3
+                field_correlation(16, 0.0, 2.0),  # 1/6
+                field_correlation(20, 0.2, (b - a) * 10),
+                field_correlation(12, 0.2, (d - c) * 6),
+            ]
+        )
+        np.testing.assert_allclose(expected[:2], [4 / 9, 1 / 36], atol=1e-12)
+        np.testing.assert_allclose(noise, expected, atol=0.05)
+
+    @staticmethod
+    def correlations(power):
+        """Doppler 1 and 2 bins apart, azimuth and elevation 1 bin near boresight."""
+        pairs = (
+            (power[1:], power[:-1]),
+            (power[2:], power[:-2]),
+            (power[..., 11], power[..., 12]),
+            (power[:, :, 4], power[:, :, 5]),
+        )
+        return [np.corrcoef(x.ravel(), y.ravel())[0, 1] for x, y in pairs]
+
+    def test_power_of_every_angle_bin_is_the_same(self):
+        rows = tensor.array_noise_basis(GRID.azimuth_rad, 21.0, 0.2)
+        assert rows.shape == (24, 21)
+        np.testing.assert_allclose(np.square(rows).sum(1), 1.0, rtol=1e-6)
+
+    def test_profile_reaches_its_own_rows_and_doppler_bins(self):
+        profile = np.full((32, 16), 1.0, np.float32)
+        profile[20, 5] = 1000.0
+        noise = tesseract(self.NONE, noise=profile)
+        assert noise[5, 20].mean() == pytest.approx(1000.0, rel=0.3)
+        noise[5, 20] = 1.0
+        assert noise.max() < 30.0
+
+    def test_adds_to_the_field_and_not_to_the_power(self):
+        # With |s|^2 = 100 and noise of mean 1 the power varies by 2 s sqrt(1/2): a sum
+        # of powers would vary by 1.
+        grid = RadarGrid.reduced(
+            num_doppler=2, num_range=2, num_elevation=2, num_azimuth=2, max_range_m=1.0,
+            max_azimuth_deg=1.0, max_elevation_deg=1.0,
+        )  # fmt: skip
+        target = points(0.0, amplitude=10.0, velocity=grid.doppler_mps[0])
+        noise = np.ones((2, 2), np.float32)
+        cells = [
+            tesseract(target, noise=noise, grid=grid, seed=(i,))[0, 0, 0, 0]
+            for i in range(300)
+        ]
+        assert np.std(cells) == pytest.approx(20.0 * np.sqrt(0.5), rel=0.2)
+
+
+def direct_tesseract(scatterers, grid, parameters):
+    """The tensor from first principles: sums over samples and antennas, float64."""
+    s = [np.asarray(v, np.float64) for v in jax.tree.leaves(scatterers)]
+    by_name = dict(
+        zip([f.name for f in dataclasses.fields(scatterers)], s, strict=True)
+    )
+
+    def transform(offset, num, pedestal):  # [bins, S] in bins of num samples
+        n = np.arange(num) - (num - 1) / 2
+        window = pedestal + (1 - pedestal) * np.cos(np.pi * n / num) ** 2
+        phase = np.exp(2j * np.pi * offset[..., None] * n / num)
+        return ((phase * window).sum(-1) / window.sum()).real
+
+    def angle(axis, angles, num):
+        sines = np.sin(axis)[:, None] - np.sin(angles)[None]
+        return transform(sines * num / 2, int(num), parameters.array_pedestal)
+
+    step = grid.doppler_mps[1] - grid.doppler_mps[0]
+    wrapped = (grid.doppler_mps[:, None] - by_name["velocity_mps"]) / step
+    wrapped = (wrapped + 8) % 16 - 8
+    doppler = transform(wrapped, 16, 0.0)
+    many = 4096  # a long chirp: the crop of its spectrum that the axis shows
+    ranges = transform(
+        (grid.range_m[:, None] - by_name["range_m"]) / grid.range_step_m, many, 0.0
+    )
+    azimuth = angle(grid.azimuth_rad, by_name["azimuth_rad"], 20)
+    elevation = angle(grid.elevation_rad, by_name["elevation_rad"], 12)
+    amplitude = by_name["amplitude"] @ [1.0, 1j]
+    field = np.einsum(
+        "s,ds,rs,es,as->drea", amplitude, doppler, ranges, elevation, azimuth
+    )
+    return np.abs(field) ** 2
+
+
+class TestOutputs:
+    def test_equals_the_sum_over_samples_and_antennas(self):
+        rng = np.random.default_rng(1)
+        scene = points(
+            rng.uniform(3, 28, 12), rng.uniform(-0.8, 0.8, 12),
+            rng.uniform(-0.2, 0.2, 12), rng.normal(0, 5, 12),
+            rng.normal(size=12) + 1j * rng.normal(size=12),
+        )  # fmt: skip
+        expected = direct_tesseract(scene, GRID, PARAMETERS)
+        np.testing.assert_allclose(
+            tesseract(scene), expected, atol=1e-4 * expected.max()
+        )
+
+    def scene(self):
+        rng = np.random.default_rng(0)
+        return points(
+            rng.uniform(3, 30, 64), rng.uniform(-0.9, 0.9, 64),
+            rng.uniform(-0.2, 0.2, 64), rng.normal(0, 5, 64),
+            1e6 * (rng.normal(size=64) + 1j * rng.normal(size=64)),
+        )  # fmt: skip
+
+    def test_projection_equals_the_projected_tesseract(self):
+        from radejax.data.projection import project
+
+        noise = np.full((32, 16), 1e9, np.float32)
+        power = tesseract(self.scene(), noise=noise)
+        fused = tensor.simulate(
+            self.scene(), noise, tensor.frame_key(1), grid=GRID, parameters=PARAMETERS
+        )
+        np.testing.assert_allclose(
+            fused, project(power.astype(np.float32)), rtol=0, atol=2e-6
+        )
+
+    def test_rows_per_step_does_not_change_the_numbers(self):
+        noise = np.full((32, 16), 1e9, np.float32)
+        one, eight = (
+            tesseract(self.scene(), noise=noise, rows_per_step=n) for n in (1, 8)
+        )
+        np.testing.assert_allclose(one, eight, rtol=2e-4)
+
+    def test_vmap_over_frames(self):
+        noise = np.full((32, 16), 1e9, np.float32)
+        keys = np.stack([tensor.frame_key(i) for i in range(2)])
+
+        def one(key):
+            return tensor.simulate(
+                self.scene(), noise, key, grid=GRID, parameters=PARAMETERS
+            )
+
+        batch = jax.vmap(one)(keys)
+        np.testing.assert_allclose(batch[1], one(keys[1]), atol=1e-5)
+
+    def test_dropping_the_weakest_scatterers_changes_little(self):
+        few = dataclasses.replace(PARAMETERS, max_scatterers_per_row=40)
+        noise = np.full((32, 16), 1e9, np.float32)
+        all_power = tesseract(self.scene(), noise=noise)
+        some_power = tesseract(self.scene(), noise=noise, parameters=few)
+        error = np.abs(some_power - all_power).max() / all_power.max()
+        assert 0 < error < 1e-3
+
+    def test_key_depends_on_every_number(self):
+        keys = {tuple(tensor.frame_key(*k)) for k in ((1, 2, 3), (1, 2, 4), (1, 3, 3))}
+        assert len(keys) == 3

@@ -1,0 +1,172 @@
+"""Scenes from label files: boxes stay the labels', motion is theirs, splits are K-Radar's."""
+
+import math
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.data.kradar import KRadar, read_labels, write
+from radejax.data.kradar.labels import Label
+from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.dataset import simulate_dataset
+from radejax.simulation.sources import LabelSource
+from radejax.simulation.world import real_scenes
+
+OFFSET = (-2.54, 0.3, 0.7)
+NUM_FRAMES = 16
+
+
+def boxes_at(i):
+    """Ego at 10 m/s: a parked car, one ahead at 12 m/s, one oncoming at 8 m/s."""
+    t = 0.1 * i
+    return [
+        Label("Sedan", (30.0 - 10.0 * t, -5.0, -0.8, 4.5, 1.9, 1.6, 0.02), "R", 7),
+        Label("Sedan", (20.0 + 2.0 * t, 0.0, -0.8, 4.6, 1.9, 1.5, 0.0), "R", 8),
+        Label("Bus or Truck", (60 - 18 * t, 4.0, 0.0, 9.0, 2.5, 3.0, math.pi), "R", 8),
+        Label("Pedestrian", (12.0, -8.0, -0.7, 0.6, 0.6, 1.7, 1.0), "L", -1),
+        Label("Pedestrian Group", (25.0, -9.0, -0.7, 2.0, 2.0, 1.7, 1.0), "R", 9),
+    ]
+
+
+@pytest.fixture
+def labels_folder(tmp_path):
+    folder = tmp_path / "labels"
+    for number in (3, 7):
+        for i in range(NUM_FRAMES):
+            name = f"{i + 31:05d}_{i + 1:05d}.txt"
+            write.write_labels(
+                folder / str(number) / name,
+                (i + 31, i + 1, i + 5, i + 9, i + 11),
+                1.6e9 + 0.1 * i,
+                boxes_at(i),
+            )
+    return folder
+
+
+def make_config(folder, **changes):
+    values = default_config() | {
+        "scenes": str(folder),
+        "frames_per_sequence": 0,
+        "image_width": 0,
+        "output": "projection",
+        "grid": {
+            "num_doppler": 8,
+            "num_range": 32,
+            "num_elevation": 5,
+            "num_azimuth": 24,
+            "max_range_m": 75.0,
+        },
+    }
+    return values | changes
+
+
+@pytest.fixture
+def source(labels_folder):
+    return LabelSource(SimulationConfig.from_mapping(make_config(labels_folder)))
+
+
+class TestScene:
+    def test_objects_have_the_labels_boxes(self, source):
+        scene = source.make(3)
+        frame = scene.frame(5)
+        boxes = {
+            (scene.tracks.label_cls[t], int(i)): b
+            for t, i, b in zip(frame.track, frame.track_id, frame.boxes, strict=True)
+        }
+        assert len(boxes) == 5
+        for label in boxes_at(5):
+            expected = np.array(label.box) + np.array([*OFFSET, 0, 0, 0, 0])
+            found = boxes[(label.cls, label.track_id)]
+            np.testing.assert_allclose(found[:6], expected[:6], atol=1e-9)
+            assert math.cos(found[6] - expected[6]) == pytest.approx(1.0)
+
+    def test_velocities_are_the_labels_motion(self, source):
+        scene = source.make(3)
+        frame = scene.frame(7)
+        relative = frame.velocity_mps - frame.ego_velocity_mps
+        found = dict(zip(frame.track_id.tolist(), relative[:, 0], strict=True))
+        names = [scene.tracks.label_cls[t] for t in frame.track]
+        for name, velocity in zip(names, relative[:, 0], strict=True):
+            if name == "Bus or Truck":
+                assert velocity == pytest.approx(-18.0, abs=1e-4)
+        assert found[7] == pytest.approx(-10.0, abs=1e-4)
+        assert found[9] == pytest.approx(0.0, abs=1e-4)
+
+    def test_ego_speed_is_that_at_which_parked_cars_stand(self, source):
+        speed = source.make(3).ego_velocity_mps[:, 0]
+        np.testing.assert_allclose(speed, 10.0, atol=1e-4)
+
+    def test_ids_of_two_classes_are_two_tracks_and_no_id_is_one_frame(self, source):
+        tracks = source.make(3).tracks
+        assert (tracks.track_id == 8).sum() == 2
+        assert (tracks.track_id == -1).sum() == NUM_FRAMES
+        assert (tracks.is_present.sum(0)[tracks.track_id == -1] == 1).all()
+
+    def test_swapped_identity_is_not_taken_for_speed(self, source):
+        tracks = source.make(3).tracks
+        tracks.position_m[8, tracks.track_id == 7] += [500.0, 0.0, 0.0]
+        clock = 0.1 * np.arange(NUM_FRAMES)
+        relative = real_scenes.relative_velocity(tracks, clock)
+        assert np.abs(relative).max() < real_scenes.MAX_SPEED_MPS
+
+    def test_without_vehicles_the_road_type_decides_the_speed(self):
+        empty = real_scenes.collect_tracks([], OFFSET)
+        assert empty.position_m.shape == (0, 0, 3)
+
+
+class TestWrittenTree:
+    def test_labels_out_are_labels_in(self, labels_folder, tmp_path):
+        root = simulate_dataset(
+            make_config(labels_folder, sequences=[7]), tmp_path / "out", progress=False
+        )
+        written = sorted((root / "7" / "info_label_v2_1").iterdir())
+        assert len(written) == NUM_FRAMES
+        for i, path in enumerate(written):
+            original = labels_folder / "7" / path.name
+            assert (
+                path.read_text().splitlines()[0]
+                == (original.read_text().splitlines()[0])
+            )
+            given = {(x.cls, x.track_id): x.box for x in boxes_at(i)}
+            for label in read_labels(path):
+                expected = given[(label.cls, label.track_id)]
+                np.testing.assert_allclose(label.box[:6], expected[:6], atol=1e-9)
+        data = KRadar(root, visibility=None)
+        assert data[0].projection_path.name == "DERA_tesseract_00031.npy"
+        assert np.load(data[0].projection_path).shape == (13, 32, 24)
+
+    def test_split_is_by_quarters(self, source):
+        splits = [spec.split for spec in source.frames(3)]
+        assert splits == ["train"] * 4 + ["test"] * 4 + ["train"] * 4 + ["test"] * 4
+
+    def test_stride_and_number_of_frames(self, labels_folder):
+        config = make_config(labels_folder, frame_stride=3, frames_per_sequence=4)
+        source = LabelSource(SimulationConfig.from_mapping(config))
+        assert [s.scene_idx for s in source.frames(3)] == [0, 3, 6, 9]
+        assert source.frames(3)[1].indices == (34, 4, 8, 12, 14)
+
+    def test_missing_labels(self, tmp_path):
+        with pytest.raises(FileNotFoundError, match="no such labels"):
+            simulate_dataset(
+                make_config(tmp_path / "nowhere"), tmp_path / "out", progress=False
+            )
+
+    def test_unknown_sequence(self, labels_folder):
+        config = make_config(labels_folder, sequences=[4])
+        with pytest.raises(UserError, match="sequence"):
+            LabelSource(SimulationConfig.from_mapping(config))
+
+
+@pytest.mark.slow
+def test_all_of_kradar_makes_scenes(shared):
+    values = make_config(shared / "data" / "kradar" / "labels_v2_1.zip")
+    source = LabelSource(SimulationConfig.from_mapping(values))
+    assert len(source.numbers) == 58
+    for number in source.numbers:
+        scene = source.make(number)
+        speed = scene.ego_velocity_mps[:, 0]
+        assert (speed >= 0).all()
+        assert (speed <= 40).all()
+        assert -1.6 < scene.ground_m < 0.3
+        assert np.isfinite(scene.tracks.velocity_mps).all()
