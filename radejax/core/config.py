@@ -45,6 +45,12 @@ def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:
     return chosen
 
 
+def config_name(filename: str) -> str:
+    """Name of a run from its config: "configs/radenet.py:stem" gives "radenet-stem"."""
+    path, _, words = filename.partition(":")
+    return "-".join([pathlib.Path(path).stem, *filter(None, words.split(","))])
+
+
 def load_config(path_and_words: str) -> ConfigDict:
     """The config of a file such as "configs/radenet.py:stem".
 

@@ -38,6 +38,11 @@ def build(config: Mapping[str, Any]) -> nn.Module:
     return importlib.import_module(_MODULES[config["name"]]).from_config(config)
 
 
+def has_camera(model: nn.Module) -> bool:
+    """Whether a model looks at images."""
+    return hasattr(model, "image_size")
+
+
 def with_dtype(model: nn.Module, dtype: str) -> nn.Module:
     """The same model computing in another dtype; parameters stay float32.
 
