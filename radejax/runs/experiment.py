@@ -19,13 +19,15 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data import pipeline
 from radejax.data.augment import Augmentation
+from radejax.data.cameras import require_images
+from radejax.data.frame_table import make_table
 from radejax.data.kradar.frame import Frame
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.embed import embeddings_sha256, weights_sha256
-from radejax.interop import image_backbone as camera_inputs
+from radejax.interop.image_backbone import load_image_backbone
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.runs.data import DataPaths, prepare_data, saved_path
+from radejax.runs.data import DataPaths, camera_inputs, prepare_data, saved_path
 from radejax.runs.workdir import (
     PathLike,
     checkpoint_info,
@@ -186,21 +188,24 @@ def train(
         "train.batch_size",
         config.train.num_accumulate,
     )
-    inputs = camera_inputs.loader_arguments(config, frames, paths.embeddings)
-    camera_inputs.require_images(frames, inputs)
-    loader = pipeline.make_loader(
+    images = camera_inputs(config, frames, paths.embeddings)
+    require_images(frames, images)
+    table = make_table(
         records,
         frames,
-        batch_size=config.train.batch_size // jax.process_count(),
         max_objects=config.data.max_objects,
         classes=config.classes,
+        images=images,
+        label_permutation_seed=config.data.label_permutation_seed,
+    )
+    options = pipeline.LoaderOptions(
+        config.train.batch_size // jax.process_count(),
         seed=config.seed,
-        augment=make_augmentation(config.data, records.grid),
         num_threads=config.data.num_threads,
         num_workers=config.data.num_workers,
-        label_permutation_seed=config.data.label_permutation_seed,
-        **inputs,
     )
+    augment = make_augmentation(config.data, records.grid)
+    loader = pipeline.make_loader(table, options, augment=augment)
     evaluate = None
     if config.train.evaluate_every_epochs:
         from radejax.runs.validation import Validation  # above: it reads whole runs
@@ -211,9 +216,7 @@ def train(
         variables = initial_variables(init_from, config)
     pretrained = None
     if not _has_backbone(variables):
-        pretrained = camera_inputs.load_image_backbone(
-            paths.image_backbone, config, paths.embeddings
-        )
+        pretrained = load_image_backbone(paths.image_backbone, config, paths.embeddings)
     return loop.train(
         model,
         variables,
