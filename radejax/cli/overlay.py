@@ -11,10 +11,10 @@ import tqdm
 
 from radejax.core.errors import UserError
 from radejax.core.structures import WIDE_ROI
+from radejax.data.images import front_view
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.frame import Frame
 from radejax.data.tesseract import project_file, read_projection_npy
-from radejax.runs.evaluate import front_view
 from radejax.visualize import animate, bev, projections
 
 ANIMATIONS = (".gif", ".mp4")

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_json, write_json
-from radejax.data.frame_table import read_left_image
+from radejax.data.images import read_left_image
 from radejax.data.kradar.frame import Frame
 from radejax.data.records import files as record_files
 from radejax.data.records.arrays import MANIFEST, ArrayRecords

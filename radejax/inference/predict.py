@@ -15,7 +15,11 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Batch, Detections
 from radejax.data.cameras import CameraInputs
 from radejax.data.frame_table import make_table
+<<<<<<< HEAD
 from radejax.data.kradar import Frame
+=======
+from radejax.data.kradar import KRadar
+>>>>>>> data
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
@@ -112,7 +116,11 @@ def predict_dataset(
         records: Projections of the frames.
         frames: Which frames, in which order.
         batch_size: Frames at once; rounded up to a multiple of the devices.
+<<<<<<< HEAD
         images: Of these frames, for a radar-camera model, see `data.cameras`.
+=======
+        images: Of the frames, for models with a camera; see `camera_inputs`.
+>>>>>>> data
         progress: Show a bar.
         should_stop: Asked before every batch.
 
@@ -135,7 +143,11 @@ def predict_dataset(
         images=images,
     )
     options = LoaderOptions(
+<<<<<<< HEAD
         batch_size=detector.rows(batch_size) if on_mesh else batch_size,
+=======
+        detector.rows(batch_size) if on_mesh else batch_size,
+>>>>>>> data
         shuffle=False,
         num_epochs=1,
         drop_remainder=False,
@@ -143,6 +155,7 @@ def predict_dataset(
         process_index=None if on_mesh else 0,
         process_count=None if on_mesh else 1,
     )
+    loader = make_loader(table, options)
 
     def start(batch: Batch) -> tuple[Detections, Any]:
         if on_mesh:

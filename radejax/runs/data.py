@@ -19,7 +19,12 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import CameraInputs, CameraOptions, camera_inputs
+from radejax.data.cameras import (
+    CameraInputs,
+    CameraOptions,
+    camera_inputs,
+    check_embeddable,
+)
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.pipeline import LoaderOptions, make_loader
@@ -175,7 +180,10 @@ class Data:
         if models.has_camera(model):
             camera = CameraOptions.of_config(config.data)
             if paths.embeddings is not None:
-                _check_embeddable(config)
+                check_embeddable(
+                    freeze=model.freeze,
+                    mirror_probability=config.data.mirror_probability,
+                )
                 features = open_embeddings(paths.embeddings, config.model)
         elif paths.embeddings is not None:
             raise UserError(
@@ -308,18 +316,6 @@ def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
     if len(data) != 1:
         raise UserError(f"a simulated data set has one folder, got {list(data)}")
     return data[0]
-
-
-def _check_embeddable(config: ConfigDict) -> None:
-    if not config.model.image.freeze:
-        raise UserError(
-            "embeddings are what a frozen backbone makes of images, but "
-            "config.model.image.freeze is False"
-        )
-    if config.data.mirror_probability:
-        raise UserError(
-            "embeddings cannot be mirrored: set config.data.mirror_probability to 0"
-        )
 
 
 def check_folders(paths: Sequence[str]) -> None:

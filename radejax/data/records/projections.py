@@ -12,6 +12,7 @@ import itertools
 import json
 import os
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ import numpy as np
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import atomic_write
 from radejax.data.encoding import MAX_ERROR_DB, check_encoding
+from radejax.data.kradar.frame import Frame
 from radejax.data.records.arrays import MANIFEST, ArrayRecords
 from radejax.data.records.files import RecordFile
 from radejax.geometry.radar_grid import RadarGrid
@@ -160,6 +162,24 @@ class RecordSource(ArrayRecords):
 
     def __getitem__(self, index: Any) -> dict[str, Any]:
         return {"projection": self.read(int(index)), "frame": int(index)}
+
+
+def record_positions(records: RecordSource, frames: Sequence[Frame]) -> list[int]:
+    """Index of the record of every frame.
+
+    Raises:
+        UserError: Frames have no record; says how many and names the first.
+    """
+    index_of = records.index_of()
+    missing = [frame.key for frame in frames if frame.key not in index_of]
+    if missing:
+        skipped = records.manifest.skipped
+        reason = f" ({skipped[missing[0]]})" if missing[0] in skipped else ""
+        raise UserError(
+            f"{records.folder}: {len(missing)} of {len(frames)} frames have no record, "
+            f"the first is {missing[0]}{reason}: project the data set again"
+        )
+    return [index_of[frame.key] for frame in frames]
 
 
 def describe_grid(grid: RadarGrid) -> str:
