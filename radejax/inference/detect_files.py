@@ -95,17 +95,8 @@ def front_images(
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
     )
-<<<<<<< HEAD
-    options = detector.camera_options
-    cameras = frame_cameras(
-        frames,
-        detector.model.image_size,
-        detector.camera_options,
-    )
-=======
     options = dataclasses.replace(detector.camera_options, allow_missing=True)
     cameras = camera_inputs(frames, detector.model.image_size, options).cameras
->>>>>>> data
     return {
         path: (frame.camera_path, camera)
         for frame, camera in zip(frames, cameras, strict=True)

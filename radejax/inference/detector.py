@@ -22,7 +22,6 @@ from radejax.data.encoding import to_float
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
-<<<<<<< HEAD
 from radejax.inference.open import (
     LoadedModel,
     PathLike,
@@ -30,10 +29,6 @@ from radejax.inference.open import (
     load_torch,
     settings_of_config,
 )
-=======
-from radejax.inference import packed
-from radejax.training.step import map_grid
->>>>>>> data
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 

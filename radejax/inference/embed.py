@@ -121,6 +121,65 @@ def embed_dataset(
     return counts
 
 
+def open_embeddings(
+    folder: str | os.PathLike, model_config: Mapping[str, Any] | None = None
+) -> ArrayRecords:
+    """Features `[h, w, C]` of a folder, by record; `index_of()` maps frame keys to them.
+
+    Args:
+        folder: What `radejax embed` wrote.
+        model_config: `config.model` that they must fit, or None.
+
+    Raises:
+        FileNotFoundError: There is no such folder, or it is not finished.
+        DataError: The manifest is damaged or of another version.
+        UserError: They come from another backbone.
+    """
+    path = pathlib.Path(folder) / MANIFEST
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
+        )
+    try:
+        manifest = read_json(path)
+        version = manifest["format"], manifest["version"]
+        if version != (FORMAT, FORMAT_VERSION):
+            raise DataError(
+                f"{path}: {version[0]} {version[1]}, this radejax reads {FORMAT} "
+                f"{FORMAT_VERSION}"
+            )
+        files = [record_files.RecordFile.from_dict(f) for f in manifest["files"]]
+        shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
+    except DataError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: damaged manifest ({error!r})") from None
+    if model_config is not None:
+        wanted = _relevant(model_config["image"])
+        for name, value in wanted.items():
+            if manifest["image"].get(name) != value:
+                raise UserError(
+                    f"{folder}: embeddings of a backbone with {name} = "
+                    f"{manifest['image'].get(name)}, config.model.image.{name} is "
+                    f"{value}"
+                )
+    return ArrayRecords(folder, files, shape, dtype)
+
+
+def embeddings_sha256(folder: str | os.PathLike) -> str:
+    """Checksum of the weights that embeddings were made with."""
+    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
+
+
+def weights_sha256(params: Mapping[str, Any]) -> str:
+    """Checksum of a tree of weights: names, shapes and values."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf, np.float32).tobytes())
+    return digest.hexdigest()
+
+
 @dataclasses.dataclass
 class _Reader:
     """Batches of images of one size, read ahead by threads; the last is filled up."""

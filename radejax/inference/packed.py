@@ -28,12 +28,7 @@ from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.geometry.radar_grid import RadarGrid
-<<<<<<< HEAD
 from radejax.models import dinorade_config, radenet
-=======
-from radejax.interop import image_backbone as camera_inputs
-from radejax.models import radenet
->>>>>>> data
 from radejax.models.dinorade import IMAGE_BACKBONE as BACKBONE
 from radejax.models.vit import ViT
 

@@ -15,11 +15,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Batch, Detections
 from radejax.data.cameras import CameraInputs
 from radejax.data.frame_table import make_table
-<<<<<<< HEAD
 from radejax.data.kradar import Frame
-=======
-from radejax.data.kradar import KRadar
->>>>>>> data
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
@@ -116,11 +112,7 @@ def predict_dataset(
         records: Projections of the frames.
         frames: Which frames, in which order.
         batch_size: Frames at once; rounded up to a multiple of the devices.
-<<<<<<< HEAD
         images: Of these frames, for a radar-camera model, see `data.cameras`.
-=======
-        images: Of the frames, for models with a camera; see `camera_inputs`.
->>>>>>> data
         progress: Show a bar.
         should_stop: Asked before every batch.
 
@@ -143,11 +135,7 @@ def predict_dataset(
         images=images,
     )
     options = LoaderOptions(
-<<<<<<< HEAD
         batch_size=detector.rows(batch_size) if on_mesh else batch_size,
-=======
-        detector.rows(batch_size) if on_mesh else batch_size,
->>>>>>> data
         shuffle=False,
         num_epochs=1,
         drop_remainder=False,
@@ -170,7 +158,7 @@ def predict_dataset(
         disable=not (progress and processes.is_main()),
     ) as bar:
         pending = None
-        for batch in make_loader(table, options):
+        for batch in loader:
             if should_stop is not None and should_stop():
                 raise processes.Stopped
             started = start(batch)

@@ -5,9 +5,9 @@ import pathlib
 
 import numpy as np
 import pytest
+from radejax.runs.camera_share import average_by_group, write_camera_share
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.runs.camera_share import average_by_group, write_camera_share
 
 
 def test_bins_out_of_view_and_frames_without_image_do_not_count(
