@@ -26,7 +26,9 @@ import jax
 import numpy as np
 
 from radejax.cli import entry
+from radejax.inference.open import load
 from radejax.runs import experiment
+from radejax.runs.data import Sources
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
@@ -70,7 +72,7 @@ def run(folder, name, steps):
         make_config(steps),
         name=name,
         workdir=folder / name,
-        data=[str(folder / "data")],
+        sources=Sources(data=(str(folder / "data"),)),
     )
 
 
@@ -97,7 +99,7 @@ def stage(folder):
 def same(folder, a, b):
     """Names of what is not equal."""
     different = []
-    variables = [experiment.load_run(folder / run).variables for run in (a, b)]
+    variables = [load(folder / run).variables for run in (a, b)]
     equal = jax.tree.map(np.array_equal, *variables)
     different += ["parameters"] * (not all(jax.tree.leaves(equal)))
     losses = [

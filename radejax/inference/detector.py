@@ -334,7 +334,9 @@ class Detector:
             thresholds = {"score_threshold": score_threshold, "nms_iou": nms_iou}
             options = {**self.decode_options, **thresholds, "roi": roi}
             inputs = variables, frames, image, camera
-            found = detect(self.model, grid, options, *inputs, is_tesseract=is_tesseract)
+            found = detect(
+                self.model, grid, options, *inputs, is_tesseract=is_tesseract
+            )
             return found.replace(class_names=self.classes)
 
         return function

@@ -73,7 +73,9 @@ def load(
     elif any(map(_is_checkpoint, path.iterdir())):
         folder = path
     elif (path / "config.json").is_file():
-        raise FileNotFoundError(f"no checkpoints in {path}: the run has not trained yet")
+        raise FileNotFoundError(
+            f"no checkpoints in {path}: the run has not trained yet"
+        )
     else:
         raise FileNotFoundError(
             f"no model in {path}: expected {packed.CONFIG_FILE} and "

@@ -27,12 +27,15 @@ from radejax.data.cameras import (
 )
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import Frame, KRadar
+from radejax.data.kradar.folders import read_grid
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records import job
 from radejax.data.records.arrays import ArrayRecords
 from radejax.data.records.embeddings import open_embeddings
-from radejax.data.records.projections import RecordSource
+from radejax.data.records.projections import RecordSource, describe_grid
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.packed import LoadedModel
+from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import processes
 
@@ -306,6 +309,48 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     _log.info("%s", data.frames.summary().to_text())
     data.project()
     return data
+
+
+def data_of_run(
+    loaded: LoadedModel, workdir: pathlib.Path, other: Sources | None = None
+) -> tuple[ConfigDict, Data]:
+    """A run's data, or others in their place, and its config with their label version.
+
+    Nothing is projected.
+
+    Raises:
+        UserError: The run has no data and none are given; they are of another radar
+            grid, or without what a frozen image backbone makes of their images.
+        FileNotFoundError: A folder is not there.
+    """
+    config, own = loaded.config, loaded.run.get("data")
+    paths = own = own and DataPaths.from_dict(own)
+    if other is not None:
+        paths = other.paths(own)
+    if paths is None:
+        raise UserError(
+            f"{workdir}: trained on frames that were never written, there is no "
+            "split to evaluate on; give --data ROOT, or use `radejax detect`"
+        )
+    if other is not None:
+        if other.label_version is not None:
+            config = config.copy_and_resolve_references()
+            config.data.label_version = other.label_version
+        grid = read_grid(list(map(pathlib.Path, paths.roots)))
+        if grid != loaded.grid:
+            raise UserError(
+                f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
+                f"{workdir} was trained on {describe_grid(loaded.grid)}"
+            )
+        is_blind = models.has_camera(loaded.model) and (
+            IMAGE_BACKBONE not in loaded.variables["params"]
+        )
+        if is_blind and paths.embeddings is None:
+            raise UserError(
+                f"{workdir} is without the weights of its image backbone: give "
+                "--image_backbone FOLDER, or --embeddings FOLDER of these images"
+            )
+    return config, Data.open(config, loaded.model, paths, grid=loaded.grid)
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

@@ -17,16 +17,13 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
 from radejax.data.kradar import Frame, KRadar
-from radejax.data.kradar.folders import read_grid
-from radejax.data.records.projections import describe_grid
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.report import Report, write_report
-from radejax.inference.open import LoadedModel, PathLike, Step, load
+from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs import pictures
-from radejax.runs.data import Data, DataPaths, Sources
+from radejax.runs.data import Data, Sources, data_of_run
 from radejax.training import processes
 
 _log = logging.getLogger(__name__)
@@ -178,48 +175,6 @@ def evaluate_run(
         num_pictures=num_pictures,
         step=loaded.step,
     )
-
-
-def data_of_run(
-    loaded: LoadedModel, workdir: pathlib.Path, other: Sources | None = None
-) -> tuple[ConfigDict, Data]:
-    """A run's data, or others in their place, and its config with their label version.
-
-    Nothing is projected.
-
-    Raises:
-        UserError: The run has no data and none are given; they are of another radar
-            grid, or without what a frozen image backbone makes of their images.
-        FileNotFoundError: A folder is not there.
-    """
-    config, own = loaded.config, loaded.run.get("data")
-    paths = own = own and DataPaths.from_dict(own)
-    if other is not None:
-        paths = other.paths(own)
-    if paths is None:
-        raise UserError(
-            f"{workdir}: trained on frames that were never written, there is no "
-            "split to evaluate on; give --data ROOT, or use `radejax detect`"
-        )
-    if other is not None:
-        if other.label_version is not None:
-            config = config.copy_and_resolve_references()
-            config.data.label_version = other.label_version
-        grid = read_grid(list(map(pathlib.Path, paths.roots)))
-        if grid != loaded.grid:
-            raise UserError(
-                f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
-                f"{workdir} was trained on {describe_grid(loaded.grid)}"
-            )
-        is_blind = models.has_camera(loaded.model) and (
-            IMAGE_BACKBONE not in loaded.variables["params"]
-        )
-        if is_blind and paths.embeddings is None:
-            raise UserError(
-                f"{workdir} is without the weights of its image backbone: give "
-                "--image_backbone FOLDER, or --embeddings FOLDER of these images"
-            )
-    return config, Data.open(config, loaded.model, paths, grid=loaded.grid)
 
 
 def source_of(

@@ -73,7 +73,9 @@ def run(
         data = open_data(config, model, sources)
         result = train(model, data, folder, config, init_from)
         if not result.finished:
-            _log.info("stopped at step %d; run the same command to continue", result.step)
+            _log.info(
+                "stopped at step %d; run the same command to continue", result.step
+            )
             return folder
         if len(data.split("test")):
             evaluate(config, model, result.state.eval_variables, data, folder)
@@ -103,7 +105,9 @@ def train(
     """
     frames = data.split("train")
     if not len(frames):
-        raise UserError(f"no frames of the train split in {', '.join(data.paths.roots)}")
+        raise UserError(
+            f"no frames of the train split in {', '.join(data.paths.roots)}"
+        )
     sharding.check_batch_size(
         config.train.batch_size,
         sharding.make_mesh(),

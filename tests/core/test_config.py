@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, config_name, parse_words
 from radejax.core.errors import UserError
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -82,3 +82,8 @@ def test_words_that_do_not_go_together_are_refused() -> None:
         _get("radenet", "big")
     assert parse_words("b, a", ("a",), ("b", "c")) == ["a", "b"]
     assert parse_words(None, ("a",)) == [None]
+
+
+def test_names_of_runs() -> None:
+    assert config_name("configs/quickstart.py") == "quickstart"
+    assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"

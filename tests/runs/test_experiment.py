@@ -10,21 +10,24 @@ import pytest
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.inference.embed import weights_sha256
+from radejax.interop.image_backbone import weights_sha256
 from radejax.runs import experiment
-from radejax.runs.data import DataPaths
-from radejax.runs.workdir import lock_workdir
-
-
-def test_names_of_runs() -> None:
-    assert experiment.config_name("configs/quickstart.py") == "quickstart"
-    assert experiment.config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
+from radejax.runs.data import Sources
+from radejax.runs.workdir import claimed
+from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.training import loop, sharding
 
 
 def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:
-    with lock_workdir(tmp_path), pytest.raises(UserError, match="another training"):
-        experiment.run(base_config(), name="x", workdir=tmp_path, data=[str(tmp_path)])
-    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+    folder, config = tmp_path / "run", base_config()
+    with (
+        claimed(folder, config),
+        pytest.raises(UserError, match="another training"),
+    ):
+        experiment.run(
+            config, name="x", workdir=folder, sources=Sources(data=(str(tmp_path),))
+        )
+    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "lock"]
 
 
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
@@ -38,12 +41,19 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
         said_before.append(caplog.text)
         return SimpleNamespace(finished=True, step=1)
 
-    monkeypatch.setattr(experiment, "prepare_data", lambda *_, **__: paths)
-    monkeypatch.setattr(DataPaths, "open", lambda *_, **__: [])
-    monkeypatch.setattr(experiment, "train", train)
-    paths = DataPaths(("/data",), None, "/records")
-    experiment.run(base_config(), name="x", workdir=tmp_path / "run")
-    assert "no frames of the test split in /data" in said_before[0]
+    simulation = default_config()
+    simulation.update(train_sequences=1, test_sequences=0, frames_per_sequence=2)
+    simulation["output"] = "projection"
+    root = simulate_dataset(simulation, tmp_path / "data", progress=False)
+    config = base_config()
+    config.train.batch_size = 2
+    monkeypatch.setattr(loop, "train", train)
+    mesh = sharding.make_mesh(1)
+    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    experiment.run(
+        config, name="x", workdir=tmp_path / "run", sources=Sources(data=(str(root),))
+    )
+    assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
 
 

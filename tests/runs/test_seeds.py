@@ -10,7 +10,8 @@ from ml_collections import config_flags
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.runs import experiment, seeds
+from radejax.runs import seeds
+from radejax.runs.data import Sources
 
 HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
 
@@ -20,12 +21,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 ) -> None:
     aps = {0: 50.0, 1: 53.0, 2: 59.0}
     seen = []
-    whole = experiment.run
 
     def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
-        if config.seeds:
-            return whole(config, workdir=workdir, **options)
-        seen.append((config.seed, pathlib.Path(workdir).name, options["data"]))
+        assert not config.seeds
+        seen.append((config.seed, pathlib.Path(workdir).name, options["sources"]))
         folder = pathlib.Path(workdir) / "evaluation"
         folder.mkdir(parents=True)
         (folder / "metrics.csv").write_text(
@@ -36,11 +35,12 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         )
         return pathlib.Path(workdir)
 
-    monkeypatch.setattr(experiment, "run", run)
+    monkeypatch.setattr(seeds, "run", run)
     config = base_config()
     config.seeds = (0, 1, 2)
-    experiment.run(config, name="x", workdir=tmp_path / "runs", data=["d"])
-    assert seen == [(i, f"seed{i}", ["d"]) for i in range(3)]
+    sources = Sources(data=("d",))
+    seeds.run_seeds(config, name="x", workdir=tmp_path / "runs", sources=sources)
+    assert seen == [(i, f"seed{i}", sources) for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
     assert rows[0]["mean"] == pytest.approx(54.0)

@@ -14,8 +14,8 @@ from radejax.core.structures import Batch
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.open import starting_weights
 from radejax.interop import radenet_torch
-from radejax.runs import experiment
 from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step, map_grid
@@ -154,7 +154,7 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
     state = radenet_torch.save(tiny.model, official)
     torch.save({k: torch.tensor(v) for k, v in state.items()}, workdir / "best.pth")
-    variables = experiment.initial_variables(str(workdir / "best.pth"), config)
+    variables, _ = starting_weights(tiny.model, init_from=workdir / "best.pth")
     result = loop.train(
         tiny.model,
         variables,
