@@ -23,9 +23,9 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.records.projections import RecordSource
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.files.load import Source, load
 from radejax.evaluation.files.predictions import frame_keys
 from radejax.evaluation.report import bootstrap
-from radejax.evaluation.report.compare import Source, load
 from radejax.evaluation.report.measure import repair_sizes
 from radejax.runs import camera_share
 from radejax.runs.data import OtherData

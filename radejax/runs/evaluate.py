@@ -19,7 +19,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import read_grid
 from radejax.data.kradar.frame import Frame
 from radejax.data.records.projections import RecordSource, describe_grid
-from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.report import Report, write_report
 from radejax.geometry.calibration import CameraCalibration

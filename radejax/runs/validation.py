@@ -14,7 +14,7 @@ import numpy as np
 from radejax.core.errors import UserError
 from radejax.data.records.projections import RecordSource
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
 from radejax.inference.predict import Predictor, predict_dataset
 from radejax.interop import image_backbone
