@@ -15,7 +15,8 @@ import numpy as np
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
-from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import SPACES
 
 LEVEL = 0.95
