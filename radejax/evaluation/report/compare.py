@@ -77,7 +77,7 @@ def compare_files(
             "runs": list(runs),
             "resamples": resamples,
             "options": options.to_dict(),
-            "rows": [row.to_dict() for row in rows],
+            "rows": [dataclasses.asdict(row) for row in rows],
         }
         out_dir = pathlib.Path(out_dir)
         out_dir.mkdir(parents=True, exist_ok=True)
