@@ -176,7 +176,7 @@ def compare(paths: list[str]) -> None:
 
 
 def _source() -> object:
-    from radejax.evaluation.report.compare import Source
+    from radejax.evaluation.files.load import Source
 
     return Source(
         data=tuple(_DATA.value),

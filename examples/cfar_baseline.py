@@ -21,7 +21,7 @@ from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
 from radejax.data.records.projections import RecordSource
-from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.report import Report, write_report
 from radejax.runs.evaluate import record_positions
 from radejax.simulation.baseline import (

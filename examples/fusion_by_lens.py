@@ -22,9 +22,9 @@ from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.files.load import Source, load
 from radejax.evaluation.files.predictions import frame_keys
 from radejax.evaluation.report import bootstrap
-from radejax.evaluation.report.compare import Source, load
 from radejax.evaluation.report.measure import repair_sizes
 from radejax.inference.open import load as open_model
 from radejax.runs.data import Sources, data_of_run

@@ -166,7 +166,8 @@ def evaluate(
             workdir, step=step, split=split, out=out, image_backbone=image_backbone
         )
     else:
-        from radejax.evaluation.report.compare import Source, evaluate_files
+        from radejax.evaluation.files.load import Source
+        from radejax.evaluation.report.compare import evaluate_files
         from radejax.evaluation.report.measure import Options
 
         out = out or predictions.with_name(f"{predictions.stem}_evaluation")

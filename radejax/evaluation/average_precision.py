@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from radejax.core.structures import CLASSES
-from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
-from radejax.evaluation.protocols import PROTOCOLS, RECOMMENDED
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT, PROTOCOLS, RECOMMENDED
 from radejax.evaluation.result import SPACES, Result, mean_ap
 
 __all__ = [

@@ -19,12 +19,13 @@ References:
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.core.structures import Detections
 from radejax.evaluation.files.predictions import Columns
 
 CLASS_KEYS = {
@@ -101,19 +102,20 @@ def write_kitti(
 
 
 def prediction_texts(
-    predictions: Mapping[str, np.ndarray], num_frames: int
+    detections: Detections, classes: Sequence[str] | None = None
 ) -> list[str]:
-    """Content of the prediction files of frames 0 to `num_frames - 1`.
+    """One text a frame as K-Radar's tools write predictions, without a final newline.
 
     Args:
-        predictions: Columns frame, box, cls and score; every row is written.
-        num_frames: Frames without predictions get the line "dummy".
+        detections: Of a batch; a frame without any gets the line "dummy".
+        classes: Names of the class indices; the detections' own if None.
 
     Raises:
-        UserError: A class K-Radar has no key for.
+        UserError: K-Radar has no key for a class.
     """
-    score = np.asarray(predictions["score"], np.float64)
-    found = _lines(predictions, np.arange(score.size), score)
+    columns = detections.to_columns(classes)
+    found = _lines(columns, np.arange(columns["score"].size), columns["score"])
+    num_frames = detections.is_valid.shape[0]
     return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
 
 
@@ -178,11 +180,6 @@ def read_kitti(
         _columns(found, scored=True),
         _frame_table(numbers, _part(root, "desc")),
     )
-
-
-def is_kitti(path: str | pathlib.Path) -> bool:
-    """Whether a path is a folder that `read_kitti` should try."""
-    return pathlib.Path(path).is_dir()
 
 
 def _find_root(folder: pathlib.Path, condition: str) -> pathlib.Path:

@@ -11,7 +11,7 @@ import csv
 import io
 import json
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,31 +21,6 @@ from radejax.core.errors import DataError, UserError
 from radejax.evaluation.columns import BOX_FIELDS
 
 Columns = dict[str, np.ndarray]
-
-
-def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:
-    """Ground truth and frame table of a data set such as `radejax.data.kradar.dataset.KRadar`.
-
-    Args:
-        frames: Objects with sequence, name, weather, environment, time, boxes `[N, 7]`
-            (radar frame) and classes `[N]` (names).
-
-    Returns:
-        Ground-truth columns and frame columns; the frame id is the position.
-    """
-    frames = list(frames)
-    counts = [len(frame.boxes) for frame in frames]
-    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
-    cls = [str(name) for frame in frames for name in frame.classes]
-    ground_truth = {
-        "frame": np.repeat(np.arange(len(frames)), counts),
-        "box": np.concatenate(box) if box else np.zeros((0, 7)),
-        "cls": np.array(cls, dtype=str),
-    }
-    table = {"frame": np.arange(len(frames))}
-    for column in ("sequence", "name", "weather", "environment", "time"):
-        table[column] = np.array([getattr(frame, column) for frame in frames])
-    return ground_truth, table
 
 
 def frame_keys(frames: Mapping[str, np.ndarray]) -> list[str]:

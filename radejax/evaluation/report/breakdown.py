@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -61,8 +63,8 @@ def slice_numbers(
         match: `[M]` from `matched_objects`.
         operating_score: Precision and recall are of predictions above this score.
     """
-    order = np.lexsort((data.pred.row, -data.pred.score))
-    order = order[(data.pred.cls[order] == cls) & pred_mask[order]]
+    order = data.by_score[cls]
+    order = order[pred_mask[order]]
     score, is_tp = data.pred.score[order], match[order] >= 0
     num_gt = int((gt_mask & (data.gt.cls == cls)).sum())
     curve = protocols.pooled_curve(
@@ -76,8 +78,8 @@ def slice_numbers(
     num_det, found = int(above.sum()), int(is_tp[above].sum())
     return Slice(
         curve.ap,
-        found / num_det if num_det else float("nan"),
-        found / num_gt if num_gt else float("nan"),
+        found / num_det if num_det else math.nan,
+        found / num_gt if num_gt else math.nan,
         num_gt,
         num_det,
     )
@@ -101,38 +103,41 @@ def by_distance(
     far = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
     if far_gt.size:
         far = np.where(match >= 0, far_gt[match], far)
-    result = {}
+    bands = {}
     for low, high in itertools.pairwise(edges_m):
-        in_gt, in_pred = ((d >= low) & (d < high) for d in (far_gt, far))
         band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
-        for cls, name in enumerate(data.classes):
-            result[band, name] = slice_numbers(
-                data, cls, in_gt, in_pred, match, operating_score
-            )
-    return result
+        bands[band] = [(d >= low) & (d < high) for d in (far_gt, far)]
+    return _by_slice(data, bands, match, operating_score)
 
 
 def by_condition(
     data: EvaluationSet,
-    conditions: dict[str, np.ndarray],
+    conditions: Mapping[str, np.ndarray],
     space: str,
     iou: float,
     *,
     operating_score: float = 0.3,
 ) -> dict[tuple[str, str], Slice]:
     """Numbers by (condition, class); a condition is a `[F]` mask of frames."""
+    masks = {
+        name: (mask[data.gt.frame], mask[data.pred.frame])
+        for name, mask in conditions.items()
+    }
     match = matched_objects(data, space, iou)
+    return _by_slice(data, masks, match, operating_score)
+
+
+def _by_slice(
+    data: EvaluationSet,
+    masks: Mapping[str, Sequence[np.ndarray]],
+    match: np.ndarray,
+    operating_score: float,
+) -> dict[tuple[str, str], Slice]:
+    """Numbers by (slice, class); a slice is `[N]` objects and `[M]` predictions."""
     return {
-        (condition, name): slice_numbers(
-            data,
-            cls,
-            mask[data.gt.frame],
-            mask[data.pred.frame],
-            match,
-            operating_score,
-        )
-        for condition, mask in conditions.items()
-        for cls, name in enumerate(data.classes)
+        (name, cls_name): slice_numbers(data, cls, *chosen, match, operating_score)
+        for name, chosen in masks.items()
+        for cls, cls_name in enumerate(data.classes)
     }
 
 
@@ -162,7 +167,7 @@ def calibration(
             "count": count.tolist(),
             "score": score.tolist(),
             "precision": precision.tolist(),
-            "error": error / total if total else float("nan"),
+            "error": error / total if total else math.nan,
         }
     return result
 
@@ -196,18 +201,16 @@ def box_errors(
     result = {}
     for cls, name in enumerate(data.classes):
         mine = data.pred.cls[rows] == cls
-        count = int(mine.sum())
-        numbers: dict[str, float] = {"count": count}
+        numbers = result[name] = {"count": int(mine.sum())}
         for what, values in errors.items():
-            numbers[f"{what}_mean"] = float(values[mine].mean()) if count else np.nan
-            numbers[f"{what}_median"] = (
-                float(np.median(values[mine])) if count else np.nan
-            )
-        numbers["reversed"] = (
-            float((turn[mine] > np.pi / 2).mean()) if count else np.nan
-        )
-        result[name] = numbers
+            numbers[f"{what}_mean"] = _or_nan(np.mean, values[mine])
+            numbers[f"{what}_median"] = _or_nan(np.median, values[mine])
+        numbers["reversed"] = _or_nan(np.mean, turn[mine] > np.pi / 2)
     return result
+
+
+def _or_nan(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    return float(statistic(values)) if values.size else math.nan
 
 
 def confusion(
@@ -225,8 +228,8 @@ def confusion(
     first, second = overlap.candidate_pairs(
         pred.frame, data.gt.frame, pred.box, data.gt.box
     )
-    iou_pairs = overlap.pair_iou(pred.box[first], data.gt.box[second])
-    values = iou_pairs[SPACES.index(space)]
+    ious = overlap.pair_iou(pred.box[first], data.gt.box[second])
+    values = ious[SPACES.index(space)]
     match = matching.match_free(
         first, second, values, pred.score, pred.frame, len(data.gt), iou
     )
@@ -258,19 +261,19 @@ def worst_frames(
     match = matched_objects(data, space, iou)
     above = data.pred.score > operating_score
     num = data.frame.size
-    objects = np.bincount(data.gt.frame, minlength=num)
     found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)
     false = np.bincount(data.pred.frame[above & (match < 0)], minlength=num)
-    missed = objects - found
+    missed = data.gt_count.sum(axis=1) - found
     order = np.lexsort((np.arange(num), -missed, -(missed + false)))[:count]
+    columns = {
+        "index": np.arange(num),
+        "frame": data.frame,
+        "missed": missed,
+        "false": false,
+        "found": found,
+    }
     return [
-        {
-            "index": int(i),
-            "frame": int(data.frame[i]),
-            "missed": int(missed[i]),
-            "false": int(false[i]),
-            "found": int(found[i]),
-        }
+        {name: int(column[i]) for name, column in columns.items()}
         for i in order
         if missed[i] + false[i] > 0
     ]

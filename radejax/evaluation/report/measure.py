@@ -12,7 +12,8 @@ import numpy as np
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation import protocols
-from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import Result, mean_ap
 
 ORDER = {
