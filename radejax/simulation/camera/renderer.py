@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
 from radejax.geometry.calibration import CameraCalibration
-from radejax.simulation.camera import lens, scenery, shapes
+from radejax.simulation.camera import lens, panels, shapes
 from radejax.simulation.radar.scattering import is_blocked
 from radejax.simulation.world.scene import SceneFrame, Sequence
 
@@ -192,7 +192,7 @@ class CameraRenderer:
         return np.asarray(lens.cover_lens(canvas, level, is_snow, brightness, block))
 
     def _polygons(self, frame, calibration) -> list[shapes.Polygon]:
-        panels = scenery.make_panels(
+        roadside = panels.make_panels(
             frame,
             shapes.camera_position(calibration),
             self.sequence.ground_m,
@@ -204,7 +204,7 @@ class CameraRenderer:
             self.colors[frame.track],
             calibration,
             self.light,
-            panels=panels,
+            panels=roadside,
         )
 
     def _lamps(self, frame, calibration, draw) -> None:

@@ -3,7 +3,7 @@
 A `Sequence` is a list of tracks (boxes that keep their identity, moving or parked) and
 of static reflectors in a fixed world frame, and the path of the ego vehicle through
 it; `Sequence.frame` gives what the sensors see at one instant, in the ego frame.
-Procedural worlds (`traffic`) and real labels (`real_scenes`) both end here.
+Procedural worlds (`traffic`) and real labels (`replay`) both end here.
 """
 
 from __future__ import annotations

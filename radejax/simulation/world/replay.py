@@ -13,7 +13,13 @@ import dataclasses
 import numpy as np
 
 from radejax.data.kradar import Frame
-from radejax.simulation.world import traffic
+from radejax.simulation.world.environments import (
+    ENVIRONMENTS,
+    GROUND_M,
+    SIGHT_M,
+    Environment,
+)
+from radejax.simulation.world.roadside import make_surroundings
 from radejax.simulation.world.scene import (
     FRAME_PERIOD_S,
     Road,
@@ -21,7 +27,6 @@ from radejax.simulation.world.scene import (
     Tracks,
     class_index,
 )
-from radejax.simulation.world.surroundings import make_surroundings
 
 MAX_SPEED_MPS = 60.0
 """Faster relative motion is taken for a swap of identities."""
@@ -47,7 +52,7 @@ def make_real_sequence(
     clock = np.array([f.header.timestamp_s for f in frames])
     relative = relative_velocity(tracks, clock)
     environment = frames[0].environment
-    law = traffic.ENVIRONMENTS.get(environment, traffic.ENVIRONMENTS["urban"])
+    law = ENVIRONMENTS.get(environment, ENVIRONMENTS["urban"])
     speed = infer_ego_speed(tracks, relative, law.speed_mps)
     periods = np.diff(clock, append=clock[-1] + FRAME_PERIOD_S).clip(0.02, 1.0)
     along = np.concatenate([[0.0], np.cumsum(speed[:-1] * periods[:-1])])
@@ -56,7 +61,7 @@ def make_real_sequence(
     ground = _ground_height(tracks)
     edges = _road_edges(tracks, law)
     reflectors, mirrors = make_surroundings(
-        law, Road(), along[-1] + traffic.SIGHT_M, edges, rng, ground
+        law, Road(), along[-1] + SIGHT_M, edges, rng, ground
     )
     world = tracks.position_m + pose[:, None] * (1.0, 1.0, 0.0)
     lanes = np.arange(-law.lanes_right - 0.5, law.lanes_left + 1.0)
@@ -185,11 +190,11 @@ def _ground_height(tracks: Tracks) -> float:
         np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1]) < 30.0
     )
     if not near.any():
-        return traffic.GROUND_M
+        return GROUND_M
     return float(np.clip(np.median(bottom[near]), -1.4, -0.4))
 
 
-def _road_edges(tracks: Tracks, law: traffic.Environment) -> tuple[float, float]:
+def _road_edges(tracks: Tracks, law: Environment) -> tuple[float, float]:
     """Lateral bounds of the labelled objects near the road, right and left."""
     left = tracks.position_m[..., 1][tracks.is_present]
     left = left[np.abs(left) < 18.0]

@@ -1,0 +1,84 @@
+"""Static surroundings beside the road: where they stand, how strongly they scatter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from radejax.simulation.world.environments import Environment
+from radejax.simulation.world.scene import REFLECTOR_KINDS, Reflectors, Road
+
+
+def make_surroundings(
+    law: Environment,
+    road: Road,
+    length_m: float,
+    edges: tuple[float, float],
+    rng: np.random.Generator,
+    ground_m: float,
+) -> tuple[Reflectors, tuple[float, ...]]:
+    """Static scatterers along the road: ground, rails, walls, trees and poles.
+
+    Args:
+        law: Road type.
+        road: Centerline.
+        length_m: How far they reach.
+        edges: Right and left edge, metres left of the centerline.
+        rng: Source of everything random.
+        ground_m: Height of the ground in the radar's frame.
+
+    Returns:
+        The scatterers in the world frame, and the lateral positions of the rails and
+        walls, which mirror objects.
+    """
+    parts: list[tuple] = []  # (kind, along, left, height over ground, dBsm, normal)
+    mirrors: list[float] = []
+    right, left = edges
+    count = int(length_m * 1.2)
+    parts.append(
+        ("ground", rng.uniform(0, length_m, count),
+         rng.uniform(right - 15.0, left + 15.0, count), np.zeros(count),
+         rng.normal(-24.0, 5.0, count), None)
+    )  # fmt: skip
+    for side, edge in ((-1.0, right), (1.0, left)):
+        if rng.random() < law.rails:
+            along = np.arange(0.0, length_m, 2.0)  # posts
+            mirrors.append(edge + side * 0.6)
+            parts.append(
+                ("rail", along, mirrors[-1] + 0 * along, 0.6 + 0 * along,
+                 rng.normal(-9.0, 3.0, along.size), -side)
+            )  # fmt: skip
+        if rng.random() < law.walls:
+            count = int(length_m * 0.8)
+            along = rng.uniform(0.0, length_m, count)
+            along = along[np.sin(along / rng.uniform(6.0, 14.0)) > -0.6]  # gaps
+            mirrors.append(edge + side * law.wall_m)
+            parts.append(
+                ("wall", along, mirrors[-1] + 0 * along,
+                 rng.uniform(0.2, 6.0, along.size), rng.normal(-7.0, 4.0, along.size),
+                 -side)
+            )  # fmt: skip
+        count = rng.poisson(law.trees_per_100m * length_m / 100.0)
+        kind = "tree" if rng.random() < 0.5 else "pole"
+        parts.append(
+            (kind, rng.uniform(0.0, length_m, count),
+             edge + side * rng.uniform(0.5, 6.0, count), rng.uniform(0.3, 3.0, count),
+             rng.normal(-5.0, 4.0, count), None)
+        )  # fmt: skip
+    return _to_world(parts, road, ground_m), tuple(mirrors)
+
+
+def _to_world(parts: list[tuple], road: Road, ground_m: float) -> Reflectors:
+    kind, position, rcs, normal = [], [], [], []
+    for name, along, left, height, dbsm, side in parts:
+        x, y, heading = road.position(along, left)
+        position.append(np.stack([x, y, ground_m + height], 1))
+        rcs.append(dbsm)
+        kind.append(np.full(len(x), REFLECTOR_KINDS.index(name)))
+        facing = heading + (0.0 if side is None else side * np.pi / 2.0)
+        normal.append(np.full(len(x), np.nan) if side is None else facing)
+    return Reflectors(
+        np.concatenate(position),
+        np.concatenate(rcs),
+        np.concatenate(normal),
+        np.concatenate(kind),
+    )
