@@ -10,11 +10,10 @@ from radejax.simulation.radar.scattering import (
     OCCLUDED_DB,
     FrameScattering,
     face_gain,
-    is_blocked,
     received_power,
 )
 from radejax.simulation.radar.tensor import RadarParameters
-from radejax.simulation.world.scene import SceneFrame, Sequence
+from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked
 
 
 def scatter_surroundings(
@@ -76,8 +75,7 @@ def scatter_ghosts(
     near = np.flatnonzero(
         np.hypot(objects.position_m[:, 0], objects.position_m[:, 1]) < _MIRROR_REACH_M
     )
-    for mirror in sequence.mirrors_m:
-        plane = mirror - sequence.ego_left_m
+    for plane in sequence.mirrors_m:
         position = objects.position_m[near].copy()
         inside = np.sign(plane) * (plane - position[:, 1]) > 0  # on our side of it
         chosen = near[inside]
@@ -92,7 +90,7 @@ def scatter_ghosts(
                 position,
                 velocity,
                 objects.power[chosen] * loss,
-                objects.phase_rad[chosen] + mirror,
+                objects.phase_rad[chosen] + plane,
                 np.full(len(chosen), -1),
             )
         )

@@ -30,55 +30,41 @@ def make_surroundings(
         The scatterers in the world frame, and the lateral positions of the rails and
         walls, which mirror objects.
     """
-    parts: list[tuple] = []  # (kind, along, left, height over ground, dBsm, normal)
+    parts: list[tuple] = []
     mirrors: list[float] = []
+
+    def add(kind, along, left, height, dbsm, side=None) -> None:
+        """Reflectors over the road; `side` is where their normal points, if anywhere."""
+        x, y, heading = road.position(along, left)
+        turn = np.nan if side is None else side * np.pi / 2.0
+        kinds = np.full(len(x), REFLECTOR_KINDS.index(kind))
+        position = np.stack([x, y, ground_m + height], 1)
+        parts.append((position, dbsm, heading + turn, kinds))
+
     right, left = edges
     count = int(length_m * 1.2)
-    parts.append(
-        ("ground", rng.uniform(0, length_m, count),
-         rng.uniform(right - 15.0, left + 15.0, count), np.zeros(count),
-         rng.normal(-24.0, 5.0, count), None)
+    add(
+        "ground", rng.uniform(0, length_m, count),
+        rng.uniform(right - 15.0, left + 15.0, count), np.zeros(count),
+        rng.normal(-24.0, 5.0, count),
     )  # fmt: skip
     for side, edge in ((-1.0, right), (1.0, left)):
         if rng.random() < law.rails:
             along = np.arange(0.0, length_m, 2.0)  # posts
             mirrors.append(edge + side * 0.6)
-            parts.append(
-                ("rail", along, mirrors[-1] + 0 * along, 0.6 + 0 * along,
-                 rng.normal(-9.0, 3.0, along.size), -side)
-            )  # fmt: skip
+            dbsm = rng.normal(-9.0, 3.0, along.size)
+            add("rail", along, mirrors[-1], np.full(along.size, 0.6), dbsm, -side)
         if rng.random() < law.walls:
-            count = int(length_m * 0.8)
-            along = rng.uniform(0.0, length_m, count)
+            along = rng.uniform(0.0, length_m, int(length_m * 0.8))
             along = along[np.sin(along / rng.uniform(6.0, 14.0)) > -0.6]  # gaps
             mirrors.append(edge + side * law.wall_m)
-            parts.append(
-                ("wall", along, mirrors[-1] + 0 * along,
-                 rng.uniform(0.2, 6.0, along.size), rng.normal(-7.0, 4.0, along.size),
-                 -side)
-            )  # fmt: skip
+            height = rng.uniform(0.2, 6.0, along.size)
+            dbsm = rng.normal(-7.0, 4.0, along.size)
+            add("wall", along, mirrors[-1], height, dbsm, -side)
         count = rng.poisson(law.trees_per_100m * length_m / 100.0)
-        kind = "tree" if rng.random() < 0.5 else "pole"
-        parts.append(
-            (kind, rng.uniform(0.0, length_m, count),
-             edge + side * rng.uniform(0.5, 6.0, count), rng.uniform(0.3, 3.0, count),
-             rng.normal(-5.0, 4.0, count), None)
+        add(
+            "tree" if rng.random() < 0.5 else "pole", rng.uniform(0.0, length_m, count),
+            edge + side * rng.uniform(0.5, 6.0, count), rng.uniform(0.3, 3.0, count),
+            rng.normal(-5.0, 4.0, count),
         )  # fmt: skip
-    return _to_world(parts, road, ground_m), tuple(mirrors)
-
-
-def _to_world(parts: list[tuple], road: Road, ground_m: float) -> Reflectors:
-    kind, position, rcs, normal = [], [], [], []
-    for name, along, left, height, dbsm, side in parts:
-        x, y, heading = road.position(along, left)
-        position.append(np.stack([x, y, ground_m + height], 1))
-        rcs.append(dbsm)
-        kind.append(np.full(len(x), REFLECTOR_KINDS.index(name)))
-        facing = heading + (0.0 if side is None else side * np.pi / 2.0)
-        normal.append(np.full(len(x), np.nan) if side is None else facing)
-    return Reflectors(
-        np.concatenate(position),
-        np.concatenate(rcs),
-        np.concatenate(normal),
-        np.concatenate(kind),
-    )
+    return Reflectors(*map(np.concatenate, zip(*parts, strict=True))), tuple(mirrors)

@@ -54,7 +54,6 @@ PARAMETERS = RadarParameters(pattern_exponent=0.0)
 class TestGhosts:
     class Wall:
         mirrors_m = (6.0,)
-        ego_left_m = 0.0
 
     def test_mirror_image_position_velocity_and_loss(self):
         part = scattering.FrameScattering(
@@ -75,7 +74,6 @@ class TestGhosts:
     def test_without_walls_no_ghosts(self):
         class Open:
             mirrors_m = ()
-            ego_left_m = 0.0
 
         part = scattering.FrameScattering(
             np.ones((1, 3)), np.ones((1, 2)), np.ones(1), np.zeros(1), np.zeros(1, int)

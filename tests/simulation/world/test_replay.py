@@ -94,7 +94,7 @@ class TestScene:
         assert found[9] == pytest.approx(0.0, abs=1e-4)
 
     def test_ego_speed_is_that_at_which_parked_cars_stand(self, source):
-        speed = source.make(3).ego_velocity_mps[:, 0]
+        speed = source.make(3).ego_speed_mps
         np.testing.assert_allclose(speed, 10.0, atol=1e-4)
 
     def test_ids_of_two_classes_are_two_tracks_and_no_id_is_one_frame(self, source):
@@ -165,7 +165,7 @@ def test_all_of_kradar_makes_scenes(shared):
     assert len(source.numbers) == 58
     for number in source.numbers:
         scene = source.make(number)
-        speed = scene.ego_velocity_mps[:, 0]
+        speed = scene.ego_speed_mps
         assert (speed >= 0).all()
         assert (speed <= 40).all()
         assert -1.6 < scene.ground_m < 0.3
