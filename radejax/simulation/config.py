@@ -12,7 +12,7 @@ from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.radar.weather import WEATHERS
-from radejax.simulation.world.traffic import ENVIRONMENTS
+from radejax.simulation.world.environments import ENVIRONMENTS
 
 SIMULATOR_VERSION = 3
 """Raised whenever the same config gives other files than before."""

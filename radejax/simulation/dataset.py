@@ -23,8 +23,8 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import write as kradar_write
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source
 from radejax.simulation.simulator import SequenceSimulator
-from radejax.simulation.sources import FrameSpec, SceneSource, make_source
 
 __all__ = ["default_config", "simulate_dataset"]
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from radejax.data.kradar.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar import scattering, tensor, two_ray, weather
-from radejax.simulation.world import surroundings
+from radejax.simulation.radar import clutter, scattering, tensor, two_ray, weather
 from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame, Sequence
 
 MIN_SNR_DB = 10.0
@@ -73,10 +72,10 @@ class SequenceSimulator:
         sequence, parameters = self.sequence, self.parameters
         frame = sequence.frame(index) if frame is None else frame
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
-        static = surroundings.scatter_surroundings(
+        static = clutter.scatter_surroundings(
             frame, sequence, self._static_phase, parameters
         )
-        ghosts = surroundings.scatter_ghosts(objects, frame, sequence)
+        ghosts = clutter.scatter_ghosts(objects, frame, sequence)
         is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
         parts = [
             self._on_the_way(part, mirrored)

@@ -14,9 +14,8 @@ from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
 from radejax.geometry.calibration import CameraCalibration
-from radejax.simulation.camera import lens, scenery, shapes
-from radejax.simulation.radar.scattering import is_blocked
-from radejax.simulation.world.scene import SceneFrame, Sequence
+from radejax.simulation.camera import lens, panels, shapes
+from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked
 
 # K-Radar's values for the pair (see the calibration files of the data set).
 _INTRINSICS = (567.7208, 577.2137, 628.7208, 369.3069)
@@ -192,7 +191,7 @@ class CameraRenderer:
         return np.asarray(lens.cover_lens(canvas, level, is_snow, brightness, block))
 
     def _polygons(self, frame, calibration) -> list[shapes.Polygon]:
-        panels = scenery.make_panels(
+        roadside = panels.make_panels(
             frame,
             shapes.camera_position(calibration),
             self.sequence.ground_m,
@@ -204,7 +203,7 @@ class CameraRenderer:
             self.colors[frame.track],
             calibration,
             self.light,
-            panels=panels,
+            panels=roadside,
         )
 
     def _lamps(self, frame, calibration, draw) -> None:
@@ -246,7 +245,7 @@ class CameraRenderer:
         x, y, depth = ground.x_m, ground.y_m, ground.depth_m
         verge = _VERGE.get(sequence.environment, _GRASS)
         verge = verge + self.air.white * (_SNOW - verge)
-        left = y - 0.5 * sequence.road.curvature_per_m * x * x + sequence.ego_left_m
+        left = y - 0.5 * sequence.road.curvature_per_m * x * x
         along = x + frame.ego_along_m
         grain = _hash_noise(np.floor(along * 3.0), np.floor(left * 3.0)) - 0.5
         color = np.broadcast_to(verge, (x.size, 3)) + 24.0 * grain[:, None]

@@ -163,7 +163,7 @@ def visible_polygons(
         colors: `[N, 2, 3]` of `object_colors`.
         calibration: The camera.
         light: Brightness and haze.
-        panels: Surroundings of `scenery.make_panels`.
+        panels: Surroundings of `panels.make_panels`.
         near_m: Faces nearer than this are cut away.
     """
     origin = camera_position(calibration)

@@ -29,7 +29,7 @@ import numpy as np
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
-from radejax.simulation.world.scene import SceneFrame
+from radejax.simulation.world.scene import SceneFrame, is_blocked
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,44 +260,6 @@ def scatter_objects(
 
 
 _ON_FOOT = [CLASSES.index("Pedestrian")]
-
-
-def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """True where the straight way from the radar to a point crosses a box.
-
-    Args:
-        targets: `[S, 3]` points.
-        boxes: `[N, 7]` obstacles.
-        owner: `[S]` index of a box that does not block (the point's own), or -1.
-
-    Returns:
-        `[S]` bool.
-    """
-    if not len(boxes) or not len(targets):
-        return np.zeros(len(targets), bool)
-    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
-
-    def into_boxes(p: np.ndarray) -> np.ndarray:  # [S, 3] -> [S, N, 3]
-        q = p[:, None] - boxes[None, :, :3]
-        return np.stack(
-            [
-                cos * q[..., 0] + sin * q[..., 1],
-                -sin * q[..., 0] + cos * q[..., 1],
-                q[..., 2],
-            ],
-            -1,
-        )
-
-    start = into_boxes(np.zeros((1, 3)))
-    ray = into_boxes(targets) - start
-    ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
-    half = boxes[:, 3:6] / 2.0
-    near, far = (-half - start) / ray, (half - start) / ray
-    enter = np.minimum(near, far).max(-1)
-    leave = np.maximum(near, far).min(-1)
-    crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
-    crosses &= np.arange(len(boxes))[None] != owner[:, None]
-    return crosses.any(1)
 
 
 def received_power(

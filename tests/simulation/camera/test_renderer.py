@@ -26,9 +26,8 @@ def make_scene(boxes, classes, *, time="day", weather="normal"):
         environment="highway",
         time=time,
         weather=weather,
-        ego_pose=np.zeros((1, 3)),
         ego_along_m=np.zeros(1),
-        ego_velocity_mps=np.zeros((1, 2)),
+        ego_speed_mps=np.zeros(1),
         tracks=Tracks(
             boxes[None, :, :3],
             boxes[None, :, 6],
@@ -42,7 +41,6 @@ def make_scene(boxes, classes, *, time="day", weather="normal"):
         reflectors=Reflectors(np.zeros((0, 3)), empty, empty, empty.astype(int)),
         road=Road(),
         lanes_m=(-1.7, 1.7),
-        ego_left_m=0.0,
         ground_m=-0.9,
     )
 

@@ -5,17 +5,17 @@ import json
 import jax
 import numpy as np
 import pytest
+from online_training import train_online
 
 from radejax import Detector
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
-from radejax.online_training import train_online
 from radejax.runs.data import OtherData
 from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import sharding
 
-from . import small_models as small
+from .. import small_models as small
 
 
 def _config(num_epochs=2):

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
+from online_batches import OnlineBatches
 
 from radejax.simulation.config import default_config
-from radejax.simulation.online import OnlineBatches
 from radejax.simulation.simulator import SequenceSimulator
 
 CONFIG = default_config() | {

@@ -14,7 +14,7 @@ import numpy as np
 from radejax.core.errors import UserError
 from radejax.data.kradar import Frame, KRadar, sequences
 from radejax.simulation.config import SimulationConfig
-from radejax.simulation.world.real_scenes import make_real_sequence
+from radejax.simulation.world.replay import make_real_sequence
 from radejax.simulation.world.scene import FRAME_PERIOD_S, Sequence
 from radejax.simulation.world.traffic import make_sequence
 
