@@ -33,7 +33,7 @@ from radejax.runs.evaluate import with_other_data
 from radejax.runs.workdir import load_run
 from radejax.simulation.camera.lens import cover_level
 from radejax.simulation.dataset import MARKER
-from radejax.visualize.camera_share import mean_share
+from radejax.visualize.camera_share import mean_share, write_camera_share
 
 GROUPS = {
     "all": lambda weather, lens: True,
@@ -169,7 +169,7 @@ def main(fusion, radar, out, data, split, resamples):
         )
         out.mkdir(parents=True, exist_ok=True)
         ordered = {name: maps[name] for name in GROUPS if name in maps}
-        camera_share.write_camera_share(out, ordered, counts, run.grid)
+        write_camera_share(out, ordered, counts, run.grid)
         shares = {name: mean_share(share, run.grid) for name, share in ordered.items()}
         sequences = np.asarray(frames["sequence"])
         # Intervals come from resampled sequences: one alone has none.

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import pathlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -12,13 +10,12 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from radejax import models
-from radejax.core import files
 from radejax.data.kradar.frame import Frame
 from radejax.data.pipeline import make_loader
 from radejax.data.records.projections import RecordSource
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import image_backbone
 from radejax.training.step import model_inputs
+from radejax.visualize.camera_share import average_by_group
 
 
 def camera_share(
@@ -80,54 +77,3 @@ def camera_share(
                     yield group(frames[index]), share
 
     return average_by_group(shares())
-
-
-def average_by_group(
-    shares: Iterable[tuple[str, np.ndarray]],
-) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Mean maps of groups, "all" first, over what the camera sees.
-
-    A bin that no query sees in the image has share 0, which says nothing of the gate:
-    every bin is averaged over the frames that have it in view.
-
-    Args:
-        shares: Group and `[R, A]` share of every frame.
-
-    Returns:
-        `[R, A]` means by group, 0 in bins that no frame has in view, and the numbers of
-        frames with anything in view, that is, with an image.
-    """
-    sums: dict[str, Any] = {}
-    seen: dict[str, Any] = {}
-    counts: dict[str, int] = {}
-    for group, share in shares:
-        is_seen = share > 0
-        for name in ("all", group):
-            sums[name] = sums.get(name, 0.0) + share
-            seen[name] = seen.get(name, 0) + is_seen
-            counts[name] = counts.get(name, 0) + int(is_seen.any())
-    return {name: sums[name] / np.maximum(seen[name], 1) for name in sums}, counts
-
-
-def write_camera_share(
-    out: pathlib.Path,
-    maps: Mapping[str, np.ndarray],
-    counts: Mapping[str, int],
-    grid: RadarGrid,
-) -> None:
-    """Writes `camera_share.json` (means and counts) and `camera_share.png`.
-
-    Means are over the bins in view; null without any.
-    """
-    from radejax.visualize import bev
-    from radejax.visualize.camera_share import draw_camera_share, mean_share
-
-    means = {name: mean_share(share, grid) for name, share in maps.items()}
-    summary = {
-        name: {"mean": None if math.isnan(m) else m, "frames": counts[name]}
-        for name, m in means.items()
-    }
-    files.write_json(out / "camera_share.json", summary)
-    bev.save_figure(
-        draw_camera_share(maps, grid, counts=counts), out / "camera_share.png"
-    )

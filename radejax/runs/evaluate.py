@@ -25,10 +25,11 @@ from radejax.evaluation.report.report import Report, write_report
 from radejax.geometry.calibration import CameraCalibration
 from radejax.inference.predict import Predictor, predict_dataset
 from radejax.interop import image_backbone as camera_inputs
-from radejax.runs.camera_share import camera_share, write_camera_share
+from radejax.runs.camera_share import camera_share
 from radejax.runs.data import OtherData, project
 from radejax.runs.workdir import Run, load_run
 from radejax.training import processes
+from radejax.visualize.camera_share import write_camera_share
 
 _log = logging.getLogger(__name__)
 
@@ -281,21 +282,13 @@ class FrameDrawer:
 
         scene = self._scene(int(index))
         frame = self._frames[int(index)]
-        figure = bev.draw_frame(
-            scene.projection,
-            self._records.grid,
-            ground_truth=scene.ground_truth,
-            predictions=scene.predictions,
-            roi=self._roi,
-            image=scene.image,
-            camera=scene.camera,
-            title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
-        )
+        title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
+        figure = bev.draw_frame(dataclasses.replace(scene, title=title))
         bev.save_figure(figure, path)
 
     def _scene(self, index: int) -> Any:
         """The frame at a position with its boxes and image."""
-        from radejax.visualize.scenes import Scene
+        from radejax.visualize.canvas import Scene
 
         frame = self._frames[index]
         mine = self._predictions["frame"] == index
@@ -305,8 +298,10 @@ class FrameDrawer:
         image, camera = front_view(frame)
         return Scene(
             decode_array(record["projection"]),
+            self._records.grid,
             ground_truth=(frame.boxes, list(frame.classes)),
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
+            roi=self._roi,
             image=image,
             camera=camera,
             title=f"{frame.weather} ({frame.key})",
@@ -326,7 +321,7 @@ class FrameDrawer:
             if len(frame.boxes) > len(self._frames[best].boxes):
                 fullest[frame.weather] = i
         scenes = [self._scene(i) for i in fullest.values()]
-        figure = draw_scenes(scenes, self._records.grid, roi=self._roi)
+        figure = draw_scenes(scenes)
         bev.save_figure(figure, path)
 
     def draw_spread(self, folder: pathlib.Path, count: int) -> list[pathlib.Path]:
