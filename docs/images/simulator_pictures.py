@@ -16,7 +16,7 @@ from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
 from radejax.visualize.canvas import COLOR_MAP, footprints, halo, new_figure
-from radejax.visualize.label_placement import draw_labels
+from radejax.visualize.label_placement import Label, draw_labels
 
 SCENES = (
     ("normal", "urban", "day", 4),
@@ -100,7 +100,7 @@ def draw_maps(axes, power_db):
 
 def draw_boxes(axis, frame, is_visible):
     """Boxes in the field of view: `R` white and named, `L` orange and dashed."""
-    outlines, names = [], []
+    labels = []
     for box, is_seen, cls in zip(frame.boxes, is_visible, frame.cls, strict=True):
         if not GRID.in_field_of_view(box[0], box[1]):
             continue
@@ -108,11 +108,8 @@ def draw_boxes(axis, frame, is_visible):
         style = SEEN if is_seen else UNSEEN
         axis.plot(*outline.T, path_effects=halo(style["lw"] + 0.8), **style)
         if is_seen:
-            outlines.append(outline)
-            names.append(CLASSES[cls].split()[0])
-    count = len(names)
-    colors, sides = ["white"] * count, ["right"] * count
-    draw_labels(axis, outlines, names, colors, sides, font_size=5.5)
+            labels.append(Label(outline, CLASSES[cls].split()[0], "white", "right"))
+    draw_labels(axis, labels, font_size=5.5)
     axis.legend(
         handles=[
             Line2D([], [], label=name, path_effects=halo(style["lw"] + 1.0), **style)

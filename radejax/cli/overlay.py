@@ -74,15 +74,16 @@ def draw_overlay(
             figure.suptitle(title)
             return figure
         image, camera = front_view(frame)
-        return bev.draw_frame(
+        scene = bev.Scene(
             projection,
             frames.grid,
             ground_truth=(frame.boxes, list(frame.classes)),
+            roi=WIDE_ROI,
             image=image,
             camera=camera,
-            roi=WIDE_ROI,
             title=title,
         )
+        return bev.draw_frame(scene)
 
     if pathlib.Path(out).suffix.lower() not in ANIMATIONS:
         bev.save_figure(draw(found[0]), out)

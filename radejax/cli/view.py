@@ -16,7 +16,8 @@ from radejax.core.errors import UserError
 from radejax.data.images import front_view
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.frame import Frame
-from radejax.visualize.viewer import ViewerFrame, write_recording
+from radejax.visualize.canvas import Scene
+from radejax.visualize.viewer import write_recording
 
 
 def write_view(
@@ -68,16 +69,14 @@ def write_view(
     entries = viewer_frames(
         tqdm.tqdm(shown, desc="record", unit="frame"), frames.grid, detector
     )
-    write_recording(entries, frames.grid, out, elevation_sign=elevation_sign)
+    write_recording(entries, out, elevation_sign=elevation_sign)
     return {
         "frames": len(shown),
         "without_radar": len(frames) - len(complete),
     }
 
 
-def viewer_frames(
-    frames: Any, grid: Any, detector: Any = None
-) -> Iterator[ViewerFrame]:
+def viewer_frames(frames: Any, grid: Any, detector: Any = None) -> Iterator[Scene]:
     """What the viewer shows of each frame, read as it is needed."""
     for frame in frames:
         projection = read_projection(frame, grid)
@@ -88,15 +87,16 @@ def viewer_frames(
             if detector.takes_camera and calibration is not None:
                 inputs += frame.camera_path, calibration
             found = jax.tree.map(lambda x: np.asarray(x[0]), detector(*inputs))
-        yield ViewerFrame(
+        yield Scene(
             projection,
+            grid,
             ground_truth=frame,
             predictions=found,
             track_ids=track_ids(frame),
             image=image,
-            calibration=calibration,
+            camera=calibration,
             time_s=frame.header.timestamp_s,
-            name=f"sequence {frame.sequence}, {frame.name}, {frame.weather}",
+            title=f"sequence {frame.sequence}, {frame.name}, {frame.weather}",
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +21,8 @@ from radejax.data.records.projections import RecordSource, record_positions
 from radejax.runs.data import Data
 from radejax.visualize import bev, curves
 from radejax.visualize.camera_share import average_by_group, write_camera_share
-from radejax.visualize.scenes import Scene, draw_scenes
+from radejax.visualize.canvas import Scene
+from radejax.visualize.scenes import draw_scenes
 
 
 class FrameDrawer:
@@ -53,18 +55,10 @@ class FrameDrawer:
 
     def __call__(self, index: int, path: str | os.PathLike) -> None:
         """Draws the frame at a position of the data set into a picture file."""
-        scene = self._scene(int(index))
         frame = self._frames[int(index)]
-        figure = bev.draw_frame(
-            scene.projection,
-            self._records.grid,
-            ground_truth=scene.ground_truth,
-            predictions=scene.predictions,
-            roi=self._roi,
-            image=scene.image,
-            camera=scene.camera,
-            title=f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}",
-        )
+        title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
+        scene = dataclasses.replace(self._scene(int(index)), title=title)
+        figure = bev.draw_frame(scene)
         bev.save_figure(figure, path)
 
     def _scene(self, index: int) -> Scene:
@@ -77,8 +71,10 @@ class FrameDrawer:
         image, camera = front_view(frame)
         return Scene(
             decode(record["projection"]),
+            self._records.grid,
             ground_truth=(frame.boxes, list(frame.classes)),
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
+            roi=self._roi,
             image=image,
             camera=camera,
             title=f"{frame.weather} ({frame.key})",
@@ -95,7 +91,7 @@ class FrameDrawer:
             if len(frame.boxes) > len(self._frames[best].boxes):
                 fullest[frame.weather] = i
         scenes = [self._scene(i) for i in fullest.values()]
-        figure = draw_scenes(scenes, self._records.grid, roi=self._roi)
+        figure = draw_scenes(scenes)
         bev.save_figure(figure, path)
 
     def draw_spread(self, folder: pathlib.Path, count: int) -> list[pathlib.Path]:

@@ -1,14 +1,19 @@
-"""Animated sequences: GIF through Pillow, MP4 through the ffmpeg program."""
+"""Animated sequences: GIF through Pillow, MP4 through matplotlib and ffmpeg.
+
+matplotlib's own GIF writer keeps every frame in memory and gives each a palette of its
+own, which flickers; Pillow writes them one by one.
+"""
 
 from __future__ import annotations
 
+import itertools
 import os
 import pathlib
-import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -16,19 +21,9 @@ from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.core.files import atomic_path
-from radejax.visualize.canvas import (
-    COLOR_MAP,
-    GROUND_TRUTH_COLOR,
-    PREDICTION_COLOR,
-    PREDICTION_TEXT_COLOR,
-)
+from radejax.visualize.canvas import COLOR_MAP, GROUND_TRUTH, PREDICTION, new_figure
 
-_LINE_COLORS = (
-    "black",
-    GROUND_TRUTH_COLOR,
-    PREDICTION_COLOR,
-    PREDICTION_TEXT_COLOR,
-)
+_LINE_COLORS = ("black", GROUND_TRUTH.color, PREDICTION.color, PREDICTION.text_color)
 _MAP_COLORS = 32
 
 
@@ -140,35 +135,25 @@ def make_palette(first: Image.Image, num_colors: int) -> Image.Image:
 def _write_mp4(
     pictures: Iterator[np.ndarray], path: pathlib.Path, rate: float, _: int
 ) -> None:
-    """Raw frames through a pipe; H.264 with the pixel format that browsers play."""
-    program = shutil.which("ffmpeg")
-    if program is None:
+    """H.264 with the pixel format that browsers play."""
+    if not FFMpegWriter.isAvailable():
         raise UserError(
             "writing .mp4 needs the ffmpeg program, which is not on the PATH; install "
             "it (apt install ffmpeg, conda install ffmpeg) or write a .gif"
         )
+    # The pixel format halves colour resolution, so sizes must be even.
+    options = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"]
+    options += ["-pix_fmt", "yuv420p", "-f", "mp4"]
+    writer = FFMpegWriter(rate, "libx264", extra_args=options)
     first = next(pictures)
     height, width = first.shape[:2]
-    command = [program, "-y", "-loglevel", "error"]
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    command += ["-r", f"{rate:g}", "-i", "-"]
-    # The pixel format halves colour resolution, so sizes must be even.
-    command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"]
-    command += ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-f", "mp4", str(path)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        try:
-            process.stdin.write(first.tobytes())
-            for picture in pictures:
-                process.stdin.write(picture.tobytes())
-            process.stdin.close()
-        except BrokenPipeError:
-            pass  # ffmpeg gave up; its own words say why
-        except BaseException:
-            process.kill()
-            raise
-        message = process.stderr.read().decode(errors="replace").strip()
-        if process.wait() != 0:
-            last = message.splitlines()[-1] if message else "no message"
-            raise UserError(f"ffmpeg could not write the video: {last}")
+    figure = new_figure(width / 100, height / 100, dpi=100)
+    shown = figure.figimage(first)
+    try:
+        with writer.saving(figure, str(path), dpi=100):
+            for picture in itertools.chain([first], pictures):
+                shown.set_data(picture)
+                writer.grab_frame()
+    except subprocess.CalledProcessError as error:
+        lines = error.stderr.strip().splitlines() or ["no message"]
+        raise UserError(f"ffmpeg could not write the video: {lines[-1]}") from error

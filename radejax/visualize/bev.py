@@ -8,43 +8,36 @@ metres, and every range-azimuth bin covers the ground that it measures.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+import dataclasses
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.visualize.camera import draw_camera
 from radejax.visualize.canvas import (
-    COLOR_MAP,
-    Objects,
+    Scene,
     add_colorbar,
-    color_limits_of,
+    draw_tiles,
     footprints,
     new_figure,
     save_figure,
 )
-from radejax.visualize.maps import Extent, draw_map, extent_m, roi_m
-from radejax.visualize.overlays import (
-    both_sets,
+from radejax.visualize.maps import (
+    Extent,
     draw_legend,
+    draw_map,
     draw_objects,
     draw_roi,
+    extent_m,
     legend_handles,
+    roi_m,
 )
-from radejax.visualize.projections import (
-    Channels,
-    Reduce,
-    Units,
-    bin_edges,
-    color_label,
-    range_azimuth,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from radejax.visualize.projections import bin_edges, color_label, range_azimuth
 
 __all__ = [
+    "Scene",
     "draw_bev",
     "draw_frame",
     "draw_map",
@@ -53,52 +46,32 @@ __all__ = [
     "save_figure",
 ]
 
-_POLAR_OPTIONS = ("channels", "reduce", "units", "color_limits")
-
 
 def draw_bev(
-    projection: Any,
-    grid: RadarGrid,
+    scene: Scene,
     *,
-    roi: Sequence[float] | None = None,
-    ground_truth: Any = None,
-    predictions: Any = None,
-    class_names: Sequence[str] | None = None,
     ax: Axes | None = None,
     extent: Extent = "roi",
-    channels: Channels = "all",
-    reduce: Reduce = "max",
-    units: Units = "normalized",
     color_limits: tuple[float, float] | None = None,
     show_labels: bool = True,
     show_legend: bool = True,
     show_colorbar: bool = True,
-    title: str | None = None,
+    **values: Any,
 ) -> Axes:
     """Draws one frame on the ground plane.
 
     Args:
-        projection: `[R, A, D+E]` normalised log power of one frame.
-        grid: The grid of the projection.
-        roi: x_min, x_max, y_min, y_max, z_min, z_max in metres (z may be left out):
-            the dashed rectangle where detections count.
-        ground_truth: Boxes with classes; anything that `canvas.as_objects` takes, such
-            as `(boxes [N, 7], classes)` or a frame.
-        predictions: Boxes with scores and classes, such as `(boxes, scores, classes)`
-            or one frame of `Detections`.
-        class_names: Names of class indices; see `canvas.as_objects`.
+        scene: The frame.
         ax: Where to draw; a new figure by default. Its limits and aspect are set.
         extent: "roi" shows the region of interest and its surroundings (all of the
             field of view without one), "fov" the field of view, or x_min, x_max,
             y_min, y_max in metres.
-        channels: Channels that the map is reduced over.
-        reduce: "max" or "mean".
-        units: "normalized" or "db".
         color_limits: Ends of the colour bar; by default from the values shown.
         show_labels: Write class and score beside the boxes.
         show_legend: Explain the lines.
         show_colorbar: Give the map's scale.
-        title: Title of the axes.
+        **values: What a bin shows: `channels`, `reduce` and `units` of
+            `projections.range_azimuth`.
 
     Returns:
         The axes; `.figure` is the figure.
@@ -106,153 +79,110 @@ def draw_bev(
     Raises:
         UserError: Projection, grid, boxes or region of interest do not fit together.
     """
-    values = range_azimuth(
-        projection, grid, channels=channels, reduce=reduce, units=units
-    )
-    truth, found = both_sets(ground_truth, predictions, class_names)
-    limits = extent_m(grid, roi, extent)
     ax = draw_map(
-        values,
-        grid,
+        range_azimuth(scene.projection, scene.grid, **values),
+        scene.grid,
         ax=ax,
-        extent=limits,
+        extent=extent_m(scene.grid, scene.roi, extent),
         color_limits=color_limits,
-        label=color_label(channels=channels, reduce=reduce, units=units),
+        label=color_label(**values),
         show_colorbar=show_colorbar,
     )
-    if roi is not None:
-        x0, x1, y0, y1 = roi_m(roi)
+    if scene.roi is not None:
+        x0, x1, y0, y1 = roi_m(scene.roi)
         outline = np.array([[x0, y0], [x0, y1], [x1, y1], [x1, y0], [x0, y0]])
         draw_roi(ax, outline[:, ::-1])
     draw_objects(
-        ax, truth, found, lambda points: points[..., ::-1], show_labels=show_labels
+        ax, scene.sets, lambda points: points[..., ::-1], show_labels=show_labels
     )
     # The sensor, pointing ahead.
     ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
-    if show_legend:
-        draw_legend(ax, truth, found, roi)
-    if title:
-        ax.set_title(title, pad=24 if show_legend else 6)
+    _explain(ax, scene, show_legend)
     return ax
 
 
 def draw_polar(
-    projection: Any,
-    grid: RadarGrid,
+    scene: Scene,
     *,
-    roi: Sequence[float] | None = None,
-    ground_truth: Any = None,
-    predictions: Any = None,
-    class_names: Sequence[str] | None = None,
     ax: Axes | None = None,
-    channels: Channels = "all",
-    reduce: Reduce = "max",
-    units: Units = "normalized",
     color_limits: tuple[float, float] | None = None,
     show_labels: bool = True,
     show_legend: bool = True,
     show_colorbar: bool = True,
-    title: str | None = None,
+    **values: Any,
 ) -> Axes:
     """Draws one frame as the network sees it: range over azimuth, one tile a bin.
 
     Straight box edges bend here; they are drawn bent. Arguments as in `draw_bev`.
     """
-    values = range_azimuth(
-        projection, grid, channels=channels, reduce=reduce, units=units
-    )
-    truth, found = both_sets(ground_truth, predictions, class_names)
+    power = range_azimuth(scene.projection, scene.grid, **values)
     ax = new_figure(6.0, 5.0).add_axes((0.11, 0.1, 0.74, 0.82)) if ax is None else ax
-    low, high = color_limits or color_limits_of(values)
-    horizontal = bin_edges(np.rad2deg(grid.azimuth_rad))
-    vertical = bin_edges(grid.range_m)
-    mesh = ax.pcolormesh(
-        horizontal,
-        vertical,
-        values,
-        cmap=COLOR_MAP,
-        vmin=low,
-        vmax=high,
-        rasterized=True,
-    )
+    horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
+    vertical = bin_edges(scene.grid.range_m)
+    mesh = draw_tiles(ax, horizontal, vertical, power, color_limits)
     ax.set_xlim(horizontal[0], horizontal[-1])
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
     if show_colorbar:
-        label = color_label(channels=channels, reduce=reduce, units=units)
-        add_colorbar(mesh, ax, label)
-    if roi is not None:
-        x0, x1, y0, y1 = roi_m(roi)
+        add_colorbar(mesh, ax, color_label(**values))
+    if scene.roi is not None:
+        x0, x1, y0, y1 = roi_m(scene.roi)
         box = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 0, x1 - x0, y1 - y0, 0, 0]])
         draw_roi(ax, _to_polar(footprints(box, 200)[0]))
-    draw_objects(ax, truth, found, _to_polar, show_labels=show_labels)
-    if show_legend:
-        draw_legend(ax, truth, found, roi)
-    if title:
-        ax.set_title(title, pad=24 if show_legend else 6)
+    draw_objects(ax, scene.sets, _to_polar, show_labels=show_labels)
+    _explain(ax, scene, show_legend)
     return ax
 
 
+def _explain(ax: Axes, scene: Scene, show_legend: bool) -> None:
+    """Legend and title."""
+    if show_legend:
+        draw_legend(ax, scene)
+    if scene.title:
+        ax.set_title(scene.title, pad=24 if show_legend else 6)
+
+
 def draw_frame(
-    projection: Any,
-    grid: RadarGrid,
+    scene: Scene,
     *,
-    ground_truth: Any = None,
-    predictions: Any = None,
-    roi: Sequence[float] | None = None,
-    image: Any = None,
-    camera: Any = None,
-    class_names: Sequence[str] | None = None,
-    title: str | None = None,
-    **bev_options: Any,
+    extent: Extent = "roi",
+    color_limits: tuple[float, float] | None = None,
+    show_labels: bool = True,
+    **values: Any,
 ) -> Figure:
     """Figure of one frame: bird's-eye view, camera image (if any) and polar view.
 
     Args:
-        projection: `[R, A, D+E]` normalised log power of one frame.
-        grid: The grid of the projection.
-        ground_truth: As in `draw_bev`.
-        predictions: As in `draw_bev`.
-        roi: As in `draw_bev`.
-        image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
-        camera: `CameraCalibration` of the image: draws the boxes on it, or None.
-        class_names: Names of class indices; see `canvas.as_objects`.
-        title: Title of the figure, such as sequence, frame and weather.
-        **bev_options: Further arguments of `draw_bev`.
+        scene: The frame.
+        extent: Of the bird's-eye view, as in `draw_bev`.
+        color_limits: As in `draw_bev`.
+        show_labels: Of the bird's-eye view, as in `draw_bev`.
+        **values: As in `draw_bev`.
 
     Returns:
         A figure of about 12 by 6.4 inches; write it with `save_figure`.
     """
     figure = new_figure(12.0, 6.4)
-    truth, found = both_sets(ground_truth, predictions, class_names)
-    shared = {"roi": roi, "ground_truth": truth, "predictions": found}
-    options = {"show_legend": False, **bev_options}
+    untitled = dataclasses.replace(scene, title="")
+    common = {"color_limits": color_limits, "show_legend": False, **values}
     bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
-    draw_bev(projection, grid, ax=bev_ax, **shared, **options)
-    has_image = image is not None
+    draw_bev(untitled, ax=bev_ax, extent=extent, show_labels=show_labels, **common)
+    has_image = scene.image is not None
     polar_place = (0.57, 0.085, 0.41, 0.26 if has_image else 0.77)
-    draw_polar(
-        projection,
-        grid,
-        ax=figure.add_axes(polar_place),
-        **shared,
-        **{k: v for k, v in options.items() if k in _POLAR_OPTIONS},
-        show_labels=not has_image,
-        show_legend=False,
-        show_colorbar=False,
-    )
+    polar_ax = figure.add_axes(polar_place)
+    common |= {"show_labels": not has_image, "show_colorbar": False}
+    draw_polar(untitled, ax=polar_ax, **common)
     if has_image:
-        view_ax = figure.add_axes((0.53, 0.40, 0.45, 0.52))
-        draw_view(view_ax, image, camera, truth, found)
+        draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
     figure.legend(
-        handles=legend_handles(truth, found, roi),
+        handles=legend_handles(scene),
         loc="lower center",
         bbox_to_anchor=(0.765, polar_place[1] + polar_place[3] + 0.01),
         ncols=3,
         frameon=False,
     )
-    if title:
-        figure.suptitle(title)
+    if scene.title:
+        figure.suptitle(scene.title)
     return figure
 
 
@@ -262,27 +192,18 @@ def _to_polar(points: np.ndarray) -> np.ndarray:
     return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
-def draw_view(
-    ax: Axes,
-    image: Any,
-    camera: Any,
-    truth: Objects | None,
-    found: Objects | None,
-    *,
-    show_labels: bool = True,
-) -> None:
+def draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
     """Camera image, with the boxes where a calibration is given."""
-    if camera is None:
-        ax.imshow(np.asarray(image))
+    if scene.camera is None:
+        ax.imshow(np.asarray(scene.image))
         ax.set_axis_off()
         return
-    from radejax.visualize.camera import draw_camera
-
     draw_camera(
-        image,
-        camera,
-        ground_truth=truth,
-        predictions=found,
+        scene.image,
+        scene.camera,
+        ground_truth=scene.ground_truth,
+        predictions=scene.predictions,
+        class_names=scene.class_names,
         ax=ax,
         show_labels=show_labels,
     )

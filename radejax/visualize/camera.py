@@ -8,27 +8,23 @@ the sensor offset first: the usual reason for boxes drawn beside their cars.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
 from radejax.core.errors import UserError
 from radejax.geometry.boxes import corners
 from radejax.geometry.calibration import CameraCalibration, ImageKind
 from radejax.visualize.canvas import (
-    GROUND_TRUTH_COLOR,
-    PREDICTION_COLOR,
-    PREDICTION_TEXT_COLOR,
     Objects,
+    Style,
     label_texts,
     new_figure,
+    styled_sets,
 )
-from radejax.visualize.label_placement import draw_labels
-from radejax.visualize.overlays import both_sets
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from radejax.visualize.label_placement import Label, draw_labels
 
 _FRONT = [0, 3, 7, 4]  # of geometry.boxes.corners
 _FONT_SIZE_PT = 6.5
@@ -87,34 +83,25 @@ def draw_camera(
     # Pixel centers are whole numbers in imshow, half numbers in the calibration.
     ax.set(xlim=(-0.5, calibration.width - 0.5), ylim=(calibration.height - 0.5, -0.5))
     ax.apply_aspect()
-    truth, found = both_sets(ground_truth, predictions, class_names)
-    outlines, texts, colors = [], [], []
-    for objects, color, text_color, width in (
-        (truth, GROUND_TRUTH_COLOR, GROUND_TRUTH_COLOR, 1.6),
-        (found, PREDICTION_COLOR, PREDICTION_TEXT_COLOR, 1.2),
-    ):
-        if objects is None or not len(objects.boxes):
-            continue
-        drawn, hulls = _draw_boxes(ax, calibration, objects, image_kind, color, width)
-        labels = label_texts(objects)
-        outlines += hulls
-        texts += [labels[i] for i in drawn]
-        colors += [text_color] * len(hulls)
-    heights = np.array([np.ptp(hull[:, 1]) for hull in outlines])
-    heights_pt = heights * _points_per_pixel(ax, calibration)
+    labels = []
+    for style, objects in styled_sets(ground_truth, predictions, class_names):
+        if len(objects.boxes):
+            hulls = _draw_boxes(ax, calibration, objects, image_kind, style)
+            texts = label_texts(objects)
+            labels += [
+                Label(hull, texts[i], style.text_color, "above")
+                for i, hull in hulls.items()
+            ]
     # Near boxes first. Far ones stand close together: texts on them would be a heap.
-    order = np.argsort(-heights, kind="stable")
-    order = order[heights_pt[order] >= _LEAST_HEIGHT_PT]
-    if show_labels and order.size:
-        draw_labels(
-            ax,
-            [outlines[i] for i in order],
-            [texts[i] for i in order],
-            [colors[i] for i in order],
-            ["above"] * len(order),
-            font_size=_FONT_SIZE_PT,
-            keep_boxes_clear=False,
-        )
+    scale = _points_per_pixel(ax, calibration)
+    labels.sort(key=lambda label: -np.ptp(label.outline[:, 1]))
+    labels = [
+        label
+        for label in labels
+        if np.ptp(label.outline[:, 1]) * scale >= _LEAST_HEIGHT_PT
+    ]
+    if show_labels:
+        draw_labels(ax, labels, font_size=_FONT_SIZE_PT, keep_boxes_clear=False)
     if title:
         ax.set_title(title)
     return ax
@@ -125,10 +112,9 @@ def _draw_boxes(
     calibration: CameraCalibration,
     objects: Objects,
     kind: ImageKind,
-    color: str,
-    width: float,
-) -> tuple[list[int], list[np.ndarray]]:
-    """Draws what is in front of the camera; indices drawn and their points."""
+    style: Style,
+) -> dict[int, np.ndarray]:
+    """Draws what is in front of the camera; points `[P, 2]` by index of the box."""
     segments, is_visible = calibration.project_boxes(objects.boxes, kind, _NEAR_M)
     segments = segments - 0.5
     # Wild pixels far outside the image confuse the renderer's clipping.
@@ -140,7 +126,9 @@ def _draw_boxes(
         points[i, _FRONT] - 0.5 for i in drawn if (depth[i, _FRONT] > _NEAR_M).all()
     ]
     ax.add_collection(
-        PolyCollection(fronts, facecolors=color, alpha=0.25, linewidths=0, zorder=3),
+        PolyCollection(
+            fronts, facecolors=style.color, alpha=0.25, linewidths=0, zorder=3
+        ),
         autolim=False,
     )
     hulls = [segments[i][is_visible[i]].reshape(-1, 2) for i in drawn]
@@ -148,17 +136,17 @@ def _draw_boxes(
     heights = [np.repeat(np.ptp(hull[:, 1]), len(hull) // 2) for hull in hulls]
     # Lines of a small box are thinner, or they would fill it.
     heights_pt = np.concatenate(heights or [[]]) * _points_per_pixel(ax, calibration)
-    widths = width * np.clip(heights_pt / 24.0, 0.4, 1.0)
-    for stroke, extra, order in (("black", 1.0, 4), (color, 0.0, 4.1)):
+    thickness = np.clip(heights_pt / 24.0, 0.4, 1.0)
+    for stroke, extra, order in (("black", 1.0, 4), (style.color, 0.0, 4.1)):
         collection = LineCollection(
             lines,
             colors=stroke,
-            linewidths=widths + extra * widths / width,
+            linewidths=(style.image_width + extra) * thickness,
             capstyle="round",
             zorder=order,
         )
         ax.add_collection(collection, autolim=False)
-    return drawn, hulls
+    return dict(zip(drawn, hulls, strict=True))
 
 
 def _points_per_pixel(ax: Axes, calibration: CameraCalibration) -> float:

@@ -2,16 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+import math
+import pathlib
+from collections.abc import Iterable, Mapping
+from typing import Any
 
+import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
+from radejax.core.files import write_json
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize.canvas import new_figure
+from radejax.visualize.canvas import new_figure, save_figure
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+
+def average_by_group(
+    shares: Iterable[tuple[str, np.ndarray]],
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Mean maps of groups, "all" first, over what the camera sees.
+
+    A bin that no query sees in the image has share 0, which says nothing of the gate:
+    every bin is averaged over the frames that have it in view.
+
+    Args:
+        shares: Group and `[R, A]` share of every frame.
+
+    Returns:
+        `[R, A]` means by group, 0 in bins that no frame has in view, and the numbers of
+        frames with anything in view, that is, with an image.
+    """
+    sums: dict[str, Any] = {}
+    seen: dict[str, Any] = {}
+    counts: dict[str, int] = {}
+    for group, share in shares:
+        is_seen = share > 0
+        for name in ("all", group):
+            sums[name] = sums.get(name, 0.0) + share
+            seen[name] = seen.get(name, 0) + is_seen
+            counts[name] = counts.get(name, 0) + int(is_seen.any())
+    return {name: sums[name] / np.maximum(seen[name], 1) for name in sums}, counts
 
 
 def mean_share(share: np.ndarray, grid: RadarGrid) -> float:
@@ -38,8 +67,6 @@ def draw_camera_share(
         counts: Frames with an image per condition, for the titles.
         columns: Panels side by side.
     """
-    from matplotlib import colormaps
-
     columns = min(columns, len(maps))
     rows = -(-len(maps) // columns)
     figure = new_figure(2.6 * columns + 1.2, 2.9 * rows + 0.4, layout="constrained")
@@ -50,7 +77,7 @@ def draw_camera_share(
     # Bins that no query sees in the image have share 0: they say nothing of the gate.
     seen = np.concatenate([m[m > 0] for m in maps.values()] or [np.zeros(0)])
     low, high = (seen.min(), seen.max()) if seen.size else (0.0, 1.0)
-    colors = colormaps["cividis"].with_extremes(bad="0.85")
+    colors = matplotlib.colormaps["cividis"].with_extremes(bad="0.85")
     azimuth = np.rad2deg(grid.azimuth_rad)
     extent = (azimuth[0], azimuth[-1], grid.range_m[0], grid.range_m[-1])
     for ax, (name, share) in zip(axes.flat, maps.items(), strict=False):
@@ -75,3 +102,22 @@ def draw_camera_share(
     bar = figure.colorbar(picture, ax=axes.ravel().tolist(), shrink=0.8)
     bar.set_label("share of the camera in the fused map (grey: not in view)")
     return figure
+
+
+def write_camera_share(
+    out: pathlib.Path,
+    maps: Mapping[str, np.ndarray],
+    counts: Mapping[str, int],
+    grid: RadarGrid,
+) -> None:
+    """Writes `camera_share.json` (means and counts) and `camera_share.png`.
+
+    Means are over the bins in view; null without any.
+    """
+    means = {name: mean_share(share, grid) for name, share in maps.items()}
+    summary = {
+        name: {"mean": None if math.isnan(m) else m, "frames": counts[name]}
+        for name, m in means.items()
+    }
+    write_json(out / "camera_share.json", summary)
+    save_figure(draw_camera_share(maps, grid, counts=counts), out / "camera_share.png")

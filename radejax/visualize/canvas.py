@@ -7,13 +7,16 @@ and in notebooks alike.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
@@ -22,21 +25,44 @@ from radejax.core.errors import UserError
 from radejax.core.files import atomic_path
 from radejax.core.structures import CLASSES
 from radejax.geometry.boxes import bev_corners
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.radar_grid import RadarGrid
 
 # The brightest fifth is left out: white boxes must stand out on the strongest echoes.
 COLOR_MAP = LinearSegmentedColormap.from_list(
     "radar", matplotlib.colormaps["viridis"](np.linspace(0.0, 0.82, 256))
 )
-GROUND_TRUTH_COLOR = "white"
-PREDICTION_COLOR = "#ff4d40"
-PREDICTION_TEXT_COLOR = "#ff7d70"  # thin strokes need more light than lines
 ROI_COLOR = "black"
 # Okabe and Ito's palette: told apart under every common colour blindness.
 CLASS_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#CC79A7")
 SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+Side = Literal["left", "right", "above"]
+
+
+class Style(NamedTuple):
+    """How one set of boxes is drawn.
+
+    Attributes:
+        name: In legends.
+        color: Of lines.
+        text_color: Of labels; thin strokes need more light than lines.
+        map_width: Of lines on a map, points.
+        image_width: Of lines on an image, points.
+        side: Of a box on a map where its label stands.
+    """
+
+    name: str
+    color: str
+    text_color: str
+    map_width: float
+    image_width: float
+    side: Side
+
+
+GROUND_TRUTH = Style("ground truth", "white", "white", 1.9, 1.6, "left")
+PREDICTION = Style("prediction", "#ff4d40", "#ff7d70", 1.3, 1.2, "right")
 
 
 class Objects(NamedTuple):
@@ -74,46 +100,25 @@ def as_objects(
         return Objects(np.zeros((0, 7)), ())
     if class_names is None:
         class_names = getattr(value, "class_names", CLASSES)
+    scores = is_valid = None
     if isinstance(value, Objects):
-        boxes, classes, scores, is_valid = value.boxes, value.names, value.scores, None
+        boxes, classes, scores = value
     elif isinstance(value, tuple | list):
         if len(value) not in (2, 3):
             raise UserError(
                 f"{what} must be (boxes, classes) or (boxes, scores, classes), "
                 f"got {len(value)} parts"
             )
-        boxes, classes, is_valid = value[0], value[-1], None
-        scores = value[1] if len(value) == 3 else None
+        boxes, *scores, classes = value
+        scores = scores[0] if scores else None
     else:
-        boxes = _field(value, ("boxes", "box"), what)
-        classes = _field(value, ("classes", "cls"), what)
-        scores = _field(value, ("scores", "score"), None)
-        is_valid = _field(value, ("is_valid",), None)
-    return _checked(boxes, classes, scores, is_valid, class_names, what)
-
-
-def _field(value: Any, names: tuple[str, ...], required_for: str | None) -> Any:
-    """First of the names that a mapping or object has."""
-    for name in names:
-        if isinstance(value, Mapping):
-            if name in value:
-                return value[name]
-        elif getattr(value, name, None) is not None:
-            return getattr(value, name)
-    if required_for is None:
-        return None
-    raise UserError(f"{required_for} ({type(value).__name__}) has no {names[0]!r}")
-
-
-def _checked(
-    boxes: Any,
-    classes: Any,
-    scores: Any,
-    is_valid: Any,
-    class_names: Sequence[str] | None,
-    what: str,
-) -> Objects:
-    """Valid rows as `Objects`, after a look at every shape."""
+        boxes = _field(value, "boxes", "box")
+        classes = _field(value, "classes", "cls")
+        scores = _field(value, "scores", "score")
+        is_valid = _field(value, "is_valid")
+        for name, column in (("boxes", boxes), ("classes", classes)):
+            if column is None:
+                raise UserError(f"{what} ({type(value).__name__}) has no {name!r}")
     boxes = np.asarray(boxes, np.float64)
     if boxes.size == 0:
         return Objects(np.zeros((0, 7)), (), None if scores is None else np.zeros(0))
@@ -127,14 +132,18 @@ def _checked(
         if column is not None and len(column) != len(boxes):
             raise UserError(f"{what}: {len(boxes)} boxes but {len(column)} {name}")
     keep = np.ones(len(boxes), bool) if is_valid is None else np.asarray(is_valid, bool)
-    names = tuple(
-        _class_name(c, class_names, what)
-        for c, kept in zip(classes, keep, strict=True)
-        if kept
-    )
+    kept_classes = (c for c, kept in zip(classes, keep, strict=True) if kept)
     return Objects(
-        boxes[keep], names, None if scores is None else np.asarray(scores)[keep]
+        boxes[keep],
+        tuple(_class_name(c, class_names, what) for c in kept_classes),
+        None if scores is None else np.asarray(scores)[keep],
     )
+
+
+def _field(value: Any, *names: str) -> Any:
+    """First of the names that a mapping or object has, or None."""
+    get = value.get if isinstance(value, Mapping) else functools.partial(getattr, value)
+    return next((v for v in (get(n, None) for n in names) if v is not None), None)
 
 
 def _class_name(value: Any, class_names: Sequence[str], what: str) -> str:
@@ -146,6 +155,62 @@ def _class_name(value: Any, class_names: Sequence[str], what: str) -> str:
             f"{what}: class index {int(value)} has no name among {tuple(class_names)}"
         )
     return class_names[int(value)]
+
+
+def styled_sets(
+    ground_truth: Any, predictions: Any, class_names: Sequence[str] | None
+) -> list[tuple[Style, Objects]]:
+    """Both sets as `Objects` with their styles; what is None is left out."""
+    sets = []
+    if ground_truth is not None:
+        truth = as_objects(ground_truth, class_names, what="ground_truth")
+        sets.append((GROUND_TRUTH, truth._replace(scores=None)))
+    if predictions is not None:
+        found = as_objects(predictions, class_names, what="predictions")
+        sets.append((PREDICTION, found))
+    return sets
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """One frame to show; every picture takes from it what it needs.
+
+    Attributes:
+        projection: `[R, A, D+E]` normalised log power of one frame.
+        grid: The grid of the projection.
+        ground_truth: Boxes with classes; anything that `as_objects` takes, such as
+            `(boxes [N, 7], classes)` or a frame; or None.
+        predictions: Boxes with scores and classes, such as `(boxes, scores, classes)`
+            or one frame of `Detections`; or None.
+        roi: x_min, x_max, y_min, y_max, z_min, z_max in metres (z may be left out): the
+            dashed rectangle where detections count; or None.
+        image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
+        camera: Calibration of the image: draws the boxes on it; or None.
+        title: Such as sequence, frame and weather.
+        class_names: Names of class indices, see `as_objects`.
+        zoom: x and y in metres of the place that `scenes` magnifies, or None.
+        track_ids: One hashable id per ground truth box, None for a box without trail; for
+            recordings; or None.
+        time_s: Seconds since the Unix epoch, for recordings; or None.
+    """
+
+    projection: Any
+    grid: RadarGrid
+    ground_truth: Any = None
+    predictions: Any = None
+    roi: Sequence[float] | None = None
+    image: Any = None
+    camera: CameraCalibration | None = None
+    title: str = ""
+    class_names: Sequence[str] | None = None
+    zoom: tuple[float, float] | None = None
+    track_ids: Any = None
+    time_s: float | None = None
+
+    @functools.cached_property
+    def sets(self) -> list[tuple[Style, Objects]]:
+        """Ground truth and predictions, where given, with their styles."""
+        return styled_sets(self.ground_truth, self.predictions, self.class_names)
 
 
 def label_texts(objects: Objects) -> list[str]:
@@ -184,6 +249,21 @@ def heading_marks(boxes: np.ndarray) -> np.ndarray:
     """
     front = bev_corners(boxes)[:, [0, 3]].mean(1)
     return np.stack([front, front + 0.7 * (front - boxes[:, :2])], 1)
+
+
+def draw_tiles(
+    ax: Axes,
+    edges_x: np.ndarray,
+    edges_y: np.ndarray,
+    values: np.ndarray,
+    color_limits: tuple[float, float] | None = None,
+    cmap: Any = COLOR_MAP,
+) -> Any:
+    """One tile per value; the colour bar's ends are the values' own by default."""
+    low, high = color_limits or color_limits_of(values)
+    return ax.pcolormesh(
+        edges_x, edges_y, values, cmap=cmap, vmin=low, vmax=high, rasterized=True
+    )
 
 
 def add_colorbar(mesh: Any, ax: Axes, label: str) -> None:

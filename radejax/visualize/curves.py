@@ -6,16 +6,14 @@ import json
 import os
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from radejax.core.errors import DataError, UserError
 from radejax.visualize.canvas import SERIES_COLORS, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 LOSS_KEYS = ("focal", "gwd", "smooth_l1")
 _LINE_STYLES = ("-", "--", "-.", ":")

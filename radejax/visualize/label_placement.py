@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from radejax.visualize.canvas import halo
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-Side = Literal["left", "right", "above"]
+from radejax.visualize.canvas import Side, halo
 
 # Sizes of DejaVu Sans, in units of the font size: near enough to reserve room.
 _CHARACTER_WIDTH = 0.60
 _LINE_HEIGHT = 1.25
 _MOST_COVERED = 0.1  # of a label by others, to stay readable
+
+
+class Label(NamedTuple):
+    """A text beside an outline.
+
+    Attributes:
+        outline: `[P, 2]` points in data coordinates.
+        text: One line.
+        color: Of text and leader.
+        side: Where the text should stand.
+    """
+
+    outline: np.ndarray
+    text: str
+    color: str
+    side: Side
 
 
 def place_labels(
@@ -91,10 +103,7 @@ def _overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def draw_labels(
     ax: Axes,
-    outlines: Sequence[np.ndarray],
-    texts: Sequence[str],
-    colors: Sequence[str],
-    prefer: Sequence[Side],
+    labels: Sequence[Label],
     *,
     font_size: float = 7.5,
     keep_boxes_clear: bool = True,
@@ -107,52 +116,38 @@ def draw_labels(
 
     Args:
         ax: Where to draw.
-        outlines: N arrays `[P, 2]` of points in data coordinates.
-        texts: N texts.
-        colors: N colours.
-        prefer: N sides where the texts should stand.
+        labels: The most important first.
         font_size: Points.
         keep_boxes_clear: Texts avoid all outlines, not only other texts.
     """
     frame = ax.get_window_extent().extents
-    rectangles = np.zeros((len(outlines), 4))
-    for i, outline in enumerate(outlines):
-        pixels = ax.transData.transform(outline)
-        rectangles[i] = [*pixels.min(0), *pixels.max(0)]
-    centers = (rectangles[:, :2] + rectangles[:, 2:]) / 2
-    shown = np.flatnonzero(((centers >= frame[:2]) & (centers <= frame[2:])).all(-1))
-    if not shown.size:
-        return
     low, high = frame[:2], frame[2:]
-    anchors = np.concatenate(
-        [
-            np.clip(rectangles[shown, :2], low, high),
-            np.clip(rectangles[shown, 2:], low, high),
-        ],
-        -1,
-    )
+    shown, anchors = [], []
+    for label in labels:
+        pixels = ax.transData.transform(label.outline)
+        first, last = pixels.min(0), pixels.max(0)
+        center = (first + last) / 2
+        if ((center >= low) & (center <= high)).all():
+            shown.append(label)
+            anchors.append([*np.clip(first, low, high), *np.clip(last, low, high)])
+    if not shown:
+        return
+    anchors = np.array(anchors)
     pixel_per_point = ax.figure.dpi / 72
     line = font_size * pixel_per_point
     sizes = np.array(
-        [[_CHARACTER_WIDTH * line * len(texts[i]), _LINE_HEIGHT * line] for i in shown]
+        [[_CHARACTER_WIDTH * line * len(s.text), _LINE_HEIGHT * line] for s in shown]
     )
     corners = place_labels(
         anchors if keep_boxes_clear else np.zeros((0, 4)),
         anchors,
         sizes,
-        [prefer[i] for i in shown],
+        [label.side for label in shown],
         frame,
         gap=3 * pixel_per_point,
     )
-    is_free = _is_free(np.concatenate([corners, corners + sizes], -1))
-    for i, anchor, corner, size in zip(
-        shown[is_free],
-        anchors[is_free],
-        corners[is_free],
-        sizes[is_free],
-        strict=True,
-    ):
-        _draw_label(ax, texts[i], colors[i], anchor, corner, size, font_size=font_size)
+    for i in np.flatnonzero(_is_free(np.concatenate([corners, corners + sizes], -1))):
+        _draw_label(ax, shown[i], anchors[i], corners[i], sizes[i], font_size)
 
 
 def _is_free(places: np.ndarray) -> np.ndarray:
@@ -167,12 +162,10 @@ def _is_free(places: np.ndarray) -> np.ndarray:
 
 def _draw_label(
     ax: Axes,
-    text: str,
-    color: str,
+    label: Label,
     anchor: np.ndarray,
     corner: np.ndarray,
     size: np.ndarray,
-    *,
     font_size: float,
 ) -> None:
     """One text, aligned with the nearest point of its box, with a leader if it moved."""
@@ -187,15 +180,16 @@ def _draw_label(
     # The point of the text that is nearest to the box.
     near = np.clip(edge, corner, corner + size)
     has_moved = np.hypot(*(near - edge)) > 0.75 * size[1]
-    leader = {"arrowstyle": "-", "color": color, "lw": 0.6, "shrinkA": 0, "shrinkB": 0}
+    leader = {"arrowstyle": "-", "color": label.color, "lw": 0.6}
+    leader |= {"shrinkA": 0, "shrinkB": 0}
     ax.annotate(
-        text,
+        label.text,
         xy=ax.transData.inverted().transform(edge),
         xytext=(target - edge) * 72 / ax.figure.dpi,
         textcoords="offset points",
         ha=align,
         va="center",
-        color=color,
+        color=label.color,
         fontsize=font_size,
         path_effects=halo(1.6),
         arrowprops=leader if has_moved else None,

@@ -1,27 +1,41 @@
-"""Range-azimuth maps on the ground plane: every bin covers the ground it measures."""
+"""Range-azimuth maps on the ground plane, and what is drawn over radar maps.
+
+Every bin covers the ground that it measures. Over it: the region of interest, boxes with
+headings and labels, the legend.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
 
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.canvas import (
     COLOR_MAP,
+    ROI_COLOR,
+    Objects,
+    Scene,
+    Style,
     add_colorbar,
-    color_limits_of,
+    draw_tiles,
+    footprints,
+    halo,
+    heading_marks,
+    label_texts,
     new_figure,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from radejax.visualize.label_placement import Label, draw_labels
 
 Extent = Literal["roi", "fov"] | Sequence[float]
 _OUTSIDE_COLOR = "0.90"
 _BEHIND_M = 2.0  # shown behind the sensor, so that its mark is whole
+_POINTS_PER_EDGE = 8  # straight edges bend in the polar view
 
 
 def draw_map(
@@ -57,7 +71,6 @@ def draw_map(
     ax = axes_for_extent((x0, x1, y0, y1)) if ax is None else ax
     rows, columns = _bins_shown(grid, (x0, x1, y0, y1))
     shown = values[rows, columns]
-    low, high = color_limits or color_limits_of(shown)
     # Edges half a bin outside the centers; the range edge before zero is zero.
     range_cell = np.arange(grid.num_range + 1) - 0.5
     range_cell = np.maximum(range_cell, -grid.range_m[0] / grid.range_step_m)
@@ -66,15 +79,7 @@ def draw_map(
         np.arange(columns.start, columns.stop + 1)[None, :] - 0.5,
     )  # [R' + 1, A' + 1, 2]
     ax.set_facecolor(_OUTSIDE_COLOR)
-    mesh = ax.pcolormesh(
-        edges[..., 1],
-        edges[..., 0],
-        shown,
-        cmap=cmap,
-        vmin=low,
-        vmax=high,
-        rasterized=True,
-    )
+    mesh = draw_tiles(ax, edges[..., 1], edges[..., 0], shown, color_limits, cmap)
     # Seen from above with x ahead, left is left: y grows to the left.
     ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, left [m]", ylabel="x, ahead [m]")
     ax.set_aspect("equal")
@@ -143,3 +148,102 @@ def _bins_shown(grid: RadarGrid, extent: Sequence[float]) -> tuple[slice, slice]
     first = int(np.clip(np.floor(low) - 1, 0, grid.num_range - 1))
     last = int(np.clip(np.ceil(high) + 2, first + 1, grid.num_range))
     return slice(first, last), slice(0, grid.num_azimuth)
+
+
+# Over maps ---------------------------------------------------------------------------
+
+
+def draw_roi(ax: Axes, outline: np.ndarray) -> None:
+    """Dashed black line with a white rim: visible on dark and on bright ground."""
+    ax.plot(
+        *outline.T,
+        color=ROI_COLOR,
+        linewidth=1.4,
+        linestyle=(0, (5, 3)),
+        path_effects=halo(2.6, "white"),
+        zorder=3,
+    )
+
+
+def draw_objects(
+    ax: Axes,
+    sets: Sequence[tuple[Style, Objects]],
+    to_axes: Callable[[np.ndarray], np.ndarray],
+    *,
+    show_labels: bool,
+) -> None:
+    """Boxes with heading marks, then their labels: ground truth left, found right.
+
+    Args:
+        ax: Where to draw; limits and aspect are final.
+        sets: Of a `Scene`.
+        to_axes: Ground positions `[..., 2]` to data coordinates.
+        show_labels: Write class and score beside the boxes.
+    """
+    ax.apply_aspect()
+    sets = [(style, objects) for style, objects in sets if len(objects.boxes)]
+    if not sets:
+        return
+    labels = []
+    thickness = _thickness(ax, np.concatenate([o.boxes for _, o in sets]), to_axes)
+    for order, (style, objects) in enumerate(sets):
+        edges = to_axes(footprints(objects.boxes, _POINTS_PER_EDGE))
+        marks = to_axes(heading_marks(objects.boxes))
+        width = style.map_width * thickness
+        ax.add_collection(
+            LineCollection(
+                [*edges, *marks],
+                colors=style.color,
+                linewidths=width,
+                path_effects=halo(width + 1.2 * thickness),
+                capstyle="round",
+                zorder=4 + order,
+            ),
+            autolim=False,
+        )
+        outlines = np.concatenate([edges, marks], 1)
+        labels += [
+            Label(outline, text, style.text_color, style.side)
+            for outline, text in zip(outlines, label_texts(objects), strict=True)
+        ]
+    if show_labels:
+        draw_labels(ax, labels)
+
+
+def _thickness(ax: Axes, boxes: np.ndarray, to_axes: Callable) -> float:
+    """Factor on line widths, so that outlines of small boxes do not become blobs."""
+    points = ax.transData.transform(to_axes(footprints(boxes)).reshape(-1, 2))
+    edges = np.diff(points.reshape(-1, 5, 2), axis=1)
+    short_side_pt = np.hypot(*np.moveaxis(edges, -1, 0)).min(-1) * 72 / ax.figure.dpi
+    return float(np.clip(np.median(short_side_pt) / 8.0, 0.5, 1.0))
+
+
+def legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
+    """One handle per kind of line in the picture."""
+    handles = []
+    for style, objects in scene.sets:
+        count = f" ({len(objects.boxes)})" if show_counts else ""
+        width, label = style.map_width, style.name + count
+        line = Line2D([], [], color=style.color, lw=width, label=label)
+        line.set_path_effects(halo(width + 1.4))
+        handles.append(line)
+    if scene.roi is not None:
+        handles.append(
+            Line2D([], [], color=ROI_COLOR, lw=1.4, ls="--", label="region of interest")
+        )
+    return handles
+
+
+def draw_legend(ax: Axes, scene: Scene) -> None:
+    """Legend above the axes, where it hides nothing."""
+    handles = legend_handles(scene)
+    if handles:
+        ax.legend(
+            handles=handles,
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=len(handles),
+            fontsize=8,
+            frameon=False,
+            handlelength=1.6,
+        )

@@ -8,17 +8,15 @@ velocity, never the velocity: pictures say so.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize.canvas import COLOR_MAP, color_limits_of, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from radejax.visualize.canvas import color_limits_of, draw_tiles, new_figure
 
 Channels = Literal["all", "doppler", "elevation"]
 Reduce = Literal["max", "mean"]
@@ -170,16 +168,8 @@ def draw_slice(
         where = "max over range" if index is None else _at(grid.range_m, index, " m")
         title = f"Azimuth–elevation, {where}"
     ax = new_figure(5.0, 4.2).add_subplot() if ax is None else ax
-    low, high = color_limits or color_limits_of(values)
-    mesh = ax.pcolormesh(
-        bin_edges(horizontal),
-        bin_edges(vertical),
-        values,
-        cmap=COLOR_MAP,
-        vmin=low,
-        vmax=high,
-        rasterized=True,
-    )
+    edges = bin_edges(horizontal), bin_edges(vertical)
+    mesh = draw_tiles(ax, *edges, values, color_limits)
     ax.set(xlabel=labels[0], ylabel=labels[1], title=title)
     ax.figure.colorbar(mesh, ax=ax, label=_UNIT_LABELS[units])
     return ax

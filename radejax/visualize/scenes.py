@@ -6,23 +6,21 @@ References:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from radejax.core.errors import UserError
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import bev
-from radejax.visualize.canvas import COLOR_MAP, new_figure
-from radejax.visualize.overlays import both_sets, legend_handles
+from radejax.visualize.canvas import COLOR_MAP, Scene, new_figure
+from radejax.visualize.maps import legend_handles
 from radejax.visualize.projections import color_label, range_azimuth
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ZOOM_COLOR = "#E69F00"
 """Orange of Okabe and Ito's colour-blind safe set, as the papers' magnified views."""
@@ -31,49 +29,18 @@ _COLOR_PERCENTILES = (20.0, 99.5)
 _FOOT_IN = 0.8  # legend and colour bar
 
 
-class Scene(NamedTuple):
-    """One frame to show.
-
-    Attributes:
-        projection: `[R, A, D+E]` normalised log power.
-        ground_truth: As in `bev.draw_bev`.
-        predictions: As in `bev.draw_bev`.
-        image: `[H, W, 3]` left front image, or None.
-        camera: `CameraCalibration` of the image, or None.
-        title: Such as the weather.
-        zoom: x and y in metres of the place to magnify, or None.
-    """
-
-    projection: Any
-    ground_truth: Any = None
-    predictions: Any = None
-    image: Any = None
-    camera: Any = None
-    title: str = ""
-    zoom: tuple[float, float] | None = None
-
-
 def draw_scenes(
-    scenes: Sequence[Scene],
-    grid: RadarGrid,
-    *,
-    roi: Sequence[float] | None = None,
-    columns: int = 4,
-    class_names: Sequence[str] | None = None,
-    zoom_m: float = 10.0,
+    scenes: Sequence[Scene], *, columns: int = 4, zoom_m: float = 10.0
 ) -> Figure:
     """Figure of scenes side by side: ground truth, predictions and region in each.
 
     Args:
-        scenes: At least one.
-        grid: The grid of the projections.
-        roi: Region of interest, dashed; as in `bev.draw_bev`.
+        scenes: At least one; the legend is the first one's.
         columns: Scenes in a row.
-        class_names: Names of class indices; see `canvas.as_objects`.
         zoom_m: Width and height of what is magnified, metres.
 
     Raises:
-        UserError: No scenes, or one that does not fit the grid.
+        UserError: No scenes, or one that does not fit its grid.
     """
     if not scenes:
         raise UserError("no scenes to draw")
@@ -81,7 +48,8 @@ def draw_scenes(
     rows = -(-len(scenes) // columns)
     width, height = 3.9 * columns, 6.4 * rows + _FOOT_IN
     figure = new_figure(width, height)
-    limits = _common_limits(scenes, grid)
+    limits = _common_limits(scenes)
+    options = {"color_limits": limits, "show_legend": False, "show_colorbar": False}
     for index, scene in enumerate(scenes):
         row, column = divmod(index, columns)
         left = (column + 0.14) / columns
@@ -90,42 +58,21 @@ def draw_scenes(
         def place(y: float, h: float, x: float = left, base: float = bottom) -> tuple:
             return x, base + y / height, 0.83 / columns, h / height
 
-        shown = {
-            "ground_truth": scene.ground_truth,
-            "predictions": scene.predictions,
-            "class_names": class_names,
-        }
         above = None
         if scene.image is not None:
             above = figure.add_axes(place(4.25, 1.85))
-            truth, found = both_sets(*list(shown.values())[:2], class_names)
             # Labels are readable on the map; here they would hide the image.
-            bev.draw_view(
-                above, scene.image, scene.camera, truth, found, show_labels=False
-            )
+            bev.draw_view(above, scene, show_labels=False)
         below = figure.add_axes(place(0.55, 3.6))
-        bev.draw_bev(
-            scene.projection,
-            grid,
-            ax=below,
-            roi=roi,
-            color_limits=limits,
-            show_legend=False,
-            show_colorbar=False,
-            **shown,
-        )
+        bev.draw_bev(dataclasses.replace(scene, title=""), ax=below, **options)
         if column:
             below.set_ylabel("")
         (above or below).set_title(scene.title, fontsize=11)
         if scene.zoom is not None:
-            _magnify(below, scene, grid, limits, zoom_m, class_names)
+            _magnify(below, scene, zoom_m, options)
     _draw_colorbar(figure, limits)
-    first = both_sets(scenes[0].ground_truth, scenes[0].predictions, class_names)
-    handles = legend_handles(*first, roi)
-    for handle in handles:  # numbers of one scene would mislead
-        handle.set_label(handle.get_label().split(" (")[0])
     figure.legend(
-        handles=handles,
+        handles=legend_handles(scenes[0], show_counts=False),  # of one scene alone
         loc="lower left",
         bbox_to_anchor=(0.3 / width, 0.2 / height),
         ncols=3 if columns > 1 else 1,
@@ -134,10 +81,10 @@ def draw_scenes(
     return figure
 
 
-def _common_limits(scenes: Sequence[Scene], grid: RadarGrid) -> tuple[float, float]:
+def _common_limits(scenes: Sequence[Scene]) -> tuple[float, float]:
     """One colour scale for all scenes, which the few strongest echoes exceed."""
-    values = np.stack([range_azimuth(scene.projection, grid) for scene in scenes])
-    low, high = np.nanpercentile(values, _COLOR_PERCENTILES)
+    values = [range_azimuth(scene.projection, scene.grid).ravel() for scene in scenes]
+    low, high = np.nanpercentile(np.concatenate(values), _COLOR_PERCENTILES)
     return float(low), float(high) if high > low else float(low) + 1.0
 
 
@@ -153,17 +100,8 @@ def _draw_colorbar(figure: Figure, limits: tuple[float, float]) -> None:
     bar.ax.tick_params(labelsize=8)
 
 
-def _magnify(
-    ax: Axes,
-    scene: Scene,
-    grid: RadarGrid,
-    limits: tuple[float, float],
-    size_m: float,
-    class_names: Sequence[str] | None,
-) -> None:
+def _magnify(ax: Axes, scene: Scene, size_m: float, options: dict) -> None:
     """An orange square on the map and what is in it, larger, in a corner."""
-    from matplotlib.patches import Rectangle
-
     x, y = scene.zoom
     half = size_m / 2
     # The axes show y to the left and x up.
@@ -174,17 +112,11 @@ def _magnify(
     )
     inset = ax.inset_axes((0.60, 0.02, 0.38, 0.38 * _aspect(ax)))
     bev.draw_bev(
-        scene.projection,
-        grid,
+        dataclasses.replace(scene, title="", roi=None),
         ax=inset,
         extent=(x - half, x + half, y - half, y + half),
-        ground_truth=scene.ground_truth,
-        predictions=scene.predictions,
-        class_names=class_names,
-        color_limits=limits,
         show_labels=False,
-        show_legend=False,
-        show_colorbar=False,
+        **options,
     )
     inset.set(xticks=[], yticks=[], xlabel="", ylabel="")
     for spine in inset.spines.values():

@@ -5,74 +5,51 @@ Needs the extra `viewer` (`pip install radejax[viewer]`); nothing else does.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import pathlib
 import shutil
 import subprocess
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from radejax.core.errors import UserError
 from radejax.core.files import atomic_path
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize.canvas import COLOR_MAP, Objects, color_limits_of, label_texts
-from radejax.visualize.overlays import both_sets
+from radejax.visualize.canvas import (
+    COLOR_MAP,
+    GROUND_TRUTH,
+    PREDICTION,
+    Objects,
+    Scene,
+    Style,
+    color_limits_of,
+    label_texts,
+)
 from radejax.visualize.projections import check_projection, range_azimuth
 
-if TYPE_CHECKING:
-    from radejax.geometry.calibration import CameraCalibration
-
-_GROUND_TRUTH_RGB = (255, 255, 255)
-_PREDICTION_RGB = (255, 77, 64)
 _INSTALL = (
     "the viewer needs rerun, which is not installed: pip install 'radejax[viewer]' "
     "(or pip install rerun-sdk)"
 )
 
-
-@dataclasses.dataclass(frozen=True)
-class ViewerFrame:
-    """What one frame of a recording shows.
-
-    Attributes:
-        projection: `[R, A, D+E]` normalised log power.
-        ground_truth: Boxes with classes, see `canvas.as_objects`, or None.
-        predictions: Boxes with scores and classes, or None.
-        track_ids: One hashable id per ground truth box, None for a box without trail; or
-            None.
-        image: `[H, W, 3]` uint8 camera image, or None.
-        calibration: Of the image, to draw boxes on it, or None.
-        time_s: Seconds since the Unix epoch, or None.
-        name: Shown as text, or None.
-    """
-
-    projection: Any
-    ground_truth: Any = None
-    predictions: Any = None
-    track_ids: Any = None
-    image: Any = None
-    calibration: CameraCalibration | None = None
-    time_s: float | None = None
-    name: str | None = None
+_ENTITIES = {GROUND_TRUTH.name: "ground_truth", PREDICTION.name: "predictions"}
 
 
 def write_recording(
-    frames: Iterable[ViewerFrame],
-    grid: RadarGrid,
+    scenes: Iterable[Scene],
     path: str | os.PathLike,
     *,
     num_points: int = 3000,
     elevation_sign: int = 1,
     trail_length: int = 20,
 ) -> pathlib.Path:
-    """Writes frames into a recording (.rrd) that `rerun PATH` opens.
+    """Writes scenes into a recording (.rrd) that `rerun PATH` opens.
 
     Args:
-        frames: In time order; an iterator keeps memory constant.
-        grid: The grid of all projections.
+        scenes: Frames in time order; an iterator keeps memory constant.
         path: Target, written completely or not at all.
         num_points: Strongest echoes shown as points.
         elevation_sign: See `echo_points`.
@@ -95,9 +72,9 @@ def write_recording(
         stream.log("world", rr.ViewCoordinates.FLU, static=True)
         trails: dict[Any, list[np.ndarray]] = {}
         count = 0
-        for count, frame in enumerate(frames, 1):
-            _log_frame(stream, frame, grid, count - 1, num_points, elevation_sign)
-            _log_trails(stream, frame, trails, trail_length)
+        for count, scene in enumerate(scenes, 1):
+            _log_scene(stream, scene, count - 1, num_points, elevation_sign)
+            _log_trails(stream, scene, trails, trail_length)
         if not count:
             raise UserError("no frames to record")
         stream.flush()
@@ -207,25 +184,20 @@ def _blueprint() -> Any:
     )
 
 
-def _log_frame(
-    stream: Any,
-    frame: ViewerFrame,
-    grid: RadarGrid,
-    index: int,
-    num_points: int,
-    elevation_sign: int,
+def _log_scene(
+    stream: Any, scene: Scene, index: int, num_points: int, elevation_sign: int
 ) -> None:
-    """One frame's radar, boxes, image and name."""
+    """One frame's radar, boxes, image and title."""
     import rerun as rr
 
     stream.set_time("frame", sequence=index)
-    if frame.time_s is not None:
-        stream.set_time("time", timestamp=frame.time_s)
-    if frame.name is not None:
-        stream.log("frame", rr.TextDocument(frame.name))
-    power = range_azimuth(frame.projection, grid)
+    if scene.time_s is not None:
+        stream.set_time("time", timestamp=scene.time_s)
+    if scene.title:
+        stream.log("frame", rr.TextDocument(scene.title))
+    power = range_azimuth(scene.projection, scene.grid)
     low, high = color_limits_of(power)
-    vertices, triangles = ground_mesh(grid)
+    vertices, triangles = ground_mesh(scene.grid)
     stream.log(
         "world/bev",
         rr.Mesh3D(
@@ -235,27 +207,26 @@ def _log_frame(
         ),
     )
     points, strength = echo_points(
-        frame.projection, grid, num_points, elevation_sign=elevation_sign
+        scene.projection, scene.grid, num_points, elevation_sign=elevation_sign
     )
     brightest = max(float(strength.max()), 1e-6)
     stream.log(
         "world/echoes",
         rr.Points3D(points, colors=_colors(strength / brightest), radii=0.12),
     )
-    truth, found = both_sets(frame.ground_truth, frame.predictions, None)
-    for name, objects, color in (
-        ("ground_truth", truth, _GROUND_TRUTH_RGB),
-        ("predictions", found, _PREDICTION_RGB),
-    ):
-        if objects is not None:
-            stream.log(f"world/{name}", _boxes(objects, color))
-    if frame.image is not None:
-        stream.log("camera", rr.Image(np.asarray(frame.image)))
-        if frame.calibration is not None:
-            _log_overlay(stream, frame.calibration, truth, found)
+    if scene.image is not None:
+        stream.log("camera", rr.Image(np.asarray(scene.image)))
+    for style, objects in scene.sets:
+        name = _ENTITIES[style.name]
+        stream.log(f"world/{name}", _boxes(objects, style))
+        if scene.image is not None and scene.camera is not None:
+            segments, is_visible = scene.camera.project_boxes(objects.boxes)
+            strips = segments[is_visible]
+            lines = rr.LineStrips2D(strips, colors=[_rgb(style)] * len(strips))
+            stream.log(f"camera/{name}", lines)
 
 
-def _boxes(objects: Objects, color: tuple[int, int, int]) -> Any:
+def _boxes(objects: Objects, style: Style) -> Any:
     """Boxes as rerun draws them."""
     import rerun as rr
 
@@ -265,7 +236,7 @@ def _boxes(objects: Objects, color: tuple[int, int, int]) -> Any:
         half_sizes=boxes[:, 3:6] / 2,
         quaternions=yaw_quaternions(boxes[:, 6]),
         labels=label_texts(objects),
-        colors=[color] * len(boxes),
+        colors=[_rgb(style)] * len(boxes),
     )
 
 
@@ -275,47 +246,23 @@ def yaw_quaternions(yaw_rad: np.ndarray) -> np.ndarray:
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], -1)
 
 
-def _log_overlay(
-    stream: Any,
-    calibration: CameraCalibration,
-    truth: Objects | None,
-    found: Objects | None,
-) -> None:
-    """Edges of the boxes on the image."""
-    import rerun as rr
-
-    for name, objects, color in (
-        ("ground_truth", truth, _GROUND_TRUTH_RGB),
-        ("predictions", found, _PREDICTION_RGB),
-    ):
-        if objects is None:
-            continue
-        segments, is_visible = calibration.project_boxes(objects.boxes)
-        stream.log(
-            f"camera/{name}",
-            rr.LineStrips2D(segments[is_visible], colors=[color] * is_visible.sum()),
-        )
-
-
 def _log_trails(
     stream: Any,
-    frame: ViewerFrame,
+    scene: Scene,
     trails: dict[Any, list[np.ndarray]],
     trail_length: int,
 ) -> None:
     """Where each tracked object was, in the moving ego frame."""
     import rerun as rr
 
-    if frame.track_ids is None or frame.ground_truth is None:
+    if scene.track_ids is None or scene.ground_truth is None:
         return
-    truth, _ = both_sets(frame.ground_truth, None, None)
-    if len(frame.track_ids) != len(truth.boxes):
-        raise UserError(
-            f"{len(truth.boxes)} boxes but {len(frame.track_ids)} track_ids"
-        )
+    boxes = scene.sets[0][1].boxes
+    if len(scene.track_ids) != len(boxes):
+        raise UserError(f"{len(boxes)} boxes but {len(scene.track_ids)} track_ids")
     seen = {
         track: box[:3]
-        for track, box in zip(frame.track_ids, truth.boxes, strict=True)
+        for track, box in zip(scene.track_ids, boxes, strict=True)
         if track is not None
     }
     for track in [t for t in trails if t not in seen]:
@@ -324,6 +271,11 @@ def _log_trails(
         trails[track] = [*trails.get(track, []), center][-trail_length:]
     strips = [np.array(t) for t in trails.values() if len(t) > 1]
     stream.log("world/tracks", rr.LineStrips3D(strips, radii=0.05))
+
+
+def _rgb(style: Style) -> tuple[int, ...]:
+    """The style's colour, 0 to 255."""
+    return tuple(round(255 * share) for share in to_rgb(style.color))
 
 
 def _colors(values: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.visualize import animate
-from radejax.visualize.canvas import PREDICTION_COLOR, new_figure
+from radejax.visualize.canvas import PREDICTION, new_figure
 
 
 def color_figure(color: str):
@@ -14,7 +14,7 @@ def color_figure(color: str):
 
 
 def test_gif_has_every_frame_in_order(tmp_path):
-    colors = ["white", PREDICTION_COLOR, "black"]
+    colors = ["white", PREDICTION.color, "black"]
     path = animate.animate(
         (color_figure(c) for c in colors), tmp_path / "a.gif", frames_per_second=5
     )
@@ -33,7 +33,7 @@ def test_gif_has_every_frame_in_order(tmp_path):
 
 
 def test_render_is_the_picture():
-    pixels = animate.render(color_figure(PREDICTION_COLOR))
+    pixels = animate.render(color_figure(PREDICTION.color))
     assert pixels.shape == (40, 50, 3)
     assert (pixels == [255, 77, 64]).all()
 
@@ -77,12 +77,15 @@ def test_mp4_pipes_every_frame(tmp_path, monkeypatch):
         f'echo "$@" > {tmp_path}/args; for last; do :; done; cat > "$last"\n',
     )
     monkeypatch.setenv("PATH", f"{tmp_path}/bin:/usr/bin:/bin")
-    frames = [np.full((4, 6, 3), i, np.uint8) for i in range(3)]
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 256, (4, 6, 3), np.uint8) for _ in range(3)]
     path = animate.animate(frames, tmp_path / "a.mp4", frames_per_second=12.5)
-    raw = np.frombuffer(path.read_bytes(), np.uint8).reshape(3, 4, 6, 3)
-    np.testing.assert_array_equal(raw, frames)
+    raw = np.frombuffer(path.read_bytes(), np.uint8).reshape(3, 4, 6, 4)
+    np.testing.assert_array_equal(raw[..., :3], frames)
+    assert (raw[..., 3] == 255).all()
     arguments = (tmp_path / "args").read_text()
-    assert "-s 6x4 -r 12.5" in arguments
+    assert "-s 6x4" in arguments
+    assert "-framerate 12.5" in arguments
     assert "yuv420p" in arguments
 
 

@@ -7,7 +7,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import bev
-from radejax.visualize.canvas import Objects, footprints
+from radejax.visualize.canvas import COLOR_MAP, Objects, Scene, footprints
 
 GRID = RadarGrid.reduced(num_doppler=4, num_range=60, num_elevation=3, num_azimuth=54)
 ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
@@ -33,7 +33,7 @@ def brightest_tile(figure, ax) -> np.ndarray:
     picture = pixels_of(figure)
     frame = np.round(ax.get_window_extent().extents).astype(int)
     inside = picture[frame[1] : frame[3], frame[0] : frame[2]]
-    color = np.round(255 * np.array(bev.COLOR_MAP(1.0)[:3])).astype(int)
+    color = np.round(255 * np.array(COLOR_MAP(1.0)[:3])).astype(int)
     rows, columns = np.nonzero((np.abs(inside - color) <= 2).all(-1))
     assert rows.size > 10
     return np.array([columns.mean() + 0.5, rows.mean() + 0.5]) + frame[:2]
@@ -42,7 +42,7 @@ def brightest_tile(figure, ax) -> np.ndarray:
 @pytest.mark.parametrize(("range_idx", "azimuth_idx"), [(20, 5), (30, 27), (33, 44)])
 def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
-    ax = bev.draw_bev(projection, GRID, extent="fov", show_legend=False)
+    ax = bev.draw_bev(Scene(projection, GRID), extent="fov", show_legend=False)
     x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
     tile = brightest_tile(ax.figure, ax)
     # At 5 pixels a metre a bin is 10 pixels deep; its center is hit to one pixel.
@@ -52,7 +52,7 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
 @pytest.mark.parametrize(("range_idx", "azimuth_idx"), [(20, 5), (50, 44)])
 def test_polar_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
-    ax = bev.draw_polar(projection, GRID, show_legend=False)
+    ax = bev.draw_polar(Scene(projection, GRID), show_legend=False)
     x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
     outline = bev._to_polar(np.array([x, y]))
     tile = brightest_tile(ax.figure, ax)
@@ -60,7 +60,7 @@ def test_polar_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
 
 
 def test_left_is_left_and_ahead_is_up():
-    ax = bev.draw_bev(blob_at(3, 3), GRID, roi=ROI)
+    ax = bev.draw_bev(Scene(blob_at(3, 3), GRID, roi=ROI))
     to_display = ax.transData.transform
     left, right = to_display((5.0, 20.0)), to_display((-5.0, 20.0))
     assert left[0] < right[0]
@@ -73,9 +73,8 @@ def test_left_is_left_and_ahead_is_up():
 def test_boxes_are_drawn_where_they_are():
     truth = ([[10.0, 3.0, 0.0, 4.0, 2.0, 1.5, np.pi / 2]], ["Sedan"])
     found = ([[20.0, -3.0, 0.0, 4.0, 2.0, 1.5, 0.0]], [0.875], [1])
-    ax = bev.draw_bev(
-        blob_at(3, 3), GRID, roi=ROI, ground_truth=truth, predictions=found
-    )
+    scene = Scene(blob_at(3, 3), GRID, roi=ROI, ground_truth=truth, predictions=found)
+    ax = bev.draw_bev(scene)
     boxes = [c for c in ax.collections if hasattr(c, "get_segments")]
     first, second = (c.get_segments()[0] for c in boxes)
     # Turned by 90 degrees: 4 m along y, 2 m along x. Axes hold (y, x).
@@ -93,21 +92,21 @@ def test_boxes_are_drawn_where_they_are():
 
 
 def test_roi_is_a_dashed_rectangle():
-    ax = bev.draw_bev(blob_at(3, 3), GRID, roi=ROI)
+    ax = bev.draw_bev(Scene(blob_at(3, 3), GRID, roi=ROI))
     line = next(line for line in ax.lines if line.is_dashed())
     y, x = line.get_data()
     assert (min(x), max(x), min(y), max(y)) == ROI[:4]
 
 
 def test_color_bar_names_unit_and_reduction():
-    ax = bev.draw_bev(blob_at(3, 3), GRID, units="db", reduce="mean")
+    ax = bev.draw_bev(Scene(blob_at(3, 3), GRID), units="db", reduce="mean")
     labels = [a.get_ylabel() for a in [*ax.figure.axes, *ax.child_axes]]
     assert "power [dB], mean over Doppler and elevation" in labels
 
 
 def test_frame_has_radar_camera_and_polar_view():
     image = np.zeros((72, 128, 3), np.uint8)
-    figure = bev.draw_frame(
+    scene = Scene(
         blob_at(20, 20),
         GRID,
         ground_truth=(footprint_boxes(3), ["Sedan"] * 3),
@@ -116,10 +115,11 @@ def test_frame_has_radar_camera_and_polar_view():
         image=image,
         title="sequence 1",
     )
+    figure = bev.draw_frame(scene)
     assert len(figure.axes) == 3
     assert figure.get_suptitle() == "sequence 1"
     assert any(ax.images for ax in figure.axes)
-    assert len(bev.draw_frame(blob_at(20, 20), GRID).axes) == 2
+    assert len(bev.draw_frame(Scene(blob_at(20, 20), GRID)).axes) == 2
 
 
 def footprint_boxes(count: int) -> np.ndarray:
@@ -136,28 +136,38 @@ def test_padded_maps_need_the_padded_grid():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("options", "message"),
     [
-        ({"roi": (0, 72, -6.4)}, "roi must be"),
-        ({"roi": (72, 0, -6.4, 6.4)}, "roi must be"),
         ({"extent": "all"}, "extent must be"),
         ({"extent": (0, 1, 2)}, "extent must be"),
         ({"channels": "power"}, "all, doppler, elevation"),
         ({"reduce": "sum"}, "max, mean"),
         ({"units": "dbm"}, "normalized, db"),
+    ],
+)
+def test_wrong_options_are_named(options, message):
+    with pytest.raises(UserError, match=message):
+        bev.draw_bev(Scene(blob_at(3, 3), GRID), **options)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"roi": (0, 72, -6.4)}, "roi must be"),
+        ({"roi": (72, 0, -6.4, 6.4)}, "roi must be"),
         ({"ground_truth": (np.zeros((1, 8)), ["Sedan"])}, r"\[N, 7\].*\(1, 8\)"),
         ({"ground_truth": (np.zeros((1, 7)), [])}, "1 boxes but 0 classes"),
         ({"predictions": (np.zeros((1, 7)), [0.5], [9])}, "class index 9"),
     ],
 )
-def test_wrong_use_is_named(arguments, message):
+def test_wrong_scenes_are_named(fields, message):
     with pytest.raises(UserError, match=message):
-        bev.draw_bev(blob_at(3, 3), GRID, **arguments)
+        bev.draw_bev(Scene(blob_at(3, 3), GRID, **fields))
 
 
 def test_batched_projection_is_refused():
     with pytest.raises(UserError, match="one frame"):
-        bev.draw_bev(blob_at(3, 3)[None], GRID)
+        bev.draw_bev(Scene(blob_at(3, 3)[None], GRID))
 
 
 def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
@@ -167,7 +177,7 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 
     def draw(i):
         try:
-            figure = bev.draw_frame(blob_at(20, 20), GRID, roi=ROI)
+            figure = bev.draw_frame(Scene(blob_at(20, 20), GRID, roi=ROI))
             bev.save_figure(figure, tmp_path / f"{i}.png")
         except Exception as error:
             errors.append(error)
@@ -186,9 +196,9 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 def test_a_frame_takes_less_than_two_seconds(tmp_path):
     """Half a second on an idle core; the bound leaves room for a busy machine."""
     truth = Objects(footprint_boxes(3), ("Sedan",) * 3)
-    bev.save_figure(bev.draw_frame(blob_at(9, 9), GRID), tmp_path / "warm.png")
+    bev.save_figure(bev.draw_frame(Scene(blob_at(9, 9), GRID)), tmp_path / "warm.png")
     start = time.process_time()
-    figure = bev.draw_frame(blob_at(9, 9), GRID, ground_truth=truth, roi=ROI)
+    figure = bev.draw_frame(Scene(blob_at(9, 9), GRID, ground_truth=truth, roi=ROI))
     bev.save_figure(figure, tmp_path / "frame.png")
     assert time.process_time() - start < 2.0
 

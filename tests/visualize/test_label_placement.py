@@ -58,13 +58,11 @@ def test_outlines_out_of_sight_get_no_text():
     ax = new_figure(4, 4).add_subplot()
     ax.set(xlim=(0, 10), ylim=(0, 10))
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    label_placement.draw_labels(
-        ax,
-        [square + 4, square + 40],
-        ["seen", "unseen"],
-        ["white", "white"],
-        ["left", "left"],
-    )
+    labels = [
+        label_placement.Label(square + shift, text, "white", "left")
+        for shift, text in ((4, "seen"), (40, "unseen"))
+    ]
+    label_placement.draw_labels(ax, labels)
     assert [t.get_text() for t in ax.texts] == ["seen"]
 
 
@@ -77,6 +75,7 @@ def test_of_texts_that_cover_each_other_the_first_is_drawn():
     ax.set(xlim=(0, 10), ylim=(0, 10))
     square = np.array([[4, 4], [6, 4], [6, 6], [4, 6]])
     texts = [f"a long text, number {i}" for i in range(60)]
-    label_placement.draw_labels(ax, [square] * 60, texts, ["white"] * 60, ["left"] * 60)
+    labels = [label_placement.Label(square, text, "white", "left") for text in texts]
+    label_placement.draw_labels(ax, labels)
     assert 1 <= len(ax.texts) < 60
     assert ax.texts[0].get_text() == texts[0]

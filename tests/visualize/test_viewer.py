@@ -7,21 +7,23 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import viewer
+from radejax.visualize.canvas import Scene
 
 GRID = RadarGrid.reduced(num_doppler=4, num_range=16, num_elevation=3, num_azimuth=9)
 BOX = [20.0, 3.0, 0.0, 4.0, 2.0, 1.5, 0.4]
 
 
-def frame(index: int) -> viewer.ViewerFrame:
+def frame(index: int) -> Scene:
     projection = np.full(GRID.projection_shape, 0.2, np.float32)
     projection[5, 3, 0] = projection[5, 3, GRID.num_doppler + 2] = 0.6
-    return viewer.ViewerFrame(
+    return Scene(
         projection,
+        GRID,
         ground_truth=([[BOX[0] + index, *BOX[1:]]], ["Sedan"]),
         predictions=([BOX], [0.5], [0]),
         track_ids=[7],
         time_s=1.6e9 + 0.1 * index,
-        name=f"frame {index}",
+        title=f"frame {index}",
     )
 
 
@@ -76,7 +78,7 @@ def test_without_rerun_the_extra_is_named(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without_rerun)
     with pytest.raises(UserError, match=r"radejax\[viewer\]"):
-        viewer.write_recording([frame(0)], GRID, tmp_path / "a.rrd")
+        viewer.write_recording([frame(0)], tmp_path / "a.rrd")
     assert not list(tmp_path.iterdir())
 
 
@@ -91,7 +93,7 @@ def test_opening_needs_recording_and_program(tmp_path, monkeypatch):
 
 def test_recording_needs_its_suffix(tmp_path):
     with pytest.raises(UserError, match=r"\.rrd"):
-        viewer.write_recording([frame(0)], GRID, tmp_path / "a.mp4")
+        viewer.write_recording([frame(0)], tmp_path / "a.mp4")
 
 
 def test_trails_follow_tracks_and_end_with_them():
@@ -116,10 +118,8 @@ def test_trails_follow_tracks_and_end_with_them():
 
 def test_recording_is_whole(tmp_path):
     pytest.importorskip("rerun")
-    path = viewer.write_recording(
-        (frame(i) for i in range(3)), GRID, tmp_path / "a.rrd"
-    )
+    path = viewer.write_recording((frame(i) for i in range(3)), tmp_path / "a.rrd")
     assert path.read_bytes()[:3] == b"RRF"
     with pytest.raises(UserError, match="no frames"):
-        viewer.write_recording([], GRID, tmp_path / "b.rrd")
+        viewer.write_recording([], tmp_path / "b.rrd")
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
