@@ -12,14 +12,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch, Detections
-from radejax.data import projection as projection_lib
 from radejax.data.cameras import CameraOptions
-from radejax.data.encoding import to_float
-from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.open import (
@@ -29,6 +27,7 @@ from radejax.inference.open import (
     load_torch,
     settings_of_config,
 )
+from radejax.inference.program import detect
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
@@ -186,7 +185,7 @@ class Detector:
     @classmethod
     def from_config(
         cls,
-        config: Any,
+        config: ConfigDict,
         variables: Mapping[str, Any],
         grid: RadarGrid,
         **overrides: Any,
@@ -366,35 +365,6 @@ class Detector:
         if self.device.platform == "cpu":
             return jax.device_put(x.copy(), self.device)
         return jax.block_until_ready(jax.device_put(x, self.device))
-
-
-def detect(
-    model: nn.Module,
-    grid: RadarGrid,
-    options: Mapping[str, Any],
-    variables: Any,
-    frames: jax.Array,
-    image: Any = None,
-    camera: Any = None,
-    *,
-    is_tesseract: bool = False,
-) -> Detections:
-    """From a batch of radar tensors to detections; pure, to be jitted.
-
-    Args:
-        model: Radar or radar-camera detector.
-        grid: Of its maps, see `models.map_grid`.
-        options: Keyword arguments of `radejax.detection.decode.decode`.
-        variables: Of the model.
-        frames: Projections `[B, R, A, D+E]` as they are stored, or tesseracts.
-        image: Of a radar-camera model, or None for the radar alone.
-        camera: Likewise.
-        is_tesseract: `frames` are `[B, D, R, E, A]`, linear power.
-    """
-    if is_tesseract:
-        frames = projection_lib.project_jax(frames)
-    inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
-    return decode(model.apply(variables, *inputs, train=False), grid, **options)
 
 
 def _pad_batch(x: Any, size: int) -> Any:

@@ -19,13 +19,16 @@ from radejax.data.kradar import Frame
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.detector import Detector, detect
+from radejax.inference.detector import Detector
 from radejax.inference.inputs import check_backbone
+from radejax.inference.program import detect
 from radejax.training import processes, sharding
 
 
 class Predictor:
     """A model with decoding and NMS, compiled once for the devices of a mesh.
+
+    It needs `update` with the model's variables before its first call.
 
     Args:
         model: Radar or radar-camera detector.
@@ -33,7 +36,6 @@ class Predictor:
         classes: Names in the order of the heatmap's channels.
         decode: Keyword arguments of `radejax.detection.decode.decode`.
         azimuth_mapping: "true", or "stretched" for official checkpoints.
-        variables: Of the model; `update` gives or takes others.
         mesh: All devices if None.
     """
 
@@ -45,12 +47,11 @@ class Predictor:
         classes: Sequence[str],
         decode: Mapping[str, Any],
         azimuth_mapping: str = "true",
-        variables: Mapping[str, Any] | None = None,
         mesh: jax.sharding.Mesh | None = None,
     ) -> None:
         self.mesh = sharding.make_mesh() if mesh is None else mesh
         self.classes = tuple(classes)
-        self.update(variables)
+        self.update(None)
         map_grid = models.map_grid(grid, model, azimuth_mapping)
 
         def predict(variables: Any, batch: Batch) -> tuple[Detections, jax.Array]:

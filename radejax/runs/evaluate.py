@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
+import jax
 import numpy as np
 from ml_collections import ConfigDict
 
@@ -65,20 +66,11 @@ def evaluate(
     """
     frames, seen = _frames(data, split, exchange_images)
     out = workdir / "evaluation" if out is None else out
-    predictor = Predictor(
-        model,
-        data.records.grid,
-        classes=config.classes,
-        decode=evaluation_decode(config),
-        azimuth_mapping=config.data.azimuth_mapping,
-        variables=variables,
-    )
+    predictor = make_predictor(config, model, data)
+    predictor.update(variables)
+    batch_size, images = config.evaluation.batch_size, data.images(seen)
     predictions = predict_dataset(
-        predictor,
-        data.records,
-        seen,
-        config.evaluation.batch_size,
-        images=data.images(seen),
+        predictor, data.records, seen, batch_size, images=images
     )
 
     def report() -> Report:
@@ -239,9 +231,22 @@ def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
     return exchanged
 
 
-def evaluation_decode(config: ConfigDict) -> dict[str, Any]:
-    """Keyword arguments of `decode` for evaluating: with its own score threshold."""
-    return {**config.decode, "score_threshold": config.evaluation.score_threshold}
+def make_predictor(
+    config: ConfigDict,
+    model: nn.Module,
+    data: Data,
+    mesh: jax.sharding.Mesh | None = None,
+) -> Predictor:
+    """Predictor with the score threshold of evaluations, still without variables."""
+    threshold = config.evaluation.score_threshold
+    return Predictor(
+        model,
+        data.records.grid,
+        classes=config.classes,
+        decode={**config.decode, "score_threshold": threshold},
+        azimuth_mapping=config.data.azimuth_mapping,
+        mesh=mesh,
+    )
 
 
 def report_options(config: ConfigDict, name: str) -> Options:

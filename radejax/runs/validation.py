@@ -18,9 +18,9 @@ from radejax.core.errors import UserError
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
-from radejax.inference.predict import Predictor, predict_dataset
+from radejax.inference.predict import predict_dataset
 from radejax.runs.data import Data
-from radejax.runs.evaluate import evaluation_decode, report_options
+from radejax.runs.evaluate import make_predictor, report_options
 from radejax.runs.pictures import FrameDrawer
 from radejax.training import processes
 from radejax.training.state import TrainState
@@ -61,14 +61,7 @@ class Validation:
         self._images = data.images(self._frames)
         self._ground_truth, self._table = tables_from_frames(self._frames)
         self._options = report_options(config, "training")
-        self._predictor = Predictor(
-            model,
-            data.records.grid,
-            classes=config.classes,
-            decode=evaluation_decode(config),
-            azimuth_mapping=config.data.azimuth_mapping,
-            mesh=mesh,
-        )
+        self._predictor = make_predictor(config, model, data, mesh)
         _check_best(config.train.best_metric, self._options)
 
     def __call__(

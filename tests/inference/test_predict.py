@@ -14,9 +14,9 @@ from radejax.core.structures import Batch
 from radejax.data.records.job import project_dataset
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
-from radejax.inference.predict import Predictor, predict_dataset
+from radejax.inference.predict import predict_dataset
 from radejax.runs.data import Data, DataPaths
-from radejax.runs.evaluate import evaluation_decode
+from radejax.runs.evaluate import make_predictor
 from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import processes, sharding
@@ -61,14 +61,9 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 
 def _predictor(setup: SimpleNamespace, mesh: jax.sharding.Mesh | None = None) -> Any:
-    return Predictor(
-        setup.model,
-        setup.records.grid,
-        classes=setup.config.classes,
-        decode=evaluation_decode(setup.config),
-        variables=setup.variables,
-        mesh=mesh,
-    )
+    predictor = make_predictor(setup.config, setup.model, setup.data, mesh)
+    predictor.update(setup.variables)
+    return predictor
 
 
 def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:

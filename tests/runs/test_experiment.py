@@ -1,5 +1,6 @@
 """Work folders, names and messages of whole runs."""
 
+import collections
 import json
 import pathlib
 from types import SimpleNamespace
@@ -8,14 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from radejax.core.config import base_config
+from radejax import models
+from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
+from radejax.data.kradar import dataset
 from radejax.interop.image_backbone import weights_sha256
 from radejax.runs import experiment
 from radejax.runs.data import Sources
 from radejax.runs.workdir import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import loop, sharding
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 
 
 def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:
@@ -83,3 +88,35 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same(
     assert stays(["1/a"], str(tmp_path), freeze=True) == frozen
     weights["w"] = weights["w"] + 1
     assert stays(["1/a"], freeze=True) != frozen
+
+
+def test_labels_are_read_once_and_the_model_is_built_once(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: collections.Counter = collections.Counter()
+    built = []
+    parse, build = dataset.parse_label_file, models.build
+
+    def count(*args: Any, where: str, **options: Any) -> Any:
+        parsed[where] += 1
+        return parse(*args, where=where, **options)
+
+    monkeypatch.setattr(dataset, "parse_label_file", count)
+    monkeypatch.setattr(models, "build", lambda c: built.append(c) or build(c))
+    mesh = sharding.make_mesh(1)
+    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
+    config.simulation.update(frames_per_sequence=2, output="projection")
+    config.model.update(widths=(8, 8), decoder_width=8, num_groups=4)
+    config.train.update(num_epochs=1, evaluate_every_epochs=1)
+    config.evaluation.num_pictures = 1
+    folder = experiment.run(
+        config,
+        name="x",
+        workdir=tmp_path / "run",
+        sources=Sources(data=(str(tmp_path / "data"),)),
+    )
+    assert (folder / "evaluation" / "metrics.json").exists()
+    assert len(parsed) == 6
+    assert set(parsed.values()) == {1}
+    assert len(built) == 1
