@@ -35,7 +35,6 @@ from radejax.runs.workdir import (
     initial_variables,
     load_run,
     lock_workdir,
-    relative,
     run_info,
 )
 from radejax.training import loop, processes, sharding
@@ -129,7 +128,7 @@ def run(
         )
         if _train_and_evaluate(config, workdir, paths, init_from):
             minutes = (time.perf_counter() - started) / 60
-            _log.info(_CLOSING.format(minutes=minutes, workdir=relative(workdir)))
+            _log.info(_CLOSING.format(minutes=minutes, workdir=files.relative(workdir)))
     return workdir
 
 
