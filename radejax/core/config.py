@@ -65,8 +65,8 @@ def load_config(path_and_words: str) -> ConfigDict:
     path, _, words = path_and_words.partition(":")
     if not pathlib.Path(path).is_file():
         raise FileNotFoundError(f"no such config file: {path}")
-    module = load_module(path)
-    return module.get_config(words) if words else module.get_config()
+    get_config = load_module(path).get_config
+    return get_config(words) if words else get_config()
 
 
 def base_config() -> ConfigDict:
