@@ -1,7 +1,6 @@
 """Radar-camera runs from images and from embeddings, with a frozen backbone from files."""
 
 import dataclasses
-import importlib.util
 import json
 import logging
 import pathlib
@@ -14,7 +13,7 @@ from click.testing import CliRunner
 from radejax.data.records.embeddings import open_embeddings
 
 from radejax.cli.main import main
-from radejax.core.config import load_config
+from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
 from radejax.inference import embed
@@ -328,9 +327,7 @@ def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
 
 def _example(name, *arguments):
     path = CONFIG.parents[1] / "examples" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     result = CliRunner().invoke(module.main, [str(a) for a in arguments])
     assert result.exit_code == 0, result.output
     return result.stdout

@@ -20,8 +20,8 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import read_json, write_json
 from radejax.data.images import read_left_image
 from radejax.data.kradar.frame import Frame
 from radejax.data.records import files as record_files
@@ -91,7 +91,7 @@ def embed_dataset(
         "num_frames": len(frames),
         "frames_sha256": _sha256("\n".join(f.key for f in frames).encode()),
     }
-    _agree_on_plan(out_dir, plan)
+    files.claim(out_dir / "plan.json", plan, "other embeddings")
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
     params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
     chunks = [
@@ -116,8 +116,9 @@ def embed_dataset(
                 bar.update(len(chunk))
             counts["missing"] += len(entry.skipped)
             entries.append(entry)
-    files = [dataclasses.asdict(entry) for entry in entries]
-    write_json(out_dir / MANIFEST, {**plan, "counts": counts, "files": files})
+    described = [dataclasses.asdict(entry) for entry in entries]
+    content = {**plan, "counts": counts, "files": described}
+    files.write_json(out_dir / MANIFEST, content)
     return counts
 
 
@@ -141,14 +142,14 @@ def open_embeddings(
             f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
         )
     try:
-        manifest = read_json(path)
+        manifest = files.read_json(path)
         version = manifest["format"], manifest["version"]
         if version != (FORMAT, FORMAT_VERSION):
             raise DataError(
                 f"{path}: {version[0]} {version[1]}, this radejax reads {FORMAT} "
                 f"{FORMAT_VERSION}"
             )
-        files = [record_files.RecordFile.from_dict(f) for f in manifest["files"]]
+        entries = [record_files.RecordFile.from_dict(f) for f in manifest["files"]]
         shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
     except DataError:
         raise
@@ -163,12 +164,12 @@ def open_embeddings(
                     f"{manifest['image'].get(name)}, config.model.image.{name} is "
                     f"{value}"
                 )
-    return ArrayRecords(folder, files, shape, dtype)
+    return ArrayRecords(folder, entries, shape, dtype)
 
 
 def embeddings_sha256(folder: str | os.PathLike) -> str:
     """Checksum of the weights that embeddings were made with."""
-    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
+    return files.read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
 
 
 def weights_sha256(params: Mapping[str, Any]) -> str:
@@ -211,8 +212,7 @@ def _write_file(
     dtype: str,
     bar: tqdm,
 ) -> record_files.RecordFile:
-    writer = record_files.RecordFileWriter(folder, name)
-    try:
+    with record_files.RecordFileWriter(folder, name) as writer:
         for frame in frames:
             if frame.camera_path is None:
                 writer.skipped[frame.key] = "no front image"
@@ -223,25 +223,6 @@ def _write_file(
                 writer.write(key, row)
             bar.update(len(keys))
         return writer.commit()
-    except BaseException:
-        writer.discard()
-        raise
-
-
-def _agree_on_plan(out_dir: pathlib.Path, plan: Mapping[str, Any]) -> None:
-    """Writes the plan of a new folder; `UserError` if the folder has another one."""
-    path = out_dir / "plan.json"
-    if not path.exists():
-        out_dir.mkdir(parents=True, exist_ok=True)
-        write_json(path, dict(plan))
-        return
-    found = read_json(path)
-    for key, value in plan.items():
-        if found.get(key) != value:
-            raise UserError(
-                f"{out_dir} holds other embeddings ({key} is {found.get(key)} there, "
-                f"{value} now); choose another folder, or delete that one"
-            )
 
 
 def _relevant(image_config: Mapping[str, Any]) -> dict[str, Any]:

@@ -186,12 +186,12 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     """`UserError` if a folder has results on other data than these."""
     if not (out / "source.json").exists():
         return
-    found = files.read_json(out / "source.json")
-    for name in ("roots", "labels", "label_version", "split"):
-        if (there := found.get(name)) != (here := source[name]):
-            raise UserError(
-                f"{out} has results of {name} {there}, these are of {here}: give --out"
-            )
+    names = ("roots", "labels", "label_version", "split")
+    found, wanted = (
+        {name: values.get(name) for name in names}
+        for values in (files.read_json(out / "source.json"), source)
+    )
+    files.require_same(found, wanted, f"{out} has other results", mend="give --out")
 
 
 def _frames(

@@ -61,7 +61,9 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
             lambda: files.claim(
                 workdir / "config.json",
                 wanted,
-                f"{files.relative(workdir)} holds a run with another config",
+                "a run with another config",
+                mend="give another --workdir, or remove that one",
+                name="config",
                 ignore=("watch",),
             )
         )
