@@ -66,9 +66,10 @@ def main(_: list[str]) -> None:
         place = _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
         if _DISTRIBUTED.value or place != (None,) * 3:
             entry.join_processes(*place)
-        from radejax.runs import experiment
+        from radejax.runs import experiment, seeds
 
-        experiment.run(
+        run = seeds.run_seeds if _CONFIG.value.seeds else experiment.run
+        run(
             _CONFIG.value,
             name=experiment.config_name(flags.FLAGS["config"].config_filename),
             workdir=_WORKDIR.value,

@@ -72,8 +72,7 @@ def run(
     """Everything from nothing to metrics; run again, it continues where it stopped.
 
     Args:
-        config: Complete configuration; with `seeds` one run of each, see
-            `seeds.run_seeds`.
+        config: Complete configuration; its `seeds` are for `seeds.run_seeds`.
         name: Of the config, for the default work folder.
         workdir: `runs/<name>` if None.
         data: K-Radar folders; None simulates them if the config says how.
@@ -91,21 +90,6 @@ def run(
         UserError: The work folder belongs to another configuration or is in use, no
             data, or no space.
     """
-    if config.seeds:
-        from radejax.runs.seeds import run_seeds
-
-        return run_seeds(
-            config,
-            name=name,
-            workdir=workdir,
-            data=data,
-            labels=labels,
-            records=records,
-            init_from=init_from,
-            embeddings=embeddings,
-            image_backbone=image_backbone,
-            camera_calibration=camera_calibration,
-        )
     started = time.perf_counter()
     workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
     models.build(config.model)  # a config that cannot be built should fail first

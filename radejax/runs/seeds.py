@@ -14,6 +14,7 @@ from tabulate import tabulate
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.runs import experiment
 from radejax.training import processes
 
 _log = logging.getLogger(__name__)
@@ -43,8 +44,6 @@ def run_seeds(
     Raises:
         UserError: Two seeds are equal; and as `experiment.run`.
     """
-    from radejax.runs.experiment import run  # which comes here for several seeds
-
     seeds = tuple(int(seed) for seed in config.seeds)
     if len(set(seeds)) < len(seeds):
         raise UserError(f"config.seeds has a seed twice: {list(seeds)}")
@@ -54,7 +53,9 @@ def run_seeds(
         one = config.copy_and_resolve_references()
         one.update(seed=seed, seeds=())
         _log.info("seed %d of %s", seed, list(seeds))
-        folder = run(one, name=name, workdir=workdir / f"seed{seed}", **options)
+        folder = experiment.run(
+            one, name=name, workdir=workdir / f"seed{seed}", **options
+        )
         if not (folder / "evaluation" / "metrics.csv").exists():
             _log.info(
                 "seed %d has no evaluation: it is not finished (run the same command to "

@@ -20,11 +20,9 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 ) -> None:
     aps = {0: 50.0, 1: 53.0, 2: 59.0}
     seen = []
-    whole = experiment.run
 
     def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
-        if config.seeds:
-            return whole(config, workdir=workdir, **options)
+        assert config.seeds == ()
         seen.append((config.seed, pathlib.Path(workdir).name, options["data"]))
         folder = pathlib.Path(workdir) / "evaluation"
         folder.mkdir(parents=True)
@@ -39,7 +37,7 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     monkeypatch.setattr(experiment, "run", run)
     config = base_config()
     config.seeds = (0, 1, 2)
-    experiment.run(config, name="x", workdir=tmp_path / "runs", data=["d"])
+    seeds.run_seeds(config, name="x", workdir=tmp_path / "runs", data=["d"])
     assert seen == [(i, f"seed{i}", ["d"]) for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
