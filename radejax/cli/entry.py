@@ -1,4 +1,7 @@
-"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up."""
+"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up.
+
+JAX and absl are imported by the functions that use them: `--help` should not wait.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,6 @@ import pathlib
 import socket
 import sys
 from collections.abc import Iterator, Sequence
-
-import jax
-from absl import flags
-from absl import logging as absl_logging
 
 from radejax.core.errors import DataError, DiskFullError, UserError
 from radejax.core.files import is_no_space
@@ -66,6 +65,8 @@ def parse_flags(argv: Sequence[str]) -> list[str]:
 
     For `app.run(main, flags_parser=parse_flags)`.
     """
+    from absl import flags
+
     try:
         with exit_codes():
             _check_config_file(argv)
@@ -111,6 +112,8 @@ def join_processes(
         UserError: JAX finds no cluster, and not all arguments are given; or the
             coordinator's port is taken or not reached.
     """
+    import jax
+
     given = [coordinator, num_processes, process_id]
     if None in given and given != [None] * 3:
         raise UserError("give --coordinator, --num_processes and --process_id together")
@@ -155,6 +158,9 @@ def set_up_jax(*, cache: bool = True) -> None:
         cache: Keep compiled programs in the folder that the environment variable
             JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
     """
+    import jax
+    from absl import logging as absl_logging
+
     log = logging.getLogger("radejax")
     if not log.handlers:
         handler = logging.StreamHandler()
