@@ -14,6 +14,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation import protocols
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import Result, mean_ap
@@ -140,9 +141,7 @@ _OF_RESULT = ("num_gt", "num_det", "num_frames", "score_threshold")
 _OF_RESULT += ("skip_empty", "roi", "label_version")
 
 
-def condition_masks(
-    frames: Mapping[str, np.ndarray], kind: str
-) -> dict[str, np.ndarray]:
+def condition_masks(frames: Columns, kind: str) -> dict[str, np.ndarray]:
     """`[F]` masks by value of a column of the frame table, K-Radar's values first."""
     if kind not in frames:
         return {}
@@ -156,7 +155,7 @@ def condition_masks(
 
 def measure(
     data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
+    frames: Columns,
     options: Options,
     *,
     kinds: Sequence[str] = ("weather",),
@@ -216,9 +215,7 @@ def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
     return counts
 
 
-def repair_sizes(
-    predictions: Mapping[str, np.ndarray], rule: str
-) -> tuple[Mapping[str, np.ndarray], int]:
+def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
     """Predictions with sizes that an untrained network may produce made harmless.
 
     Args:

@@ -74,11 +74,7 @@ def table_1(rows: Rows, options: Options, iou: float = 0.3) -> Table:
 
 
 def _our_table_1_rows(
-    rows: Rows,
-    options: Options,
-    space: str,
-    iou: float,
-    listed: Sequence[PublishedRow],
+    rows: Rows, options: Options, space: str, iou: float, listed: Sequence[PublishedRow]
 ) -> list[list[str]]:
     """Our row in each protocol that matters, and differences to the papers' own rows."""
     title = SPACE_TITLES[space]

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from radejax.core import files
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report import breakdown
@@ -19,10 +20,7 @@ from radejax.visualize.curves import draw_calibration, draw_precision_recall
 
 
 def draw(
-    data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
-    options: Options,
-    out_dir: pathlib.Path,
+    data: EvaluationSet, frames: Columns, options: Options, out_dir: pathlib.Path
 ) -> list[pathlib.Path]:
     """Draws precision and recall in both spaces, and calibration in 3D.
 

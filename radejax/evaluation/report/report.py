@@ -14,6 +14,7 @@ import numpy as np
 
 from radejax.core import files
 from radejax.evaluation import protocols
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.predictions import write_table
 from radejax.evaluation.report import (
@@ -45,9 +46,9 @@ class Report:
 
 
 def write_report(
-    ground_truth: Mapping[str, np.ndarray],
-    predictions: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray],
+    ground_truth: Columns,
+    predictions: Columns,
+    frames: Columns,
     out_dir: str | pathlib.Path,
     options: Options | None = None,
     **changes: Any,
@@ -111,7 +112,7 @@ def write_report(
     return Report(text, metrics, rows, written)
 
 
-def why_no_intervals(frames: Mapping[str, np.ndarray], options: Options) -> str | None:
+def why_no_intervals(frames: Columns, options: Options) -> str | None:
     """The reason for not computing intervals, or None."""
     if not options.bootstrap:
         return "none asked for"
@@ -123,10 +124,7 @@ def why_no_intervals(frames: Mapping[str, np.ndarray], options: Options) -> str 
 
 
 def with_intervals(
-    data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
-    rows: list[Measured],
-    options: Options,
+    data: EvaluationSet, frames: Columns, rows: list[Measured], options: Options
 ) -> list[Measured]:
     """The rows with 95 % intervals: all over all frames, the main ones per weather."""
     main = (protocols.RECOMMENDED, "kradar_r40", options.paper_protocol)
@@ -151,10 +149,7 @@ def with_intervals(
 
 
 def collect(
-    data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
-    rows: list[Measured],
-    options: Options,
+    data: EvaluationSet, frames: Columns, rows: list[Measured], options: Options
 ) -> dict[str, Any]:
     """Everything of metrics.json, as plain values (NaN where nothing is defined)."""
     iou, cut = options.iou_thresholds[0], options.operating_score
@@ -198,7 +193,7 @@ def collect(
     }
 
 
-def _name(frames: Mapping[str, np.ndarray], index: int) -> dict[str, Any]:
+def _name(frames: Columns, index: int) -> dict[str, Any]:
     """Name and sequence of a frame, as far as the frame table has them."""
     known = [column for column in ("name", "sequence") if column in frames]
     return {column: np.asarray(frames[column]).item(index) for column in known}
@@ -272,7 +267,7 @@ def plain(value: Any) -> Any:
 
 def _draw(
     data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
+    frames: Columns,
     metrics: Mapping[str, Any],
     out_dir: pathlib.Path,
     options: Options,

@@ -60,11 +60,7 @@ class Table:
         """As "text", "markdown" or "latex"."""
         align = ["left", *["right"] * (len(self.header) - 1)]
         body = tabulate(
-            self.rows,
-            self.header,
-            STYLES[style],
-            disable_numparse=True,
-            colalign=align,
+            self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         if style == "latex":
             return f"% {self.title}\n{body}\n"
