@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import CLASSES, NARROW_ROI, WIDE_ROI
+from radejax.core.structures import BOX_FIELDS, CLASSES, NARROW_ROI, WIDE_ROI
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not asked for are ignored."""
@@ -21,7 +21,8 @@ KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
 """Regions of interest: x, y, z bounds in metres, inclusive, for box centers (ego)."""
 
-BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
+Columns = Mapping[str, np.ndarray]
+"""A table: frames, ground truth or predictions by the name of the column."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +95,7 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
     return ",".join(f"{value:g}" for value in bounds)
 
 
-def frame_ids(frames: Mapping[str, np.ndarray]) -> np.ndarray:
+def frame_ids(frames: Columns) -> np.ndarray:
     """`[F]` ids of a frame table, checked to be integers without repetition."""
     if "frame" not in frames:
         raise UserError(f"frames need a column 'frame', found {sorted(frames)}")
@@ -114,7 +115,7 @@ def frame_ids(frames: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def read_columns(
-    table: Mapping[str, np.ndarray], *, name: str, scored: bool
+    table: Columns, *, name: str, scored: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Frame `[N]`, box `[N, 7]`, class name `[N]`, score `[N]` of a column table.
 

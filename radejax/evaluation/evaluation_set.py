@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation import columns, matching, overlap, protocols
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT, Curve, Protocol
 from radejax.evaluation.result import SPACES, Result
 
@@ -33,11 +34,11 @@ class EvaluationSet:
 
     def __init__(
         self,
-        ground_truth: Mapping[str, np.ndarray],
-        predictions: Mapping[str, np.ndarray],
+        ground_truth: Columns,
+        predictions: Columns,
         *,
         classes: Sequence[str] = CLASSES,
-        frames: Mapping[str, np.ndarray] | None = None,
+        frames: Columns | None = None,
         roi: str | Sequence[float] | None = None,
         label_version: str | None = None,
     ) -> None:
@@ -114,13 +115,16 @@ class EvaluationSet:
         key = (geometry, protocol.matching, space, iou)
         if key not in self._matches:
             values = self.overlaps(geometry)[SPACES.index(space)]
-            pairs = (self.pair_pred, self.pair_gt, values, self.pred.score)
+            pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
+            score = self.pred.score
             if protocol.matching == "kradar":
-                match = matching.match_kradar(*pairs, self.gt_group, iou)
+                match = matching.match_kradar(pairs, score, self.gt_group, iou)
             elif protocol.matching == "best":
-                match = matching.match_best(*pairs, iou)
+                match = matching.match_best(pairs, score, iou)
             else:
-                match = matching.match_free(*pairs, self.pred_group, len(self.gt), iou)
+                match = matching.match_free(
+                    pairs, score, self.pred_group, len(self.gt), iou
+                )
             self._matches[key] = match
         return self._matches[key]
 

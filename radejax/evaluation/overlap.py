@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import chex
 import numpy as np
 
 from radejax.geometry.rotated_iou import bev_intersection_np
@@ -25,6 +26,7 @@ def candidate_pairs(
     Returns:
         Two `[P]` index arrays, ordered by a, then b.
     """
+    chex.assert_shape([box_a, box_b], (None, 7))
     first = np.searchsorted(group_b, group_a, side="left")
     count = np.searchsorted(group_b, group_a, side="right") - first
     # Half diagonals; 3 cm of slack for boxes that a protocol rounds to centimetres.
@@ -63,6 +65,7 @@ def pair_iou(
     Returns:
         `[P]` BEV IoU and `[P]` 3D IoU, float64.
     """
+    chex.assert_equal_shape((a, b))
     bev, iou_3d = np.zeros(len(a)), np.zeros(len(a))
     for low in range(0, len(a), PAIRS_PER_CHUNK // 8):
         part = slice(low, low + PAIRS_PER_CHUNK // 8)

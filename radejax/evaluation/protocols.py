@@ -214,12 +214,7 @@ def _sum_at_least(score: np.ndarray, value: np.ndarray, at: np.ndarray) -> np.nd
 
 
 def pooled_curve(
-    *,
-    score: np.ndarray,
-    is_tp: np.ndarray,
-    weight: np.ndarray,
-    num_gt: int,
-    curve: str,
+    *, score: np.ndarray, is_tp: np.ndarray, weight: np.ndarray, num_gt: int, curve: str
 ) -> Curve:
     """AP from all predictions sorted by falling score.
 

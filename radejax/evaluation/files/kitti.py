@@ -26,7 +26,7 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
-from radejax.evaluation.files.predictions import Columns
+from radejax.evaluation.columns import Columns
 
 CLASS_KEYS = {
     "Sedan": "sed",
@@ -46,9 +46,9 @@ BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # h w l y z x yaw of x y z l w h yaw
 
 def write_kitti(
     folder: str | pathlib.Path,
-    ground_truth: Mapping[str, np.ndarray],
-    predictions: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray],
+    ground_truth: Columns,
+    predictions: Columns,
+    frames: Columns,
     *,
     score_threshold: float = 0.0,
     conditions: Iterable[str] = ("weather", "environment", "time"),
@@ -125,7 +125,7 @@ def _write(path: pathlib.Path, text: str) -> None:
 
 
 def _lines(
-    table: Mapping[str, np.ndarray], rows: np.ndarray, score: np.ndarray | None
+    table: Columns, rows: np.ndarray, score: np.ndarray | None
 ) -> dict[int, list[str]]:
     """Lines of every frame, in the order of the rows."""
     box = np.asarray(table["box"], np.float64).reshape(-1, 7)

@@ -13,8 +13,8 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.files import kitti, predictions
-from radejax.evaluation.files.predictions import Columns
 
 PathLike = str | os.PathLike
 

@@ -11,19 +11,18 @@ import csv
 import io
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation.columns import BOX_FIELDS
+from radejax.core.structures import BOX_FIELDS
+from radejax.evaluation.columns import Columns
 
-Columns = dict[str, np.ndarray]
 
-
-def frame_keys(frames: Mapping[str, np.ndarray]) -> list[str]:
+def frame_keys(frames: Columns) -> list[str]:
     """Key "sequence/name" of every frame; the id where these are not known."""
     if "name" not in frames:
         return [str(frame) for frame in np.asarray(frames["frame"]).tolist()]
@@ -42,10 +41,7 @@ def _strip(name: str) -> str:
 
 
 def read_table(
-    path: str | pathlib.Path,
-    frames: Mapping[str, np.ndarray] | None = None,
-    *,
-    scored: bool = True,
+    path: str | pathlib.Path, frames: Columns | None = None, *, scored: bool = True
 ) -> Columns:
     """Reads predictions (or, not `scored`, ground truth) from .npz, .json or .csv.
 
@@ -85,10 +81,7 @@ def read_table(
 
 
 def find_frames(
-    named: np.ndarray | Sequence[Any],
-    frames: Mapping[str, np.ndarray] | None,
-    *,
-    where: str,
+    named: np.ndarray | Sequence[Any], frames: Columns | None, *, where: str
 ) -> np.ndarray:
     """Ids of frames that are named by id or by key.
 
@@ -217,9 +210,7 @@ def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float
 
 
 def write_table(
-    path: str | pathlib.Path,
-    table: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray] | None = None,
+    path: str | pathlib.Path, table: Columns, frames: Columns | None = None
 ) -> None:
     """Writes columns as .npz, .json or .csv; `read_table` gives the same back.
 

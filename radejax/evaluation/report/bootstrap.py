@@ -15,6 +15,7 @@ import numpy as np
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import SPACES
@@ -224,7 +225,7 @@ def check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
 
 def add_intervals(
     data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
+    frames: Columns,
     terms: Sequence[tuple[str, str, float]],
     *,
     resamples: int,

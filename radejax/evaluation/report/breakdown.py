@@ -223,16 +223,13 @@ def confusion(
     that were not found.
     """
     num_classes = len(data.classes)
-    rows = np.flatnonzero(data.pred.score > operating_score)
-    pred = data.pred.take(rows)
+    pred = data.pred.take(data.pred.score > operating_score)
     first, second = overlap.candidate_pairs(
         pred.frame, data.gt.frame, pred.box, data.gt.box
     )
     ious = overlap.pair_iou(pred.box[first], data.gt.box[second])
-    values = ious[SPACES.index(space)]
-    match = matching.match_free(
-        first, second, values, pred.score, pred.frame, len(data.gt), iou
-    )
+    pairs = matching.Pairs(first, second, ious[SPACES.index(space)])
+    match = matching.match_free(pairs, pred.score, pred.frame, len(data.gt), iou)
     table = np.zeros((num_classes + 1, num_classes + 1), np.int64)
     hit = match >= 0
     np.add.at(table, (data.gt.cls[match[hit]], pred.cls[hit]), 1)

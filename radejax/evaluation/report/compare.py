@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import PathLike, Source, load
-from radejax.evaluation.files.predictions import Columns
 from radejax.evaluation.report import bootstrap, paper_tables, tables
 from radejax.evaluation.report.measure import Options, measure, repair_sizes
-from radejax.evaluation.report.report import Report, evaluate_predictions, plain
+from radejax.evaluation.report.report import Report, plain, write_report
 
 
 def evaluate_files(
@@ -24,7 +24,7 @@ def evaluate_files(
     options = dataclasses.replace(
         options, left_out_before={**left_out, **options.left_out_before}
     )
-    return evaluate_predictions(truth, found, frames, out_dir, options)
+    return write_report(truth, found, frames, out_dir, options)
 
 
 def compare_files(

@@ -211,7 +211,7 @@ def test_conditions_are_in_the_papers_order():
 def test_frames_with_ids_only(scene, tmp_path):
     truth, found, frames = scene
     only = {"frame": frames["frame"]}
-    made = report.evaluate_predictions(
+    made = report.write_report(
         truth, found, only, tmp_path, Options(protocols=("exact",), **TERMS)
     )
     assert {row.condition for row in made.rows} == {"all"}
