@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from radejax.simulation.radar.scattering import (
     OCCLUDED_DB,
     FrameScattering,
     face_gain,
+    join,
     received_power,
 )
 from radejax.simulation.radar.tensor import RadarParameters
-from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked
+from radejax.simulation.world.scene import SceneFrame, is_blocked
 
 
 def scatter_surroundings(
     frame: SceneFrame,
-    sequence: Sequence,
     phase_rad: np.ndarray,
     parameters: RadarParameters,
 ) -> FrameScattering:
@@ -26,8 +26,7 @@ def scatter_surroundings(
 
     Args:
         frame: Its reflectors are used.
-        sequence: Where they come from.
-        phase_rad: `[M]` phases of all reflectors of the sequence.
+        phase_rad: `[M]` phases of all reflectors of its sequence.
         parameters: The sensor.
     """
     fixed = frame.reflectors
@@ -55,7 +54,7 @@ _MIRROR_REACH_M = 45.0
 
 
 def scatter_ghosts(
-    objects: FrameScattering, frame: SceneFrame, sequence: Sequence
+    objects: FrameScattering, mirrors_m: Sequence[float]
 ) -> FrameScattering:
     """Mirror images of objects behind rails and walls beside the road.
 
@@ -64,8 +63,7 @@ def scatter_ghosts(
 
     Args:
         objects: Scatterers of the objects of the frame.
-        frame: The frame; the walls run along its x axis near the ego.
-        sequence: Whose `mirrors_m` are used.
+        mirrors_m: Rails and walls, metres left of the ego; near it they run along x.
 
     References:
         Ghosts: Kraus et al., "Using machine learning to detect ghost images in
@@ -75,36 +73,21 @@ def scatter_ghosts(
     near = np.flatnonzero(
         np.hypot(objects.position_m[:, 0], objects.position_m[:, 1]) < _MIRROR_REACH_M
     )
-    for plane in sequence.mirrors_m:
+    for plane in mirrors_m:
         position = objects.position_m[near].copy()
         inside = np.sign(plane) * (plane - position[:, 1]) > 0  # on our side of it
-        chosen = near[inside]
-        position = position[inside]
+        chosen, position = near[inside], position[inside]
         direct = np.linalg.norm(position, axis=1)
         position[:, 1] = 2.0 * plane - position[:, 1]
         mirrored = np.linalg.norm(position, axis=1)
-        velocity = objects.velocity_mps[chosen] * (1.0, -1.0)
         loss = 10.0 ** (MIRROR_DB / 10.0) * (direct / mirrored) ** 4
         parts.append(
             FrameScattering(
                 position,
-                velocity,
+                objects.velocity_mps[chosen] * (1.0, -1.0),
                 objects.power[chosen] * loss,
                 objects.phase_rad[chosen] + plane,
                 np.full(len(chosen), -1),
             )
         )
-    if not parts:
-        return FrameScattering(
-            np.zeros((0, 3)),
-            np.zeros((0, 2)),
-            np.zeros(0),
-            np.zeros(0),
-            np.zeros(0, int),
-        )
-    return FrameScattering(
-        *(
-            np.concatenate([getattr(p, f.name) for p in parts])
-            for f in dataclasses.fields(FrameScattering)
-        )
-    )
+    return join(parts)

@@ -37,12 +37,12 @@ def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
     )
     parameters = RadarParameters(pattern_exponent=0.0)
     free = clutter.scatter_surroundings(
-        frame_with(reflectors=reflectors), None, np.zeros(2), parameters
+        frame_with(reflectors=reflectors), np.zeros(2), parameters
     )
     assert free.power[0] > 5.0 * free.power[1]
     truck = [10.0, 0.0, 0.0, 8.0, 2.5, 3.0, 0.0]
     hidden = clutter.scatter_surroundings(
-        frame_with([truck], reflectors), None, np.zeros(2), parameters
+        frame_with([truck], reflectors), np.zeros(2), parameters
     )
     loss = 10 * np.log10(hidden.power / free.power)
     np.testing.assert_allclose(loss, [scattering.OCCLUDED_DB, 0.0], atol=1e-9)
@@ -52,9 +52,6 @@ PARAMETERS = RadarParameters(pattern_exponent=0.0)
 
 
 class TestGhosts:
-    class Wall:
-        mirrors_m = (6.0,)
-
     def test_mirror_image_position_velocity_and_loss(self):
         part = scattering.FrameScattering(
             np.array([[20.0, 2.0, 0.0], [20.0, 8.0, 0.0], [90.0, 0.0, 0.0]]),
@@ -63,7 +60,7 @@ class TestGhosts:
             np.zeros(3),
             np.zeros(3, int),
         )
-        ghosts = clutter.scatter_ghosts(part, frame_with(), self.Wall())
+        ghosts = clutter.scatter_ghosts(part, (6.0,))
         # Only the first: the second is behind the wall, the third too far.
         np.testing.assert_allclose(ghosts.position_m, [[20.0, 10.0, 0.0]])
         np.testing.assert_allclose(ghosts.velocity_mps, [[3.0, 1.0]])
@@ -72,11 +69,8 @@ class TestGhosts:
         assert ghosts.owner.tolist() == [-1]
 
     def test_without_walls_no_ghosts(self):
-        class Open:
-            mirrors_m = ()
-
         part = scattering.FrameScattering(
             np.ones((1, 3)), np.ones((1, 2)), np.ones(1), np.zeros(1), np.zeros(1, int)
         )
-        ghosts = clutter.scatter_ghosts(part, frame_with(), Open())
+        ghosts = clutter.scatter_ghosts(part, ())
         assert len(ghosts.power) == 0

@@ -123,7 +123,9 @@ class TestMotion:
             np.zeros(1),
             np.zeros(1, int),
         )
-        seen = scattering.to_scatterers([part], np.array([12.0, 0.0]), PARAMETERS)
+        seen = scattering.to_scatterers(
+            part, np.array([12.0, 0.0]), PARAMETERS.wavelength_m
+        )
         # (2 - 12, 11) . (0.6, 0.8) = -6 + 8.8
         assert seen.velocity_mps[0] == pytest.approx(2.8, abs=1e-5)
         assert seen.range_m[0] == pytest.approx(50.0)
@@ -138,7 +140,7 @@ class TestMotion:
             np.zeros(2),
             np.zeros(2, int),
         )
-        seen = scattering.to_scatterers([part], np.zeros(2), PARAMETERS)
+        seen = scattering.to_scatterers(part, np.zeros(2), PARAMETERS.wavelength_m)
         # An eighth of a wavelength farther: a quarter turn.
         np.testing.assert_allclose(seen.amplitude[0], [2.0, 0.0], atol=1e-3)
         np.testing.assert_allclose(seen.amplitude[1], [0.0, 2.0], atol=1e-3)
