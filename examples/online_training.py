@@ -26,11 +26,9 @@ from radejax.cli import entry
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.interop import image_backbone
-from radejax.runs.workdir import checkpoint_info, claim_workdir, lock_workdir
+from radejax.runs.workdir import checkpoint_info, claimed
 from radejax.simulation.config import plain
 from radejax.training import loop, sharding
-from radejax.training.step import map_grid
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -60,7 +58,7 @@ def train_online(
     for is_wrong, text in (
         (not simulation, "the config has no `simulation` section"),
         (simulation.get("scenes") != "procedural", "scenes must be procedural"),
-        (image_backbone.has_camera(config), "the model takes a camera"),
+        (config.model.name == "dinorade", "the model takes a camera"),
         (tuple(config.classes) != CLASSES, f"classes must be {CLASSES}"),
         (jax.process_count() > 1, "one process only"),
     ):
@@ -72,8 +70,7 @@ def train_online(
         "seed": simulation["seed"] + SEED_OFFSET,
     }
     workdir = pathlib.Path(workdir).absolute()
-    with lock_workdir(workdir):
-        claim_workdir(workdir, config)
+    with claimed(workdir, config):
         batch_size = config.train.batch_size
         sharding.check_batch_size(
             batch_size,
@@ -95,9 +92,12 @@ def train_online(
             model,
             None,
             batches.loader(),
-            map_grid(batches.grid, model, config.data.azimuth_mapping),
+            models.map_grid(batches.grid, model, config.data.azimuth_mapping),
             workdir,
-            config=config,
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
             info=checkpoint_info(
                 config,
                 batches.grid,

@@ -164,7 +164,7 @@ def test_a_wrong_shape_names_what_was_expected(detector: Detector) -> None:
 
 
 def test_a_run_that_is_not_there(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no run in"):
+    with pytest.raises(FileNotFoundError, match="no model in"):
         Detector.from_workdir(tmp_path)
 
 
