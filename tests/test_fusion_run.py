@@ -15,6 +15,7 @@ from radejax.cli.main import main
 from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
+from radejax.data.records import embeddings as embeddings_records
 from radejax.data.records.projections import RecordSource
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
@@ -203,8 +204,8 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
 def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path):
     config = small_config()
     config.model.image.standardize = False
-    with pytest.raises(UserError, match=r"standardize = True, .* is False"):
-        embed.open_embeddings(embeddings, config.model)
+    with pytest.raises(UserError, match=r"standardize is True there and False here"):
+        embeddings_records.open_embeddings(embeddings, config.model.image)
     config = small_config()
     config.data.mirror_probability = 0.5
     with pytest.raises(UserError, match="cannot be mirrored"):
@@ -214,10 +215,10 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
     with pytest.raises(UserError, match="freeze is False"):
         camera_inputs(config, [], embeddings)
     with pytest.raises(FileNotFoundError, match="radejax embed"):
-        embed.open_embeddings(tmp_path)
+        embeddings_records.open_embeddings(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
     with pytest.raises(DataError, match="other 1"):
-        embed.open_embeddings(tmp_path)
+        embeddings_records.open_embeddings(tmp_path)
 
 
 def test_weights_that_do_not_fit_are_refused(data, tmp_path):
@@ -412,6 +413,6 @@ def test_embed_command(data, from_images, tmp_path):
     result = CliRunner().invoke(main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout.splitlines()[-1])["embedded"] == 12
-    half = embed.open_embeddings(tmp_path / "out")
+    half = embeddings_records.open_embeddings(tmp_path / "out")
     assert half.dtype == np.float32
     assert half.shape == (2, 6, 96)

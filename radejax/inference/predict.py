@@ -15,6 +15,7 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, Detections
 from radejax.data.cameras import CameraInputs
+from radejax.data.encoding import model_inputs
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import LoaderOptions, make_loader
@@ -24,7 +25,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
 from radejax.training import processes, sharding
-from radejax.training.step import map_grid, model_inputs
+from radejax.training.step import map_grid
 
 
 class Predictor:

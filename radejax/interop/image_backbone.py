@@ -14,7 +14,8 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.inference.embed import embeddings_sha256, weights_sha256
+from radejax.data.records.embeddings import embeddings_sha256
+from radejax.inference.embed import weights_sha256
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.models.lifting import ReferencePoints
 

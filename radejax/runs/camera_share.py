@@ -13,13 +13,13 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
+from radejax.data.encoding import model_inputs
 from radejax.data.frame_table import make_table
 from radejax.data.kradar.frame import Frame
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.data import camera_inputs
-from radejax.training.step import model_inputs
 
 
 def camera_share(

@@ -16,7 +16,7 @@ from radejax.data import cameras
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.frame import Frame
 from radejax.data.records import job
-from radejax.inference.embed import open_embeddings
+from radejax.data.records.embeddings import open_embeddings
 from radejax.interop.image_backbone import has_camera
 
 _log = logging.getLogger(__name__)
@@ -204,7 +204,7 @@ def camera_inputs(
             freeze=config.model.image.freeze,
             mirror_probability=config.data.mirror_probability,
         )
-        features = open_embeddings(embeddings, config.model)
+        features = open_embeddings(embeddings, config.model.image)
     options = cameras.CameraOptions.of_config(config.data)
     return cameras.camera_inputs(frames, config.model.image.size, options, features)
 

@@ -18,13 +18,13 @@ from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data import pipeline
-from radejax.data.augment import Augmentation
+from radejax.data.augment import make_augmentation
 from radejax.data.cameras import require_images
 from radejax.data.frame_table import make_table
 from radejax.data.kradar.frame import Frame
+from radejax.data.records.embeddings import embeddings_sha256
 from radejax.data.records.projections import RecordSource
-from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.embed import embeddings_sha256, weights_sha256
+from radejax.inference.embed import weights_sha256
 from radejax.interop.image_backbone import load_image_backbone
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.data import DataPaths, camera_inputs, prepare_data, saved_path
@@ -43,7 +43,6 @@ from radejax.training.step import map_grid
 __all__ = [
     "config_name",
     "load_run",
-    "make_augmentation",
     "run",
     "train",
 ]
@@ -203,7 +202,12 @@ def train(
         num_threads=config.data.num_threads,
         num_workers=config.data.num_workers,
     )
-    augment = make_augmentation(config.data, records.grid)
+    augment = make_augmentation(
+        records.grid,
+        mirror_probability=config.data.mirror_probability,
+        gain_db=config.data.gain_db,
+        gain_slope_db=config.data.gain_slope_db,
+    )
     loader = pipeline.make_loader(table, options, augment=augment)
     evaluate = None
     if config.train.evaluate_every_epochs:
@@ -270,15 +274,3 @@ def _what_stays(
             digest = weights_sha256(source["params"][IMAGE_BACKBONE])
         stays["sha256 of the frozen image backbone"] = digest[:16]
     return stays
-
-
-def make_augmentation(data: ConfigDict, grid: RadarGrid) -> Augmentation | None:
-    """Random changes of training frames as `config.data` says; None for none."""
-    augmentation = Augmentation(
-        grid=grid,
-        mirror_probability=data.mirror_probability,
-        gain_db=data.gain_db,
-        gain_slope_db=data.gain_slope_db,
-    )
-    is_on = data.mirror_probability or data.gain_db or data.gain_slope_db
-    return augmentation if is_on else None
