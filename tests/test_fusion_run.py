@@ -10,12 +10,12 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from radejax.data.records.embeddings import open_embeddings
 
 from radejax.cli.main import main
 from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
+from radejax.data.records.embeddings import open_embeddings
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
 from radejax.inference.detector import Detector
@@ -217,7 +217,7 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
     config = small_config()
     config.model.image.standardize = False
     with pytest.raises(UserError, match=r"standardize = True, .* is False"):
-        open_embeddings(embeddings, config.model)
+        open_embeddings(embeddings, config.model.image)
     paths = DataPaths((str(data.folder),), None, "records", str(embeddings))
     config = small_config()
     config.data.mirror_probability = 0.5

@@ -82,14 +82,11 @@ def _draw(frame: Any, grid: Any, slices: bool) -> Any:
     """
     from radejax.core.structures import WIDE_ROI
     from radejax.data.images import front_view
-    from radejax.data.tesseract import read_frame
+    from radejax.data.tesseract import read_projection
     from radejax.visualize import bev, projections
     from radejax.visualize.canvas import Scene
 
-    radar = frame.tesseract_path or frame.projection_path
-    if radar is None:
-        raise UserError(f"frame {frame.key} has no tesseract or projection")
-    projection = read_frame(radar, grid)
+    projection = read_projection(frame, grid)
     title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
     if slices:
         figure = projections.draw_slices(projection, grid)

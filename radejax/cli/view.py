@@ -78,11 +78,11 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
     import numpy as np
 
     from radejax.data.images import front_view
-    from radejax.data.tesseract import read_frame
+    from radejax.data.tesseract import read_projection
     from radejax.visualize.canvas import Scene
 
     for frame in frames:
-        projection = read_frame(frame.tesseract_path or frame.projection_path, grid)
+        projection = read_projection(frame, grid)
         image, calibration = front_view(frame)
         found = None
         if detector is not None:

@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
+from radejax.data.kradar.frame import Frame
 from radejax.data.projection import project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -227,6 +228,19 @@ def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
         projection = read_projection_npy(path, projection_shape=shape)
         return projection.astype(np.float32)
     return project_file(path, shape_drea=grid.shape_drea)
+
+
+def read_projection(frame: Frame, grid: RadarGrid) -> np.ndarray:
+    """`[R, A, D+E]` float32 projection of a frame: from its tesseract, or the released one.
+
+    Raises:
+        UserError: The frame has neither.
+        FileNotFoundError, DataError: As `read_frame`.
+    """
+    path = frame.tesseract_path or frame.projection_path
+    if path is None:
+        raise UserError(f"frame {frame.key} has no tesseract or projection")
+    return read_frame(path, grid)
 
 
 def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:

@@ -187,7 +187,7 @@ class Data:
                     freeze=model.freeze,
                     mirror_probability=config.data.mirror_probability,
                 )
-                features = open_embeddings(paths.embeddings, config.model)
+                features = open_embeddings(paths.embeddings, config.model.image)
         elif paths.embeddings is not None:
             raise UserError(
                 "embeddings are given, but config.model.name is "

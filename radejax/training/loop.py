@@ -19,6 +19,7 @@ import numpy as np
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
+from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.training import processes, sharding
 from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
@@ -29,7 +30,7 @@ from radejax.training.state import (
     make_optimizer,
     make_schedule,
 )
-from radejax.training.step import make_train_step, model_inputs
+from radejax.training.step import make_train_step
 from radejax.training.watch import Scores, Watch
 
 _log = logging.getLogger(__name__)
