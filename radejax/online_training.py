@@ -22,7 +22,6 @@ from radejax.runs.workdir import checkpoint_info, claim_workdir, lock_workdir
 from radejax.simulation.config import plain
 from radejax.simulation.online import OnlineBatches
 from radejax.training import loop, sharding
-from radejax.training.step import map_grid
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -104,7 +103,7 @@ def _train(
         model,
         None,
         batches.loader(),
-        map_grid(batches.grid, model, config.data.azimuth_mapping),
+        models.map_grid(batches.grid, model, config.data.azimuth_mapping),
         workdir,
         config=config,
         info=checkpoint_info(

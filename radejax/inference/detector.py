@@ -24,7 +24,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference import packed
 from radejax.inference.inputs import CameraOptions
-from radejax.training.step import map_grid
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
@@ -327,7 +326,7 @@ class Detector:
         Its arguments are variables, frames, image, camera (or None, None), score
         threshold, NMS IoU, region `[6]`, and the keyword `is_tesseract`.
         """
-        grid = map_grid(self.grid, self.model, self.azimuth_mapping)
+        grid = models.map_grid(self.grid, self.model, self.azimuth_mapping)
         return functools.partial(
             _detect, self.model, grid, self.classes, self.decode_options
         )

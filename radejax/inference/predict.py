@@ -22,7 +22,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
 from radejax.training import processes, sharding
-from radejax.training.step import map_grid, model_inputs
+from radejax.training.step import model_inputs
 
 
 class Predictor:
@@ -59,7 +59,7 @@ class Predictor:
             functools.partial(
                 _predict,
                 model,
-                map_grid(grid, model, config.data.azimuth_mapping),
+                models.map_grid(grid, model, config.data.azimuth_mapping),
                 options,
             ),
             # Every process gets all detections: they are small.

@@ -37,7 +37,6 @@ from radejax.runs.workdir import (
     run_info,
 )
 from radejax.training import loop, processes, sharding
-from radejax.training.step import map_grid
 
 __all__ = [
     "config_name",
@@ -218,7 +217,7 @@ def train(
         model,
         variables,
         loader,
-        map_grid(records.grid, model, config.data.azimuth_mapping),
+        models.map_grid(records.grid, model, config.data.azimuth_mapping),
         workdir,
         config=config,
         info=checkpoint_info(
