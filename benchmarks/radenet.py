@@ -3,6 +3,7 @@
     python benchmarks/radenet.py                    # CPU, or the GPU where there is one
     python benchmarks/radenet.py --cpu-time         # on a machine that others use too
     python benchmarks/radenet.py --batch 1 10 --dtype float32 bfloat16   # GPU
+    python benchmarks/radenet.py --parts            # parameters and FLOPs of every part
 
 Rows: forward, gradient, training step (loss and AdamW), detection (forward, decoding,
 NMS; ours only). Without torch the table has our column only. Each cell is the median
@@ -29,7 +30,6 @@ from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import radenet_torch
 from radejax.losses.detection import detection_loss
-from radejax.models.summary import summarize
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 try:
@@ -155,6 +155,18 @@ def torch_tasks(model, batch, dtype, device, *, is_compiled):
     return {"forward": forward, "gradient": gradient, "training step": step}
 
 
+def forward_flops(model, variables, batch):
+    """Operations of the forward pass, as XLA counts them."""
+    lowered = jax.jit(model.apply).lower(variables, batch.projection)
+    return lowered.cost_analysis()["flops"]
+
+
+def parts_table(model, size):
+    """Outputs, parameters and operations of every part of the network."""
+    x = np.zeros((size, 256, 107, 101), np.float32)
+    return model.tabulate(jax.random.key(0), x, compute_flops=True, depth=2)
+
+
 def measure(columns, repeats, clock):
     """Seconds by column and task, interleaved so that a slow moment hits all."""
     times = {}
@@ -218,6 +230,7 @@ def main():
     parser.add_argument("--repeats", type=int, default=20 if on_gpu else 5)
     parser.add_argument("--cpu-time", action="store_true", help="CPU seconds, not wall")
     parser.add_argument("--tasks", nargs="+", help="only these rows")
+    parser.add_argument("--parts", action="store_true", help="only the network's parts")
     parser.add_argument("--overfit", type=int, metavar="STEPS", help="only train")
     arguments = parser.parse_args()
     clock = time.process_time if arguments.cpu_time else time.perf_counter
@@ -233,6 +246,9 @@ def main():
         x = np.zeros((1, 16, 16, 101), np.float32)
         variables = jax.jit(model.init)(jax.random.key(0), x)
         for size in arguments.batch:
+            if arguments.parts:
+                sys.stdout.write(parts_table(model, size))
+                continue
             batch = make_batch(size)
             if arguments.overfit:
                 overfit(config, variables, batch, arguments.overfit)
@@ -244,7 +260,7 @@ def main():
                     name: {k: v for k, v in tasks.items() if k in arguments.tasks}
                     for name, tasks in columns.items()
                 }
-            flops = sum(c.flops for c in summarize(model, batch=size).values())
+            flops = forward_flops(model, variables, batch)
             times = measure(columns, arguments.repeats, clock)
             rows = report(times, columns, size, flops, peaks.get(dtype))
             sys.stdout.write(f"\nbatch {size}, {dtype}\n{rows}\n")

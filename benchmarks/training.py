@@ -33,7 +33,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.radenet import REMAT
 from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer
-from radejax.training.step import make_train_step, map_grid
+from radejax.training.step import make_train_step
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from pipeline import make_frames, write_records
@@ -64,7 +64,7 @@ def step_memory(config, batch_size):
     step = make_train_step(
         model,
         optimizer,
-        map_grid(grid, model, config.data.azimuth_mapping),
+        models.map_grid(grid, model, config.data.azimuth_mapping),
         loss=dict(config.loss),
     )
     rng = jax.eval_shape(lambda: jax.random.key(0))
@@ -112,7 +112,7 @@ def train(config, grid, steps, num_devices, folder):
         model,
         None,
         loader,
-        map_grid(grid, model, config.data.azimuth_mapping),
+        models.map_grid(grid, model, config.data.azimuth_mapping),
         folder,
         config=config,
         info={},

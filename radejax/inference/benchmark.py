@@ -18,7 +18,6 @@ from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import placeholder
-from radejax.training.step import map_grid
 
 STAGES = ("transfer", "projection", "network", "decode + NMS")
 
@@ -100,7 +99,7 @@ def _measure(
     decode_function = jax.jit(
         functools.partial(
             decode,
-            grid=map_grid(grid, detector.model, detector.azimuth_mapping),
+            grid=models.map_grid(grid, detector.model, detector.azimuth_mapping),
             score_threshold=detector.score_threshold,
             nms_iou=detector.nms_iou,
             **detector.decode_options,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -133,24 +132,4 @@ def split_batch(batch: Batch, num_parts: int) -> Batch:
     """
     return jax.tree.map(
         lambda x: x.reshape(-1, num_parts, *x.shape[1:]).swapaxes(0, 1), batch
-    )
-
-
-def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: str) -> RadarGrid:
-    """Grid of the maps that a model makes from projections on `grid`.
-
-    Args:
-        grid: Of the sensor.
-        model: Pads to `pad_multiple` and, if `crop_output`, crops again; a
-            radar-camera model does so in its `radar` part.
-        azimuth_mapping: See `RadarGrid.padded`.
-    """
-    model = getattr(model, "radar", model)
-    padded = grid.padded(model.pad_multiple, azimuth_mapping)
-    if not model.crop_output:
-        return padded
-    return dataclasses.replace(
-        padded,
-        range_m=padded.range_m[: grid.num_range],
-        azimuth_rad=padded.azimuth_rad[: grid.num_azimuth],
     )

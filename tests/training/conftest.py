@@ -13,7 +13,6 @@ from radejax import models
 from radejax.core.config import base_config
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.training.step import map_grid
 
 NUM_FRAMES = 16
 
@@ -68,7 +67,7 @@ def tiny() -> Tiny:
         config=config,
         model=model,
         grid=grid,
-        map_grid=map_grid(grid, model, "true"),
+        map_grid=models.map_grid(grid, model, "true"),
         frames=make_frames(grid, seed=0),
     )
 

@@ -18,7 +18,7 @@ from radejax.inference.open import starting_weights
 from radejax.interop import radenet_torch
 from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer, make_schedule
-from radejax.training.step import make_train_step, map_grid
+from radejax.training.step import make_train_step
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SIZE = (32, 576)  # the released crop leaves out 280 columns on both sides
@@ -191,7 +191,7 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
         make_train_step(
             model,
             optimizer,
-            map_grid(grid, model, config.data.azimuth_mapping),
+            models.map_grid(grid, model, config.data.azimuth_mapping),
             loss=dict(config.loss),
         )
     )

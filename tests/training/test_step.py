@@ -15,7 +15,7 @@ from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.training import sharding
 from radejax.training.state import create_state, make_optimizer
-from radejax.training.step import make_train_step, map_grid, split_batch
+from radejax.training.step import make_train_step, split_batch
 
 RNG = jax.random.key(7)
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -217,13 +217,3 @@ def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(
     assert set(floats) == {jnp.dtype("float32")}
     losses = ("loss", "focal", "gwd", "smooth_l1", "grad_norm")
     assert {metrics[name].dtype for name in losses} == {jnp.dtype("float32")}
-
-
-def test_map_grid_follows_padding_and_cropping(tiny: Tiny) -> None:
-    padded = map_grid(tiny.grid, tiny.model.clone(crop_output=False), "true")
-    assert (padded.num_range, padded.num_azimuth) == (16, 16)
-    cropped = map_grid(tiny.grid, tiny.model.clone(crop_output=True), "true")
-    assert cropped == tiny.grid
-    stretched = map_grid(tiny.grid, tiny.model.clone(crop_output=True), "stretched")
-    assert stretched.num_azimuth == 14
-    assert stretched.azimuth_step_rad < tiny.grid.azimuth_step_rad
