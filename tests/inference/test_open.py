@@ -3,6 +3,7 @@
 import json
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 from ml_collections import ConfigDict
@@ -17,9 +18,15 @@ from .. import small_models as small
 
 
 def test_a_torch_file_is_opened_like_a_folder(tmp_path: pathlib.Path) -> None:
-    detector = small.detector()
+    fields = packed.model_config(small.detector().model)
+    fields |= {"doppler_bins": 64, "elevation_bins": 37, "num_groups": 32}
+    model = models.build(fields | {"widths": (32, 32), "decoder_width": 64})
+    shapes = jax.eval_shape(
+        model.init, jax.random.key(0), np.zeros((1, 16, 16, 101), np.float32)
+    )
+    variables = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), shapes)
     path = tmp_path / "best.npz"
-    radenet_torch.save(detector.model, detector.variables, path)
+    radenet_torch.save(model, variables, path)
     loaded = opening.load(path)
     assert loaded.settings["azimuth_mapping"] == "stretched"
     assert (loaded.config, loaded.step, loaded.run) == (None, None, {})
