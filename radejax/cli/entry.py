@@ -13,7 +13,7 @@ import socket
 import sys
 from collections.abc import Iterator, Sequence
 
-from radejax.core.errors import DataError, DiskFullError, UserError
+from radejax.core.errors import UserError
 from radejax.core.files import is_no_space
 
 FAILED = 1
@@ -31,16 +31,19 @@ _WRONG_PATH = (
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with one line instead of a traceback for the user's errors.
 
-    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk.
+    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk:
+    see `core.errors`.
 
     Args:
         debug: Let the traceback through.
     """
     try:
         yield
-    except (DataError, DiskFullError) as error:
-        _fail(error, FAILED, debug)
-    except (UserError, *_WRONG_PATH) as error:
+    except ValueError as error:
+        if not hasattr(error, "exit_code"):
+            raise
+        _fail(error, error.exit_code, debug)
+    except _WRONG_PATH as error:
         _fail(error, WRONG_USE, debug)
     except OSError as error:
         if not is_no_space(error):

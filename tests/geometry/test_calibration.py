@@ -11,9 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError, UserError
-from radejax.geometry import calibration as camera_lib
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry import camera as camera_lib
+from radejax.geometry.calibration import (
+    CalibrationError,
+    CalibrationFileError,
+    CameraCalibration,
+)
 
 # The distortion and matrix of K-Radar's cameras.
 INTRINSICS = (567.720776478944, 577.2136917114258, 628.72078, 369.30687)
@@ -221,12 +224,14 @@ def test_bad_calibrations(tmp_path):
     path = tmp_path / "cam_1.yml"
     text = forward_camera().to_kradar_text()
     path.write_text(text.replace("fx: ", "fx= "))
-    with pytest.raises(DataError, match=r"cam_1\.yml:1: expected 'key: number'"):
+    with pytest.raises(
+        CalibrationFileError, match=r"cam_1\.yml:1: expected 'key: number'"
+    ):
         CameraCalibration.from_kradar(path)
     path.write_text("\n".join(line for line in text.splitlines() if "k3" not in line))
-    with pytest.raises(DataError, match="lacks k3"):
+    with pytest.raises(CalibrationFileError, match="lacks k3"):
         CameraCalibration.from_kradar(path)
-    with pytest.raises(UserError, match="intrinsics must be"):
+    with pytest.raises(CalibrationError, match="intrinsics must be"):
         forward_camera(intrinsics=(1.0, 2.0))
-    with pytest.raises(UserError, match="raw, rectified, pinhole"):
+    with pytest.raises(CalibrationError, match="raw, rectified, pinhole"):
         forward_camera().camera("fisheye")
