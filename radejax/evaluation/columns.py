@@ -149,34 +149,23 @@ def read_columns(
             raise UserError(
                 f"{name}: column {column!r} has shape {values.shape}, expected ({num},)"
             )
-    _check_values(frame, box, score, name, scored)
-    return frame, box, cls, score
-
-
-def _check_values(
-    frame: np.ndarray, box: np.ndarray, score: np.ndarray, name: str, scored: bool
-) -> None:
-    """Raise for the first row with a value that no box may have."""
-    bad = ~np.isfinite(box)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise DataError(
-            f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[column]} of the box is"
-            f" {box[row, column]}, expected a finite number"
-        )
-    bad = box[:, 3:6] <= 0
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise DataError(
-            f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[3 + column]} of the box"
-            f" is {box[row, 3 + column]:g} m, expected a size above 0"
-        )
+    for bad, first, must in (
+        (~np.isfinite(box), 0, "is {}, expected a finite number"),
+        (box[:, 3:6] <= 0, 3, "is {:g} m, expected a size above 0"),
+    ):
+        if bad.any():
+            row, column = np.argwhere(bad)[0] + (0, first)
+            raise DataError(
+                f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[column]} of the box "
+                + must.format(box[row, column])
+            )
     bad = ~((score >= 0) & (score <= 1))
-    if scored and bad.any():
-        row = int(np.flatnonzero(bad)[0])
+    if bad.any():
+        row = int(np.argmax(bad))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: score {score[row]} is outside [0, 1]"
         )
+    return frame, box, cls, score
 
 
 def _integers(column: np.ndarray, name: str) -> np.ndarray:
@@ -215,7 +204,7 @@ def class_indices(
     )
     index = index[inverse] if names.size else np.zeros(0, np.int64)
     if (index == -2).any():
-        row = int(np.flatnonzero(index == -2)[0])
+        row = int(np.argmax(index == -2))
         known = ", ".join(dict.fromkeys((*classes, *KNOWN_CLASSES)))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: unknown class {str(cls[row])!r};"
@@ -235,7 +224,7 @@ def dense_frames(frame: np.ndarray, ids: np.ndarray, *, name: str) -> np.ndarray
     position = np.minimum(position, max(ids.size - 1, 0))
     known = ids[order][position] == frame if ids.size else np.zeros(frame.size, bool)
     if not known.all():
-        row = int(np.flatnonzero(~known)[0])
+        row = int(np.argmin(known))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: no such frame among the"
             f" {ids.size} frames that are evaluated"

@@ -62,12 +62,20 @@ def load(
         truth = predictions.read_table(path / "ground_truth.npz", frames, scored=False)
         found = predictions.read_table(path / "predictions.npz", frames)
         return truth, found, frames, {}
-    left_out: dict[str, int] = {}
+    frames, left_out = None, {}
     if source.ground_truth:
-        frames = _read_frames(pathlib.Path(source.frames)) if source.frames else None
+        frames = _read_frames(source.frames) if source.frames else None
         truth = predictions.read_table(source.ground_truth, frames, scored=False)
     elif source.data or source.labels:
-        truth, frames, left_out = _from_kradar(source, classes)
+        data = KRadar(
+            list(source.data) or None,
+            source.labels,
+            version=source.label_version,
+            split=source.split,
+            classes=classes,
+        )
+        truth, frames = tables_from_frames(data)
+        left_out = {f"labels: {what}": int(n) for what, n in data.counts.items()}
     elif path.is_dir():
         return (*kitti.read_kitti(path), left_out)
     else:
@@ -75,38 +83,21 @@ def load(
             f"{path} holds predictions only: say where the ground truth is, with --data,"
             " --labels or --ground_truth"
         )
-    is_folder = path.is_dir()
+    is_kitti = path.is_dir()
     found = (
-        kitti.read_kitti(path)[1] if is_folder else predictions.read_table(path, frames)
+        kitti.read_kitti(path)[1] if is_kitti else predictions.read_table(path, frames)
     )
     if frames is None:
-        both = np.concatenate([truth["frame"], found["frame"]])
-        frames = {"frame": np.unique(both)}
+        frames = {"frame": np.union1d(truth["frame"], found["frame"])}
     return truth, found, frames, left_out
 
 
-def _read_frames(path: pathlib.Path) -> Columns:
+def _read_frames(path: PathLike) -> Columns:
     """A frame table written by `report.write_report`."""
     content = files.read_json(path)
     if not isinstance(content, dict) or "frame" not in content:
         raise UserError(f"{path}: expected an object of columns with 'frame'")
     return {name: np.asarray(column) for name, column in content.items()}
-
-
-def _from_kradar(
-    source: Source, classes: Sequence[str]
-) -> tuple[Columns, Columns, dict[str, int]]:
-    """Ground truth and frames of K-Radar's labels, and what reading them left out."""
-    data = KRadar(
-        list(source.data) or None,
-        source.labels,
-        version=source.label_version,
-        split=source.split,
-        classes=classes,
-    )
-    truth, frames = tables_from_frames(data)
-    left_out = {f"labels: {what}": int(count) for what, count in data.counts.items()}
-    return truth, frames, left_out
 
 
 def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:

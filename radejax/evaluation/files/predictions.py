@@ -11,7 +11,7 @@ import csv
 import io
 import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -126,38 +126,32 @@ def _read_json(path: pathlib.Path) -> Columns:
         columns = content
     else:
         columns = _columns_of_records(_records(content, path), path)
+    types = {"frame": None, "cls": None, "box": np.float64, "score": np.float64}
     try:
         return {
-            name: np.asarray(values)
-            if name in ("frame", "cls")
-            else np.asarray(values, np.float64)
-            for name, values in columns.items()
-            if name in ("frame", "box", "cls", "score")
+            name: np.asarray(columns[name], dtype)
+            for name, dtype in types.items()
+            if name in columns
         }
     except (ValueError, TypeError) as error:
         raise DataError(f"{path}: a box or score is not a number: {error}") from error
 
 
-def _records(content: Any, path: pathlib.Path) -> list[dict]:
+def _records(content: Any, path: pathlib.Path) -> Iterator[dict]:
     """Flat records of a list of records or of a mapping frame -> list of records."""
-    if isinstance(content, dict):
-        return [
-            {"frame": frame, **record}
-            for frame, listed in content.items()
-            for record in _as_list(listed, f"{path}: frame {frame!r}")
-        ]
-    return _as_list(content, str(path))
+    is_by_frame = isinstance(content, dict)
+    for frame, listed in content.items() if is_by_frame else [(None, content)]:
+        if not isinstance(listed, list) or any(
+            not isinstance(item, dict) for item in listed
+        ):
+            where = f"{path}: frame {frame!r}" if is_by_frame else str(path)
+            raise DataError(
+                f"{where}: expected a list of objects with frame, cls, box and score"
+            )
+        yield from ({"frame": frame, **r} if is_by_frame else r for r in listed)
 
 
-def _as_list(value: Any, where: str) -> list[dict]:
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise DataError(
-            f"{where}: expected a list of objects with frame, cls, box and score"
-        )
-    return value
-
-
-def _columns_of_records(records: list[dict], path: pathlib.Path) -> dict[str, list]:
+def _columns_of_records(records: Iterator[dict], path: pathlib.Path) -> dict[str, list]:
     columns: dict[str, list] = {"frame": [], "cls": [], "box": [], "score": []}
     for row, record in enumerate(records):
         box = record.get("box", [record.get(name) for name in BOX_FIELDS])
@@ -173,7 +167,7 @@ def _columns_of_records(records: list[dict], path: pathlib.Path) -> dict[str, li
         columns["box"].append(box)
         columns["score"].append(record.get("score"))
     lacking = [row for row, score in enumerate(columns["score"]) if score is None]
-    if lacking and len(lacking) < len(records):
+    if lacking and len(lacking) < len(columns["score"]):
         raise DataError(f"{path}: row {lacking[0]}: lacks 'score'")
     if lacking:
         del columns["score"]
@@ -245,14 +239,9 @@ def write_table(
 
 
 def _csv_text(columns: Columns) -> str:
+    flat = columns | dict(zip(BOX_FIELDS, columns["box"].T, strict=True))
+    names = [name for name in ("frame", "cls", *BOX_FIELDS, "score") if name in flat]
+    rows = zip(*(flat[name].tolist() for name in names), strict=True)
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    scored = "score" in columns
-    writer.writerow(["frame", "cls", *BOX_FIELDS, *(["score"] * scored)])
-    rows = zip(columns["frame"].tolist(), columns["cls"].tolist(), strict=True)
-    for index, (frame, cls) in enumerate(rows):
-        numbers = [repr(value) for value in columns["box"][index].tolist()]
-        if scored:
-            numbers.append(repr(float(columns["score"][index])))
-        writer.writerow([frame, cls, *numbers])
+    csv.writer(buffer, lineterminator="\n").writerows([names, *rows])
     return buffer.getvalue()

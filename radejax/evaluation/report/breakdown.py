@@ -16,7 +16,6 @@ import numpy as np
 from radejax.evaluation import matching, overlap, protocols
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.result import SPACES
-from radejax.visualize.curves import calibration_bins
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
@@ -151,6 +150,9 @@ def calibration(
         "precision" per bin (NaN where empty), and "error", the mean of
         |precision - score| weighted by count (expected calibration error).
     """
+    # Here, for it loads matplotlib, and the numbers of a training run need none of that.
+    from radejax.visualize.curves import calibration_bins
+
     is_match = matched_objects(data, space, iou) >= 0
     edges = np.linspace(0, 1, num_bins + 1)
     result = {}

@@ -275,7 +275,7 @@ def _draw(
     """Curves, and pictures of the worst frames if somebody can draw them."""
     written = []
     if options.plots:
-        from radejax.evaluation.report import plots  # matplotlib takes a second to load
+        from radejax.evaluation.report import plots  # takes a second: matplotlib
 
         written += plots.draw(data, frames, options, out_dir)
     if options.draw_frame is not None:
