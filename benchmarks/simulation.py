@@ -15,6 +15,7 @@ One line each: wall and processor time per frame, frames/s, peak memory of the p
 """
 
 import argparse
+import io
 import pathlib
 import resource
 import subprocess
@@ -28,7 +29,7 @@ import numpy as np
 from radejax.data.kradar import write as kradar_write
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
-from radejax.simulation.dataset import encode_png, simulate_dataset
+from radejax.simulation.dataset import simulate_dataset, write_png
 from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
@@ -152,7 +153,9 @@ class Bench:
         frame = self.sequence.frame
         image = renderer.render(frame(0))
         measure("camera image", lambda i: renderer.render(frame(i)), frames)
-        measure("camera image to .png", lambda i: encode_png(image), frames)
+        measure(
+            "camera image to .png", lambda i: write_png(io.BytesIO(), image), frames
+        )
 
 
 def main():
