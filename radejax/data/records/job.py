@@ -18,19 +18,18 @@ import pathlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
 from radejax.core import files as core_files
 from radejax.core.errors import DataError, UserError
 from radejax.data.encoding import check_encoding, encode, num_clipped
+from radejax.data.kradar import Frame, KRadar
 from radejax.data.records import files
+from radejax.data.records.projections import Manifest, write_manifest
 from radejax.data.tesseract import project_file, read_projection_npy
-
-if TYPE_CHECKING:
-    from radejax.data.kradar import Frame, KRadar
-    from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid
 
 PLAN = "plan.json"
 
@@ -342,8 +341,6 @@ def _finish(
     sources: list[tuple[str, pathlib.Path | None, pathlib.Path | None]],
 ) -> bool:
     """Writes the manifest of the folder if every file is there."""
-    from radejax.data.records.projections import Manifest, write_manifest
-
     entries = [files.read_manifest_of(out_dir, name) for name in names]
     if any(entry is None for entry in entries):
         return False
