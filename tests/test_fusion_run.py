@@ -230,7 +230,7 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
     with pytest.raises(FileNotFoundError, match="radejax embed"):
         open_embeddings(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
-    with pytest.raises(DataError, match="other 1"):
+    with pytest.raises(DataError, match="other version 1"):
         open_embeddings(tmp_path)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import chex
 import numpy as np
 
 from radejax.core.errors import UserError
@@ -32,6 +33,12 @@ class FrameTable:
     boxes: np.ndarray
     classes: np.ndarray
     images: CameraInputs | None = None
+
+    def __post_init__(self) -> None:
+        chex.assert_rank([self.record, self.boxes, self.classes], [1, 3, 2])
+        chex.assert_equal_shape_prefix([self.boxes, self.classes], 2)
+        chex.assert_equal_shape_prefix([self.record, self.boxes], 1)
+        chex.assert_axis_dimension(self.boxes, -1, 8)
 
     def __len__(self) -> int:
         return len(self.record)

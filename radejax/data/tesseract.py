@@ -80,7 +80,7 @@ def project_file(
             _check(path, np.broadcast_to(stored.type(0), layout[1]), shape_drea)
             slab = np.empty((elevation, range_, doppler), stored)
             columns = _read_slabs(file, slab, azimuth, timings)
-            projection = project_columns(columns, azimuth, dtype=dtype)
+            projection = project_columns(columns, dtype=dtype)
     if layout is None:
         began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)

@@ -63,6 +63,7 @@ class KRadar(Sequence[Frame]):
 
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
+        split_folders: In and beside which split files are looked for.
 
     Raises:
         FileNotFoundError: A folder or file that was named does not exist.
@@ -99,9 +100,9 @@ class KRadar(Sequence[Frame]):
         self.folders = folders.find_sequences(self.roots)
         self.grid = folders.read_grid(self.roots)
         self._source = self._open_labels(labels)
-        self._near = list(self.roots)
+        self.split_folders = list(self.roots)
         if labels is not None:
-            self._near += [pathlib.Path(labels), pathlib.Path(labels).parent]
+            self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
         self._sequence_numbers = sequence_numbers
         self._offset = (radar_from_lidar, float(z_offset_m))
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
@@ -169,7 +170,7 @@ class KRadar(Sequence[Frame]):
             self._source,
             self._findings,
             split=split,
-            near=self._near,
+            near=self.split_folders,
             sequence_numbers=self._sequence_numbers,
         )
         files = self._read_label_files(keys)

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from radejax.core.errors import DataError
 from radejax.core.files import read_json, require_same
-from radejax.data.records.arrays import MANIFEST, ArrayRecords
-from radejax.data.records.files import RecordFile
+from radejax.data.records.arrays import MANIFEST, ArrayRecords, read_manifest_json
+from radejax.data.records.files import RecordFile, damage_named
 
 FORMAT = "radejax-embeddings"
 FORMAT_VERSION = 1
@@ -40,25 +39,15 @@ def open_embeddings(
         DataError: The manifest is damaged or of another version.
         UserError: They come from another backbone.
     """
-    path = pathlib.Path(folder) / MANIFEST
-    if not path.is_file():
+    folder = pathlib.Path(folder)
+    if not (folder / MANIFEST).is_file():
         raise FileNotFoundError(
             f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
         )
-    try:
-        manifest = read_json(path)
-        version = manifest["format"], manifest["version"]
-        if version != (FORMAT, FORMAT_VERSION):
-            raise DataError(
-                f"{path}: {version[0]} {version[1]}, this radejax reads {FORMAT} "
-                f"{FORMAT_VERSION}"
-            )
+    manifest = read_manifest_json(folder, (FORMAT, FORMAT_VERSION))
+    with damage_named(folder / MANIFEST):
         entries = [RecordFile.from_dict(f) for f in manifest["files"]]
         shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
-    except DataError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged manifest ({error!r})") from None
     if image_config is not None:
         wanted = relevant_fields(image_config)
         require_same(

@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -126,13 +127,23 @@ def read_manifest_of(folder: pathlib.Path, name: str) -> RecordFile | None:
     """
     path = manifest_path(folder, name)
     try:
-        entry = RecordFile.from_dict(json.loads(path.read_bytes()))
+        with damage_named(path):
+            entry = RecordFile.from_dict(core_files.read_json(path))
         size = (folder / name).stat().st_size
     except FileNotFoundError:
         return None
+    return entry if size == entry.num_bytes else None
+
+
+@contextlib.contextmanager
+def damage_named(path: pathlib.Path) -> Iterator[None]:
+    """Turns what reading the fields of a damaged manifest raises into a `DataError`."""
+    try:
+        yield
+    except DataError:
+        raise
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: damaged manifest ({error!r}); delete it") from None
-    return entry if size == entry.num_bytes else None
 
 
 def sha256(path: pathlib.Path) -> str:
