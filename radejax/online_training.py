@@ -106,7 +106,10 @@ def _train(
         batches.loader(),
         map_grid(batches.grid, model, config.data.azimuth_mapping),
         workdir,
-        config=config,
+        options=config.train,
+        loss=config.loss,
+        watch=config.watch,
+        seed=config.seed,
         info=checkpoint_info(
             config,
             batches.grid,

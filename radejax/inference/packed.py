@@ -293,9 +293,9 @@ def _of_run(
 
 def _of_checkpoint(folder: pathlib.Path, step: int | str | None) -> LoadedModel:
     """A checkpoint without its run: it carries config and grid itself."""
-    from radejax.training.checkpoints import BEST, Checkpoints
+    from radejax.training.checkpoints import Checkpoints
 
-    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
+    with Checkpoints(folder, read_only=True) as checkpoints:
         if step == "best":
             step = checkpoints.best_step()
         state, info, _ = checkpoints.restore_variables(step)

@@ -130,7 +130,7 @@ def require_images(
 def load_image_backbone(
     path: PathLike | None, config: ConfigDict, embeddings: PathLike | None = None
 ) -> Any:
-    """Pretrained part of the variables, for `radejax.models.dinorade.with_pretrained`.
+    """Pretrained part of the variables, for `radejax.training.state.with_pretrained`.
 
     Args:
         path: A DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.

@@ -220,7 +220,10 @@ def train(
         loader,
         map_grid(records.grid, model, config.data.azimuth_mapping),
         workdir,
-        config=config,
+        options=config.train,
+        loss=config.loss,
+        watch=config.watch,
+        seed=config.seed,
         info=checkpoint_info(
             config,
             records.grid,

@@ -34,7 +34,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import image_backbone as camera_inputs
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.data import DataPaths, saved_path
-from radejax.training.checkpoints import BEST, Checkpoints
+from radejax.training.checkpoints import Checkpoints
 
 _log = logging.getLogger(__name__)
 
@@ -211,7 +211,7 @@ def load_run(
             f"no checkpoints in {workdir}: the run has not trained yet"
         )
     folder = workdir / "checkpoints"
-    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
+    with Checkpoints(folder, read_only=True) as checkpoints:
         if step == "best":
             step = checkpoints.best_step()
         state, info, step = checkpoints.restore_variables(step)
