@@ -26,7 +26,7 @@ from radejax.inference.packed import LoadedModel
 from radejax.interop import dinorade_torch, image_backbone, radenet_torch
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
-from radejax.training.checkpoints import BEST, Checkpoints
+from radejax.training.checkpoints import Checkpoints
 
 _log = logging.getLogger(__name__)
 
@@ -193,7 +193,7 @@ def _check_no_step(path: pathlib.Path, step: Step) -> None:
 
 def _read_checkpoint(folder: pathlib.Path, step: Step) -> LoadedModel:
     """A checkpoint; it carries config, grid and what its run was made with."""
-    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
+    with Checkpoints(folder, read_only=True) as checkpoints:
         if step == "best":
             step = checkpoints.best_step()
         state, info, step = checkpoints.restore_variables(step)

@@ -14,6 +14,7 @@ from radejax.runs.data import Sources
 from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import sharding
+from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
 
@@ -41,16 +42,15 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     # Stops after the first checkpoint, as if killed, and goes on.
     saved = []
 
-    def stop(self, step, *args, original=None):
-        original(self, step, *args)
+    save = Checkpoints.save
+
+    def stop(self, step, *args, **options):
+        save(self, step, *args, **options)
         saved.append(step)
         raise KeyboardInterrupt
 
-    from radejax.training import loop
-
-    original = loop._Run._save
     with monkeypatch.context() as patch:
-        patch.setattr(loop._Run, "_save", lambda *a: stop(*a, original=original))
+        patch.setattr(Checkpoints, "save", stop)
         with pytest.raises(KeyboardInterrupt):
             train_online(_config(), parts, num_sequences=2)
     assert saved == [1]

@@ -357,15 +357,3 @@ def test_images_of_another_size_are_refused():
 def test_impossible_configs_are_refused(changes, message):
     with pytest.raises(UserError, match=message):
         small(**changes)
-
-
-def test_pretrained_parts_replace_their_like():
-    _, variables = model_and_variables()
-    part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}}}}
-    merged = dinorade.with_pretrained(variables, part)
-    assert (merged["params"]["image_neck"]["proj"]["bias"] == 7).all()
-    kept = variables["params"]["image_neck"]["proj"]["kernel"]
-    assert merged["params"]["image_neck"]["proj"]["kernel"] is kept
-    wrong = {"params": {"image_neck": {"proj": {"bias": np.zeros(9)}}}}
-    with pytest.raises(UserError, match=r"params/image_neck/proj/bias is \(9,\)"):
-        dinorade.with_pretrained(variables, wrong)
