@@ -63,6 +63,7 @@ RUN_IN = {
         for path in (ROOT / "benchmarks").glob("*.py")
         if not path.name.startswith("torch_")  # modules of the others
     },
+    "docs/images/house.py": HELP,
     "docs/images/simulator_pictures.py": HELP,
 }
 

@@ -94,6 +94,11 @@ def test_the_page_has_every_room_once() -> None:
     _agrees("room", {f"room {name}" for name in rooms - set(named)})
 
 
+def test_the_page_has_the_tree() -> None:
+    """Where not: `python docs/images/house.py` writes it."""
+    assert house.tree() in house.PAGE.read_text(encoding="utf-8")
+
+
 def test_arrows_lead_to_lower_floors() -> None:
     wrong = {f"up {a.source} -> {a.target}" for a in ARROWS if _is_wrong(a)}
     _agrees("up", wrong)

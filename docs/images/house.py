@@ -1,8 +1,9 @@
-"""Draws the house: rooms on their floors and who imports whom, from the code itself.
+"""Draws the house from the code: rooms on their floors, and who imports whom.
 
-    python docs/images/house.py --out docs/images/house.png
+    python docs/images/house.py
 
-`tests/test_house.py` holds the same graph to the floors of docs/architecture.md.
+writes docs/images/house.png, and the tree of files into docs/architecture.md. The floors
+are those of the page's table; `tests/test_house.py` holds the same graph to them.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import dataclasses
 import functools
 import pathlib
 import re
+import textwrap
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "architecture.md"
 GROUND = "radejax/__init__"
 """Room of the lazy names: whoever imports a module of the package runs it first."""
 
@@ -163,13 +166,37 @@ def heights(graph: Mapping[str, set[str]]) -> dict[str, int]:
 
 def floors_of_the_page() -> list[tuple[str, list[str]]]:
     """Name and rooms of every floor of docs/architecture.md's table, ground first."""
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
     rows = re.search(r"\| floor \|.*\n\|[-|]+\n((?:\|.*\n)+)", page).group(1)
     cells = [[cell.strip() for cell in row.split("|")] for row in rows.splitlines()]
     return [
         (name, [found.rstrip("/") for found in re.findall(r"`([^`]+)`", rooms)])
         for _, name, rooms, *_ in reversed(cells)
     ]
+
+
+def tree() -> str:
+    """Files of the package by room, from the upper floors down, as the page has them."""
+    folders: dict[pathlib.Path, list[str]] = {}
+    for module, path in modules().items():
+        if module.startswith("radejax") and path.name != "__init__.py":
+            folders.setdefault(path.parent, []).append(path.stem)
+    rooms = [name for _, names in reversed(floors_of_the_page()) for name in names]
+    package = ROOT / "radejax"
+    order = sorted(
+        (folder for folder in folders if folder != package),
+        key=lambda folder: (rooms.index(folder.relative_to(package).parts[0]), folder),
+    )
+    lines = ["radejax/"]
+    for folder in order:
+        indent = "  " * len(folder.relative_to(package).parts)
+        lines += textwrap.wrap(
+            " ".join(sorted(folders[folder])),
+            width=88,
+            initial_indent=f"{indent + folder.name + '/':<16}",
+            subsequent_indent=16 * " ",
+        )
+    return "\n".join(lines)
 
 
 def count_lines(path: pathlib.Path) -> int:
@@ -345,10 +372,16 @@ def draw(out: pathlib.Path) -> None:
 
 
 def main() -> None:
-    """Draws it where the command line says."""
+    """Draws the picture, and writes the page's tree anew."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=pathlib.Path, required=True)
+    parser.add_argument(
+        "--out", type=pathlib.Path, default=ROOT / "docs" / "images" / "house.png"
+    )
     draw(parser.parse_args().out)
+    page = PAGE.read_text(encoding="utf-8")
+    block = re.search(r"(?<=```\n)radejax/\n.*?(?=\n```)", page, re.DOTALL)
+    page = page[: block.start()] + tree() + page[block.end() :]
+    PAGE.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
