@@ -89,10 +89,8 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
     if isinstance(roi, str):
         return roi
     bounds = tuple(float(value) for value in np.asarray(roi).reshape(-1))
-    for name, known in ROIS.items():
-        if bounds == known:
-            return name
-    return ",".join(f"{value:g}" for value in bounds)
+    names = {known: name for name, known in ROIS.items()}
+    return names.get(bounds) or ",".join(f"{value:g}" for value in bounds)
 
 
 def frame_ids(frames: Columns) -> np.ndarray:
@@ -114,6 +112,11 @@ def frame_ids(frames: Columns) -> np.ndarray:
     return ids
 
 
+def wanted_columns(scored: bool) -> tuple[str, ...]:
+    """Names of the columns of ground truth or, `scored`, of predictions."""
+    return ("frame", "box", "cls", "score")[: 4 if scored else 3]
+
+
 def read_columns(
     table: Columns, *, name: str, scored: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -124,8 +127,7 @@ def read_columns(
         DataError: A value no box may have, named by frame and row: not finite, a size
             that is not positive, a score outside [0, 1].
     """
-    wanted = ("frame", "box", "cls", "score") if scored else ("frame", "box", "cls")
-    missing = [column for column in wanted if column not in table]
+    missing = [column for column in wanted_columns(scored) if column not in table]
     if missing:
         raise UserError(f"{name} lack the columns {missing}; found {sorted(table)}")
     frame = _integers(table["frame"], name)
@@ -194,21 +196,15 @@ def class_indices(
     Raises:
         DataError: A class name that is neither asked for nor one of K-Radar's.
     """
+    index_of = dict.fromkeys((*classes, *KNOWN_CLASSES), -1)
+    index_of |= {name: i for i, name in enumerate(classes)}
     names, inverse = np.unique(cls, return_inverse=True)
-    index = np.array(
-        [
-            classes.index(n) if n in classes else -1 if n in KNOWN_CLASSES else -2
-            for n in names.tolist()
-        ],
-        np.int64,
-    )
-    index = index[inverse] if names.size else np.zeros(0, np.int64)
+    index = np.array([index_of.get(n, -2) for n in names.tolist()], np.int64)[inverse]
     if (index == -2).any():
         row = int(np.argmax(index == -2))
-        known = ", ".join(dict.fromkeys((*classes, *KNOWN_CLASSES)))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: unknown class {str(cls[row])!r};"
-            f" known: {known}"
+            f" known: {', '.join(index_of)}"
         )
     return index
 

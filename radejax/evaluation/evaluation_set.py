@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,15 @@ from radejax.evaluation.result import SPACES, Result
 
 # Scores [K], falling; frames [K]; how many true positives (or matches) each adds [K].
 Falling = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class Terms(NamedTuple):
+    """What one AP of a class is asked in: protocol, "bev" or "3d", IoU, score cut."""
+
+    protocol: Protocol
+    space: str
+    iou: float
+    score_threshold: float = 0.0
 
 
 class EvaluationSet:
@@ -186,14 +196,15 @@ class EvaluationSet:
             spaces, _check_ious(iou_thresholds), enumerate(self.classes)
         ):
             weight = frame_weights[:, index]
-            curve = self.curve(chosen, space, iou, index, weight, score_threshold)
+            terms = Terms(chosen, space, iou, float(score_threshold))
+            curve = self.curve(terms, index, weight)
             result = Result(
                 cls=name,
                 space=space,
                 iou=iou,
                 protocol=chosen.name,
                 num_frames=int((weight > 0).sum()),
-                score_threshold=float(score_threshold),
+                score_threshold=terms.score_threshold,
                 skip_empty=skip,
                 roi=self.roi,
                 label_version=self.label_version,
@@ -204,12 +215,9 @@ class EvaluationSet:
 
     def curve(
         self,
-        protocol: Protocol,
-        space: str,
-        iou: float,
+        terms: Terms,
         cls: int,
         weight: np.ndarray,
-        score_threshold: float = 0.0,
         among: np.ndarray | None = None,
     ) -> Curve:
         """Curve and AP of one class over frames with integer weights `[F]`.
@@ -217,62 +225,45 @@ class EvaluationSet:
         `among` is a `[F]` mask outside which all weights are zero: many questions about
         few frames (resamples of a condition) are answered faster with it.
         """
-        detections, *steps = self._falling(
-            protocol, space, iou, cls, float(score_threshold), among
-        )
-        num_gt = int(weight @ self.gt_count[:, cls])
-        score, frame, is_tp = detections
-        if protocol.matching != "kradar":
-            return protocols.pooled_curve(
-                score=score,
-                is_tp=is_tp,
-                weight=weight[frame],
-                num_gt=num_gt,
-                curve=protocol.curve,
-            )
-        matched, events = (
-            (score, count * weight[frame]) for score, frame, count in steps
-        )
-        return protocols.kradar_curve(
-            matched, events, (score, weight[frame]), num_gt, protocol.curve
+        (score, frame, is_tp), *steps = self._falling(terms, cls, among)
+        num_gt, curve = int(weight @ self.gt_count[:, cls]), terms.protocol.curve
+        det_weight = weight[frame]
+        if terms.protocol.matching == "kradar":
+            matched, events = ((s, count * weight[f]) for s, f, count in steps)
+            made = (score, det_weight)
+            return protocols.kradar_curve(matched, events, made, num_gt, curve)
+        return protocols.pooled_curve(
+            score=score, is_tp=is_tp, weight=det_weight, num_gt=num_gt, curve=curve
         )
 
     def _falling(
-        self,
-        protocol: Protocol,
-        space: str,
-        iou: float,
-        cls: int,
-        score_threshold: float,
-        among: np.ndarray | None,
+        self, terms: Terms, cls: int, among: np.ndarray | None
     ) -> list[Falling]:
         """What a curve of one class needs by falling score, for any weights.
 
         Predictions with what they found; in K-Radar's protocols then the matches of the
         first pass and the steps of the second.
         """
+        protocol, *others = terms
         where = None if among is None else among.tobytes()
-        key = (protocol.geometry, protocol.matching, space, iou, cls, score_threshold)
-        if (key, where) in self._parts:
-            return self._parts[key, where]
+        key = (protocol.geometry, protocol.matching, *others, cls, where)
+        if key in self._parts:
+            return self._parts[key]
         if among is not None:
-            whole = self._falling(protocol, space, iou, cls, score_threshold, None)
+            whole = self._falling(terms, cls, None)
             parts = [tuple(v[among[part[1]]] for v in part) for part in whole]
         else:
-            match, mine = self.match(protocol, space, iou), self.by_score[cls]
-            if protocol.matching != "kradar":
-                cut = score_threshold if score_threshold != 0 else -1.0
-                parts = [self._sorted(mine, match[mine] >= 0, cls, cut)]
-            else:
-                parts = [
-                    self._sorted(pred, count, cls, score_threshold)
-                    for pred, count in (
-                        (mine, np.ones(mine.size, np.int64)),
-                        (match.first_pred, np.ones(match.first_pred.size, np.int64)),
-                        (match.event_pred, match.event_delta),
-                    )
-                ]
-        self._parts[key, where] = parts
+            match, mine = self.match(*terms[:3]), self.by_score[cls]
+            if protocol.matching == "kradar":
+                first, event = match.first_pred, match.event_pred
+                counts = [(pred, np.ones_like(pred)) for pred in (mine, first)]
+                counts.append((event, match.event_delta))
+                cut = terms.score_threshold
+            else:  # a cut of 0 keeps all, scores of 0 too
+                counts = [(mine, match[mine] >= 0)]
+                cut = terms.score_threshold or -1.0
+            parts = [self._sorted(pred, count, cls, cut) for pred, count in counts]
+        self._parts[key] = parts
         return parts
 
     def _sorted(

@@ -19,7 +19,7 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS
-from radejax.evaluation.columns import Columns
+from radejax.evaluation.columns import Columns, wanted_columns
 
 
 def frame_keys(frames: Columns) -> list[str]:
@@ -69,7 +69,7 @@ def read_table(
             " and folders in KITTI's layout"
         )
     columns = readers[path.suffix](path)
-    wanted = ("frame", "box", "cls", "score") if scored else ("frame", "box", "cls")
+    wanted = wanted_columns(scored)
     missing = [name for name in wanted if name not in columns]
     if missing:
         raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")

@@ -16,7 +16,7 @@ import numpy as np
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
 from radejax.evaluation.columns import Columns
-from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.evaluation_set import EvaluationSet, Terms
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import SPACES
 
@@ -60,15 +60,14 @@ def resample(
     """
     chosen = protocols.get_protocol(protocol)
     skip = chosen.frame_rule(skip_empty)
+    terms = Terms(chosen, space, iou, float(score_threshold))
     num_classes = len(data.classes)
     among = weights.any(axis=0)
     ap = np.full((len(weights), num_classes + 1), np.nan)
     for row, weight in enumerate(weights):
         by_class = data.frame_weights(skip, weight)
         for cls in range(num_classes):
-            curve = data.curve(
-                chosen, space, iou, cls, by_class[:, cls], score_threshold, among
-            )
+            curve = data.curve(terms, cls, by_class[:, cls], among)
             if curve.num_gt:
                 ap[row, cls] = curve.ap
         present = ap[row, ~np.isnan(ap[row])]
