@@ -15,6 +15,7 @@ One line each: wall and processor time per frame, frames/s, peak memory of the p
 """
 
 import argparse
+import functools
 import io
 import pathlib
 import resource
@@ -99,14 +100,12 @@ class Bench:
                 *[(x.scatterers, x.noise_power, x.key) for x in self.inputs],
             )
         )
-        grid, parameters = self.simulator.grid, self.simulator.parameters
-
-        def one(scatterers, noise, key):
-            return tensor.simulate(
-                scatterers, noise, key, grid=grid, parameters=parameters,
-                rows_per_step=self.rows,
-            )  # fmt: skip
-
+        one = functools.partial(
+            tensor.simulate,
+            grid=self.simulator.grid,
+            parameters=self.simulator.parameters,
+            rows_per_step=self.rows,
+        )
         run = jax.jit(jax.vmap(one))
         count = len(self.inputs)
         measure(

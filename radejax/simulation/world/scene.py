@@ -225,8 +225,6 @@ def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.
     Returns:
         `[S]` bool.
     """
-    if not len(boxes) or not len(targets):
-        return np.zeros(len(targets), bool)
     cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
 
     def into_boxes(p: np.ndarray) -> np.ndarray:  # [S, 3] -> [S, N, 3]
