@@ -2,6 +2,8 @@
 
 import json
 import pathlib
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -57,6 +59,15 @@ def test_a_seed_twice_is_refused() -> None:
     config.seeds = (1, 2, 1)
     with pytest.raises(UserError, match=r"a seed twice: \[1, 2, 1\]"):
         seeds.run_seeds(config, name="x")
+
+
+def test_train_py_runs_several_seeds(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "train.py", "--config=configs/quickstart.py:short"]
+    command += ["--config.seeds=1,2,1", f"--workdir={tmp_path / 'run'}"]
+    root = pathlib.Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == "error: config.seeds has a seed twice: [1, 2, 1]\n"
 
 
 @pytest.mark.parametrize(("text", "expected"), [("0,1,2", (0, 1, 2)), ("(4,)", (4,))])
