@@ -40,13 +40,14 @@ def benchmark(
     """
     if (source is None) == (config is None):
         raise UserError("give one of SOURCE and --config")
+    from radejax.core.config import load_config
     from radejax.inference import benchmark as timing
     from radejax.inference.detector import Detector
     from radejax.inference.open import load
 
     entry.set_up_jax()
     detector = (
-        timing.untrained(config, dtype=dtype)
+        timing.untrained(load_config(config), dtype=dtype)
         if config is not None
         else Detector.from_loaded(load(source), dtype=dtype)
     )

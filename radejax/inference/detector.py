@@ -12,7 +12,6 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.errors import UserError
@@ -185,14 +184,14 @@ class Detector:
     @classmethod
     def from_config(
         cls,
-        config: ConfigDict,
+        config: Mapping[str, Any],
         variables: Mapping[str, Any],
         grid: RadarGrid,
         **overrides: Any,
     ) -> Detector:
         """Detector with the model, thresholds and mapping that a config states."""
         arguments = settings_of_config(config) | overrides
-        return cls(models.build(config.model), variables, grid, **arguments)
+        return cls(models.build(config["model"]), variables, grid, **arguments)
 
     # Use -----------------------------------------------------------------------------
 

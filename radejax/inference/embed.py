@@ -72,6 +72,7 @@ def embed_dataset(
         raise UserError("no frames to embed")
     out_dir = pathlib.Path(out_dir)
     params = variables["params"][IMAGE_BACKBONE]
+    keys = "\n".join(frame.key for frame in frames)
     plan = {
         "format": embeddings.FORMAT,
         "version": embeddings.FORMAT_VERSION,
@@ -81,15 +82,13 @@ def embed_dataset(
         "dtype": dtype,
         "frames_per_file": frames_per_file,
         "num_frames": len(frames),
-        "frames_sha256": _sha256("\n".join(f.key for f in frames).encode()),
+        "frames_sha256": hashlib.sha256(keys.encode()).hexdigest(),
     }
     files.claim(out_dir / "plan.json", plan, "other embeddings")
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
     params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
-    chunks = [
-        frames[start : start + frames_per_file]
-        for start in range(0, len(frames), frames_per_file)
-    ]
+    starts = range(0, len(frames), frames_per_file)
+    chunks = [frames[start : start + frames_per_file] for start in starts]
     counts = {"frames": len(frames), "embedded": 0, "found": 0, "missing": 0}
     entries = []
     bar = tqdm(total=len(frames), unit="frame", desc="embed", disable=not progress)
@@ -98,18 +97,16 @@ def embed_dataset(
         for number, chunk in enumerate(chunks):
             name = record_files.file_name(number, len(chunks), "embeddings")
             entry = record_files.read_manifest_of(out_dir, name)
+            kind = "embedded" if entry is None else "found"
             if entry is None:
-                batches = reader(chunk)
-                run = ((keys, embed(params, images)) for keys, images in batches)
+                run = ((keys, embed(params, image)) for keys, image in reader(chunk))
                 entry = _write_file(out_dir, name, chunk, run, dtype, bar)
-                counts["embedded"] += len(entry.frames)
             else:
-                counts["found"] += len(entry.frames)
                 bar.update(len(chunk))
+            counts[kind] += len(entry.frames)
             counts["missing"] += len(entry.skipped)
-            entries.append(entry)
-    described = [dataclasses.asdict(entry) for entry in entries]
-    content = {**plan, "counts": counts, "files": described}
+            entries.append(dataclasses.asdict(entry))
+    content = {**plan, "counts": counts, "files": entries}
     files.write_json(out_dir / MANIFEST, content)
     return counts
 
@@ -156,7 +153,3 @@ def _write_file(
                 writer.write(key, row)
             bar.update(len(keys))
         return writer.commit()
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()

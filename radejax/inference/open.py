@@ -119,7 +119,7 @@ def load_torch(
     return LoadedModel(model, variables, RadarGrid.kradar(), settings)
 
 
-def settings_of_config(config: ConfigDict) -> dict[str, Any]:
+def settings_of_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """Keyword arguments of `Detector` that a config states."""
     decode = dict(config["decode"])
     return {

@@ -18,12 +18,13 @@ from ml_collections import ConfigDict
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
-from radejax.data.augment import Augmentation
+from radejax.data.augment import make_augmentation
 from radejax.data.cameras import (
     CameraInputs,
     CameraOptions,
     camera_inputs,
     check_embeddable,
+    require_images,
 )
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import Frame, KRadar
@@ -141,11 +142,7 @@ class Data:
         paths: Where they are.
         frames: All of them, with the labels that the config asks for.
         classes: Names in the order of the class indices.
-        max_objects: Rows of boxes in a training batch.
-        label_version: Of the labels.
-        num_threads: That prepare training batches.
-        num_workers: Processes likewise.
-        label_permutation_seed: Exchanges the labels of training frames, or None.
+        options: `config.data`.
         camera: How images and calibrations are used; None for the radar alone.
         image_size: Height and width that the model takes, or None.
         features: Embedded images, or None.
@@ -155,11 +152,7 @@ class Data:
     paths: DataPaths
     frames: KRadar
     classes: tuple[str, ...]
-    max_objects: int
-    label_version: str
-    num_threads: int
-    num_workers: int
-    label_permutation_seed: int | None
+    options: ConfigDict
     camera: CameraOptions | None
     image_size: tuple[int, int] | None
     features: ArrayRecords | None
@@ -205,11 +198,7 @@ class Data:
             paths=paths,
             frames=frames,
             classes=tuple(config.classes),
-            max_objects=config.data.max_objects,
-            label_version=config.data.label_version,
-            num_threads=config.data.num_threads,
-            num_workers=config.data.num_workers,
-            label_permutation_seed=config.data.label_permutation_seed,
+            options=config.data,
             camera=camera,
             image_size=None if camera is None else tuple(model.image_size),
             features=features,
@@ -252,30 +241,36 @@ class Data:
         return camera_inputs(frames, self.image_size, self.camera, self.features)
 
     def training_batches(
-        self,
-        frames: Sequence[Frame],
-        images: CameraInputs | None,
-        *,
-        batch_size: int,
-        seed: int,
-        augment: Augmentation | None,
+        self, frames: Sequence[Frame], *, batch_size: int, seed: int
     ) -> grain.DatasetIterator[Batch]:
-        """An endless, shuffled, checkpointable iterator over batches of this process."""
+        """An endless, shuffled, checkpointable iterator over batches of this process.
+
+        Raises:
+            UserError: As `images`, or no frame has a usable one; too few frames.
+        """
+        images, options = self.images(frames), self.options
+        require_images(frames, images)
         table = make_table(
             self.records,
             frames,
-            max_objects=self.max_objects,
+            max_objects=options.max_objects,
             classes=self.classes,
             images=images,
-            label_permutation_seed=self.label_permutation_seed,
+            label_permutation_seed=options.label_permutation_seed,
         )
-        options = LoaderOptions(
+        augment = make_augmentation(
+            self.records.grid,
+            mirror_probability=options.mirror_probability,
+            gain_db=options.gain_db,
+            gain_slope_db=options.gain_slope_db,
+        )
+        loading = LoaderOptions(
             batch_size=batch_size,
             seed=seed,
-            num_threads=self.num_threads,
-            num_workers=self.num_workers,
+            num_threads=options.num_threads,
+            num_workers=options.num_workers,
         )
-        return make_loader(table, options, augment=augment)
+        return make_loader(table, loading, augment=augment)
 
 
 def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:

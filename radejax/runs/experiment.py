@@ -17,8 +17,6 @@ from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data import pipeline
-from radejax.data.augment import make_augmentation
-from radejax.data.cameras import require_images
 from radejax.data.kradar import Frame
 from radejax.data.records.embeddings import embeddings_sha256
 from radejax.inference.open import PathLike, starting_weights
@@ -71,13 +69,19 @@ def run(
     model = models.build(config.model)  # what cannot be built fails first
     with claimed(folder, config):
         data = open_data(config, model, sources)
+        has_test = len(data.split("test")) > 0
+        if not has_test:
+            _log.warning(
+                "no frames of the test split in %s: the run is trained and not evaluated",
+                ", ".join(data.paths.roots),
+            )
         result = train(model, data, folder, config, init_from)
         if not result.finished:
             _log.info(
                 "stopped at step %d; run the same command to continue", result.step
             )
             return folder
-        if len(data.split("test")):
+        if has_test:
             evaluate(config, model, result.state.eval_variables, data, folder)
     minutes = (time.perf_counter() - started) / 60
     _log.info(_CLOSING.format(minutes=minutes, folder=files.relative(folder)))
@@ -114,8 +118,8 @@ def train(
         "train.batch_size",
         config.train.num_accumulate,
     )
-    images = data.images(frames)
-    require_images(frames, images)
+    rows = config.train.batch_size // jax.process_count()
+    loader = data.training_batches(frames, batch_size=rows, seed=config.seed)
     variables, pretrained = starting_weights(
         model,
         init_from=init_from,
@@ -129,27 +133,10 @@ def train(
     validation = None
     if config.train.evaluate_every_epochs:
         validation = Validation(config, model, data)
-    elif not len(data.split("test")):
-        _log.warning(
-            "no frames of the test split in %s: the run is trained and not evaluated",
-            ", ".join(data.paths.roots),
-        )
-    rows = config.train.batch_size // jax.process_count()
     return loop.train(
         model,
         variables,
-        data.training_batches(
-            frames,
-            images,
-            batch_size=rows,
-            seed=config.seed,
-            augment=make_augmentation(
-                data.records.grid,
-                mirror_probability=config.data.mirror_probability,
-                gain_db=config.data.gain_db,
-                gain_slope_db=config.data.gain_slope_db,
-            ),
-        ),
+        loader,
         models.map_grid(data.records.grid, model, config.data.azimuth_mapping),
         folder,
         options=config.train,
