@@ -14,6 +14,8 @@ import jax
 import numpy as np
 from flax import struct
 
+from radejax.core.kitti_text import prediction_texts
+
 CLASSES = ("Sedan", "Bus or Truck", "Pedestrian", "Motorcycle", "Bicycle")
 """K-Radar's five detection classes in the order of every class axis."""
 
@@ -133,8 +135,6 @@ class Detections:
             UserError: K-Radar has no key for a class.
 
         References:
-            `radejax.evaluation.files.kitti` describes the lines.
+            `radejax.core.kitti_text` describes the lines.
         """
-        from radejax.evaluation.files.kitti import prediction_texts
-
         return prediction_texts(self.to_columns(classes), self.is_valid.shape[0])

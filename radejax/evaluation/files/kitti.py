@@ -3,14 +3,10 @@
     <folder>/<score cut>/<condition>/{preds,gts,desc}/000012.txt and val.txt
 
 with condition "all" or a tag of the frame (weather, environment, time). The number of a
-file is the frame's position in the data set. A line is
-
-    sed 0.00 0 0 50 50 150 150 h w l y z x yaw          (ground truth, 2 decimals)
-    sed -1 -1 0 50 50 150 150 h w l y z x yaw score     (prediction)
-
-and a frame without predictions has one line "dummy". Frames without ground truth are not
-written. K-Radar's evaluator then compares every box with l and w exchanged (its issue
-81): that is the reader's doing, the numbers in the files are the plain ones.
+file is the frame's position in the data set; `core.kitti_text` shows its lines. Frames
+without ground truth are not written. K-Radar's evaluator then compares every box with l
+and w exchanged (its issue 81): that is the reader's doing, the numbers in the files are
+the plain ones.
 
 References:
     K-Radar, pipelines/pipeline_detection_v1_0.py and utils/util_pipeline.py.
@@ -25,22 +21,10 @@ import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.core.kitti_text import CLASS_KEYS, DUMMY, object_lines
 from radejax.evaluation.files.predictions import Columns
 
-CLASS_KEYS = {
-    "Sedan": "sed",
-    "Bus or Truck": "bus",
-    "Pedestrian": "ped",
-    "Motorcycle": "mot",
-    "Bicycle": "bic",
-    "Pedestrian Group": "peg",
-    "Bicycle Group": "big",
-}
 CLASS_NAMES = {key: name for name, key in CLASS_KEYS.items()}
-GT_HEADER = "0.00 0 0 50 50 150 150"
-PRED_HEADER = "-1 -1 0 50 50 150 150"
-DUMMY = "dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"
-BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # h w l y z x yaw of x y z l w h yaw
 
 
 def write_kitti(
@@ -73,8 +57,8 @@ def write_kitti(
     root = pathlib.Path(folder) / f"{float(score_threshold)}"
     score = np.asarray(predictions["score"], np.float64)
     above = np.flatnonzero(score > score_threshold)
-    truth = _lines(ground_truth, np.arange(len(ground_truth["cls"])), None)
-    found = _lines(predictions, above, score)
+    truth = object_lines(ground_truth, np.arange(len(ground_truth["cls"])), None)
+    found = object_lines(predictions, above, score)
     kinds = [kind for kind in conditions if kind in frames]
     ids = np.asarray(frames["frame"]).tolist()
     listed: dict[pathlib.Path, list[str]] = {root / "all": []}
@@ -100,52 +84,9 @@ def write_kitti(
     return len(listed[root / "all"])
 
 
-def prediction_texts(
-    predictions: Mapping[str, np.ndarray], num_frames: int
-) -> list[str]:
-    """Content of the prediction files of frames 0 to `num_frames - 1`.
-
-    Args:
-        predictions: Columns frame, box, cls and score; every row is written.
-        num_frames: Frames without predictions get the line "dummy".
-
-    Raises:
-        UserError: A class K-Radar has no key for.
-    """
-    score = np.asarray(predictions["score"], np.float64)
-    found = _lines(predictions, np.arange(score.size), score)
-    return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
-
-
 def _write(path: pathlib.Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
-
-
-def _lines(
-    table: Mapping[str, np.ndarray], rows: np.ndarray, score: np.ndarray | None
-) -> dict[int, list[str]]:
-    """Lines of every frame, in the order of the rows."""
-    box = np.asarray(table["box"], np.float64).reshape(-1, 7)
-    if score is None:
-        box = np.round(box, 2)
-    frame, cls = np.asarray(table["frame"]).tolist(), np.asarray(table["cls"]).tolist()
-    lines: dict[int, list[str]] = {}
-    for row in rows.tolist():
-        if cls[row] not in CLASS_KEYS:
-            raise UserError(
-                f"K-Radar's tools have no key for class {cls[row]!r} (frame {frame[row]},"
-                f" row {row}); known: {', '.join(CLASS_KEYS)}"
-            )
-        numbers = [repr(value) for value in box[row, BOX_ORDER].tolist()]
-        header = GT_HEADER
-        if score is not None:
-            numbers.append(repr(float(score[row])))
-            header = PRED_HEADER
-        lines.setdefault(frame[row], []).append(
-            " ".join([CLASS_KEYS[cls[row]], header, *numbers])
-        )
-    return lines
 
 
 def read_kitti(
