@@ -6,7 +6,6 @@ import contextlib
 import math
 import os
 import pathlib
-import struct
 import time
 from collections.abc import Iterator
 from typing import Any, BinaryIO
@@ -50,7 +49,7 @@ def read_tesseract(
             )
         else:
             tesseract = _read_hdf5(path) if _is_hdf5(path) else _read_mat(path)
-    _check(path, tesseract, shape_drea)
+    _check(path, tesseract.dtype, tesseract.shape, shape_drea)
     return tesseract
 
 
@@ -77,7 +76,7 @@ def project_file(
         layout = _parse_mat5(file)
         if layout is not None:
             stored, (doppler, range_, elevation, azimuth) = layout
-            _check(path, np.broadcast_to(stored.type(0), layout[1]), shape_drea)
+            _check(path, *layout, shape_drea)
             slab = np.empty((elevation, range_, doppler), stored)
             columns = _read_slabs(file, slab, azimuth, timings)
             projection = project_columns(columns, dtype=dtype)
@@ -137,17 +136,20 @@ def _open(path: str | os.PathLike) -> BinaryIO:
 
 
 def _check(
-    path: str | os.PathLike, tesseract: np.ndarray, shape_drea: tuple[int, ...] | None
+    path: str | os.PathLike,
+    dtype: np.dtype,
+    shape: tuple[int, ...],
+    shape_drea: tuple[int, ...] | None,
 ) -> None:
     """`DataError` unless it is a real tensor of the demanded shape."""
-    if tesseract.ndim != 4 or tesseract.dtype.kind not in "fiu":
+    if len(shape) != 4 or dtype.kind not in "fiu":
         raise DataError(
-            f"{path}: {VARIABLE} has shape {tesseract.shape} of {tesseract.dtype}, "
+            f"{path}: {VARIABLE} has shape {shape} of {dtype}, "
             "expected real numbers [Doppler, range, elevation, azimuth]"
         )
-    if shape_drea is not None and tesseract.shape != tuple(shape_drea):
+    if shape_drea is not None and shape != tuple(shape_drea):
         raise DataError(
-            f"{path}: {VARIABLE} has shape {tesseract.shape}, the sensor's grid demands "
+            f"{path}: {VARIABLE} has shape {shape}, the sensor's grid demands "
             f"{tuple(shape_drea)} (Doppler, range, elevation, azimuth)"
         )
 
@@ -169,8 +171,7 @@ def check_tesseract(
     with _open(path) as file:
         layout = _parse_mat5(file)
     if layout is not None:
-        dtype, shape = layout
-        _check(path, np.broadcast_to(dtype.type(0), shape), shape_drea)
+        _check(path, *layout, shape_drea)
 
 
 def read_projection_npy(
@@ -252,35 +253,21 @@ def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:
     head = file.read(200)
     if len(head) < 200 or head[124:128] != b"\x00\x01IM":
         return None
-    (
-        *tags,
-        dims_tag,
-        dims_size,
-        d,
-        r,
-        e,
-        a,
-        name_tag,
-        name_size,
-        name,
-        data_tag,
-        data_size,
-    ) = struct.unpack_from("<II III4x II4i II8s II", head, 128)
-    matrix_tag, _, flags_tag, flags_size, flags = tags
-    shape = (d, r, e, a)
-    dtype = _MI_FLOATS.get(data_tag)
+    # Tag, size and content of the matrix, its flags, dimensions, name and numbers.
+    words = np.frombuffer(head, "<u4", count=18, offset=128).tolist()
+    shape, dtype = tuple(words[8:12]), _MI_FLOATS.get(words[16])
     if (
-        (matrix_tag, flags_tag, flags_size) != (_MI_MATRIX, _MI_UINT32, 8)
-        or flags & _COMPLEX
-        or (dims_tag, dims_size) != (_MI_INT32, 16)
-        or (name_tag, name_size) != (_MI_INT8, len(VARIABLE))
-        or name != VARIABLE.encode().ljust(8, b"\0")
+        (words[0], *words[2:4]) != (_MI_MATRIX, _MI_UINT32, 8)
+        or words[4] & _COMPLEX
+        or words[6:8] != [_MI_INT32, 16]
+        or words[12:14] != [_MI_INT8, len(VARIABLE)]
+        or head[184:192] != VARIABLE.encode().ljust(8, b"\0")
         or dtype is None
         or min(shape) < 1
-        or data_size != dtype.itemsize * math.prod(shape)
+        or words[17] != dtype.itemsize * math.prod(shape)
     ):
         return None
-    size, needed = os.fstat(file.fileno()).st_size, file.tell() + data_size
+    size, needed = os.fstat(file.fileno()).st_size, file.tell() + words[17]
     if size < needed:
         raise DataError(
             f"{file.name}: truncated: {size} bytes, {VARIABLE} of shape {shape} needs "
