@@ -191,6 +191,8 @@ class EvaluationSet:
         if not set(spaces) <= set(SPACES):
             raise UserError(f"spaces must be among {SPACES}, got {spaces}")
         frame_weights = self.frame_weights(skip, weights)
+        points = () if curves else ("precision", "recall", "score")
+        dropped = dict.fromkeys(points, np.zeros(0))
         results = []
         for space, iou, (index, name) in itertools.product(
             spaces, _check_ious(iou_thresholds), enumerate(self.classes)
@@ -208,7 +210,7 @@ class EvaluationSet:
                 skip_empty=skip,
                 roi=self.roi,
                 label_version=self.label_version,
-                **vars(curve if curves else curve.without_points()),
+                **(vars(curve) | dropped),
             )
             results.append(result)
         return results

@@ -15,6 +15,8 @@ import chex
 import numpy as np
 from scipy import sparse
 
+from radejax.evaluation.overlap import ranges
+
 VIRTUAL_PAIRS_PER_CHUNK = 2_000_000
 
 
@@ -176,10 +178,7 @@ def _steps(
     chunk = np.cumsum(count) // VIRTUAL_PAIRS_PER_CHUNK
     bounds = np.flatnonzero(np.diff(chunk, prepend=-1, append=chunk[-1] + 1))
     for low, high in itertools.pairwise(bounds):
-        part = count[low:high]
-        level = np.repeat(np.arange(high - low), part)
-        pair = np.arange(level.size) - np.repeat(np.cumsum(part) - part, part)
-        pair += np.repeat(first[low:high], part)
+        level, pair = ranges(first[low:high], count[low:high])
         enters = score[pred[pair]] >= score[level_pred[low:high]][level]
         level, pair = level[enters], pair[enters]
         # Every level is a world of its own: number its predictions anew.

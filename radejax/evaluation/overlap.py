@@ -37,19 +37,22 @@ def candidate_pairs(
         ends, np.arange(0, ends[-1] if ends.size else 0, PAIRS_PER_CHUNK)
     )
     bounds = np.unique(np.concatenate([[0], cuts, [count.size]]))
-    parts_a, parts_b = [], []
+    parts_a, parts_b = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for low, high in itertools.pairwise(bounds):
-        part = count[low:high]
-        a = np.repeat(np.arange(low, high), part)
-        b = np.arange(a.size) - np.repeat(np.cumsum(part) - part, part)
-        b += np.repeat(first[low:high], part)
+        a, b = ranges(first[low:high], count[low:high])
+        a += low
         gap = box_a[a, :2] - box_b[b, :2]
         near = np.hypot(gap[:, 0], gap[:, 1]) <= reach_a[a] + reach_b[b]
         parts_a.append(a[near])
         parts_b.append(b[near])
-    if not parts_a:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return np.concatenate(parts_a), np.concatenate(parts_b)
+
+
+def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which range, and index, of everything in the ranges [first, first + count)."""
+    owner = np.repeat(np.arange(count.size), count)
+    before = np.cumsum(count) - count
+    return owner, np.arange(owner.size) + (first - before)[owner]
 
 
 def pair_iou(

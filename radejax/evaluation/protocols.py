@@ -125,11 +125,6 @@ class Curve:
     recall: np.ndarray
     score: np.ndarray
 
-    def without_points(self) -> Curve:
-        """The numbers without the curve."""
-        none = np.zeros(0)
-        return Curve(self.ap, self.num_gt, self.num_det, none, none, none)
-
 
 def score_thresholds(
     sampled: np.ndarray, weight: np.ndarray, num_gt: int

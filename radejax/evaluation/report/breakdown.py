@@ -44,46 +44,6 @@ def matched_objects(data: EvaluationSet, space: str, iou: float) -> np.ndarray:
     return data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
 
 
-def slice_numbers(
-    data: EvaluationSet,
-    cls: int,
-    gt_mask: np.ndarray,
-    pred_mask: np.ndarray,
-    match: np.ndarray,
-    operating_score: float,
-) -> Slice:
-    """AP, precision and recall of one class over chosen objects and predictions.
-
-    Args:
-        data: The evaluation set.
-        cls: Class index.
-        gt_mask: `[N]` objects in the slice.
-        pred_mask: `[M]` predictions in the slice.
-        match: `[M]` from `matched_objects`.
-        operating_score: Precision and recall are of predictions above this score.
-    """
-    order = data.by_score[cls]
-    order = order[pred_mask[order]]
-    score, is_tp = data.pred.score[order], match[order] >= 0
-    num_gt = int((gt_mask & (data.gt.cls == cls)).sum())
-    curve = protocols.pooled_curve(
-        score=score,
-        is_tp=is_tp,
-        weight=np.ones(order.size, np.int64),
-        num_gt=num_gt,
-        curve="exact",
-    )
-    above = score > operating_score
-    num_det, found = int(above.sum()), int(is_tp[above].sum())
-    return Slice(
-        curve.ap,
-        found / num_det if num_det else math.nan,
-        found / num_gt if num_gt else math.nan,
-        num_gt,
-        num_det,
-    )
-
-
 def by_distance(
     data: EvaluationSet,
     space: str,
@@ -132,12 +92,35 @@ def _by_slice(
     match: np.ndarray,
     operating_score: float,
 ) -> dict[tuple[str, str], Slice]:
-    """Numbers by (slice, class); a slice is `[N]` objects and `[M]` predictions."""
-    return {
-        (name, cls_name): slice_numbers(data, cls, *chosen, match, operating_score)
-        for name, chosen in masks.items()
-        for cls, cls_name in enumerate(data.classes)
-    }
+    """Numbers by (slice, class).
+
+    Args:
+        data: The evaluation set.
+        masks: `[N]` objects and `[M]` predictions in each slice.
+        match: `[M]` from `matched_objects`.
+        operating_score: Precision and recall are of predictions above this score.
+    """
+    result = {}
+    for (name, (in_gt, in_pred)), (cls, cls_name) in itertools.product(
+        masks.items(), enumerate(data.classes)
+    ):
+        order = data.by_score[cls]
+        order = order[in_pred[order]]
+        score, is_tp = data.pred.score[order], match[order] >= 0
+        num_gt = int((in_gt & (data.gt.cls == cls)).sum())
+        curve = protocols.pooled_curve(
+            score=score,
+            is_tp=is_tp,
+            weight=np.ones_like(order),
+            num_gt=num_gt,
+            curve="exact",
+        )
+        above = score > operating_score
+        num_det, found = int(above.sum()), int(is_tp[above].sum())
+        precision = found / num_det if num_det else math.nan
+        recall = found / num_gt if num_gt else math.nan
+        result[name, cls_name] = Slice(curve.ap, precision, recall, num_gt, num_det)
+    return result
 
 
 def calibration(

@@ -29,6 +29,9 @@ ORDER = {
 }
 """K-Radar's tags in the order of its papers."""
 
+_OF_RESULT = ("num_gt", "num_det", "num_frames", "score_threshold")
+_OF_RESULT += ("skip_empty", "roi", "label_version")
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -135,10 +138,6 @@ class Measured:
             "ap_official": None if math.isnan(made.ap) else made.ap,
             **{name: getattr(made, name) for name in _OF_RESULT},
         }
-
-
-_OF_RESULT = ("num_gt", "num_det", "num_frames", "score_threshold")
-_OF_RESULT += ("skip_empty", "roi", "label_version")
 
 
 def condition_masks(frames: Columns, kind: str) -> dict[str, np.ndarray]:

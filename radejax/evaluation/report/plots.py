@@ -8,14 +8,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from radejax.core import files
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report import breakdown
 from radejax.evaluation.report.measure import Options, condition_masks
 from radejax.evaluation.result import SPACES, Result
-from radejax.visualize.canvas import new_figure
+from radejax.visualize.canvas import new_figure, save_figure
 from radejax.visualize.curves import draw_calibration, draw_precision_recall
 
 
@@ -40,7 +39,6 @@ def draw(
     }
     written = []
     for space in SPACES:
-        written.append(out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png")
         results = {
             name: data.results(
                 RECOMMENDED,
@@ -51,12 +49,12 @@ def draw(
             )
             for name, mask in masks.items()
         }
-        _save(_precision_recall(results, f"{space}, IoU {iou:g}"), written[-1])
+        figure = _precision_recall(results, f"{space}, IoU {iou:g}")
+        path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
+        written.append(save_figure(figure, path, dpi=110))
     match = breakdown.matched_objects(data, "3d", iou)
     axis = draw_calibration(data.pred.score, match >= 0, title=f"3d, IoU {iou:g}")
-    written.append(out_dir / "calibration.png")
-    _save(axis.figure, written[-1])
-    return written
+    return [*written, save_figure(axis.figure, out_dir / "calibration.png", dpi=110)]
 
 
 def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Figure:
@@ -76,8 +74,3 @@ def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Fi
         }
         draw_precision_recall(lines, ax=axis, title=f"{panel[0].cls}, {terms}")
     return figure
-
-
-def _save(figure: Figure, path: pathlib.Path) -> None:
-    with files.atomic_path(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:], dpi=110)

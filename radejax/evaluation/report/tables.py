@@ -13,18 +13,12 @@ from typing import Any
 
 from tabulate import tabulate
 
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.report.bootstrap import Comparison
 from radejax.evaluation.report.measure import Measured, Options
 
-TITLES = {
-    "all": "Total",
-    "normal": "Normal",
-    "overcast": "Overcast",
-    "fog": "Fog",
-    "rain": "Rain",
-    "sleet": "Sleet",
-    "lightsnow": "Light Snow",
-    "heavysnow": "Heavy Snow",
+TITLES = {"all": "Total"} | {
+    name: name.replace("snow", " snow").title() for name in WEATHERS
 }
 SPACE_TITLES = {"3d": "3D", "bev": "BEV"}
 """Titles of the spaces, in the order of the papers."""
