@@ -81,7 +81,7 @@ class Bench:
             seed=0,
         )
         self.inputs = [
-            self.simulator.radar_input(i) for i in range(self.sequence.num_frames)
+            self.simulator.radar_input(i) for i in range(len(self.sequence.ego_along_m))
         ]
 
     def run(self, output):

@@ -20,8 +20,9 @@ import numpy as np
 from scipy import ndimage
 
 from radejax.core.structures import CLASSES
+from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar.tensor import TPM_OFFSET_DB, TPM_SPAN_DB, RadarParameters
+from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.world.traffic import SIZES
 
 
@@ -132,7 +133,7 @@ def apparent_rcs_db(power_db, range_m, parameters: RadarParameters):
 
 def _power_db(projection: np.ndarray, grid: RadarGrid) -> np.ndarray:
     """`[R, A]` range-azimuth map in dB."""
-    return projection[..., : grid.num_doppler].max(-1) * TPM_SPAN_DB - TPM_OFFSET_DB
+    return projection[..., : grid.num_doppler].max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
 
 
 def detect(

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 from radejax.core.structures import CLASSES
 from radejax.geometry.calibration import CameraCalibration
 from radejax.simulation.camera import lens, panels, shapes
-from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked
+from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
 
 # K-Radar's values for the pair (see the calibration files of the data set).
 _INTRINSICS = (567.7208, 577.2137, 628.7208, 369.3069)
@@ -157,21 +157,12 @@ class CameraRenderer:
         """`[H, 2 W, 3]` uint8 image of the pair, left half first."""
         return np.concatenate([self._one(frame, side) for side in (0, 1)], axis=1)
 
-    def object_mask(self, frame: SceneFrame, side: int = 0) -> np.ndarray:
-        """`[H, W]` int32: which box of the frame each pixel shows, -1 for none."""
-        calibration = self.calibrations[side]
-        canvas = Image.new("I", (calibration.width, calibration.height), -1)
-        draw = ImageDraw.Draw(canvas)
-        for polygon in self._polygons(frame, calibration):
-            draw.polygon(polygon.points, fill=int(polygon.box))
-        return np.asarray(canvas)
-
     def _one(self, frame: SceneFrame, side: int) -> np.ndarray:
         """`[H, W, 3]` image of one camera."""
         calibration = self.calibrations[side]
         canvas = Image.fromarray(self._background(frame, self.grounds[side]))
         draw = ImageDraw.Draw(canvas)
-        for polygon in self._polygons(frame, calibration):
+        for polygon in self.polygons(frame, side):
             draw.polygon(polygon.points, fill=polygon.color)
         if self.light.headlights:
             self._lamps(frame, calibration, draw)
@@ -186,7 +177,9 @@ class CameraRenderer:
             canvas = lens.cover_lens(canvas, level, air.is_snow, brightness, rng)
         return np.asarray(canvas)
 
-    def _polygons(self, frame, calibration) -> list[shapes.Polygon]:
+    def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:
+        """What one camera sees of objects and roadside, far ones first."""
+        calibration = self.calibrations[side]
         origin, white = shapes.camera_position(calibration), self.air.white
         roadside = panels.make_panels(frame, origin, self.sequence.ground_m, white)
         classes, colors = [CLASSES[c] for c in frame.cls], self.colors[frame.track]
@@ -198,18 +191,11 @@ class CameraRenderer:
         """Rear lights and headlights of vehicles by night, where nothing hides them."""
         vehicles = np.flatnonzero(np.isin(frame.cls, _WITH_LAMPS))
         x, y, z, length, width, height, yaw = frame.boxes[np.repeat(vehicles, 2)].T
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        is_front = x * cos + y * sin < 0  # the end that looks at us
+        is_front = rotate(x, y, -yaw)[0] < 0  # the end that looks at us
         along = np.where(is_front, 1.0, -1.0) * length / 2.0
         across = np.tile([-0.75, 0.75], len(vehicles)) * width / 2.0
-        lamps = np.stack(
-            [
-                x + (along * cos - across * sin),
-                y + (along * sin + across * cos),
-                z - 0.15 * height,
-            ],
-            axis=1,
-        )
+        dx, dy = rotate(along, across, yaw)
+        lamps = np.stack([x + dx, y + dy, z - 0.15 * height], 1)
         origin = shapes.camera_position(calibration)
         obstacles = frame.boxes - np.r_[origin, np.zeros(4)]
         hidden = is_blocked(lamps - origin, obstacles, np.repeat(vehicles, 2))

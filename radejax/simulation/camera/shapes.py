@@ -162,7 +162,6 @@ def visible_polygons(
         calibration: The camera.
         light: Brightness and haze.
         panels: Surroundings of `panels.make_panels`.
-        near_m: Faces nearer than this are cut away.
     """
     faces = _object_faces(boxes, classes, colors, camera_position(calibration))
     if panels is not None:

@@ -31,7 +31,7 @@ import numpy as np
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
-from radejax.simulation.world.scene import SceneFrame, is_blocked
+from radejax.simulation.world.scene import SceneFrame, is_blocked, rotate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,12 +231,9 @@ def scatter_objects(
     used = np.flatnonzero(owner_of_track[centers.track] >= 0)
     owner = owner_of_track[centers.track[used]]
     box = boxes[owner]  # [S, 7]
-    cos, sin = np.cos(box[:, 6]), np.sin(box[:, 6])
 
     def turn(v: np.ndarray) -> np.ndarray:
-        return np.stack(
-            [cos * v[:, 0] - sin * v[:, 1], sin * v[:, 0] + cos * v[:, 1], v[:, 2]], 1
-        )
+        return np.stack([*rotate(v[:, 0], v[:, 1], box[:, 6]), v[:, 2]], 1)
 
     position = box[:, :3] + turn(centers.position[used] * box[:, 3:6] / 2.0)
     normal = turn(centers.normal[used])

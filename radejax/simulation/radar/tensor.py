@@ -20,15 +20,13 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
 
 Output = Literal["tesseract", "rows", "projection"]
 
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
-
-TPM_OFFSET_DB = 1.2
-TPM_SPAN_DB = 184.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,7 +210,7 @@ def simulate(
 def _project_row(power: jax.Array) -> jax.Array:
     """`[A, D+E]` normalised maxima of one range row `[E, D, A]`."""
     maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
-    return (10.0 * jnp.log10(maxima + 1e-10) + TPM_OFFSET_DB) / TPM_SPAN_DB
+    return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
 
 def array_noise_basis(

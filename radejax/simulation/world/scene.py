@@ -152,10 +152,6 @@ class Sequence:
     ground_m: float
     mirrors_m: tuple[float, ...] = ()
 
-    @property
-    def num_frames(self) -> int:
-        return len(self.ego_along_m)
-
     @functools.cached_property
     def ego_pose(self) -> np.ndarray:
         """`[F, 3]` world x, y and heading of the radar."""
@@ -177,9 +173,10 @@ class Sequence:
         seen = np.flatnonzero(
             (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
         )
+        velocity = tracks.velocity_mps[index, chosen]
         return SceneFrame(
             boxes=boxes[chosen],
-            velocity_mps=_rotate(tracks.velocity_mps[index, chosen], -pose[2]),
+            velocity_mps=np.stack(rotate(*velocity.T, -pose[2]), 1),
             cls=tracks.cls[chosen],
             track=chosen,
             track_id=tracks.track_id[chosen],
@@ -225,11 +222,10 @@ def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.
     Returns:
         `[S]` bool.
     """
-    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
 
     def into_boxes(p: np.ndarray) -> np.ndarray:  # [S, 3] -> [S, N, 3]
         x, y, z = np.moveaxis(p[:, None] - boxes[None, :, :3], -1, 0)
-        return np.stack([cos * x + sin * y, -sin * x + cos * y, z], -1)
+        return np.stack([*rotate(x, y, -boxes[:, 6]), z], -1)
 
     start = into_boxes(np.zeros((1, 3)))
     ray = into_boxes(targets) - start
@@ -248,13 +244,13 @@ def wrap_angle(angle_rad: Any) -> Any:
     return np.mod(np.asarray(angle_rad) + np.pi, 2.0 * np.pi) - np.pi
 
 
-def _rotate(vectors: np.ndarray, angle_rad: float) -> np.ndarray:
-    """`[N, 2]` vectors turned counter-clockwise."""
-    (x, y), c, s = vectors.T, np.cos(angle_rad), np.sin(angle_rad)
-    return np.stack([c * x - s * y, s * x + c * y], 1)
+def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
+    """Vectors in the ground plane turned counter-clockwise."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return cos * x - sin * y, sin * x + cos * y
 
 
 def _to_ego(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """`[N, 3]` world points in the frame of the radar at `pose` (x, y, heading)."""
-    flat = _rotate(points[:, :2] - pose[:2], -pose[2])
-    return np.concatenate([flat, points[:, 2:]], 1)
+    x, y, z = points.T
+    return np.stack([*rotate(x - pose[0], y - pose[1], -pose[2]), z], 1)
