@@ -14,6 +14,7 @@ import pytest
 from radejax.core.errors import DataError, UserError
 from radejax.geometry import calibration as camera_lib
 from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import stack_cameras
 
 # The distortion and matrix of K-Radar's cameras.
 INTRINSICS = (567.720776478944, 577.2136917114258, 628.72078, 369.30687)
@@ -186,7 +187,7 @@ def test_batches_of_cameras_under_jit(image):
         forward_camera(yaw_deg=yaw, distortion=DISTORTION) for yaw in (88, 90, 93)
     ]
     points = rng.uniform([5, -3, -2], [60, 3, 2], (3, 6, 3))
-    batch = camera_lib.stack_cameras([c.camera(image) for c in calibrations])
+    batch = stack_cameras([c.camera(image) for c in calibrations])
     chex.assert_shape(batch.cam_from_ego, (3, 3, 4))
     pixels, depth = jax.jit(camera_lib.project)(jnp.asarray(points, jnp.float32), batch)
     for i, calibration in enumerate(calibrations):
