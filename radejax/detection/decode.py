@@ -6,6 +6,7 @@ use, and a count of the peaks that found no row.
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -189,7 +190,12 @@ def boxes_at(
 
     Returns:
         `[..., 8]` float32 x, y, z, l, w, h and the raw sin, cos.
+
+    Raises:
+        AssertionError: Shapes are not these.
     """
+    chex.assert_shape(params, (*cell.shape[:-1], 8))
+    chex.assert_axis_dimension(cell, -1, 2)
     params = params.astype(jnp.float32)
     range_m = jnp.asarray(grid.range_m, jnp.float32)[cell[..., 0]]
     cos = jnp.asarray(np.cos(grid.azimuth_rad), jnp.float32)[cell[..., 1]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -55,14 +56,20 @@ def match_boxes(
 
     Raises:
         ValueError: `space` is unknown, or only one of the class arrays is given.
+        AssertionError: The arrays have not one row per prediction and object.
     """
     if space not in ("bev", "3d"):
         raise ValueError(f"space must be 'bev' or '3d', got {space!r}")
     if (predicted_classes is None) != (object_classes is None):
         raise ValueError("give both predicted_classes and object_classes, or neither")
+    chex.assert_rank([predicted, objects], 2)
+    chex.assert_shape(is_predicted, predicted.shape[:1])
+    chex.assert_shape(is_object, objects.shape[:1])
     iou = (bev_iou if space == "bev" else iou_3d)(predicted, objects)  # [K, N]
     allowed = is_predicted[:, None] & is_object[None, :] & (iou > iou_threshold)
     if predicted_classes is not None:
+        chex.assert_equal_shape([predicted_classes, is_predicted])
+        chex.assert_equal_shape([object_classes, is_object])
         allowed &= predicted_classes[:, None] == object_classes[None, :]
     iou = jnp.where(allowed, iou, 0.0)
     if one_to_one:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -33,13 +34,18 @@ def rotated_nms(
     Returns:
         `[K]` bool, True where a box is kept.
 
+    Raises:
+        AssertionError: The arrays have not one row per box.
+
     Examples:
         >>> boxes = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
         >>> rotated_nms(boxes, jnp.array([True, True]), 0.3).tolist()
         [True, False]
     """
+    chex.assert_rank(boxes, 2)
     overlaps = bev_iou(boxes, boxes) >= iou_threshold
     if classes is not None:
+        chex.assert_shape(classes, boxes.shape[:1])
         overlaps &= classes[:, None] == classes[None, :]
     return greedy_suppression(overlaps, is_valid)
 
@@ -60,6 +66,7 @@ def greedy_suppression(overlaps: jax.Array, is_valid: jax.Array) -> jax.Array:
     Returns:
         `[K]` bool, True where a row is kept.
     """
+    chex.assert_shape(overlaps, is_valid.shape * 2)
     before = jnp.triu(overlaps, 1)  # [i, j]: i would suppress j
 
     def decide(keep: jax.Array) -> jax.Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import chex
 import jax
 import numpy as np
 from flax import struct
@@ -54,7 +55,15 @@ def project(
     Returns:
         Pixels `[..., 2]` (u, v) and depth `[...]` in metres. Where the depth is not
         positive the pixels are finite but mean nothing.
+
+    Raises:
+        AssertionError: Points are not `[..., 3]`, or their first axes not the cameras'.
     """
+    batch = np.shape(camera.max_radius)
+    chex.assert_shape(points_ego, (*batch, ..., 3))
+    chex.assert_shape(camera.cam_from_ego, (*batch, 3, 4))
+    chex.assert_shape(camera.intrinsics, (*batch, 4))
+    chex.assert_shape(camera.distortion, (*batch, 5))
     points_cam = to_camera(points_ego, camera)
     return to_pixels(points_cam, camera, depth_offset_m), points_cam[..., 2]
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +44,7 @@ def bev_iou(a: jax.Array, b: jax.Array) -> jax.Array:
 
     Raises:
         ValueError: The last axis is neither 7 nor 8 long.
+        AssertionError: `a` and `b` differ in leading axes.
 
     Examples:
         >>> car = jnp.array([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
@@ -50,7 +52,7 @@ def bev_iou(a: jax.Array, b: jax.Array) -> jax.Array:
         >>> round(float(bev_iou(car, moved)[0, 0]), 4)
         0.3333
     """
-    return bev_iou_pairs(a[..., :, None, :], b[..., None, :, :])
+    return bev_iou_pairs(*_all_pairs(a, b))
 
 
 def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -59,7 +61,7 @@ def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
     Returns:
         `[..., N, M]` float32 in [0, 1].
     """
-    return iou_3d_pairs(a[..., :, None, :], b[..., None, :, :])
+    return iou_3d_pairs(*_all_pairs(a, b))
 
 
 def bev_iou_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -113,6 +115,13 @@ def bev_iou_np(
 def iou_3d_np(a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16) -> np.ndarray:
     """Volume IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`."""
     return _by_chunks(lambda a, b: _iou_3d(np, a, b), a, b, chunk_size)
+
+
+def _all_pairs(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`[..., N, 1, 7 or 8]` and `[..., 1, M, 7 or 8]`."""
+    chex.assert_equal_rank([a, b])
+    chex.assert_equal_shape_prefix([a, b], a.ndim - 2)
+    return a[..., :, None, :], b[..., None, :, :]
 
 
 def _by_chunks(function: Any, a: Any, b: Any, chunk_size: int) -> np.ndarray:

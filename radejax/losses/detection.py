@@ -128,10 +128,14 @@ def detection_loss(
     return total, parts
 
 
-def smooth_l1(difference: jax.Array, beta: float = 1.0) -> jax.Array:
-    """Quadratic below `beta`, linear above: `[...]` -> `[...]`."""
+def smooth_l1(difference: jax.Array) -> jax.Array:
+    """Quadratic below 1, linear above: `[...]` -> `[...]`.
+
+    `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
+    loses the digits of small differences.
+    """
     size = jnp.abs(difference)
-    return jnp.where(size < beta, 0.5 * size * size / beta, size - 0.5 * beta)
+    return jnp.where(size < 1.0, 0.5 * size * size, size - 0.5)
 
 
 def _pairs_at_centers(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +54,7 @@ def gaussian_heatmap(
 
     Raises:
         ValueError: `sigma` is unknown.
+        AssertionError: Shapes of boxes, classes and mask do not fit together.
 
     References:
         RADE-Net, section on the focal loss (sigma 3); DinoRADE (sigma 0.75).
@@ -65,6 +67,8 @@ def gaussian_heatmap(
         >>> target.shape, int((target == 1).sum())
         ((256, 107, 5), 1)
     """
+    chex.assert_equal_shape_prefix([boxes, classes, is_valid], boxes.ndim - 1)
+    chex.assert_equal_rank([classes, is_valid])
     boxes = boxes.astype(jnp.float32)
     cell = grid.nearest_cell(boxes[..., 0], boxes[..., 1])  # [..., N, 2]
     sigma_range, sigma_azimuth = _sigmas(boxes, sigma, sigma_cells)
@@ -109,9 +113,15 @@ def focal_loss(
     Returns:
         Scalar float32.
 
+    Raises:
+        AssertionError: Logits and target differ in shape.
+
     References:
         Law and Deng, CornerNet, arXiv:1808.01244, equation (1).
     """
+    chex.assert_equal_shape([logits, target])
+    if is_frame_valid is not None:
+        chex.assert_shape(is_frame_valid, logits.shape[:1])
     loss = focal_loss_per_bin(logits, target, alpha, gamma)
     is_positive = target >= 1
     num_bins = jnp.asarray(loss.size, jnp.float32)

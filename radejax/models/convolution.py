@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -37,7 +38,11 @@ def conv2d(x: jax.Array, kernel: jax.Array, dilation: int = 1) -> jax.Array:
 
     Returns:
         `[B, R, A, C']` in the dtype of `x`.
+
+    Raises:
+        AssertionError: Channels of map and kernel differ.
     """
+    chex.assert_shape(kernel, (None, None, x.shape[-1], None))
     return _conv2d(x, kernel, dilation)
 
 

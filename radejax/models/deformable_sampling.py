@@ -15,6 +15,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,7 +45,10 @@ def deformable_attention(
 
     Raises:
         ValueError: `sizes` do not add up to the length of `value`.
+        AssertionError: Arrays do not fit together.
     """
+    chex.assert_shape(locations, (*weights.shape, 2))
+    chex.assert_shape(weights, (len(value), None, value.shape[2], len(sizes), None))
     b, queries, heads = locations.shape[:3]
     starts = np.cumsum([0] + [h * w for h, w in sizes])
     if starts[-1] != value.shape[1]:
@@ -113,8 +117,18 @@ def lifted_attention(
 
     Returns:
         `[B, N, heads, D]`.
+
+    Raises:
+        AssertionError: Arrays do not fit together.
     """
-    b, bins = offsets.shape[:2]
+    b, bins, heads, points = logits.shape
+    chex.assert_shape(value, (b, None, None, heads, None))
+    chex.assert_shape(offsets, (*logits.shape, 2))
+    chex.assert_shape(scale, (b, bins, None))
+    chex.assert_shape(reference, (None, *scale.shape[1:], 2))
+    chex.assert_shape(query_weights, (None, *scale.shape[1:]))
+    chex.assert_shape(offset_bias, (heads, points, 2))
+    chex.assert_shape(logit_bias, (heads, points))
     chunk_size = min(chunk_size, bins)
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
     by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
