@@ -19,49 +19,7 @@ MOST_INSIDE = 70
 """Imports of ours inside functions: of commands, for a start without JAX."""
 
 # What does not hold yet: a line is to go with the wall that it names.
-KNOWN: set[str] = {
-    "room online_training",
-    "up radejax.core.structures -> radejax.evaluation.files.kitti",
-    "up radejax.data.records.job -> radejax.data.records.projections",
-    "up radejax.evaluation.report.report -> radejax.evaluation.report.plots",
-    "up radejax.inference.detector -> radejax.runs.workdir",
-    "up radejax.inference.packed -> radejax.runs.workdir",
-    "up radejax.interop.image_backbone -> radejax.inference.embed",
-    "up radejax.interop.image_backbone -> radejax.interop.dinov3_hf",
-    "up radejax.interop.image_backbone -> radejax.interop.resnet_torch",
-    "up radejax.models -> radejax.models.radenet",
-    "up radejax.models.summary -> radejax.cli.entry",
-    "up radejax.runs.experiment -> radejax.runs.evaluate",
-    "up radejax.runs.experiment -> radejax.runs.validation",
-    "up radejax.visualize.bev -> radejax.visualize.camera",
-    "circle radejax.core.structures radejax.evaluation.columns"
-    " radejax.evaluation.files.kitti radejax.evaluation.files.predictions",
-    "circle radejax.simulation.world.surroundings radejax.simulation.world.traffic",
-    "long radejax.data.frame_table.make_table",
-    "long radejax.data.pipeline.make_loader",
-    "long radejax.inference.embed.embed_dataset",
-    "long radejax.losses.detection.detection_loss",
-    "long radejax.training.loop.train",
-    "long radejax.training.step.make_train_step",
-    "long radejax.visualize.camera.draw_camera",
-    "config radejax.inference.benchmark.untrained",
-    "config radejax.inference.detector.from_config",
-    "config radejax.inference.packed.settings_of_config",
-    "config radejax.inference.predict.__init__",
-    "config radejax.interop.image_backbone._check_embeddable",
-    "config radejax.interop.image_backbone._load_dinov3",
-    "config radejax.interop.image_backbone.has_camera",
-    "config radejax.interop.image_backbone.load_image_backbone",
-    "config radejax.interop.image_backbone.loader_arguments",
-    "config radejax.interop.image_backbone.missing_backbone",
-    "config radejax.interop.image_backbone.require_camera",
-    "config radejax.online_training._train",
-    "config radejax.online_training.train_online",
-    "config radejax.simulation.dataset.simulate_dataset",
-    "config radejax.simulation.online.__init__",
-    "config radejax.training.loop._init_state",
-    "config radejax.training.loop.train",
-}
+KNOWN: set[str] = set()
 
 READERS = ("radejax.core.config", "radejax.models", "radejax.simulation.config")
 """They make configs, or read the section that is theirs and nothing else."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 from typing import Any
 
@@ -171,7 +172,7 @@ def _compare(flags: dict[str, Any]) -> tuple[list[dict[str, Any]], str]:
         _options(flags, "comparison"),
         resamples=2000 if flags["bootstrap"] is None else flags["bootstrap"],
     )
-    return plain([row.to_dict() for row in rows]), text.rstrip("\n")
+    return plain([dataclasses.asdict(row) for row in rows]), text.rstrip("\n")
 
 
 def _source(flags: dict[str, Any]) -> Any:

@@ -62,8 +62,7 @@ def embed_dataset(
         Counts: "frames", "embedded", "found", "missing" (frames without an image).
 
     Raises:
-        UserError: The folder holds embeddings of another backbone or data set, a full
-            disk, or an unknown dtype.
+        UserError: Embeddings of others are in the folder; a full disk; unknown dtype.
         DataError: An image is damaged or of another size.
     """
     if dtype not in DTYPES:

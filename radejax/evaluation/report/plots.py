@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -14,8 +14,6 @@ from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report import breakdown
 from radejax.evaluation.report.measure import Options, condition_masks
 from radejax.evaluation.result import SPACES, Result
-from radejax.visualize.canvas import new_figure, save_figure
-from radejax.visualize.curves import draw_calibration, draw_precision_recall
 
 
 def draw(
@@ -32,6 +30,10 @@ def draw(
     Returns:
         The pictures.
     """
+    # Here, as matplotlib takes a second to load and not every report has pictures.
+    from radejax.visualize.canvas import save_figure
+    from radejax.visualize.curves import draw_calibration
+
     iou = options.iou_thresholds[0]
     masks = {
         "all": np.ones(data.frame.size, bool),
@@ -57,8 +59,11 @@ def draw(
     return [*written, save_figure(axis.figure, out_dir / "calibration.png", dpi=110)]
 
 
-def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Figure:
-    """One panel per class, one curve per condition."""
+def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Any:
+    """Figure with one panel per class, one curve per condition."""
+    from radejax.visualize.canvas import new_figure
+    from radejax.visualize.curves import draw_precision_recall
+
     panels = list(zip(*results.values(), strict=True))  # results of a class each
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)

@@ -22,6 +22,7 @@ from radejax.evaluation.report import (
     breakdown,
     measure,
     paper_tables,
+    plots,
     tables,
 )
 from radejax.evaluation.report.measure import Measured, Options
@@ -275,8 +276,6 @@ def _draw(
     """Curves, and pictures of the worst frames if somebody can draw them."""
     written = []
     if options.plots:
-        from radejax.evaluation.report import plots  # takes a second: matplotlib
-
         written += plots.draw(data, frames, options, out_dir)
     if options.draw_frame is not None:
         folder = out_dir / "worst_frames"
