@@ -20,6 +20,7 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.files import differences
 from radejax.data.cameras import CameraOptions
+from radejax.data.records.embeddings import embeddings_sha256
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
 from radejax.inference.packed import LoadedModel
@@ -132,14 +133,30 @@ def settings_of_config(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+@dataclasses.dataclass(frozen=True)
+class StartingWeights:
+    """What a training starts from in place of random numbers.
+
+    Attributes:
+        source: Where `variables` come from, or None.
+        variables: Of the whole model, or None.
+        pretrained: A part that takes the place of drawn ones, or None.
+        frozen_sha256: Checksum of the frozen image backbone; None where none is.
+    """
+
+    source: str | None = None
+    variables: Mapping[str, Any] | None = None
+    pretrained: Mapping[str, Any] | None = None
+    frozen_sha256: str | None = None
+
+
 def starting_weights(
     model: nn.Module,
-    *,
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings: PathLike | None = None,
-) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None]:
-    """What a training starts from in place of random numbers.
+) -> StartingWeights:
+    """Reads what is to be trained further, or to stay as it is.
 
     Args:
         model: To be trained.
@@ -148,18 +165,24 @@ def starting_weights(
             `image_backbone.load_image_backbone`.
         embeddings: Folder of `radejax embed` that stands for the frozen part.
 
-    Returns:
-        All variables, or None; and a part that takes the place of drawn ones, or None.
-
     Raises:
         UserError: They do not fit the model; names what differs.
     """
-    variables = None if init_from is None else _fitting_variables(init_from, model)
-    if variables is not None and IMAGE_BACKBONE in variables["params"]:
-        return variables, None
-    return variables, image_backbone.load_image_backbone(
-        image_backbone_path, model, embeddings
-    )
+    variables = pretrained = digest = source = None
+    if init_from is not None:
+        source = str(pathlib.Path(init_from).absolute())
+        variables = _fitting_variables(init_from, model)
+    if variables is None or IMAGE_BACKBONE not in variables["params"]:
+        pretrained = image_backbone.load_image_backbone(
+            image_backbone_path, model, embeddings
+        )
+    if getattr(model, "freeze", False):
+        if embeddings is not None:
+            digest = embeddings_sha256(embeddings)
+        else:
+            given = variables if pretrained is None else pretrained
+            digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
+    return StartingWeights(source, variables, pretrained, digest)
 
 
 def _fitting_variables(path: PathLike, model: nn.Module) -> Mapping[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import flax.linen as nn
 import grain
+import jax
 from ml_collections import ConfigDict
 
 from radejax import models
@@ -38,7 +39,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import processes
+from radejax.training import processes, sharding
 
 _log = logging.getLogger(__name__)
 
@@ -241,13 +242,25 @@ class Data:
         return camera_inputs(frames, self.image_size, self.camera, self.features)
 
     def training_batches(
-        self, frames: Sequence[Frame], *, batch_size: int, seed: int
+        self, frames: Sequence[Frame], train: ConfigDict, seed: int
     ) -> grain.DatasetIterator[Batch]:
         """An endless, shuffled, checkpointable iterator over batches of this process.
 
+        Args:
+            frames: To train on.
+            train: `config.train`.
+            seed: Of order and augmentation.
+
         Raises:
-            UserError: As `images`, or no frame has a usable one; too few frames.
+            UserError: As `images`, or no frame has a usable one; the batch does not fit
+                the devices, or the frames are fewer.
         """
+        sharding.check_batch_size(
+            train.batch_size,
+            sharding.make_mesh(),
+            "train.batch_size",
+            train.num_accumulate,
+        )
         images, options = self.images(frames), self.options
         require_images(frames, images)
         table = make_table(
@@ -265,7 +278,7 @@ class Data:
             gain_slope_db=options.gain_slope_db,
         )
         loading = LoaderOptions(
-            batch_size=batch_size,
+            batch_size=train.batch_size // jax.process_count(),
             seed=seed,
             num_threads=options.num_threads,
             num_workers=options.num_workers,

@@ -6,27 +6,22 @@ import hashlib
 import logging
 import pathlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
-import jax
 from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data import pipeline
 from radejax.data.kradar import Frame
-from radejax.data.records.embeddings import embeddings_sha256
-from radejax.inference.open import PathLike, starting_weights
-from radejax.interop.image_backbone import weights_sha256
-from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.inference.open import PathLike, StartingWeights, starting_weights
 from radejax.runs.data import Data, Sources, open_data
 from radejax.runs.evaluate import evaluate
 from radejax.runs.validation import Validation
 from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
-from radejax.training import loop, processes, sharding
+from radejax.training import loop, processes
 
 _log = logging.getLogger(__name__)
 
@@ -68,6 +63,9 @@ def run(
     folder = default_workdir(workdir, name)
     model = models.build(config.model)  # what cannot be built fails first
     with claimed(folder, config):
+        weights = starting_weights(
+            model, init_from, sources.image_backbone, sources.embeddings
+        )
         data = open_data(config, model, sources)
         has_test = len(data.split("test")) > 0
         if not has_test:
@@ -75,7 +73,7 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.paths.roots),
             )
-        result = train(model, data, folder, config, init_from)
+        result = train(model, weights, data, folder, config)
         if not result.finished:
             _log.info(
                 "stopped at step %d; run the same command to continue", result.step
@@ -90,44 +88,30 @@ def run(
 
 def train(
     model: nn.Module,
+    weights: StartingWeights,
     data: Data,
     folder: pathlib.Path,
     config: ConfigDict,
-    init_from: PathLike | None = None,
 ) -> loop.TrainResult:
     """Trains on the train split until the configured epochs are done.
 
     Args:
         model: What `config.model` describes.
+        weights: That it starts from.
         data: Of the run.
         folder: Work folder.
         config: Of the run.
-        init_from: Weights to start from: official .pth file or another work folder.
 
     Raises:
-        UserError: No frames to train on or no usable image, or weights that do not fit.
+        UserError: No frames to train on, or no usable image.
     """
     frames = data.split("train")
     if not len(frames):
         raise UserError(
             f"no frames of the train split in {', '.join(data.paths.roots)}"
         )
-    sharding.check_batch_size(
-        config.train.batch_size,
-        sharding.make_mesh(),
-        "train.batch_size",
-        config.train.num_accumulate,
-    )
-    rows = config.train.batch_size // jax.process_count()
-    loader = data.training_batches(frames, batch_size=rows, seed=config.seed)
-    variables, pretrained = starting_weights(
-        model,
-        init_from=init_from,
-        image_backbone_path=data.paths.image_backbone,
-        embeddings=data.paths.embeddings,
-    )
-    stays = _what_stays(frames, variables, pretrained, data.paths.embeddings, model)
-    info = run_info(folder, data.paths, init_from)
+    loader = data.training_batches(frames, config.train, config.seed)
+    info = run_info(folder, data.paths, weights.source)
     if processes.is_main():
         files.write_json(folder / "run.json", info)
     validation = None
@@ -135,7 +119,7 @@ def train(
         validation = Validation(config, model, data)
     return loop.train(
         model,
-        variables,
+        weights.variables,
         loader,
         models.map_grid(data.records.grid, model, config.data.azimuth_mapping),
         folder,
@@ -143,24 +127,18 @@ def train(
         loss=config.loss,
         watch=config.watch,
         seed=config.seed,
-        info=checkpoint_info(config, data.records.grid, info, stays),
-        steps_per_epoch=pipeline.steps_per_epoch(
-            len(frames), rows, process_count=jax.process_count()
+        info=checkpoint_info(
+            config, data.records.grid, info, _what_stays(frames, weights)
         ),
-        pretrained=pretrained,
+        steps_per_epoch=len(frames) // config.train.batch_size,
+        pretrained=weights.pretrained,
         evaluate=validation,
         trace_folder=config.profile,
         frame_names=[frame.key for frame in frames],
     )
 
 
-def _what_stays(
-    frames: Sequence[Frame],
-    variables: Mapping[str, Any] | None,
-    pretrained: Mapping[str, Any] | None,
-    embeddings: str | None,
-    model: nn.Module,
-) -> dict[str, Any]:
+def _what_stays(frames: Sequence[Frame], weights: StartingWeights) -> dict[str, Any]:
     """What a checkpoint does not hold and a run must not change on its way.
 
     Folders may move, therefore frames are compared by their keys and the frozen
@@ -171,11 +149,6 @@ def _what_stays(
         "frames to train on": len(frames),
         "sha256 of their keys": hashlib.sha256(keys.encode()).hexdigest()[:16],
     }
-    if getattr(model, "freeze", False):
-        if embeddings is not None:
-            digest = embeddings_sha256(embeddings)
-        else:
-            source = pretrained if pretrained is not None else variables
-            digest = weights_sha256(source["params"][IMAGE_BACKBONE])
-        stays["sha256 of the frozen image backbone"] = digest[:16]
+    if weights.frozen_sha256 is not None:
+        stays["sha256 of the frozen image backbone"] = weights.frozen_sha256[:16]
     return stays

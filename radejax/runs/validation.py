@@ -52,6 +52,8 @@ class Validation:
         mesh: jax.sharding.Mesh | None = None,
     ) -> None:
         self._config, self._records = config, data.records
+        self._options = report_options(config, "training")
+        _check_best(config.train.best_metric, self._options)
         self._frames = data.split("test")
         if not len(self._frames):
             raise UserError(
@@ -60,9 +62,7 @@ class Validation:
             )
         self._images = data.images(self._frames)
         self._ground_truth, self._table = tables_from_frames(self._frames)
-        self._options = report_options(config, "training")
         self._predictor = make_predictor(config, model, data, mesh)
-        _check_best(config.train.best_metric, self._options)
 
     def __call__(
         self,

@@ -13,6 +13,7 @@ from radejax.core.config import base_config
 from radejax.inference import open as opening
 from radejax.inference import packed
 from radejax.interop import radenet_torch
+from radejax.interop.image_backbone import weights_sha256
 
 from .. import small_models as small
 
@@ -49,8 +50,10 @@ def test_a_run_that_has_not_trained_says_so(tmp_path: pathlib.Path) -> None:
 def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> None:
     detector = small.detector()
     packed.write_packed(tmp_path, detector, training_config=ConfigDict({"seed": 3}))
-    variables, part = opening.starting_weights(detector.model, init_from=tmp_path)
-    assert part is None
+    weights = opening.starting_weights(detector.model, init_from=tmp_path)
+    variables = weights.variables
+    assert weights.source == str(tmp_path)
+    assert weights.pretrained is None
     for name, value in detector.variables["params"]["backbone"].items():
         assert set(variables["params"]["backbone"][name]) == set(value)
     config = packed.model_config(detector.model)
@@ -63,7 +66,7 @@ def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> N
 
 def test_without_anything_to_start_from_all_is_drawn() -> None:
     model = small.detector().model
-    assert opening.starting_weights(model) == (None, None)
+    assert opening.starting_weights(model) == opening.StartingWeights()
     with pytest.raises(UserError, match="which has no camera"):
         opening.starting_weights(model, image_backbone_path="dinov3")
 
@@ -77,3 +80,22 @@ def test_settings_are_those_of_the_config() -> None:
         assert np.isclose(settings["score_threshold"], 0.2)
         assert settings["decode_options"]["per_class_nms"] is True
         assert "nms_iou" not in settings["decode_options"]
+
+
+def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> None:
+    detector = small.detector("camera")
+    weights = detector.variables["params"]["image_backbone"]
+    packed.write_packed(tmp_path / "all", detector, with_backbone=True)
+    found = opening.starting_weights(detector.model, tmp_path / "all")
+    assert found.pretrained is None
+    assert found.frozen_sha256 == weights_sha256(weights)
+    # Embeddings of the same backbone stand for it.
+    content = {"weights_sha256": found.frozen_sha256}
+    (tmp_path / "manifest.json").write_text(json.dumps(content))
+    embedded = opening.starting_weights(detector.model, embeddings=tmp_path)
+    assert embedded.frozen_sha256 == found.frozen_sha256
+    assert embedded.variables is embedded.pretrained is None
+    trained = opening.starting_weights(
+        detector.model.clone(freeze=False), tmp_path / "all"
+    )
+    assert trained.frozen_sha256 is None

@@ -151,7 +151,7 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
     state = radenet_torch.save(tiny.model, official)
     torch.save({k: torch.tensor(v) for k, v in state.items()}, workdir / "best.pth")
-    variables, _ = starting_weights(tiny.model, init_from=workdir / "best.pth")
+    variables = starting_weights(tiny.model, workdir / "best.pth").variables
     result = loop.train(
         tiny.model,
         variables,
