@@ -81,7 +81,8 @@ class Bench:
             seed=0,
         )
         self.inputs = [
-            self.simulator.radar_input(i) for i in range(len(self.sequence.ego_along_m))
+            self.simulator.radar_input(self.sequence.frame(i))
+            for i in range(len(self.sequence.ego_along_m))
         ]
 
     def run(self, output):
@@ -136,7 +137,8 @@ class Bench:
 
     def parts(self):
         frames, config = self.frames, self.config
-        measure("scene to scatterers", self.simulator.radar_input, frames)
+        scatter, frame = self.simulator.radar_input, self.sequence.frame
+        measure("scene to scatterers", lambda i: scatter(frame(i)), frames)
         tesseract = self.run("tesseract")(0)
         with tempfile.TemporaryDirectory() as folder:
             path = pathlib.Path(folder) / "tesseract_00001.mat"
@@ -149,7 +151,6 @@ class Bench:
             config.lidar_to_radar_m, config.image_width, config.image_height
         )
         renderer = CameraRenderer(self.sequence, pair, seed=0)
-        frame = self.sequence.frame
         image = renderer.render(frame(0))
         measure("camera image", lambda i: renderer.render(frame(i)), frames)
         measure(

@@ -111,7 +111,7 @@ class OnlineBatches:
         with self._lock:  # one thread makes a scene, the others find it
             simulator = self._simulator(number)
         frame = simulator.sequence.frame(spec.scene_idx)
-        given = simulator.radar_input(spec.scene_idx, frame)
+        given = simulator.radar_input(frame)
         visible = simulator.is_radar_visible(frame, given)
         boxes = frame.boxes[visible].copy()
         boxes[:, 2] -= self._config.lidar_to_radar_m[2]  # z as readers of files have it

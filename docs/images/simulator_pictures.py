@@ -43,7 +43,7 @@ def draw(weather, environment, time, seed, path):
     )  # fmt: skip
     simulator = SequenceSimulator(sequence, GRID, RadarParameters(), seed)
     frame = sequence.frame(30)
-    given = simulator.radar_input(30, frame)
+    given = simulator.radar_input(frame)
     power_db = 10 * np.log10(simulator.run(given, "tesseract") + 1e-10)  # [D, R, E, A]
     renderer = CameraRenderer(
         sequence, stereo_calibration(OFFSET, 640, 360), 0, cover_lens=weather == "sleet"

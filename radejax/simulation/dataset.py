@@ -210,7 +210,7 @@ class _SequenceWriter:
         config, simulator = self.config, self.simulator
         radar_idx, _, camera_idx, *_ = spec.indices
         frame = simulator.sequence.frame(spec.scene_idx)
-        given = simulator.radar_input(spec.scene_idx, frame)
+        given = simulator.radar_input(frame)
         output = simulator.run(given, config.output)
         if config.output == "tesseract":
             path = self.folder / "radar_tesseract" / f"tesseract_{radar_idx:05d}.mat"

@@ -67,10 +67,9 @@ class SequenceSimulator:
         count = len(sequence.reflectors.kind)
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
 
-    def radar_input(self, index: int, frame: SceneFrame | None = None) -> RadarInput:
+    def radar_input(self, frame: SceneFrame) -> RadarInput:
         """Scatterers and noise of a frame: NumPy, ready for `tensor.simulate`."""
         sequence, parameters = self.sequence, self.parameters
-        frame = sequence.frame(index) if frame is None else frame
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
         static = clutter.scatter_surroundings(frame, self._static_phase, parameters)
         ghosts = clutter.scatter_ghosts(objects, sequence.mirrors_m)
@@ -88,7 +87,7 @@ class SequenceSimulator:
             noise_power=weather.noise_profile(
                 sequence.weather, self.grid, parameters, frame.ego_velocity_mps
             ),
-            key=tensor.frame_key(self.seed, sequence.name, index),
+            key=tensor.frame_key(self.seed, sequence.name, frame.index),
             snr_db=10.0 * np.log10(power + 1e-30) - parameters.noise_db,
             lit=lit,
         )

@@ -64,7 +64,9 @@ def test_frame_differs_from_the_simulator_by_noise_only(source):
     simulator = SequenceSimulator(
         source._source.make(number), source.grid, source._parameters, 0
     )
-    expected = simulator.run(simulator.radar_input(spec.scene_idx))
+    expected = simulator.run(
+        simulator.radar_input(simulator.sequence.frame(spec.scene_idx))
+    )
     found = np.asarray(batch.projection[0])
     bright = expected > 0.65
     assert bright.any()

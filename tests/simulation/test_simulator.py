@@ -31,7 +31,7 @@ def test_visible_objects_stand_out_of_the_noise(urban):
     brightness, floor = [], []
     for index in range(5):
         frame = urban.sequence.frame(index)
-        given = urban.radar_input(index, frame)
+        given = urban.radar_input(frame)
         projection = urban.run(given)
         visible = urban.is_radar_visible(frame, given)
         peak = projection[..., :16].max(-1)
@@ -47,7 +47,7 @@ def test_visible_objects_stand_out_of_the_noise(urban):
 
 
 def radar_frame(made, index):
-    return made.run(made.radar_input(index))
+    return made.run(made.radar_input(made.sequence.frame(index)))
 
 
 def test_frames_repeat_and_differ(urban):
@@ -65,19 +65,20 @@ def test_normalised_values_have_a_floor_and_stay_below_one(urban):
 
 def test_hidden_weak_and_outside_objects_are_not_visible(urban):
     frame = urban.sequence.frame(0)
-    given = urban.radar_input(0, frame)
+    given = urban.radar_input(frame)
     visible = urban.is_radar_visible(frame, given)
     inside = GRID.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
     assert visible.any()
     assert not visible[~inside].any()
     assert not visible[given.lit < 0.15].any()
     deaf = simulator(parameters=RadarParameters(gain_db=100.0))
-    assert not deaf.is_radar_visible(frame, deaf.radar_input(0, frame)).any()
+    assert not deaf.is_radar_visible(frame, deaf.radar_input(frame)).any()
 
 
 def test_rain_weakens_targets(urban):
-    dry, wet = urban.radar_input(0), simulator("rain").radar_input(0)
-    boxes = urban.sequence.frame(0).boxes
+    frame = urban.sequence.frame(0)
+    dry, wet = urban.radar_input(frame), simulator("rain").radar_input(frame)
+    boxes = frame.boxes
     inside = GRID.in_field_of_view(boxes[:, 0], boxes[:, 1])
     difference = (dry.snr_db - wet.snr_db)[inside]
     # The wet radome costs 2 dB; the wet road mirrors better and gives some of it back.
@@ -88,7 +89,7 @@ def test_rain_weakens_targets(urban):
 
 def test_labels_are_in_the_lidar_frame(urban):
     frame = urban.sequence.frame(1)
-    labels = urban.labels(frame, urban.radar_input(1), (-2.54, 0.3, 0.7), 60.0)
+    labels = urban.labels(frame, urban.radar_input(frame), (-2.54, 0.3, 0.7), 60.0)
     by_id = {label.track_id: label for label in labels}
     distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
     assert len(labels) == (distance < 60.0).sum()

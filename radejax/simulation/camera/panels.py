@@ -45,15 +45,13 @@ def make_panels(
     ):
         chosen = np.flatnonzero(near & (fixed.kind == REFLECTOR_KINDS.index(name)))
         position = fixed.position_m[chosen]
-        if name in ("rail", "wall"):
-            angle = fixed.normal_rad[chosen] + np.pi / 2.0
-        else:
-            sight = position - origin
-            angle = np.arctan2(sight[:, 1], sight[:, 0]) + np.pi / 2.0
+        facing = fixed.normal_rad[chosen]
+        if name in ("tree", "pole"):
+            facing = np.arctan2(position[:, 1] - origin[1], position[:, 0] - origin[0])
+        angle = facing + np.pi / 2.0
         side = half_width * np.stack([np.cos(angle), np.sin(angle)], 1)
         panels.append(_upright(position[:, :2], side, ground_m + low, ground_m + high))
-        pick = frame.reflector_idx[chosen] * 7919 % len(palette)
-        color = palette[pick]
+        color = palette[frame.reflector_idx[chosen] * 7919 % len(palette)]
         if name in ("tree", "pole"):
             color = color + white * 0.6 * (_SNOWY - color)
         colors.append(color)
@@ -65,8 +63,6 @@ def make_panels(
 def _upright(center, side, low: float, high: float) -> np.ndarray:
     """`[P, 4, 3]` rectangles around ground points `[P, 2]`."""
     a, b = center - side, center + side
-    count = len(center)
-    bottom, top = np.full((count, 1), low), np.full((count, 1), high)
-    return np.stack(
-        [np.c_[a, bottom], np.c_[b, bottom], np.c_[b, top], np.c_[a, top]], axis=1
-    )
+    flat = np.stack([a, b, b, a], 1)
+    height = np.broadcast_to([[low], [low], [high], [high]], (len(center), 4, 1))
+    return np.concatenate([flat, height], -1)

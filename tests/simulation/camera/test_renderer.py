@@ -117,7 +117,7 @@ class TestLabelsProjectOntoObjects:
             sequence, RadarGrid.kradar(), RadarParameters(), seed=0
         )
         frame = sequence.frame(0)
-        labels = simulator.labels(frame, simulator.radar_input(0), OFFSET, 100.0)
+        labels = simulator.labels(frame, simulator.radar_input(frame), OFFSET, 100.0)
         write.write_labels(tmp_path / "1.txt", [1] * 5, 0.0, labels)
         (tmp_path / "cam.yml").write_text(PAIR[0].to_kradar_text())
         calibration = CameraCalibration.from_kradar(tmp_path / "cam.yml")
