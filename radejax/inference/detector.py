@@ -185,11 +185,12 @@ class Detector:
             **overrides: Arguments of `Detector`.
         """
         from radejax.interop import dinorade_torch, radenet_torch
+        from radejax.interop.state_dict import read_state_dict
         from radejax.models.lifting import OFFICIAL_OFFSET_M
 
         content = path_or_state_dict
         if isinstance(content, str | pathlib.Path):
-            content = dinorade_torch.read(content)
+            content, _ = read_state_dict(content)
         fields: dict[str, Any] = dict(model_overrides or {})
         arguments: dict[str, Any] = {"azimuth_mapping": "stretched"}
         if dinorade_torch.is_dinorade(content):
