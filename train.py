@@ -66,19 +66,26 @@ def main(_: list[str]) -> None:
         place = _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
         if _DISTRIBUTED.value or place != (None,) * 3:
             entry.join_processes(*place)
-        from radejax.runs import experiment
+        from radejax.core.config import config_name
+        from radejax.runs import experiment, seeds
+        from radejax.runs.data import Sources
 
-        experiment.run(
-            _CONFIG.value,
-            name=experiment.config_name(flags.FLAGS["config"].config_filename),
-            workdir=_WORKDIR.value,
-            data=_DATA.value,
+        config = _CONFIG.value
+        sources = Sources(
+            data=tuple(_DATA.value or ()),
             labels=_LABELS.value,
             records=_RECORDS.value,
-            init_from=_INIT.value,
             embeddings=_EMBEDDINGS.value,
             image_backbone=_BACKBONE.value,
             camera_calibration=_CALIBRATION.value,
+        )
+        run = seeds.run_seeds if config.seeds else experiment.run
+        run(
+            config,
+            name=config_name(flags.FLAGS["config"].config_filename),
+            sources=sources,
+            workdir=_WORKDIR.value,
+            init_from=_INIT.value,
         )
 
 

@@ -10,6 +10,7 @@ import argparse
 import json
 import pathlib
 
+from radejax.core.config import load_config
 from radejax.inference.benchmark import as_table, measure, untrained
 
 CONFIG = pathlib.Path(__file__).resolve().parents[1] / "configs" / "radenet.py"
@@ -23,7 +24,7 @@ def main() -> None:
     parser.add_argument("--dtype", choices=["float32", "bfloat16"], default="float32")
     parser.add_argument("--json", type=pathlib.Path, help="Also write the rows there.")
     args = parser.parse_args()
-    detector = untrained(str(CONFIG), dtype=args.dtype)
+    detector = untrained(load_config(str(CONFIG)), dtype=args.dtype)
     rows = []
     for kind in args.input or ["tesseract", "projection"]:
         found = measure(

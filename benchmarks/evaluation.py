@@ -16,19 +16,11 @@ import time
 import numpy as np
 
 from radejax.core.structures import CLASSES
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.average_precision import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.report.measure import Options, measure
 
-WEATHERS = (
-    "normal",
-    "overcast",
-    "fog",
-    "rain",
-    "sleet",
-    "lightsnow",
-    "heavysnow",
-)
 COUNTS = (20000, 4200, 1800, 160, 570)
 SIZES = ((4.4, 1.9, 1.6), (9, 2.6, 3), (0.7, 0.7, 1.7), (2, 0.8, 1.5), (1.8, 0.7, 1.6))
 

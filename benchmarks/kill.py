@@ -13,7 +13,6 @@ projection, and evaluation on the way is off. tests/test_quickstart.py kills at 
 
 import argparse
 import collections
-import importlib.util
 import json
 import multiprocessing
 import pathlib
@@ -26,7 +25,10 @@ import jax
 import numpy as np
 
 from radejax.cli import entry
+from radejax.core.config import load_module
+from radejax.inference.open import load
 from radejax.runs import experiment
+from radejax.runs.data import Sources
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
@@ -40,9 +42,7 @@ PROCESSES.set_forkserver_preload(
 def make_config(steps):
     """The quickstart in so small that most of a start is not training."""
     path = REPOSITORY / "configs" / "quickstart.py"
-    spec = importlib.util.spec_from_file_location("quickstart", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     config = module.get_config("short")
     config.simulation.update(train_sequences=2, frames_per_sequence=5)
     config.model.update(
@@ -70,7 +70,7 @@ def run(folder, name, steps):
         make_config(steps),
         name=name,
         workdir=folder / name,
-        data=[str(folder / "data")],
+        sources=Sources(data=(str(folder / "data"),)),
     )
 
 
@@ -97,7 +97,7 @@ def stage(folder):
 def same(folder, a, b):
     """Names of what is not equal."""
     different = []
-    variables = [experiment.load_run(folder / run).variables for run in (a, b)]
+    variables = [load(folder / run).variables for run in (a, b)]
     equal = jax.tree.map(np.array_equal, *variables)
     different += ["parameters"] * (not all(jax.tree.leaves(equal)))
     losses = [

@@ -15,6 +15,8 @@ One line each: wall and processor time per frame, frames/s, peak memory of the p
 """
 
 import argparse
+import functools
+import io
 import pathlib
 import resource
 import subprocess
@@ -28,7 +30,7 @@ import numpy as np
 from radejax.data.kradar import write as kradar_write
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
-from radejax.simulation.dataset import encode_png, simulate_dataset
+from radejax.simulation.dataset import simulate_dataset, write_png
 from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
@@ -79,7 +81,7 @@ class Bench:
             seed=0,
         )
         self.inputs = [
-            self.simulator.radar_input(i) for i in range(self.sequence.num_frames)
+            self.simulator.radar_input(i) for i in range(len(self.sequence.ego_along_m))
         ]
 
     def run(self, output):
@@ -98,14 +100,12 @@ class Bench:
                 *[(x.scatterers, x.noise_power, x.key) for x in self.inputs],
             )
         )
-        grid, parameters = self.simulator.grid, self.simulator.parameters
-
-        def one(scatterers, noise, key):
-            return tensor.simulate(
-                scatterers, noise, key, grid=grid, parameters=parameters,
-                rows_per_step=self.rows,
-            )  # fmt: skip
-
+        one = functools.partial(
+            tensor.simulate,
+            grid=self.simulator.grid,
+            parameters=self.simulator.parameters,
+            rows_per_step=self.rows,
+        )
         run = jax.jit(jax.vmap(one))
         count = len(self.inputs)
         measure(
@@ -152,7 +152,9 @@ class Bench:
         frame = self.sequence.frame
         image = renderer.render(frame(0))
         measure("camera image", lambda i: renderer.render(frame(i)), frames)
-        measure("camera image to .png", lambda i: encode_png(image), frames)
+        measure(
+            "camera image to .png", lambda i: write_png(io.BytesIO(), image), frames
+        )
 
 
 def main():

@@ -15,21 +15,21 @@ import dataclasses
 import pathlib
 
 import numpy as np
+from cfar import (
+    CfarSettings,
+    detect,
+    fit_rcs_steps,
+    object_rcs_db,
+)
 from tqdm import tqdm
 
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
 from radejax.data.records.projections import RecordSource
-from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.report import Report, write_report
 from radejax.runs.evaluate import record_positions
-from radejax.simulation.baseline import (
-    CfarSettings,
-    detect,
-    fit_rcs_steps,
-    object_rcs_db,
-)
 from radejax.simulation.radar.tensor import RadarParameters
 
 # The gain only shifts the cross-sections, and the steps between classes with them.

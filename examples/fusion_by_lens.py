@@ -21,16 +21,14 @@ from tabulate import tabulate
 from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.records.projections import RecordSource
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.files.load import Source, load
 from radejax.evaluation.files.predictions import frame_keys
 from radejax.evaluation.report import bootstrap
-from radejax.evaluation.report.compare import Source, load
 from radejax.evaluation.report.measure import repair_sizes
-from radejax.runs import camera_share
-from radejax.runs.data import OtherData
-from radejax.runs.evaluate import with_other_data
-from radejax.runs.workdir import load_run
+from radejax.inference.open import load as open_model
+from radejax.runs.data import Sources, data_of_run
+from radejax.runs.pictures import camera_share
 from radejax.simulation.camera.lens import cover_level
 from radejax.simulation.dataset import MARKER
 from radejax.visualize.camera_share import mean_share, write_camera_share
@@ -127,24 +125,21 @@ def main(fusion, radar, out, data, split, resamples):
     """Compares FUSION with RADAR, two work folders evaluated on the same test split."""
     entry.set_up_jax()
     with entry.exit_codes():
-        run, name = load_run(fusion), ""
-        if data is not None:
-            other = OtherData(data=(data,))
-            run, name = with_other_data(run, other), f"_{other.name}"
-        if run.paths is None:
-            raise UserError(f"{fusion}: the run has no data, give --data ROOT")
-        config = run.config
+        run = open_model(fusion)
+        other = None if data is None else Sources(data=(data,))
+        name = "" if other is None else f"_{other.name}"
+        config, opened = data_of_run(run, fusion, other)
         out = out or fusion / f"by_lens{name}"
         reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]
-        dataset = run.paths.open(config, None if split == "all" else split)
+        dataset = opened.split(None if split == "all" else split)
         for report in reports:
             frames = load(report, Source(), tuple(config.classes))[2]
             if frame_keys(frames) != [frame.key for frame in dataset]:
                 raise UserError(
                     f"{report} is of other frames than split {split} of "
-                    f"{run.paths.roots[0]}: evaluate both runs on it first"
+                    f"{opened.paths.roots[0]}: evaluate both runs on it first"
                 )
-        lens = lens_of_frames(run.paths.roots[0], frames)
+        lens = lens_of_frames(opened.paths.roots[0], frames)
         groups = {
             name: np.array(
                 [
@@ -155,10 +150,10 @@ def main(fusion, radar, out, data, split, resamples):
             for name, rule in GROUPS.items()
         }
         level_of = {f.key: level for f, level in zip(dataset, lens, strict=True)}
-        maps, counts = camera_share.camera_share(
-            config,
+        maps, counts = camera_share(
+            run.model,
             run.variables,
-            RecordSource(run.paths.records),
+            opened,
             list(dataset),
             group=lambda frame: next(
                 name

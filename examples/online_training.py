@@ -1,20 +1,112 @@
-"""Trains RADE-Net on frames that are simulated as they are needed.
+"""Trains RADE-Net on frames that are simulated as they are needed: no data set, no disk.
 
     python examples/online_training.py --config configs/quickstart.py \\
         --workdir runs/online --sequences 1000
 
-The same command continues after an interruption. Then, for a look at the result:
+Every step sees new frames of procedural scenes, so that there is nothing to overfit
+but the simulator itself. The same command continues after an interruption. Then, for a
+look at the result:
 
     radejax detect --model runs/online/checkpoints --out boxes data/sim
 """
 
+from __future__ import annotations
+
+import logging
+import os
 import pathlib
 
 import click
+import jax
+from ml_collections import ConfigDict
+from online_batches import OnlineBatches
 
+from radejax import models
 from radejax.cli import entry
 from radejax.core.config import load_config
-from radejax.online_training import train_online
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES
+from radejax.runs.workdir import checkpoint_info, claimed
+from radejax.simulation.config import plain
+from radejax.training import loop, sharding
+
+SEED_OFFSET = 1_000_003
+"""Added to the seed of scenes: those of a data set of the same config stay unseen."""
+
+_log = logging.getLogger(__name__)
+
+
+def train_online(
+    config: ConfigDict, workdir: str | os.PathLike, *, num_sequences: int = 1000
+) -> loop.TrainResult:
+    """Trains a radar model on fresh frames; run again, it continues.
+
+    An epoch is as many frames as the sequences have. Frames are drawn with
+    replacement and get new noise each time; they are not augmented.
+
+    Args:
+        config: With a `simulation` section that describes sensor and frames a
+            sequence. Its data set is neither made nor used.
+        workdir: Of the run: `config.json`, `checkpoints/`, `metrics.jsonl`.
+        num_sequences: Procedural sequences that frames are drawn from.
+
+    Raises:
+        UserError: A camera, other classes, real scenes or several processes are asked
+            for, or the folder belongs to a run with another config.
+    """
+    simulation = plain(config.get("simulation") or {})
+    for is_wrong, text in (
+        (not simulation, "the config has no `simulation` section"),
+        (simulation.get("scenes") != "procedural", "scenes must be procedural"),
+        (config.model.name == "dinorade", "the model takes a camera"),
+        (tuple(config.classes) != CLASSES, f"classes must be {CLASSES}"),
+        (jax.process_count() > 1, "one process only"),
+    ):
+        if is_wrong:
+            raise UserError(f"on-line training: {text}")
+    simulation |= {
+        "train_sequences": num_sequences,
+        "test_sequences": 0,
+        "seed": simulation["seed"] + SEED_OFFSET,
+    }
+    workdir = pathlib.Path(workdir).absolute()
+    with claimed(workdir, config):
+        batch_size = config.train.batch_size
+        sharding.check_batch_size(
+            batch_size,
+            sharding.make_mesh(),
+            "train.batch_size",
+            config.train.num_accumulate,
+        )
+        batches = OnlineBatches(
+            simulation,
+            batch_size=batch_size,
+            max_objects=config.data.max_objects,
+            seed=config.seed,
+            rows_per_step=1 if jax.default_backend() == "cpu" else 64,
+            num_threads=config.data.num_threads,
+        )
+        _log.info("%d frames to draw from, simulated anew", len(batches.frame_names))
+        model = models.build(config.model)
+        return loop.train(
+            model,
+            None,
+            batches.loader(),
+            models.map_grid(batches.grid, model, config.data.azimuth_mapping),
+            workdir,
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info=checkpoint_info(
+                config,
+                batches.grid,
+                {"online_sequences": num_sequences},
+                {"number of sequences": num_sequences},
+            ),
+            steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
+            frame_names=batches.frame_names,
+        )
 
 
 @click.command()

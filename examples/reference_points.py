@@ -11,16 +11,56 @@ import pathlib
 
 import click
 import numpy as np
+from matplotlib.axes import Axes
 
 from radejax.cli import entry
-from radejax.data.frame_table import read_left_image
+from radejax.data.images import read_left_image
 from radejax.data.kradar import read_labels
 from radejax.geometry.calibration import EGO_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import LiftingAxes, static_reference_points
 from radejax.visualize.bev import save_figure
 from radejax.visualize.camera import draw_camera
-from radejax.visualize.reference_points import draw_reference_points
+
+POINT_COLOR = "#d03b3b"
+RADAR_COLOR = "#2a6fdb"
+
+
+def draw_reference_points(
+    ax: Axes,
+    points: np.ndarray,
+    is_valid: np.ndarray,
+    calibration: CameraCalibration,
+    *,
+    every: tuple[int, int, int] = (16, 2, 1),
+) -> int:
+    """Draws valid reference points and the radar's place onto axes with an image.
+
+    Args:
+        ax: Axes in pixels, e.g. from `radejax.visualize.camera.draw_camera`.
+        points: `[R, A, E, 2]` (x, y) in 0..1 from edge to edge of the image, as in
+            `radejax.models.lifting.ReferencePoints`, of one frame.
+        is_valid: `[R, A, E]` bool, True for points that lie in the image.
+        calibration: The camera they were computed with.
+        every: Draw each so many bins of range, azimuth and elevation.
+
+    Returns:
+        Number of points drawn.
+
+    References:
+        DinoRADE, figure 2: points red, radar blue.
+    """
+    step = tuple(slice(None, None, n) for n in every)
+    size = (calibration.width, calibration.height)
+    points = np.asarray(points)[step][np.asarray(is_valid)[step]] * size
+    # Pixel centers are whole numbers in imshow, half numbers in the calibration.
+    points = points - 0.5
+    ax.scatter(*points.T, s=2.0, color=POINT_COLOR, linewidths=0, alpha=0.7, zorder=2)
+    pixel, depth = calibration.project_ego(np.zeros(3))
+    if calibration.in_image(pixel, depth):
+        ax.scatter(*(pixel - 0.5), s=40, color=RADAR_COLOR, edgecolor="white", zorder=4)
+    return len(points)
+
 
 FILE = click.Path(exists=True, path_type=pathlib.Path)
 

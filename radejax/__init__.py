@@ -3,28 +3,20 @@
 import importlib
 from typing import Any
 
-from radejax.core.errors import DataError, UserError
-
 __version__ = "0.1.0"
 
 # On first use: reading labels or evaluating files should not load the models.
 _LAZY = {
     "Batch": "radejax.core.structures",
     "CLASSES": "radejax.core.structures",
+    "DataError": "radejax.core.errors",
     "DetectionMaps": "radejax.core.structures",
     "Detections": "radejax.core.structures",
     "Detector": "radejax.inference.detector",
+    "UserError": "radejax.core.errors",
 }
 
-__all__ = [
-    "CLASSES",
-    "Batch",
-    "DataError",
-    "DetectionMaps",
-    "Detections",
-    "Detector",
-    "UserError",
-]
+__all__ = list(_LAZY)
 
 
 def __getattr__(name: str) -> Any:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from radejax.cli import main
+from radejax.cli.evaluate import evaluate
 from radejax.core.config import load_config
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -41,17 +42,18 @@ RUN_IN = {
     "radejax overlay": "tests/test_documented_commands.py::test_overlay_draws_a_frame",
     "radejax view": "tests/test_documented_commands.py::test_view_writes_a_recording",
     "radejax detect": ".ci/run: radejax detect --workdir",
-    "radejax evaluate": "tests/test_cli.py::test_evaluate_scores_predictions_in_files",
-    "radejax export": "tests/test_cli.py"
+    "radejax evaluate": "tests/cli/test_main.py"
+    "::test_evaluate_scores_predictions_in_files",
+    "radejax export": "tests/cli/test_main.py"
     "::test_export_and_benchmark_take_a_packed_folder",
-    "radejax benchmark": "tests/test_cli.py"
+    "radejax benchmark": "tests/cli/test_main.py"
     "::test_export_and_benchmark_take_a_packed_folder",
     "radejax embed": "tests/test_fusion_run.py::test_embed_command",
-    "examples/cfar_baseline.py": "tests/test_examples.py"
+    "examples/cfar_baseline.py": "tests/examples/test_cfar_baseline.py"
     "::test_cfar_baseline_fits_detects_and_reports",
     "examples/fusion_by_lens.py": "tests/test_fusion_run.py"
     "::test_example_compares_fusion_and_radar_by_the_lens",
-    "examples/online_training.py": "tests/test_online_training.py"
+    "examples/online_training.py": "tests/examples/test_online_training.py"
     "::test_fresh_frames_train_a_model_and_a_stop_changes_nothing",
     "examples/reference_points.py": "tests/test_fusion_run.py"
     "::test_example_draws_reference_points",
@@ -61,6 +63,7 @@ RUN_IN = {
         for path in (ROOT / "benchmarks").glob("*.py")
         if not path.name.startswith("torch_")  # modules of the others
     },
+    "docs/images/house.py": HELP,
     "docs/images/simulator_pictures.py": HELP,
 }
 
@@ -128,17 +131,16 @@ def _without_placeholders(arguments: list[str]) -> list[str]:
     return [word.strip("[]") for word in arguments]
 
 
-def _check_radejax(arguments: list[str]) -> None:
+def _check_radejax(arguments: list[str], command: click.Command = main.main) -> None:
     """Options exist and no required parameter is missing, as click would say it."""
-    command = main.main
     while isinstance(command, click.Group):
         name = arguments[0]
         assert name in command.commands, f"no command {name!r}"
         command, arguments = command.commands[name], arguments[1:]
     if not arguments:  # mentioned by name alone
         return
-    parser = command.make_parser(click.Context(command))
-    given, rest, _ = parser.parse_args(list(arguments))
+    context = click.Context(command, **command.context_settings)
+    given, rest, _ = command.make_parser(context).parse_args(list(arguments))
     assert not rest
     for parameter in command.params:
         assert given.get(parameter.name) or not parameter.required, parameter.name
@@ -166,6 +168,9 @@ def _check_script(script: str, arguments: list[str]) -> None:
     if "/" in script:
         for flag in flags:
             assert flag.partition("=")[0] in _help(script)
+        return
+    if script == "evaluate.py":
+        _check_radejax([word for word in arguments if word != "..."], evaluate)
         return
     config = None
     for i, flag in enumerate(arguments):
@@ -227,7 +232,9 @@ def test_every_kind_of_command_is_run_by_a_test() -> None:
     kinds |= {f"radejax {name}" for name in main.main.commands}
     assert kinds - set(RUN_IN) == set()
     assert {kind for kind in RUN_IN if "/" in kind} >= {
-        str(path.relative_to(ROOT)) for path in (ROOT / "examples").glob("*.py")
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "examples").glob("*.py")
+        if "__main__" in path.read_text()  # the rest are modules of the others
     }
 
 

@@ -1,7 +1,6 @@
 """Radar-camera runs from images and from embeddings, with a frozen backbone from files."""
 
 import dataclasses
-import importlib.util
 import json
 import logging
 import pathlib
@@ -13,18 +12,20 @@ import pytest
 from click.testing import CliRunner
 
 from radejax.cli.main import main
-from radejax.core.config import load_config
+from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
-from radejax.data.frame_table import make_table
-from radejax.data.records.projections import RecordSource
+from radejax.data.cameras import require_images
+from radejax.data.records.embeddings import open_embeddings
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
 from radejax.inference.detector import Detector
+from radejax.inference.open import load
+from radejax.inference.predict import predict_dataset
 from radejax.interop import image_backbone
 from radejax.models import build
 from radejax.runs import experiment
-from radejax.runs.data import OtherData
-from radejax.runs.evaluate import evaluate_run, predict_dataset
+from radejax.runs.data import Data, DataPaths, Sources, data_of_run
+from radejax.runs.evaluate import evaluate_run
 from radejax.training import sharding
 
 pytestmark = pytest.mark.slow  # several programs to compile
@@ -63,17 +64,27 @@ class _Data:
     backbone: pathlib.Path
     runs: pathlib.Path
 
-    def train(self, name, config=None, **options):
+    def train(self, name, config=None, init_from=None, **sources):
         config = small_config() if config is None else config
         workdir = self.runs / name
         experiment.run(
-            config, name=name, workdir=workdir, data=[str(self.folder)], **options
+            config,
+            name=name,
+            workdir=workdir,
+            sources=Sources(data=(str(self.folder),), **sources),
+            init_from=init_from,
         )
         return workdir
 
     def losses(self, workdir):
         rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
         return [[row[k] for k in ("focal", "gwd", "smooth_l1")] for row in rows]
+
+
+def opened(workdir):
+    """Model and data of a run."""
+    loaded = load(workdir)
+    return loaded, data_of_run(loaded, workdir)[1]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -102,8 +113,8 @@ def embeddings(data, from_images, tmp_path_factory):
     out = tmp_path_factory.mktemp("embeddings")
     config = small_config()
     model = build(config.model)
-    variables = image_backbone.load_image_backbone(data.backbone, config)
-    frames = experiment.load_run(from_images).paths.open(config, None)
+    variables = image_backbone.load_image_backbone(data.backbone, model)
+    frames = opened(from_images)[1].frames
     arguments = (model, variables, config.model.image, frames, out)
     counts = embed.embed_dataset(*arguments, frames_per_file=5, progress=False)
     assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
@@ -114,8 +125,8 @@ def embeddings(data, from_images, tmp_path_factory):
 
 def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
     config = small_config()
-    run = experiment.load_run(from_images)
-    given = image_backbone.load_image_backbone(data.backbone, config)
+    run = load(from_images)
+    given = image_backbone.load_image_backbone(data.backbone, build(config.model))
     backbone = run.variables["params"]["image_backbone"]
     for found, wanted in zip(
         jax.tree.leaves(backbone),
@@ -136,7 +147,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     assert len(found) == len(wanted) > 0
     np.testing.assert_allclose(found, wanted, rtol=2e-5)
     # Evaluated from the embeddings too: the backbone is nowhere.
-    assert "image_backbone" not in experiment.load_run(workdir).variables["params"]
+    assert "image_backbone" not in load(workdir).variables["params"]
     reports = [
         json.loads((w / "evaluation" / "metrics.json").read_text())
         for w in (workdir, from_images)
@@ -144,8 +155,8 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     assert reports[0]["ap"] == reports[1]["ap"]
     other = shutil.copytree(data.folder, tmp_path / "other")
     with pytest.raises(UserError, match="give --image_backbone FOLDER, or --embedd"):
-        evaluate_run(workdir, other=OtherData(data=(str(other),)))
-    given = OtherData(data=(str(other),), embeddings=str(embeddings))
+        evaluate_run(workdir, other=Sources(data=(str(other),)))
+    given = Sources(data=(str(other),), embeddings=str(embeddings))
     evaluate_run(workdir, other=given, num_pictures=0)
     report = json.loads((workdir / "evaluation_other/metrics.json").read_text())
     assert report["ap"] == reports[0]["ap"]
@@ -155,7 +166,7 @@ def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
     # No --image_backbone: the weights come with those that the run starts from.
     workdir = data.train("continued", init_from=str(from_images))
     assert (workdir / "evaluation" / "metrics.json").exists()
-    first, second = (experiment.load_run(w).variables for w in (from_images, workdir))
+    first, second = (load(w).variables for w in (from_images, workdir))
     for name, is_same in (("image_backbone", True), ("image_neck", False)):
         pairs = zip(
             jax.tree.leaves(first["params"][name]),
@@ -176,81 +187,63 @@ def test_a_backbone_that_is_gone_leaves_embedded_images(
     text = stored.read_text().replace(str(data.backbone), str(tmp_path / "gone"))
     stored.write_text(text)
     with caplog.at_level(logging.WARNING):
-        run = experiment.load_run(copy)
+        run = load(copy)
     assert "image backbone" in caplog.text
     assert "is gone" in caplog.text
     assert "image_backbone" not in run.variables["params"]
-    again = experiment.load_run(copy, image_backbone=data.backbone)
+    again = load(copy, image_backbone=data.backbone)
     assert "image_backbone" in again.variables["params"]
 
 
 def test_images_that_are_not_embedded_are_an_error(data, embeddings):
-    run = experiment.load_run(data.runs / "images")
-    frames = list(run.paths.open(run.config, "test"))
-    records = RecordSource(run.paths.records)
+    _, own = opened(data.runs / "images")
+    frames = list(own.split("test"))
+    embedded = dataclasses.replace(own, features=open_embeddings(embeddings))
     other = [dataclasses.replace(frames[0], name="99999_99999"), *frames[1:]]
-    inputs = image_backbone.loader_arguments(run.config, other, embeddings)
     with pytest.raises(
         UserError, match=r"1 of 4 frames have an image that .* `radejax embed`"
     ):
-        make_table(
-            _Renamed(records, other[0].key, frames[0].key),
-            other,
-            max_objects=50,
-            cameras=inputs["cameras"],
-            features=inputs["features"],
-        )
+        embedded.images(other)
     # Embedded images need no files.
     gone = [dataclasses.replace(frame, camera_path=None) for frame in frames]
-    inputs = image_backbone.loader_arguments(run.config, gone, embeddings)
-    assert all(camera.is_valid for camera in inputs["cameras"])
-    inputs = image_backbone.loader_arguments(run.config, gone)
+    inputs = embedded.images(gone)
+    assert all(camera.is_valid for camera in inputs.cameras)
+    inputs = own.images(gone)
     with pytest.raises(UserError, match=r"\(4\) can use the camera: 4 have no front"):
-        image_backbone.require_images(gone, inputs)
-
-
-class _Renamed:
-    """Records in which one frame has another key."""
-
-    def __init__(self, records, key, old):
-        self._index = {**records.index_of(), key: records.index_of()[old]}
-        self.manifest = records.manifest
-        self.folder = records.folder
-
-    def index_of(self):
-        return self._index
+        require_images(gone, inputs)
 
 
 def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path):
     config = small_config()
     config.model.image.standardize = False
     with pytest.raises(UserError, match=r"standardize = True, .* is False"):
-        embed.open_embeddings(embeddings, config.model)
+        open_embeddings(embeddings, config.model.image)
+    paths = DataPaths((str(data.folder),), None, "records", str(embeddings))
     config = small_config()
     config.data.mirror_probability = 0.5
     with pytest.raises(UserError, match="cannot be mirrored"):
-        image_backbone.loader_arguments(config, [], embeddings)
+        Data.open(config, build(config.model), paths)
     config = small_config()
     config.model.image.freeze = False
     with pytest.raises(UserError, match="freeze is False"):
-        image_backbone.loader_arguments(config, [], embeddings)
+        Data.open(config, build(config.model), paths)
     with pytest.raises(FileNotFoundError, match="radejax embed"):
-        embed.open_embeddings(tmp_path)
+        open_embeddings(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
-    with pytest.raises(DataError, match="other 1"):
-        embed.open_embeddings(tmp_path)
+    with pytest.raises(DataError, match="other version 1"):
+        open_embeddings(tmp_path)
 
 
 def test_weights_that_do_not_fit_are_refused(data, tmp_path):
     config = small_config()
     with pytest.raises(UserError, match="--image_backbone FOLDER"):
-        image_backbone.load_image_backbone(None, config)
+        image_backbone.load_image_backbone(None, build(config.model))
     with pytest.raises(FileNotFoundError, match=r"lacks config.json"):
-        image_backbone.load_image_backbone(tmp_path, config)
+        image_backbone.load_image_backbone(tmp_path, build(config.model))
     config.model.image.num_layers = 12
     with pytest.raises(UserError, match=r"num_layers = 3, .* is 12"):
-        image_backbone.load_image_backbone(data.backbone, config)
-    radar = load_config(f"{CONFIG}:radar")
+        image_backbone.load_image_backbone(data.backbone, build(config.model))
+    radar = build(load_config(f"{CONFIG}:radar").model)
     with pytest.raises(UserError, match="has no camera"):
         image_backbone.load_image_backbone(data.backbone, radar)
     assert image_backbone.load_image_backbone(None, radar) is None
@@ -259,16 +252,13 @@ def test_weights_that_do_not_fit_are_refused(data, tmp_path):
 def test_frames_without_image_are_counted_and_predicted_by_radar(
     data, from_images, caplog
 ):
-    run = experiment.load_run(from_images)
-    frames = list(run.paths.open(run.config, "test"))
-    records = RecordSource(run.paths.records)
-    detector = Detector.from_config(
-        run.config, run.variables, run.grid, score_threshold=0.0
-    )
+    run, own = opened(from_images)
+    frames = list(own.split("test"))
+    detector = Detector.from_loaded(run, score_threshold=0.0)
 
     def boxes(frames):
-        inputs = image_backbone.loader_arguments(run.config, frames)
-        found = predict_dataset(detector, records, frames, 4, inputs=inputs)
+        images = own.images(frames)
+        found = predict_dataset(detector, own.records, frames, 4, images=images)
         return {i: found["box"][found["frame"] == i] for i in range(len(frames))}
 
     seen = boxes(frames)
@@ -278,17 +268,16 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     assert "1 of 4 frames have no front image" in caplog.text
     assert not np.array_equal(half[0], seen[0])
     np.testing.assert_allclose(half[1], seen[1], rtol=1e-4, atol=1e-4)
-    radar = predict_dataset(detector, records, frames[:1], 4)
+    radar = predict_dataset(detector, own.records, frames[:1], 4)
     np.testing.assert_allclose(radar["box"], half[0], rtol=1e-4, atol=1e-4)
 
-    run.config.data.camera.allow_missing = False
+    strict = dataclasses.replace(own.camera, allow_missing=False)
     with pytest.raises(UserError, match="1 of 4 frames"):
-        image_backbone.loader_arguments(run.config, blind)
+        dataclasses.replace(own, camera=strict).images(blind)
 
 
 def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
-    run = experiment.load_run(from_images)
-    frames = list(run.paths.open(run.config, "test"))
+    frames = list(opened(from_images)[1].split("test"))
     path = frames[0].projection_path
     folder = path.parents[1]
     root = tmp_path / "kradar"
@@ -338,9 +327,7 @@ def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
 
 def _example(name, *arguments):
     path = CONFIG.parents[1] / "examples" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     result = CliRunner().invoke(module.main, [str(a) for a in arguments])
     assert result.exit_code == 0, result.output
     return result.stdout
@@ -385,7 +372,7 @@ def test_example_compares_on_another_data_set(
 ):
     run = shutil.copytree(from_images, tmp_path / "run")
     other = shutil.copytree(data.folder, tmp_path / "other")
-    for data in (None, OtherData(data=(str(other),))):
+    for data in (None, Sources(data=(str(other),))):
         evaluate_run(run, num_pictures=0, other=data)
     results = []
     monkeypatch.chdir(other)
@@ -406,13 +393,12 @@ def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
     for image in other.rglob("cam-front*.png"):
         image.unlink()
     with pytest.raises(UserError, match=r"no frame of the test split .* front image"):
-        evaluate_run(from_images, other=OtherData(data=(str(other),)))
+        evaluate_run(from_images, other=Sources(data=(str(other),)))
     assert not (other / "records").exists()
 
 
 def test_example_draws_reference_points(data, from_images, tmp_path):
-    run = experiment.load_run(from_images)
-    frame = run.paths.open(run.config, "test")[0]
+    frame = opened(from_images)[1].split("test")[0]
     files = frame.camera_path, frame.camera_calibration_path
     (label,) = (data.folder / str(frame.sequence)).glob(f"info_label*/{frame.name}.txt")
     out = tmp_path / "points.png"
@@ -435,6 +421,6 @@ def test_embed_command(data, from_images, tmp_path):
     result = CliRunner().invoke(main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout.splitlines()[-1])["embedded"] == 12
-    half = embed.open_embeddings(tmp_path / "out")
+    half = open_embeddings(tmp_path / "out")
     assert half.dtype == np.float32
     assert half.shape == (2, 6, 96)

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax.inference import packed
+from radejax.inference.open import load
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
@@ -141,7 +141,7 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     assert source["split"] == "test"
     for flag, message in (
         ("--roi=wide", "--roi: config.evaluation of the run says that"),
-        ("--split=train", "has results of split test, these are of train: give --out"),
+        ("--split=train", "split is 'test' there and 'train' here; give --out"),
         ("--data=", "--data names no folder"),
         (f"--data={tmp_path / 'nowhere'}", "no such folder"),
     ):
@@ -155,10 +155,10 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
 @pytest.mark.timeout(900)
 def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
     run = undisturbed[0] / "run"
-    expected = packed.load(run)
+    expected = load(run)
     newest = max((run / "checkpoints").glob("[0-9]*"), key=lambda p: int(p.name))
     for path in (run / "checkpoints", newest):
-        found = packed.load(path)
+        found = load(path)
         assert found.model == expected.model
         assert found.grid == expected.grid
         assert found.settings == expected.settings

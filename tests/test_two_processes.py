@@ -12,7 +12,7 @@ import chex
 import numpy as np
 import pytest
 
-from radejax.runs.workdir import load_run
+from radejax.inference.open import load
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
@@ -109,7 +109,7 @@ def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
         [v for _, v in actual], [v for _, v in expected], rtol=1e-5
     )
     chex.assert_trees_all_close(
-        load_run(runs / run).variables, load_run(runs / "one").variables, atol=1e-6
+        load(runs / run).variables, load(runs / "one").variables, atol=1e-6
     )
     assert _aps(runs / run) == _aps(runs / "one")
 

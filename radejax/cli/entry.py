@@ -1,4 +1,7 @@
-"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up."""
+"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up.
+
+JAX and absl are imported by the functions that use them: `--help` should not wait.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,7 @@ import socket
 import sys
 from collections.abc import Iterator, Sequence
 
-import jax
-from absl import flags
-from absl import logging as absl_logging
-
-from radejax.core.errors import DataError, DiskFullError, UserError
+from radejax.core.errors import UserError
 from radejax.core.files import is_no_space
 
 FAILED = 1
@@ -32,16 +31,19 @@ _WRONG_PATH = (
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with one line instead of a traceback for the user's errors.
 
-    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk.
+    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk:
+    see `core.errors`.
 
     Args:
         debug: Let the traceback through.
     """
     try:
         yield
-    except (DataError, DiskFullError) as error:
-        _fail(error, FAILED, debug)
-    except (UserError, *_WRONG_PATH) as error:
+    except ValueError as error:
+        if not hasattr(error, "exit_code"):
+            raise
+        _fail(error, error.exit_code, debug)
+    except _WRONG_PATH as error:
         _fail(error, WRONG_USE, debug)
     except OSError as error:
         if not is_no_space(error):
@@ -66,6 +68,8 @@ def parse_flags(argv: Sequence[str]) -> list[str]:
 
     For `app.run(main, flags_parser=parse_flags)`.
     """
+    from absl import flags
+
     try:
         with exit_codes():
             _check_config_file(argv)
@@ -111,6 +115,8 @@ def join_processes(
         UserError: JAX finds no cluster, and not all arguments are given; or the
             coordinator's port is taken or not reached.
     """
+    import jax
+
     given = [coordinator, num_processes, process_id]
     if None in given and given != [None] * 3:
         raise UserError("give --coordinator, --num_processes and --process_id together")
@@ -155,6 +161,9 @@ def set_up_jax(*, cache: bool = True) -> None:
         cache: Keep compiled programs in the folder that the environment variable
             JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
     """
+    import jax
+    from absl import logging as absl_logging
+
     log = logging.getLogger("radejax")
     if not log.handlers:
         handler = logging.StreamHandler()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pathlib
-from collections.abc import Callable
 from typing import Any
 
 import click
@@ -15,6 +14,12 @@ COUNT = click.IntRange(1)
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
 FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(path_type=pathlib.Path, exists=True)
+
+roots = click.argument("roots", nargs=-1, required=True, type=EXISTING)
+labels = click.option(
+    "--labels", type=EXISTING, help="Folder or zip of a label revision."
+)
+label_version = click.option("--label-version", default="v2.1", show_default=True)
 
 
 class Step(click.ParamType):
@@ -36,19 +41,31 @@ class Step(click.ParamType):
 STEP = Step()
 
 
-class Group(click.Group):
-    """Turns the user's errors into one line and an exit code, for every command."""
+class Command(click.Command):
+    """A command with `--json`, whose user's errors are one line and an exit code.
+
+    `--with_underscores` is understood as `--with-hyphens` is. `--debug`, of the command
+    or before it, lets tracebacks through.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.context_settings["token_normalize_func"] = _hyphenated
+        self.context_settings["help_option_names"] = ["-h", "--help"]
+        self.params.append(
+            click.Option(
+                ["--json", "as_json"], is_flag=True, help="Print the result as JSON."
+            )
+        )
 
     def invoke(self, ctx: click.Context) -> Any:
-        with entry.exit_codes(debug=ctx.params.get("debug", False)):
+        debug = any(c.params.get("debug") for c in (ctx, ctx.find_root()))
+        with entry.exit_codes(debug=debug):
             return super().invoke(ctx)
 
 
-def json_option(command: Callable) -> Callable:
-    """`--json`: the result as one JSON value on standard output, and nothing else."""
-    return click.option(
-        "--json", "as_json", is_flag=True, help="Print the result as JSON."
-    )(command)
+def _hyphenated(name: str) -> str:
+    return name.replace("_", "-")
 
 
 def echo_result(as_json: bool, values: Any, text: str) -> None:

@@ -1,108 +1,105 @@
-"""Labels on radar and camera: the first look at new data, a frame or a sequence."""
+"""`radejax overlay`: labels on radar and camera, a frame or a sequence."""
 
 from __future__ import annotations
 
-import os
 import pathlib
-from collections.abc import Sequence
 from typing import Any
 
-import tqdm
+import click
 
+from radejax.cli import options
 from radejax.core.errors import UserError
-from radejax.core.structures import WIDE_ROI
-from radejax.data.kradar import KRadar
-from radejax.data.kradar.frame import Frame
-from radejax.data.tesseract import project_file, read_projection_npy
-from radejax.runs.evaluate import front_view
-from radejax.visualize import animate, bev, projections
 
 ANIMATIONS = (".gif", ".mp4")
 
 
-def draw_overlay(
+@click.command(cls=options.Command)
+@click.argument("name", metavar="FRAME")
+@click.option("--data", "roots", multiple=True, required=True, type=options.EXISTING)
+@options.labels
+@options.label_version
+@click.option("--out", type=options.FILE, default="overlay.png", show_default=True)
+@click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
+@click.option(
+    "--max-frames", type=options.COUNT, help="Of an animation; all by default."
+)
+def overlay(
     name: str,
-    roots: Sequence[str | os.PathLike],
-    out: str | os.PathLike,
-    *,
-    labels: str | os.PathLike | None = None,
-    version: str = "v2.1",
-    slices: bool = False,
-    max_frames: int | None = None,
-) -> int:
-    """Draws radar map, boxes and camera image of a frame, or of a sequence in motion.
+    roots: tuple[pathlib.Path, ...],
+    labels: pathlib.Path | None,
+    label_version: str,
+    out: pathlib.Path,
+    slices: bool,
+    max_frames: int | None,
+    as_json: bool,
+) -> None:
+    """Draw one frame's labels on radar and camera: the first look at new data.
 
-    Args:
-        name: Sequence and frame, such as "1/00033_00001", or the sequence alone for
-            its first frame, or for all of them if `out` is an animation.
-        roots: K-Radar folders.
-        out: Picture to write; an animation if it ends in .gif or .mp4.
-        labels: Label revision, see `KRadar`.
-        version: Of the labels.
-        slices: Instead draw range-azimuth, range-Doppler and azimuth-elevation planes.
-        max_frames: Of an animation; None: all.
+    FRAME is sequence/radar_lidar, or a sequence: its first frame, or all of them where
+    --out ends in .gif or .mp4.
 
-    Returns:
-        Number of frames drawn.
-
-    Raises:
-        UserError: There is no such frame, or it has neither tesseract nor
-            projection.
+    Example: radejax overlay 1/00033_00001 --data ROOT
     """
+    import tqdm
+
+    from radejax.data.kradar import KRadar
+    from radejax.visualize import animate, bev
+
     sequence, _, frame_name = name.partition("/")
     if not sequence.isdigit():
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
     frames = KRadar(
         roots,
         labels,
-        version=version,
+        version=label_version,
         sequence_numbers=[int(sequence)],
         visibility=None,
     )
-    found = [f for f in frames if frame_name in ("", f.name)]
+    found = [frame for frame in frames if frame_name in ("", frame.name)]
     if not found:
         raise UserError(
             f"no frame {frame_name} in sequence {sequence}; there are "
             f"{frames[0].name} to {frames[-1].name}"
         )
-
-    def draw(frame: Frame) -> Any:
-        projection = read_projection(frame, frames.grid)
-        title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
-        if slices:
-            figure = projections.draw_slices(projection, frames.grid)
-            figure.suptitle(title)
-            return figure
-        image, camera = front_view(frame)
-        scene = bev.Scene(
-            projection,
-            frames.grid,
-            ground_truth=(frame.boxes, list(frame.classes)),
-            roi=WIDE_ROI,
-            image=image,
-            camera=camera,
-            title=title,
-        )
-        return bev.draw_frame(scene)
-
-    if pathlib.Path(out).suffix.lower() not in ANIMATIONS:
-        bev.save_figure(draw(found[0]), out)
-        return 1
-    found = found[:max_frames]
-    animate.animate(map(draw, tqdm.tqdm(found, desc="draw", unit="frame")), out)
-    return len(found)
+    if out.suffix.lower() in ANIMATIONS:
+        found = found[:max_frames]
+        drawn = (_draw(frame, frames.grid, slices) for frame in found)
+        total = len(found)
+        animate.animate(tqdm.tqdm(drawn, "draw", total, unit="frame"), out)
+    else:
+        found = found[:1]
+        bev.save_figure(_draw(found[0], frames.grid, slices), out)
+    options.echo_result(
+        as_json, {"picture": str(out), "frames": len(found)}, f"drew {out}"
+    )
 
 
-def read_projection(frame: Frame, grid: Any) -> Any:
-    """`[R, A, D+E]` float32 projection of a frame: from its tesseract, or the released one.
+def _draw(frame: Any, grid: Any, slices: bool) -> Any:
+    """Figure of one frame: planes of the radar, or radar map and camera image.
 
     Raises:
-        UserError: The frame has neither.
+        UserError: It has neither tesseract nor projection.
     """
-    if frame.tesseract_path is not None:
-        return project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
-    if frame.projection_path is None:
-        raise UserError(f"frame {frame.key} has no tesseract or projection")
-    shape = grid.projection_shape
-    found = read_projection_npy(frame.projection_path, projection_shape=shape)
-    return found.astype("float32")
+    from radejax.core.structures import WIDE_ROI
+    from radejax.data.images import front_view
+    from radejax.data.tesseract import read_projection
+    from radejax.visualize import bev, projections
+    from radejax.visualize.canvas import Scene
+
+    projection = read_projection(frame, grid)
+    title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
+    if slices:
+        figure = projections.draw_slices(projection, grid)
+        figure.suptitle(title)
+        return figure
+    image, camera = front_view(frame)
+    scene = Scene(
+        projection,
+        grid,
+        ground_truth=(frame.boxes, list(frame.classes)),
+        roi=WIDE_ROI,
+        image=image,
+        camera=camera,
+        title=title,
+    )
+    return bev.draw_frame(scene)

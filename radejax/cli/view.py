@@ -1,59 +1,57 @@
-"""A rerun recording of sequences: radar, labels with tracks, camera, detections."""
+"""`radejax view`: a recording of radar, labels with tracks, camera and detections."""
 
 from __future__ import annotations
 
-import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
-import jax
-import numpy as np
-import tqdm
+import click
 
-from radejax.cli.overlay import read_projection
+from radejax.cli import options
 from radejax.core.errors import UserError
-from radejax.data.kradar import KRadar
-from radejax.data.kradar.frame import Frame
-from radejax.runs.evaluate import front_view
-from radejax.visualize.canvas import Scene
-from radejax.visualize.viewer import write_recording
 
 
-def write_view(
-    roots: Sequence[str | os.PathLike],
-    out: str | os.PathLike,
-    *,
-    sequence: int | None = None,
-    labels: str | os.PathLike | None = None,
-    version: str = "v2.1",
-    workdir: str | os.PathLike | None = None,
-    max_frames: int | None = None,
-    elevation_sign: int = 1,
-) -> dict[str, int]:
-    """Records frames for the rerun viewer.
+@click.command(cls=options.Command)
+@options.roots
+@click.option("--out", type=options.FILE, default="recording.rrd", show_default=True)
+@click.option("--sequence", type=int, help="All by default.")
+@options.labels
+@options.label_version
+@click.option(
+    "--workdir", type=options.EXISTING, help="Run whose detections are shown too."
+)
+@click.option("--max-frames", type=options.COUNT, help="All by default.")
+@click.option("--open", "open_it", is_flag=True, help="Open it in the viewer.")
+def view(
+    roots: tuple[pathlib.Path, ...],
+    out: pathlib.Path,
+    sequence: int | None,
+    labels: pathlib.Path | None,
+    label_version: str,
+    workdir: pathlib.Path | None,
+    max_frames: int | None,
+    open_it: bool,
+    as_json: bool,
+) -> None:
+    """Record a sequence for the rerun viewer (extra "viewer").
 
-    Args:
-        roots: K-Radar folders.
-        out: Recording to write, `.rrd`.
-        sequence: The only one to record; all by default.
-        labels: Label revision, see `KRadar`.
-        version: Of the labels.
-        workdir: Run whose detections are shown as well, or None.
-        max_frames: Record only the first so many.
-        elevation_sign: See `visualize.viewer.echo_points`.
+    Frames without tesseract and projection are left out and counted.
 
-    Returns:
-        Counts "frames" recorded and "without_radar": left out, having neither tesseract
-        nor projection.
-
-    Raises:
-        UserError: rerun is not installed, or no frame has a tesseract or a
-            projection.
+    Example: radejax view data/kradar --sequence 5 --out five.rrd --open
     """
-    numbers = None if sequence is None else [sequence]
+    import tqdm
+
+    from radejax.data.kradar import KRadar
+    from radejax.inference.detector import Detector
+    from radejax.visualize.viewer import open_viewer, write_recording
+
     frames = KRadar(
-        roots, labels, version=version, sequence_numbers=numbers, visibility=None
+        roots,
+        labels,
+        version=label_version,
+        sequence_numbers=None if sequence is None else [sequence],
+        visibility=None,
     )
     complete = [f for f in frames if f.tesseract_path or f.projection_path]
     if not complete:
@@ -61,23 +59,28 @@ def write_view(
             f"no tesseract or projection for any of {len(frames)} labelled frames"
         )
     shown = complete[:max_frames]
-    detector = None
-    if workdir is not None:
-        from radejax.inference.detector import Detector
-
-        detector = Detector.from_workdir(pathlib.Path(workdir))
-    entries = viewer_frames(
-        tqdm.tqdm(shown, desc="record", unit="frame"), frames.grid, detector
-    )
-    write_recording(entries, out, elevation_sign=elevation_sign)
-    return {
-        "frames": len(shown),
-        "without_radar": len(frames) - len(complete),
-    }
+    detector = None if workdir is None else Detector.from_workdir(workdir)
+    bar = tqdm.tqdm(shown, desc="record", unit="frame")
+    write_recording(viewer_scenes(bar, frames.grid, detector), out)
+    if open_it:
+        open_viewer(out)
+    text = f"{len(shown)} frames written to {out}"
+    lacking = len(frames) - len(complete)
+    if lacking:
+        text += f"; {lacking} without tesseract or projection left out"
+    values = {"frames": len(shown), "without_radar": lacking, "recording": str(out)}
+    options.echo_result(as_json, values, text)
 
 
-def viewer_frames(frames: Any, grid: Any, detector: Any = None) -> Iterator[Scene]:
-    """What the viewer shows of each frame, read as it is needed."""
+def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:
+    """`Scene` of each frame with radar data, read as it is needed."""
+    import jax
+    import numpy as np
+
+    from radejax.data.images import front_view
+    from radejax.data.tesseract import read_projection
+    from radejax.visualize.canvas import Scene
+
     for frame in frames:
         projection = read_projection(frame, grid)
         image, calibration = front_view(frame)
@@ -100,12 +103,14 @@ def viewer_frames(frames: Any, grid: Any, detector: Any = None) -> Iterator[Scen
         )
 
 
-def track_ids(frame: Frame) -> list[tuple[int, int] | None]:
+def track_ids(frame: Any) -> list[tuple[int, int] | None]:
     """Sequence and track id of each box that the data set keeps: `[N]`.
 
     Boxes are those of some labels, moved to the radar's frame. None where the label
     has no id.
     """
+    import numpy as np
+
     if not len(frame.boxes):
         return []
     centers = np.array([label.box[:3] for label in frame.labels])

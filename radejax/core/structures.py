@@ -125,16 +125,3 @@ class Detections:
         columns = self.to_columns(classes)
         boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
         return pandas.DataFrame({**columns, **boxes})
-
-    def to_kitti(self, classes: Sequence[str] | None = None) -> list[str]:
-        """One text a frame as K-Radar's tools write predictions, without a final newline.
-
-        Raises:
-            UserError: K-Radar has no key for a class.
-
-        References:
-            `radejax.evaluation.files.kitti` describes the lines.
-        """
-        from radejax.evaluation.files.kitti import prediction_texts
-
-        return prediction_texts(self.to_columns(classes), self.is_valid.shape[0])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import chex
 import numpy as np
 
 from radejax.core.errors import UserError
@@ -76,6 +77,15 @@ class Augmentation:
         return sample
 
 
+def make_augmentation(
+    grid: RadarGrid, *, mirror_probability: float, gain_db: float, gain_slope_db: float
+) -> Augmentation | None:
+    """An `Augmentation` of these strengths; None where all are 0."""
+    if not (mirror_probability or gain_db or gain_slope_db):
+        return None
+    return Augmentation(grid, mirror_probability, gain_db, gain_slope_db)
+
+
 def mirror(sample: Sample) -> Sample:
     """Left and right exchanged: y to -y in the radar frame, u to W - u in the image.
 
@@ -94,6 +104,7 @@ def mirror(sample: Sample) -> Sample:
 
 def mirror_boxes(boxes: np.ndarray) -> np.ndarray:
     """Boxes `[..., 8]` on the other side: y and sin yaw change sign."""
+    chex.assert_axis_dimension(boxes, -1, 8)
     return boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype)
 
 
@@ -132,6 +143,7 @@ def add_range_gain(
     Returns:
         `[R, A, D+E]` in the same type; 8-bit values are clipped to their scale.
     """
+    chex.assert_shape(projection, grid.projection_shape)
     db = gain_db + slope_db * grid.range_m / grid.range_m[-1]
     shift = np.float32(db / LOG_SCALE_DB)[:, None, None]
     return encode(decode(projection) + shift, projection.dtype.name)

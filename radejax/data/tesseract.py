@@ -6,14 +6,14 @@ import contextlib
 import math
 import os
 import pathlib
-import struct
 import time
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
+from radejax.data.kradar.frame import Frame
 from radejax.data.projection import project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -49,7 +49,7 @@ def read_tesseract(
             )
         else:
             tesseract = _read_hdf5(path) if _is_hdf5(path) else _read_mat(path)
-    _check(path, tesseract, shape_drea)
+    _check(path, tesseract.dtype, tesseract.shape, shape_drea)
     return tesseract
 
 
@@ -76,10 +76,10 @@ def project_file(
         layout = _parse_mat5(file)
         if layout is not None:
             stored, (doppler, range_, elevation, azimuth) = layout
-            _check(path, np.broadcast_to(stored.type(0), layout[1]), shape_drea)
+            _check(path, *layout, shape_drea)
             slab = np.empty((elevation, range_, doppler), stored)
             columns = _read_slabs(file, slab, azimuth, timings)
-            projection = project_columns(columns, azimuth, dtype=dtype)
+            projection = project_columns(columns, dtype=dtype)
     if layout is None:
         began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)
@@ -136,17 +136,20 @@ def _open(path: str | os.PathLike) -> BinaryIO:
 
 
 def _check(
-    path: str | os.PathLike, tesseract: np.ndarray, shape_drea: tuple[int, ...] | None
+    path: str | os.PathLike,
+    dtype: np.dtype,
+    shape: tuple[int, ...],
+    shape_drea: tuple[int, ...] | None,
 ) -> None:
     """`DataError` unless it is a real tensor of the demanded shape."""
-    if tesseract.ndim != 4 or tesseract.dtype.kind not in "fiu":
+    if len(shape) != 4 or dtype.kind not in "fiu":
         raise DataError(
-            f"{path}: {VARIABLE} has shape {tesseract.shape} of {tesseract.dtype}, "
+            f"{path}: {VARIABLE} has shape {shape} of {dtype}, "
             "expected real numbers [Doppler, range, elevation, azimuth]"
         )
-    if shape_drea is not None and tesseract.shape != tuple(shape_drea):
+    if shape_drea is not None and shape != tuple(shape_drea):
         raise DataError(
-            f"{path}: {VARIABLE} has shape {tesseract.shape}, the sensor's grid demands "
+            f"{path}: {VARIABLE} has shape {shape}, the sensor's grid demands "
             f"{tuple(shape_drea)} (Doppler, range, elevation, azimuth)"
         )
 
@@ -168,8 +171,7 @@ def check_tesseract(
     with _open(path) as file:
         layout = _parse_mat5(file)
     if layout is not None:
-        dtype, shape = layout
-        _check(path, np.broadcast_to(dtype.type(0), shape), shape_drea)
+        _check(path, *layout, shape_drea)
 
 
 def read_projection_npy(
@@ -229,6 +231,19 @@ def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
     return project_file(path, shape_drea=grid.shape_drea)
 
 
+def read_projection(frame: Frame, grid: RadarGrid) -> np.ndarray:
+    """`[R, A, D+E]` float32 projection of a frame: from its tesseract, or the released one.
+
+    Raises:
+        UserError: The frame has neither.
+        FileNotFoundError, DataError: As `read_frame`.
+    """
+    path = frame.tesseract_path or frame.projection_path
+    if path is None:
+        raise UserError(f"frame {frame.key} has no tesseract or projection")
+    return read_frame(path, grid)
+
+
 def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:
     """Type and shape of an uncompressed little-endian v5 file that holds `arrDREA`.
 
@@ -238,35 +253,21 @@ def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:
     head = file.read(200)
     if len(head) < 200 or head[124:128] != b"\x00\x01IM":
         return None
-    (
-        *tags,
-        dims_tag,
-        dims_size,
-        d,
-        r,
-        e,
-        a,
-        name_tag,
-        name_size,
-        name,
-        data_tag,
-        data_size,
-    ) = struct.unpack_from("<II III4x II4i II8s II", head, 128)
-    matrix_tag, _, flags_tag, flags_size, flags = tags
-    shape = (d, r, e, a)
-    dtype = _MI_FLOATS.get(data_tag)
+    # Tag, size and content of the matrix, its flags, dimensions, name and numbers.
+    words = np.frombuffer(head, "<u4", count=18, offset=128).tolist()
+    shape, dtype = tuple(words[8:12]), _MI_FLOATS.get(words[16])
     if (
-        (matrix_tag, flags_tag, flags_size) != (_MI_MATRIX, _MI_UINT32, 8)
-        or flags & _COMPLEX
-        or (dims_tag, dims_size) != (_MI_INT32, 16)
-        or (name_tag, name_size) != (_MI_INT8, len(VARIABLE))
-        or name != VARIABLE.encode().ljust(8, b"\0")
+        (words[0], *words[2:4]) != (_MI_MATRIX, _MI_UINT32, 8)
+        or words[4] & _COMPLEX
+        or words[6:8] != [_MI_INT32, 16]
+        or words[12:14] != [_MI_INT8, len(VARIABLE)]
+        or head[184:192] != VARIABLE.encode().ljust(8, b"\0")
         or dtype is None
         or min(shape) < 1
-        or data_size != dtype.itemsize * math.prod(shape)
+        or words[17] != dtype.itemsize * math.prod(shape)
     ):
         return None
-    size, needed = os.fstat(file.fileno()).st_size, file.tell() + data_size
+    size, needed = os.fstat(file.fileno()).st_size, file.tell() + words[17]
     if size < needed:
         raise DataError(
             f"{file.name}: truncated: {size} bytes, {VARIABLE} of shape {shape} needs "

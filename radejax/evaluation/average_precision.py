@@ -6,13 +6,12 @@ the same predictions (protocols, weathers, resamples) builds an `EvaluationSet` 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-import numpy as np
+from collections.abc import Sequence
 
 from radejax.core.structures import CLASSES
-from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
-from radejax.evaluation.protocols import PROTOCOLS, RECOMMENDED
+from radejax.evaluation.columns import Columns
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT, PROTOCOLS, RECOMMENDED
 from radejax.evaluation.result import SPACES, Result, mean_ap
 
 __all__ = [
@@ -28,13 +27,13 @@ __all__ = [
 
 
 def evaluate(
-    ground_truth: Mapping[str, np.ndarray],
-    predictions: Mapping[str, np.ndarray],
+    ground_truth: Columns,
+    predictions: Columns,
     *,
     classes: Sequence[str] = CLASSES,
     iou_thresholds: Sequence[float] | float = (0.3,),
     protocol: str = "kradar_r40",
-    frames: Mapping[str, np.ndarray] | None = None,
+    frames: Columns | None = None,
     skip_empty: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
     roi: str | Sequence[float] | None = None,

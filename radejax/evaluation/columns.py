@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import CLASSES, NARROW_ROI, WIDE_ROI
+from radejax.core.structures import BOX_FIELDS, CLASSES, NARROW_ROI, WIDE_ROI
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not asked for are ignored."""
@@ -21,7 +21,8 @@ KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
 """Regions of interest: x, y, z bounds in metres, inclusive, for box centers (ego)."""
 
-BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
+Columns = Mapping[str, np.ndarray]
+"""A table: frames, ground truth or predictions by the name of the column."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,13 +89,11 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
     if isinstance(roi, str):
         return roi
     bounds = tuple(float(value) for value in np.asarray(roi).reshape(-1))
-    for name, known in ROIS.items():
-        if bounds == known:
-            return name
-    return ",".join(f"{value:g}" for value in bounds)
+    names = {known: name for name, known in ROIS.items()}
+    return names.get(bounds) or ",".join(f"{value:g}" for value in bounds)
 
 
-def frame_ids(frames: Mapping[str, np.ndarray]) -> np.ndarray:
+def frame_ids(frames: Columns) -> np.ndarray:
     """`[F]` ids of a frame table, checked to be integers without repetition."""
     if "frame" not in frames:
         raise UserError(f"frames need a column 'frame', found {sorted(frames)}")
@@ -113,8 +112,13 @@ def frame_ids(frames: Mapping[str, np.ndarray]) -> np.ndarray:
     return ids
 
 
+def wanted_columns(scored: bool) -> tuple[str, ...]:
+    """Names of the columns of ground truth or, `scored`, of predictions."""
+    return ("frame", "box", "cls", "score")[: 4 if scored else 3]
+
+
 def read_columns(
-    table: Mapping[str, np.ndarray], *, name: str, scored: bool
+    table: Columns, *, name: str, scored: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Frame `[N]`, box `[N, 7]`, class name `[N]`, score `[N]` of a column table.
 
@@ -123,8 +127,7 @@ def read_columns(
         DataError: A value no box may have, named by frame and row: not finite, a size
             that is not positive, a score outside [0, 1].
     """
-    wanted = ("frame", "box", "cls", "score") if scored else ("frame", "box", "cls")
-    missing = [column for column in wanted if column not in table]
+    missing = [column for column in wanted_columns(scored) if column not in table]
     if missing:
         raise UserError(f"{name} lack the columns {missing}; found {sorted(table)}")
     frame = _integers(table["frame"], name)
@@ -148,34 +151,23 @@ def read_columns(
             raise UserError(
                 f"{name}: column {column!r} has shape {values.shape}, expected ({num},)"
             )
-    _check_values(frame, box, score, name, scored)
-    return frame, box, cls, score
-
-
-def _check_values(
-    frame: np.ndarray, box: np.ndarray, score: np.ndarray, name: str, scored: bool
-) -> None:
-    """Raise for the first row with a value that no box may have."""
-    bad = ~np.isfinite(box)
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise DataError(
-            f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[column]} of the box is"
-            f" {box[row, column]}, expected a finite number"
-        )
-    bad = box[:, 3:6] <= 0
-    if bad.any():
-        row, column = np.argwhere(bad)[0]
-        raise DataError(
-            f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[3 + column]} of the box"
-            f" is {box[row, 3 + column]:g} m, expected a size above 0"
-        )
+    for bad, first, must in (
+        (~np.isfinite(box), 0, "is {}, expected a finite number"),
+        (box[:, 3:6] <= 0, 3, "is {:g} m, expected a size above 0"),
+    ):
+        if bad.any():
+            row, column = np.argwhere(bad)[0] + (0, first)
+            raise DataError(
+                f"{name}: frame {frame[row]}, row {row}: {BOX_FIELDS[column]} of the box "
+                + must.format(box[row, column])
+            )
     bad = ~((score >= 0) & (score <= 1))
-    if scored and bad.any():
-        row = int(np.flatnonzero(bad)[0])
+    if bad.any():
+        row = int(np.argmax(bad))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: score {score[row]} is outside [0, 1]"
         )
+    return frame, box, cls, score
 
 
 def _integers(column: np.ndarray, name: str) -> np.ndarray:
@@ -204,21 +196,15 @@ def class_indices(
     Raises:
         DataError: A class name that is neither asked for nor one of K-Radar's.
     """
+    index_of = dict.fromkeys((*classes, *KNOWN_CLASSES), -1)
+    index_of |= {name: i for i, name in enumerate(classes)}
     names, inverse = np.unique(cls, return_inverse=True)
-    index = np.array(
-        [
-            classes.index(n) if n in classes else -1 if n in KNOWN_CLASSES else -2
-            for n in names.tolist()
-        ],
-        np.int64,
-    )
-    index = index[inverse] if names.size else np.zeros(0, np.int64)
+    index = np.array([index_of.get(n, -2) for n in names.tolist()], np.int64)[inverse]
     if (index == -2).any():
-        row = int(np.flatnonzero(index == -2)[0])
-        known = ", ".join(dict.fromkeys((*classes, *KNOWN_CLASSES)))
+        row = int(np.argmax(index == -2))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: unknown class {str(cls[row])!r};"
-            f" known: {known}"
+            f" known: {', '.join(index_of)}"
         )
     return index
 
@@ -234,7 +220,7 @@ def dense_frames(frame: np.ndarray, ids: np.ndarray, *, name: str) -> np.ndarray
     position = np.minimum(position, max(ids.size - 1, 0))
     known = ids[order][position] == frame if ids.size else np.zeros(frame.size, bool)
     if not known.all():
-        row = int(np.flatnonzero(~known)[0])
+        row = int(np.argmin(known))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: no such frame among the"
             f" {ids.size} frames that are evaluated"

@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.evaluation import columns as tables
-from radejax.evaluation import matching, overlap, protocols
+from radejax.evaluation import columns, matching, overlap, protocols
+from radejax.evaluation.columns import Columns
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT, Curve, Protocol
 from radejax.evaluation.result import SPACES, Result
 
-PROTOCOL_DEFAULT = "protocol"
+# Scores [K], falling; frames [K]; how many true positives (or matches) each adds [K].
+Falling = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class Terms(NamedTuple):
+    """What one AP of a class is asked in: protocol, "bev" or "3d", IoU, score cut."""
+
+    protocol: Protocol
+    space: str
+    iou: float
+    score_threshold: float = 0.0
 
 
 class EvaluationSet:
@@ -31,24 +44,24 @@ class EvaluationSet:
 
     def __init__(
         self,
-        ground_truth: Mapping[str, np.ndarray],
-        predictions: Mapping[str, np.ndarray],
+        ground_truth: Columns,
+        predictions: Columns,
         *,
         classes: Sequence[str] = CLASSES,
-        frames: Mapping[str, np.ndarray] | None = None,
+        frames: Columns | None = None,
         roi: str | Sequence[float] | None = None,
         label_version: str | None = None,
     ) -> None:
         """See `evaluate` for the arguments."""
         self.classes = _check_classes(classes)
-        self.roi = tables.roi_name(roi)
+        self.roi = columns.roi_name(roi)
         self.label_version = label_version
-        truth = tables.read_columns(ground_truth, name="ground truth", scored=False)
-        found = tables.read_columns(predictions, name="predictions", scored=True)
+        truth = columns.read_columns(ground_truth, name="ground truth", scored=False)
+        found = columns.read_columns(predictions, name="predictions", scored=True)
         if frames is None:
             self.frame = np.unique(np.concatenate([truth[0], found[0]]))
         else:
-            self.frame = tables.frame_ids(frames)
+            self.frame = columns.frame_ids(frames)
         self.left_out: dict[str, int] = {}
         self.gt = self._select(truth, "ground truth", roi)
         self.pred = self._select(found, "predictions", roi)
@@ -63,22 +76,22 @@ class EvaluationSet:
         ).reshape(self.frame.size, num_classes)
         self._overlaps: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._matches: dict[tuple, object] = {}
-        self._parts: dict[tuple, dict[str, np.ndarray]] = {}
+        self._parts: dict[tuple, list[Falling]] = {}
 
-    def _select(self, columns: tuple, name: str, roi: object) -> tables.Objects:
+    def _select(self, table: tuple, name: str, roi: object) -> columns.Objects:
         """Boxes of the evaluated classes in the region, sorted; counts the others."""
-        frame, box, cls_name, score = columns
-        dense = tables.dense_frames(frame, self.frame, name=name)
-        cls = tables.class_indices(cls_name, frame, self.classes, name=name)
+        frame, box, cls_name, score = table
+        dense = columns.dense_frames(frame, self.frame, name=name)
+        cls = columns.class_indices(cls_name, frame, self.classes, name=name)
         wanted = cls >= 0
-        inside = tables.in_roi(box, roi)
+        inside = columns.in_roi(box, roi)
         self.left_out[f"{name}: class not evaluated"] = int((~wanted).sum())
         self.left_out[f"{name}: center outside the region of interest"] = int(
             (wanted & ~inside).sum()
         )
         row = np.flatnonzero(wanted & inside)
         row = row[np.lexsort((row, cls[row], dense[row]))]
-        return tables.Objects(dense[row], box[row], cls[row], score[row], row)
+        return columns.Objects(dense[row], box[row], cls[row], score[row], row)
 
     # Shared work ---------------------------------------------------------------------
 
@@ -104,7 +117,7 @@ class EvaluationSet:
         # The original stores overlaps in single and compares them in double precision.
         return tuple(iou.astype(np.float32).astype(np.float64) for iou in (bev, iou_3d))
 
-    def match(self, protocol: protocols.Protocol, space: str, iou: float) -> object:
+    def match(self, protocol: Protocol, space: str, iou: float) -> object:
         """Matches of all frames and classes: `KradarMatches` or `[M]` object or -1."""
         geometry = protocol.geometry
         if geometry == "exchanged_top" and space == "bev":
@@ -112,18 +125,21 @@ class EvaluationSet:
         key = (geometry, protocol.matching, space, iou)
         if key not in self._matches:
             values = self.overlaps(geometry)[SPACES.index(space)]
-            pairs = (self.pair_pred, self.pair_gt, values, self.pred.score)
+            pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
+            score = self.pred.score
             if protocol.matching == "kradar":
-                match = matching.match_kradar(*pairs, self.gt_group, iou)
+                match = matching.match_kradar(pairs, score, self.gt_group, iou)
             elif protocol.matching == "best":
-                match = matching.match_best(*pairs, iou)
+                match = matching.match_best(pairs, score, iou)
             else:
-                match = matching.match_free(*pairs, self.pred_group, len(self.gt), iou)
+                match = matching.match_free(
+                    pairs, score, self.pred_group, len(self.gt), iou
+                )
             self._matches[key] = match
         return self._matches[key]
 
     @functools.cached_property
-    def _by_score(self) -> list[np.ndarray]:
+    def by_score(self) -> list[np.ndarray]:
         """Predictions of every class by falling score, ties by the caller's row."""
         order = np.lexsort((self.pred.row, -self.pred.score))
         return [order[self.pred.cls[order] == c] for c in range(len(self.classes))]
@@ -170,137 +186,97 @@ class EvaluationSet:
             curves: Keep the precision, recall and score arrays.
         """
         chosen = protocols.get_protocol(protocol)
-        skip = chosen.skip_empty if skip_empty == PROTOCOL_DEFAULT else skip_empty
+        skip = chosen.frame_rule(skip_empty)
         spaces = (spaces,) if isinstance(spaces, str) else tuple(spaces)
         if not set(spaces) <= set(SPACES):
             raise UserError(f"spaces must be among {SPACES}, got {spaces}")
         frame_weights = self.frame_weights(skip, weights)
-        empty = np.zeros(0)
+        points = () if curves else ("precision", "recall", "score")
+        dropped = dict.fromkeys(points, np.zeros(0))
         results = []
-        for space in spaces:
-            for iou in _check_ious(iou_thresholds):
-                for index, name in enumerate(self.classes):
-                    weight = frame_weights[:, index]
-                    curve = self.curve(
-                        chosen, space, iou, index, weight, score_threshold
-                    )
-                    kept = (curve.precision, curve.recall, curve.score)
-                    results.append(
-                        Result(
-                            name,
-                            space,
-                            iou,
-                            curve.ap,
-                            curve.num_gt,
-                            curve.num_det,
-                            chosen.name,
-                            int((weight > 0).sum()),
-                            float(score_threshold),
-                            skip,
-                            self.roi,
-                            self.label_version,
-                            *(kept if curves else (empty, empty, empty)),
-                        )
-                    )
+        for space, iou, (index, name) in itertools.product(
+            spaces, _check_ious(iou_thresholds), enumerate(self.classes)
+        ):
+            weight = frame_weights[:, index]
+            terms = Terms(chosen, space, iou, float(score_threshold))
+            curve = self.curve(terms, index, weight)
+            result = Result(
+                cls=name,
+                space=space,
+                iou=iou,
+                protocol=chosen.name,
+                num_frames=int((weight > 0).sum()),
+                score_threshold=terms.score_threshold,
+                skip_empty=skip,
+                roi=self.roi,
+                label_version=self.label_version,
+                **(vars(curve) | dropped),
+            )
+            results.append(result)
         return results
 
     def curve(
         self,
-        protocol: protocols.Protocol,
-        space: str,
-        iou: float,
+        terms: Terms,
         cls: int,
         weight: np.ndarray,
-        score_threshold: float = 0.0,
         among: np.ndarray | None = None,
-    ) -> protocols.Curve:
+    ) -> Curve:
         """Curve and AP of one class over frames with integer weights `[F]`.
 
         `among` is a `[F]` mask outside which all weights are zero: many questions about
         few frames (resamples of a condition) are answered faster with it.
         """
-        parts = self._sorted_parts(
-            protocol, space, iou, cls, float(score_threshold), among
+        (score, frame, is_tp), *steps = self._falling(terms, cls, among)
+        num_gt, curve = int(weight @ self.gt_count[:, cls]), terms.protocol.curve
+        det_weight = weight[frame]
+        if terms.protocol.matching == "kradar":
+            matched, events = ((s, count * weight[f]) for s, f, count in steps)
+            made = (score, det_weight)
+            return protocols.kradar_curve(matched, events, made, num_gt, curve)
+        return protocols.pooled_curve(
+            score=score, is_tp=is_tp, weight=det_weight, num_gt=num_gt, curve=curve
         )
-        num_gt = int(weight @ self.gt_count[:, cls])
-        det_weight = weight[parts["frame"]]
-        if protocol.matching != "kradar":
-            return protocols.pooled_curve(
-                score=parts["score"],
-                is_tp=parts["is_tp"],
-                weight=det_weight,
-                num_gt=num_gt,
-                curve=protocol.curve,
-            )
-        return protocols.kradar_curve(
-            matched_score=parts["first_score"],
-            matched_weight=weight[parts["first_frame"]],
-            event_score=parts["event_score"],
-            event_delta=parts["event_delta"] * weight[parts["event_frame"]],
-            det_score=parts["score"],
-            det_weight=det_weight,
-            num_gt=num_gt,
-            samples=protocol.curve,
-        )
-
-    def _sorted_parts(
-        self,
-        protocol: protocols.Protocol,
-        space: str,
-        iou: float,
-        cls: int,
-        score_threshold: float,
-        among: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
-        """What a curve of one class needs, sorted by falling score, for any weights."""
-        where = None if among is None else among.tobytes()
-        key = (protocol.geometry, protocol.matching, space, iou, cls, score_threshold)
-        if (key, where) in self._parts:
-            return self._parts[key, where]
-        if among is not None:
-            parts = self._sorted_parts(protocol, space, iou, cls, score_threshold, None)
-            self._parts[key, where] = _parts_among(parts, among)
-            return self._parts[key, where]
-        score, frame = self.pred.score, self.pred.frame
-        order = self._by_score[cls]
-        if protocol.matching == "kradar" or score_threshold != 0:
-            order = order[score[order] > score_threshold]
-        parts = {"score": score[order], "frame": frame[order]}
-        match = self.match(protocol, space, iou)
-        if protocol.matching != "kradar":
-            parts["is_tp"] = match[order] >= 0
-        else:
-            first = self._falling(match.first_pred, cls, score_threshold)
-            event = self._falling(match.event_pred, cls, score_threshold)
-            for name, rows in (("first", first), ("event", event)):
-                pred = getattr(match, f"{name}_pred")[rows]
-                parts[f"{name}_score"], parts[f"{name}_frame"] = (
-                    score[pred],
-                    frame[pred],
-                )
-            parts["event_delta"] = match.event_delta[event]
-        self._parts[key, where] = parts
-        return parts
 
     def _falling(
-        self, pred: np.ndarray, cls: int, score_threshold: float
-    ) -> np.ndarray:
-        """Positions of a class's predictions above the score cut, by falling score."""
-        which = np.flatnonzero(
-            (self.pred.cls[pred] == cls) & (self.pred.score[pred] > score_threshold)
-        )
-        return which[np.argsort(-self.pred.score[pred[which]], kind="stable")]
+        self, terms: Terms, cls: int, among: np.ndarray | None
+    ) -> list[Falling]:
+        """What a curve of one class needs by falling score, for any weights.
 
+        Predictions with what they found; in K-Radar's protocols then the matches of the
+        first pass and the steps of the second.
+        """
+        protocol, *others = terms
+        where = None if among is None else among.tobytes()
+        key = (protocol.geometry, protocol.matching, *others, cls, where)
+        if key in self._parts:
+            return self._parts[key]
+        if among is not None:
+            whole = self._falling(terms, cls, None)
+            parts = [tuple(v[among[part[1]]] for v in part) for part in whole]
+        else:
+            match, mine = self.match(*terms[:3]), self.by_score[cls]
+            if protocol.matching == "kradar":
+                first, event = match.first_pred, match.event_pred
+                counts = [(pred, np.ones_like(pred)) for pred in (mine, first)]
+                counts.append((event, match.event_delta))
+                cut = terms.score_threshold
+            else:  # a cut of 0 keeps all, scores of 0 too
+                counts = [(mine, match[mine] >= 0)]
+                cut = terms.score_threshold or -1.0
+            parts = [self._sorted(pred, count, cls, cut) for pred, count in counts]
+        self._parts[key] = parts
+        return parts
 
-def _parts_among(
-    parts: dict[str, np.ndarray], among: np.ndarray
-) -> dict[str, np.ndarray]:
-    """The entries of `_sorted_parts` that lie in the frames of a mask."""
-    inside = {name: among[parts[name]] for name in parts if name.endswith("frame")}
-    return {
-        name: values[inside.get(f"{name.rpartition('_')[0]}_frame", inside["frame"])]
-        for name, values in parts.items()
-    }
+    def _sorted(
+        self, pred: np.ndarray, count: np.ndarray, cls: int, cut: float
+    ) -> Falling:
+        """Counts at predictions of a class above the score cut, by falling score."""
+        keep = (self.pred.cls[pred] == cls) & (self.pred.score[pred] > cut)
+        pred, count = pred[keep], count[keep]
+        order = np.argsort(-self.pred.score[pred], kind="stable")
+        pred = pred[order]
+        return self.pred.score[pred], self.pred.frame[pred], count[order]
 
 
 def _check_classes(classes: Sequence[str]) -> tuple[str, ...]:

@@ -1,20 +1,41 @@
 """Assigning predictions to ground truth: every frame and class at the same time.
 
-Pairs are given as two index arrays (prediction, ground truth) with an IoU each. Boxes
-of different groups (a group is one class in one frame) never meet in a pair, so one
-round serves the r-th box of every group at once, and the number of rounds is the
-largest number of boxes in a group, not the number of boxes.
+Boxes of different groups (a group is one class in one frame) never meet in a pair, so one
+round serves the r-th box of every group at once, and the number of rounds is the largest
+number of boxes in a group, not the number of boxes.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import NamedTuple
 
+import chex
 import numpy as np
 from scipy import sparse
 
+from radejax.evaluation.overlap import ranges
+
 VIRTUAL_PAIRS_PER_CHUNK = 2_000_000
+
+
+class Pairs(NamedTuple):
+    """Boxes of one group that may overlap.
+
+    Attributes:
+        pred: `[P]` prediction of every pair.
+        gt: `[P]` ground truth of every pair.
+        iou: `[P]` overlap of every pair.
+    """
+
+    pred: np.ndarray
+    gt: np.ndarray
+    iou: np.ndarray
+
+    def take(self, index: np.ndarray) -> Pairs:
+        """The pairs that `index` (positions or mask) selects."""
+        return Pairs(*(column[index] for column in self))
 
 
 def greedy(
@@ -36,13 +57,12 @@ def greedy(
     Returns:
         `[K]` positions of the chosen pairs.
     """
+    chex.assert_equal_shape((claimant, target, preference, group))
     if claimant.size == 0:
         return np.zeros(0, np.int64)
     order = np.lexsort((target, -preference, claimant, group))
-    new_group = np.ones(order.size, bool)
-    new_group[1:] = group[order][1:] != group[order][:-1]
-    first = new_group.copy()  # a claimant may occur in several groups
-    first[1:] |= claimant[order][1:] != claimant[order][:-1]
+    new_group = _is_new(group[order])
+    first = new_group | _is_new(claimant[order])  # a claimant may be in several groups
     number = np.cumsum(first) - 1  # [P] running number of the claimant
     rank = number - np.maximum.accumulate(np.where(new_group, number, 0))
     by_rank = np.argsort(rank, kind="stable")
@@ -58,6 +78,15 @@ def greedy(
         taken[target[won]] = True
         chosen.append(won)
     return np.concatenate(chosen)
+
+
+def _is_new(*columns: np.ndarray) -> np.ndarray:
+    """`[K]` bool: entries that differ from the one before in any column."""
+    new = np.zeros(columns[0].size, bool)
+    new[:1] = True
+    for column in columns:
+        new[1:] |= column[1:] != column[:-1]
+    return new
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +108,7 @@ class KradarMatches:
 
 
 def match_kradar(
-    pred: np.ndarray,
-    gt: np.ndarray,
-    iou: np.ndarray,
-    score: np.ndarray,
-    gt_group: np.ndarray,
-    threshold: float,
+    pairs: Pairs, score: np.ndarray, gt_group: np.ndarray, threshold: float
 ) -> KradarMatches:
     """Both passes of K-Radar's matching.
 
@@ -95,36 +119,29 @@ def match_kradar(
     thresholds, frames or frame weights costs only a sum.
 
     Args:
-        pred: `[P]` prediction of every pair.
-        gt: `[P]` ground truth of every pair.
-        iou: `[P]` overlap of every pair.
+        pairs: Predictions and ground truths that may overlap.
         score: `[M]` scores of the predictions.
         gt_group: `[N]` group of every ground truth.
         threshold: A match needs an IoU above this.
     """
-    keep = iou > threshold
-    pred, gt, iou = pred[keep], gt[keep], iou[keep]
-    chosen = greedy(gt, pred, score[pred], gt_group[gt], score.size)
-    event_pred, event_delta = _second_pass(pred, gt, iou, score)
-    return KradarMatches(gt[chosen], pred[chosen], event_pred, event_delta)
+    pairs = pairs.take(pairs.iou > threshold)
+    preference = score[pairs.pred]
+    chosen = greedy(pairs.gt, pairs.pred, preference, gt_group[pairs.gt], score.size)
+    first = pairs.take(chosen)
+    return KradarMatches(first.gt, first.pred, *_second_pass(pairs, score))
 
 
-def _second_pass(
-    pred: np.ndarray, gt: np.ndarray, iou: np.ndarray, score: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _second_pass(pairs: Pairs, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """True positives as steps over the score threshold."""
-    if pred.size == 0:
+    if pairs.pred.size == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    component, num_gt = _components(pred, gt)
-    lone = num_gt[component] == 1
+    component, num_gt = _components(pairs.pred, pairs.gt)
+    is_lone = num_gt[component] == 1
     # A ground truth that shares no prediction is found once its best score is reached.
-    order = np.lexsort((-score[pred[lone]], gt[lone]))
-    first = np.unique(gt[lone][order], return_index=True)[1]
-    lone_pred = pred[lone][order][first]
-    shared = ~lone
-    step_pred, step_delta = _steps(
-        pred[shared], gt[shared], iou[shared], score, component[shared]
-    )
+    lone = pairs.take(is_lone)
+    order = np.lexsort((-score[lone.pred], lone.gt))
+    lone_pred = lone.pred[order][_is_new(lone.gt[order])]
+    step_pred, step_delta = _steps(pairs.take(~is_lone), score, component[~is_lone])
     return (
         np.concatenate([lone_pred, step_pred]),
         np.concatenate([np.ones(lone_pred.size, np.int64), step_delta]),
@@ -144,59 +161,39 @@ def _components(pred: np.ndarray, gt: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _steps(
-    pred: np.ndarray,
-    gt: np.ndarray,
-    iou: np.ndarray,
-    score: np.ndarray,
-    component: np.ndarray,
+    pairs: Pairs, score: np.ndarray, component: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Second pass where ground truths compete: once per distinct score in a component."""
-    if pred.size == 0:
+    if component.size == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     order = np.argsort(component, kind="stable")
-    pred, gt, iou, component = pred[order], gt[order], iou[order], component[order]
+    (pred, gt, iou), component = pairs.take(order), component[order]
     # Levels: distinct (component, score), scores falling.
     rows = np.lexsort((pred, -score[pred], component))
-    new = np.ones(rows.size, bool)
-    new[1:] = (component[rows][1:] != component[rows][:-1]) | (
-        score[pred[rows]][1:] != score[pred[rows]][:-1]
-    )
-    level_pred, level_component = pred[rows][new], component[rows][new]
+    rows = rows[_is_new(component[rows], score[pred[rows]])]
+    level_pred, level_component = pred[rows], component[rows]
     first = np.searchsorted(component, level_component, side="left")
     count = np.searchsorted(component, level_component, side="right") - first
     true_positives = np.zeros(level_pred.size, np.int64)
     chunk = np.cumsum(count) // VIRTUAL_PAIRS_PER_CHUNK
     bounds = np.flatnonzero(np.diff(chunk, prepend=-1, append=chunk[-1] + 1))
     for low, high in itertools.pairwise(bounds):
-        part = count[low:high]
-        level = np.repeat(np.arange(high - low), part)
-        pair = np.arange(level.size) - np.repeat(np.cumsum(part) - part, part)
-        pair += np.repeat(first[low:high], part)
+        level, pair = ranges(first[low:high], count[low:high])
         enters = score[pred[pair]] >= score[level_pred[low:high]][level]
         level, pair = level[enters], pair[enters]
         # Every level is a world of its own: number its predictions anew.
         target = np.unique(level * score.size + pred[pair], return_inverse=True)[1]
         won = greedy(gt[pair], target, iou[pair], level, target.max() + 1)
         true_positives[low:high] = np.bincount(level[won], minlength=high - low)
-    same = np.zeros(level_pred.size, bool)
-    same[1:] = level_component[1:] == level_component[:-1]
-    before = np.where(same, np.roll(true_positives, 1), 0)
+    before = np.where(_is_new(level_component), 0, np.roll(true_positives, 1))
     return level_pred, true_positives - before
 
 
-def match_best(
-    pred: np.ndarray,
-    gt: np.ndarray,
-    iou: np.ndarray,
-    score: np.ndarray,
-    threshold: float,
-) -> np.ndarray:
+def match_best(pairs: Pairs, score: np.ndarray, threshold: float) -> np.ndarray:
     """RADE-Net's rule: a prediction may only take its own best ground truth.
 
     Args:
-        pred: `[P]` prediction of every pair.
-        gt: `[P]` ground truth of every pair.
-        iou: `[P]` overlap of every pair.
+        pairs: Predictions and ground truths that may overlap.
         score: `[M]` scores of the predictions.
         threshold: A match needs an IoU above this.
 
@@ -205,21 +202,14 @@ def match_best(
         (the first on a tie), taken or not; of the predictions that want the same one,
         the highest score gets it (the first on a tie).
     """
-    matched = np.full(score.size, -1)
-    order = np.lexsort((gt, -iou, pred))
-    best = order[np.unique(pred[order], return_index=True)[1]]
-    best = best[iou[best] > threshold]
-    order = np.lexsort((pred[best], -score[pred[best]], gt[best]))
-    best = best[order]
-    winner = best[np.unique(gt[best], return_index=True)[1]]
-    matched[pred[winner]] = gt[winner]
-    return matched
+    best = pairs.take(np.lexsort((pairs.gt, -pairs.iou, pairs.pred)))
+    best = best.take(_is_new(best.pred) & (best.iou > threshold))
+    best = best.take(np.lexsort((best.pred, -score[best.pred], best.gt)))
+    return _matched(best.take(_is_new(best.gt)), score.size)
 
 
 def match_free(
-    pred: np.ndarray,
-    gt: np.ndarray,
-    iou: np.ndarray,
+    pairs: Pairs,
     score: np.ndarray,
     pred_group: np.ndarray,
     num_gt: int,
@@ -228,9 +218,7 @@ def match_free(
     """The plain rule: by falling score, each prediction takes the best free object.
 
     Args:
-        pred: `[P]` prediction of every pair.
-        gt: `[P]` ground truth of every pair.
-        iou: `[P]` overlap of every pair.
+        pairs: Predictions and ground truths that may overlap.
         score: `[M]` scores of the predictions.
         pred_group: `[M]` group (frame and class) of every prediction.
         num_gt: Number of ground truths.
@@ -239,11 +227,16 @@ def match_free(
     Returns:
         `[M]` matched ground truth or -1.
     """
-    keep = iou > threshold
-    pred, gt, iou = pred[keep], gt[keep], iou[keep]
+    pairs = pairs.take(pairs.iou > threshold)
     turn = np.empty(score.size, np.int64)
     turn[np.argsort(-score, kind="stable")] = np.arange(score.size)
-    chosen = greedy(turn[pred], gt, iou, pred_group[pred], num_gt)
-    matched = np.full(score.size, -1)
-    matched[pred[chosen]] = gt[chosen]
+    group = pred_group[pairs.pred]
+    chosen = greedy(turn[pairs.pred], pairs.gt, pairs.iou, group, num_gt)
+    return _matched(pairs.take(chosen), score.size)
+
+
+def _matched(pairs: Pairs, num_pred: int) -> np.ndarray:
+    """`[M]` ground truth of each prediction in the pairs, -1 of all others."""
+    matched = np.full(num_pred, -1)
+    matched[pairs.pred] = pairs.gt
     return matched

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import chex
 import numpy as np
 
 from radejax.geometry.rotated_iou import bev_intersection_np
@@ -25,6 +26,7 @@ def candidate_pairs(
     Returns:
         Two `[P]` index arrays, ordered by a, then b.
     """
+    chex.assert_shape([box_a, box_b], (None, 7))
     first = np.searchsorted(group_b, group_a, side="left")
     count = np.searchsorted(group_b, group_a, side="right") - first
     # Half diagonals; 3 cm of slack for boxes that a protocol rounds to centimetres.
@@ -35,19 +37,22 @@ def candidate_pairs(
         ends, np.arange(0, ends[-1] if ends.size else 0, PAIRS_PER_CHUNK)
     )
     bounds = np.unique(np.concatenate([[0], cuts, [count.size]]))
-    parts_a, parts_b = [], []
+    parts_a, parts_b = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for low, high in itertools.pairwise(bounds):
-        part = count[low:high]
-        a = np.repeat(np.arange(low, high), part)
-        b = np.arange(a.size) - np.repeat(np.cumsum(part) - part, part)
-        b += np.repeat(first[low:high], part)
+        a, b = ranges(first[low:high], count[low:high])
+        a += low
         gap = box_a[a, :2] - box_b[b, :2]
         near = np.hypot(gap[:, 0], gap[:, 1]) <= reach_a[a] + reach_b[b]
         parts_a.append(a[near])
         parts_b.append(b[near])
-    if not parts_a:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     return np.concatenate(parts_a), np.concatenate(parts_b)
+
+
+def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which range, and index, of everything in the ranges [first, first + count)."""
+    owner = np.repeat(np.arange(count.size), count)
+    before = np.cumsum(count) - count
+    return owner, np.arange(owner.size) + (first - before)[owner]
 
 
 def pair_iou(
@@ -63,6 +68,7 @@ def pair_iou(
     Returns:
         `[P]` BEV IoU and `[P]` 3D IoU, float64.
     """
+    chex.assert_equal_shape((a, b))
     bev, iou_3d = np.zeros(len(a)), np.zeros(len(a))
     for low in range(0, len(a), PAIRS_PER_CHUNK // 8):
         part = slice(low, low + PAIRS_PER_CHUNK // 8)

@@ -13,7 +13,9 @@ import numpy as np
 
 from radejax.core.errors import UserError
 
-SkipEmpty = Literal["class", "frame"] | None
+PROTOCOL_DEFAULT = "protocol"
+"""In place of a frame rule: the protocol's own."""
+
 EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall
 
 
@@ -38,82 +40,57 @@ class Protocol:
     geometry: Literal["plain", "rounded", "exchanged", "exchanged_top"]
     matching: Literal["kradar", "best", "free"]
     curve: Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "exact"]
-    skip_empty: SkipEmpty
+    skip_empty: Literal["class", "frame"] | None
     summary: str
+
+    def frame_rule(self, skip_empty: str | None) -> str | None:
+        """A frame rule, or the protocol's own for `PROTOCOL_DEFAULT`."""
+        return self.skip_empty if skip_empty == PROTOCOL_DEFAULT else skip_empty
 
 
 RECOMMENDED = "exact"
 """The protocol of our own choice; docs/evaluation.md says why."""
 
-PROTOCOLS = {
-    protocol.name: protocol
-    for protocol in (
-        Protocol(
-            "kradar_r40",
-            "exchanged",
-            "kradar",
-            "r40",
-            "frame",
-            "K-Radar's revised evaluation as the field runs it (l and w exchanged)",
-        ),
-        Protocol(
-            "kradar_r40_yaw",
-            "rounded",
-            "kradar",
-            "r40",
-            "frame",
-            "K-Radar's revised evaluation with the yaw right",
-        ),
-        Protocol(
-            "kradar_r11",
-            "exchanged_top",
-            "kradar",
-            "r11",
-            "frame",
-            "K-Radar's older evaluation: 11 of 41 samples, z as the top of a box",
-        ),
-        Protocol(
-            "voc11",
-            "plain",
-            "best",
-            "voc11",
-            "class",
-            "RADE-Net's evaluator, 11 recall levels",
-        ),
-        Protocol(
-            "recall41",
-            "plain",
-            "best",
-            "recall41",
-            "class",
-            "RADE-Net's evaluator, 41 recall levels",
-        ),
-        Protocol(
-            "coco101",
-            "plain",
-            "best",
-            "coco101",
-            "class",
-            "RADE-Net's evaluator, 101 recall levels (RADE-Net, DinoRADE)",
-        ),
-        Protocol(
-            "auc",
-            "plain",
-            "best",
-            "auc",
-            "class",
-            "RADE-Net's evaluator, area under the raw curve",
-        ),
-        Protocol(
-            RECOMMENDED,
-            "plain",
-            "free",
-            "exact",
-            None,
-            "exact area under the interpolated curve, every frame counts (recommended)",
-        ),
-    )
-}
+
+def _kradar(name: str, geometry: str, curve: str, summary: str) -> Protocol:
+    return Protocol(name, geometry, "kradar", curve, "frame", f"K-Radar's {summary}")
+
+
+def _radenet(curve: str, summary: str) -> Protocol:
+    summary = f"RADE-Net's evaluator, {summary}"
+    return Protocol(curve, "plain", "best", curve, "class", summary)
+
+
+_ALL = (
+    _kradar(
+        "kradar_r40",
+        "exchanged",
+        "r40",
+        "revised evaluation as the field runs it (l and w exchanged)",
+    ),
+    _kradar(
+        "kradar_r40_yaw", "rounded", "r40", "revised evaluation with the yaw right"
+    ),
+    _kradar(
+        "kradar_r11",
+        "exchanged_top",
+        "r11",
+        "older evaluation: 11 of 41 samples, z as the top of a box",
+    ),
+    _radenet("voc11", "11 recall levels"),
+    _radenet("recall41", "41 recall levels"),
+    _radenet("coco101", "101 recall levels (RADE-Net, DinoRADE)"),
+    _radenet("auc", "area under the raw curve"),
+    Protocol(
+        RECOMMENDED,
+        "plain",
+        "free",
+        "exact",
+        None,
+        "exact area under the interpolated curve, every frame counts (recommended)",
+    ),
+)
+PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
 
 
 def get_protocol(name: str) -> Protocol:
@@ -175,9 +152,7 @@ def score_thresholds(
     total = int(ends[-1]) if ends.size else 0
     if total == 0 or num_gt == 0:
         return np.zeros(0)
-    current = np.concatenate(
-        [[0.0], np.cumsum(np.full(40, 1.0 / 40.0))]
-    )  # step by step
+    current = np.cumsum([0.0, *[1.0 / 40.0] * 40])  # step by step
     # The crossing lies at i = c n - 3/2; a window decides it with the original rounding.
     low = np.maximum(np.ceil(current * num_gt - 1.5).astype(np.int64) - 4, 0)
     index = low[:, None] + np.arange(9)
@@ -192,40 +167,35 @@ def score_thresholds(
 
 
 def kradar_curve(
-    *,
-    matched_score: np.ndarray,
-    matched_weight: np.ndarray,
-    event_score: np.ndarray,
-    event_delta: np.ndarray,
-    det_score: np.ndarray,
-    det_weight: np.ndarray,
+    matched: tuple[np.ndarray, np.ndarray],
+    events: tuple[np.ndarray, np.ndarray],
+    detections: tuple[np.ndarray, np.ndarray],
     num_gt: int,
     samples: Literal["r40", "r11"],
 ) -> Curve:
     """AP in K-Radar's protocol from the steps of `matching.match_kradar`.
 
     Args:
-        matched_score: `[S]` scores matched in the first pass, falling.
-        matched_weight: `[S]` weights of their frames.
-        event_score: `[E]` scores at which true positives appear, falling.
-        event_delta: `[E]` how many, times the weight of the frame.
-        det_score: `[M]` scores of all predictions, falling.
-        det_weight: `[M]` weights of their frames.
+        matched: `[S]` scores matched in the first pass, falling, and the weights of
+            their frames.
+        events: `[E]` scores at which true positives appear, falling, and how many,
+            times the weight of the frame.
+        detections: `[M]` scores of all predictions, falling, and the weights of their
+            frames.
         num_gt: Number of ground truths.
         samples: All 41 precision samples, or every fourth (11).
     """
-    thresholds = score_thresholds(matched_score, matched_weight, num_gt)
-    found = _sum_at_least(event_score, event_delta, thresholds)
-    made = _sum_at_least(det_score, det_weight, thresholds)
+    thresholds = score_thresholds(*matched, num_gt)
+    found = _sum_at_least(*events, thresholds)
+    made = _sum_at_least(*detections, thresholds)
     precision = np.zeros(41)
     precision[: thresholds.size] = found / np.maximum(made, 1)
     precision = np.maximum.accumulate(precision[::-1])[::-1]
-    step = 1 if samples == "r40" else 4
-    taken = precision[::step]
+    taken = precision[:: 1 if samples == "r40" else 4]
     return Curve(
         ap=float(taken.sum() / taken.size * 100),
         num_gt=int(num_gt),
-        num_det=int(det_weight.sum()),
+        num_det=int(detections[1].sum()),
         precision=precision[: thresholds.size],
         recall=found / max(num_gt, 1),
         score=thresholds,
@@ -239,12 +209,7 @@ def _sum_at_least(score: np.ndarray, value: np.ndarray, at: np.ndarray) -> np.nd
 
 
 def pooled_curve(
-    *,
-    score: np.ndarray,
-    is_tp: np.ndarray,
-    weight: np.ndarray,
-    num_gt: int,
-    curve: str,
+    *, score: np.ndarray, is_tp: np.ndarray, weight: np.ndarray, num_gt: int, curve: str
 ) -> Curve:
     """AP from all predictions sorted by falling score.
 

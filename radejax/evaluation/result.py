@@ -56,37 +56,15 @@ class Result:
 
     @property
     def metric(self) -> str:
-        """Name with everything the number depends on but the class and the frames."""
-        return metric_name(
-            self.space,
-            self.iou,
-            self.protocol,
-            self.score_threshold,
-            self.skip_empty,
-            self.label_version,
-            self.roi,
+        """Name with everything the number depends on but the class and the frames.
+
+        Such as ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow.
+        """
+        return (
+            f"ap_{self.space}_iou{100 * self.iou:.4g}/{self.protocol}"
+            f"/score>{self.score_threshold:g}/skip={self.skip_empty or 'none'}"
+            f"/labels={self.label_version or 'unknown'}/roi={self.roi}"
         )
-
-
-def metric_name(
-    space: str,
-    iou: float,
-    protocol: str,
-    score_threshold: float,
-    skip_empty: str | None,
-    label_version: str | None,
-    roi: str,
-) -> str:
-    """A metric's full name.
-
-    Examples:
-        >>> metric_name("3d", 0.3, "kradar_r40", 0.0, "frame", "v2.1", "narrow")
-        'ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow'
-    """
-    return (
-        f"ap_{space}_iou{100 * iou:.4g}/{protocol}/score>{score_threshold:g}"
-        f"/skip={skip_empty or 'none'}/labels={label_version or 'unknown'}/roi={roi}"
-    )
 
 
 def mean_ap(results: Sequence[Result]) -> float:

@@ -17,7 +17,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from radejax.core.errors import DataError, UserError
 from radejax.geometry.boxes import corners
 from radejax.geometry.camera import Camera, project, to_camera, to_pixels
 
@@ -42,6 +41,18 @@ _BOX_EDGES = np.array(
     + [(4 + i, 4 + (i + 1) % 4) for i in range(4)]
     + [(i, 4 + i) for i in range(4)]
 )
+
+
+class CalibrationError(ValueError):
+    """No numbers or kind of image of a camera: of the user, see `core.errors`."""
+
+    exit_code = 2
+
+
+class CalibrationFileError(CalibrationError):
+    """A calibration file that is malformed or incomplete; the message names it."""
+
+    exit_code = 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -80,7 +91,7 @@ class CameraCalibration:
         for name, shape in shapes.items():
             value = np.array(getattr(self, name), np.float64)
             if value.shape != shape or not np.isfinite(value).all():
-                raise UserError(
+                raise CalibrationError(
                     f"{name} must be {shape} finite numbers, got {value.tolist()}"
                 )
             value.setflags(write=False)
@@ -127,7 +138,7 @@ class CameraCalibration:
 
         Raises:
             FileNotFoundError: There is no such file.
-            DataError: A line is not `key: number`, or a key is missing.
+            CalibrationFileError: A line is not `key: number`, or a key is missing.
         """
         path = pathlib.Path(path)
         if not path.is_file():
@@ -137,7 +148,9 @@ class CameraCalibration:
             key for key in _PINHOLE + _LENS + _ANGLES + _SHIFTS if key not in values
         ]
         if missing:
-            raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
+            raise CalibrationFileError(
+                f"{path}: camera calibration lacks {', '.join(missing)}"
+            )
         yaw, pitch, roll = (values[key] for key in _ANGLES)
         size = {
             "width": int(values.get("img_size_w", 1280)),
@@ -300,7 +313,7 @@ def _read_numbers(path: pathlib.Path) -> dict[str, float]:
                 raise ValueError
             values[key.strip()] = float(value)
         except ValueError:
-            raise DataError(
+            raise CalibrationFileError(
                 f"{path}:{number}: expected 'key: number', found {line!r}"
             ) from None
     return values
@@ -308,5 +321,7 @@ def _read_numbers(path: pathlib.Path) -> dict[str, float]:
 
 def _choose(name: str, **options: Any) -> Any:
     if name not in options:
-        raise UserError(f"image must be one of {', '.join(options)}, got {name!r}")
+        raise CalibrationError(
+            f"image must be one of {', '.join(options)}, got {name!r}"
+        )
     return options[name]

@@ -12,33 +12,29 @@ import numpy as np
 from tabulate import tabulate
 
 from radejax import models
-from radejax.core.config import load_config
 from radejax.data.projection import project_jax
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import placeholder
+from radejax.simulation.config import SimulationConfig
 
 STAGES = ("transfer", "projection", "network", "decode + NMS")
 
 
-def untrained(config: Any, **overrides: Any) -> Detector:
+def untrained(config: Mapping[str, Any], **overrides: Any) -> Detector:
     """Detector with random weights of a config, on the sensor that it is made for.
 
     Args:
-        config: A config or the name of its file, ":words" included.
+        config: A whole config.
         **overrides: Arguments of `Detector`.
     """
-    if isinstance(config, str):
-        config = load_config(config)
     grid = RadarGrid.kradar()
     if "simulation" in config:
-        from radejax.simulation.config import SimulationConfig
-
-        grid = SimulationConfig.from_mapping(config.simulation).make_grid()
-    model = models.build(config.model)
+        grid = SimulationConfig.from_mapping(config["simulation"]).make_grid()
+    model = models.build(config["model"])
     inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
-    if hasattr(model, "image_size"):
+    if models.has_camera(model):
         inputs += placeholder(1, model)
     # Shapes alone: to compile the initialisation takes longer than to measure.
     shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)

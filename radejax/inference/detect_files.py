@@ -6,6 +6,7 @@ which image belongs to a frame.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
@@ -17,12 +18,12 @@ import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Detections
-from radejax.data.cameras import frame_cameras
+from radejax.data.cameras import camera_inputs
 from radejax.data.kradar import KRadar
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import Camera
 from radejax.inference.detector import Detector
-from radejax.inference.open import open_detector
+from radejax.inference.open import Step, load
 
 PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
 """Names of the files that hold a frame."""
@@ -94,15 +95,8 @@ def front_images(
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
     )
-    options = detector.camera_options
-    cameras = frame_cameras(
-        frames,
-        detector.model.image_size,
-        projection=options.projection,
-        ego_from_lidar_m=options.ego_from_lidar_m,
-        resize=options.resize,
-        allow_missing=True,
-    )
+    options = dataclasses.replace(detector.camera_options, allow_missing=True)
+    cameras = camera_inputs(frames, detector.model.image_size, options).cameras
     return {
         path: (frame.camera_path, camera)
         for frame, camera in zip(frames, cameras, strict=True)
@@ -116,7 +110,7 @@ def detect_files(
     paths: Sequence[str | os.PathLike],
     out: str | os.PathLike,
     *,
-    step: int | str | None = None,
+    step: Step = None,
     batch_size: int = 8,
     labels: str | os.PathLike | None = None,
     image_backbone: str | os.PathLike | None = None,
@@ -125,7 +119,7 @@ def detect_files(
     """Detects in every frame and writes one JSON file each, atomically.
 
     Args:
-        source: Model, as `open_detector` takes it: a run, an exported folder, ...
+        source: Model, as `load` takes it: a run, an exported folder, ...
         paths: Files and folders of frames.
         out: Folder for `<sequence>_<frame>.json`: a list of {cls, score, x, y, z, l,
             w, h, yaw}, metres and radians in the ego frame.
@@ -148,16 +142,16 @@ def detect_files(
     """
     frames = find_frames(paths)
     _check_names(frames)
-    detector, loaded = open_detector(source, image_backbone, step=step)
+    loaded = load(source, step=step, image_backbone=image_backbone)
+    detector = Detector.from_loaded(loaded)
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
 
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or (loaded and loaded.labels)
-        config = (loaded and loaded.config) or {}
-        version = config.get("data", {}).get("label_version", "v2.1")
+        labels = labels or (loaded.run.get("data") or {}).get("labels")
+        version = loaded.config.data.label_version if loaded.config else "v2.1"
         known = front_images(frames, detector, labels, version)
 
     def batches() -> Iterator[tuple[Any, ...]]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-import functools
-import pathlib
+import dataclasses
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -17,13 +16,17 @@ import numpy as np
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch, Detections
-from radejax.data import projection as projection_lib
-from radejax.data.encoding import to_float
-from radejax.detection.decode import decode
+from radejax.data.cameras import CameraOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
-from radejax.inference import packed
-from radejax.inference.inputs import CameraOptions
+from radejax.inference.open import (
+    LoadedModel,
+    PathLike,
+    load,
+    load_torch,
+    settings_of_config,
+)
+from radejax.inference.program import detect
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
@@ -79,7 +82,7 @@ class Detector:
         camera_options: CameraOptions = CameraOptions(),  # noqa: B008, frozen
     ) -> None:
         self.model = model = model if dtype is None else models.with_dtype(model, dtype)
-        self.takes_camera = hasattr(model, "image_size")
+        self.takes_camera = models.has_camera(model)
         self.camera_options = camera_options
         self.num_radar_alone = 0
         self._lock = threading.Lock()
@@ -98,19 +101,25 @@ class Detector:
     # Construction --------------------------------------------------------------------
 
     @classmethod
+    def from_loaded(cls, loaded: LoadedModel, **overrides: Any) -> Detector:
+        """Detector of what `radejax.inference.open.load` returned."""
+        settings = {**loaded.settings, **overrides}
+        return cls(loaded.model, loaded.variables, loaded.grid, **settings)
+
+    @classmethod
     def from_workdir(
         cls,
-        path: str | pathlib.Path,
-        step: int | None = None,
+        path: PathLike,
+        step: int | str | None = None,
         *,
-        image_backbone: str | pathlib.Path | None = None,
+        image_backbone: PathLike | None = None,
         **overrides: Any,
     ) -> Detector:
         """Detector of a training run.
 
         Args:
             path: Work folder of `train.py`.
-            step: Of the checkpoint; the newest if None.
+            step: Of the checkpoint, or "best"; the newest if None.
             image_backbone: Weights of a frozen image backbone, where they are not at
                 the place any more that the run was trained from.
             **overrides: Arguments of `Detector`.
@@ -118,31 +127,15 @@ class Detector:
         Raises:
             FileNotFoundError: No run or no such checkpoint there.
         """
-        from radejax.runs.workdir import load_run  # above this floor: a convenience
-
-        run = load_run(path, step, image_backbone)
-        return cls.from_config(run.config, run.variables, run.grid, **overrides)
-
-    @classmethod
-    def from_config(
-        cls,
-        config: Any,
-        variables: Mapping[str, Any],
-        grid: RadarGrid,
-        **overrides: Any,
-    ) -> Detector:
-        """Detector with the model, thresholds and mapping that a config states."""
-        arguments = packed.settings_of_config(config)
-        return cls(
-            models.build(config.model), variables, grid, **(arguments | overrides)
-        )
+        loaded = load(path, step=step, image_backbone=image_backbone)
+        return cls.from_loaded(loaded, **overrides)
 
     @classmethod
     def from_checkpoint(
         cls,
-        path: str | pathlib.Path,
+        path: PathLike,
         *,
-        image_backbone: str | pathlib.Path | None = None,
+        image_backbone: PathLike | None = None,
         **overrides: Any,
     ) -> Detector:
         """Detector of a folder with a model, wherever it came from.
@@ -158,18 +151,15 @@ class Detector:
         Raises:
             FileNotFoundError: There is no model in that folder.
         """
-        loaded = packed.load(path, image_backbone=image_backbone)
-        return cls(
-            loaded.model, loaded.variables, loaded.grid, **(loaded.settings | overrides)
-        )
+        return cls.from_loaded(load(path, image_backbone=image_backbone), **overrides)
 
     @classmethod
     def from_torch(
         cls,
-        path_or_state_dict: str | pathlib.Path | Mapping[str, Any],
+        path_or_state_dict: PathLike | Mapping[str, Any],
         *,
         grid: RadarGrid | None = None,
-        image_backbone: str | pathlib.Path | None = None,
+        image_backbone: PathLike | None = None,
         model_overrides: Mapping[str, Any] | None = None,
         **overrides: Any,
     ) -> Detector:
@@ -184,25 +174,24 @@ class Detector:
             model_overrides: For what names and shapes cannot tell.
             **overrides: Arguments of `Detector`.
         """
-        from radejax.interop import dinorade_torch, radenet_torch
-        from radejax.interop.state_dict import read_state_dict
-        from radejax.models.lifting import OFFICIAL_OFFSET_M
+        loaded = load_torch(
+            path_or_state_dict, image_backbone=image_backbone, **(model_overrides or {})
+        )
+        if grid is not None:
+            loaded = dataclasses.replace(loaded, grid=grid)
+        return cls.from_loaded(loaded, **overrides)
 
-        content = path_or_state_dict
-        if isinstance(content, str | pathlib.Path):
-            content, _ = read_state_dict(content)
-        fields: dict[str, Any] = dict(model_overrides or {})
-        arguments: dict[str, Any] = {"azimuth_mapping": "stretched"}
-        if dinorade_torch.is_dinorade(content):
-            load = functools.partial(dinorade_torch.load, dinov3=image_backbone)
-            arguments["camera_options"] = CameraOptions("pinhole", OFFICIAL_OFFSET_M)
-        else:
-            if image_backbone is not None:
-                raise UserError("image_backbone is given, but the model is RADE-Net")
-            load = radenet_torch.load
-        model, variables = load(path_or_state_dict, **fields)
-        arguments |= overrides
-        return cls(model, variables, grid or RadarGrid.kradar(), **arguments)
+    @classmethod
+    def from_config(
+        cls,
+        config: Mapping[str, Any],
+        variables: Mapping[str, Any],
+        grid: RadarGrid,
+        **overrides: Any,
+    ) -> Detector:
+        """Detector with the model, thresholds and mapping that a config states."""
+        arguments = settings_of_config(config) | overrides
+        return cls(models.build(config["model"]), variables, grid, **arguments)
 
     # Use -----------------------------------------------------------------------------
 
@@ -322,15 +311,33 @@ class Detector:
     # Inside --------------------------------------------------------------------------
 
     def detect_function(self) -> Callable[..., Detections]:
-        """The pure function that is jitted.
+        """The pure function that is jitted: `detect` of this model and options.
 
         Its arguments are variables, frames, image, camera (or None, None), score
         threshold, NMS IoU, region `[6]`, and the keyword `is_tesseract`.
         """
         grid = models.map_grid(self.grid, self.model, self.azimuth_mapping)
-        return functools.partial(
-            _detect, self.model, grid, self.classes, self.decode_options
-        )
+
+        def function(
+            variables: Any,
+            frames: jax.Array,
+            image: Any,
+            camera: Any,
+            score_threshold: jax.Array,
+            nms_iou: jax.Array,
+            roi: jax.Array,
+            *,
+            is_tesseract: bool,
+        ) -> Detections:
+            thresholds = {"score_threshold": score_threshold, "nms_iou": nms_iou}
+            options = {**self.decode_options, **thresholds, "roi": roi}
+            inputs = variables, frames, image, camera
+            found = detect(
+                self.model, grid, options, *inputs, is_tesseract=is_tesseract
+            )
+            return found.replace(class_names=self.classes)
+
+        return function
 
     def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
         """Images and cameras as arrays; counts the frames without."""
@@ -357,37 +364,6 @@ class Detector:
         if self.device.platform == "cpu":
             return jax.device_put(x.copy(), self.device)
         return jax.block_until_ready(jax.device_put(x, self.device))
-
-
-def _detect(
-    model: nn.Module,
-    grid: RadarGrid,
-    classes: tuple[str, ...],
-    options: Mapping[str, Any],
-    variables: Any,
-    frames: jax.Array,
-    image: Any,
-    camera: Any,
-    score_threshold: jax.Array,
-    nms_iou: jax.Array,
-    roi: jax.Array,
-    *,
-    is_tesseract: bool,
-) -> Detections:
-    """From a batch of tensors to detections; pure, to be jitted."""
-    if is_tesseract:
-        frames = projection_lib.project_jax(frames)
-    inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
-    maps = model.apply(variables, *inputs, train=False)
-    found = decode(
-        maps,
-        grid,
-        score_threshold=score_threshold,
-        nms_iou=nms_iou,
-        roi=roi,
-        **options,
-    )
-    return found.replace(class_names=classes)
 
 
 def _pad_batch(x: Any, size: int) -> Any:

@@ -1,15 +1,10 @@
-"""Images through the frozen image backbone once, into records to train from.
-
-A folder of embeddings has a `manifest.json` like one of projections: which backbone
-made them (configuration and a checksum of its weights), their shape, and its files.
-"""
+"""Images through the frozen image backbone once, into records to train from."""
 
 from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
 import hashlib
-import json
 import os
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,20 +15,17 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from radejax.core.errors import DataError, UserError
-from radejax.core.files import read_json, write_json
-from radejax.data.frame_table import read_left_image
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.data.images import read_left_image
 from radejax.data.kradar.frame import Frame
+from radejax.data.records import embeddings
 from radejax.data.records import files as record_files
-from radejax.data.records.arrays import MANIFEST, ArrayRecords
+from radejax.data.records.arrays import MANIFEST
+from radejax.interop.image_backbone import weights_sha256
 from radejax.models.dinorade import IMAGE_BACKBONE
 
-FORMAT = "radejax-embeddings"
-FORMAT_VERSION = 1
 DTYPES = ("float32", "float16")
-
-# Fields of `config.model.image` that do not change what comes out.
-_IRRELEVANT = ("freeze", "attention", "layer_scale")
 
 
 def embed_dataset(
@@ -70,8 +62,7 @@ def embed_dataset(
         Counts: "frames", "embedded", "found", "missing" (frames without an image).
 
     Raises:
-        UserError: The folder holds embeddings of another backbone or data set, a full
-            disk, or an unknown dtype.
+        UserError: Embeddings of others are in the folder; a full disk; unknown dtype.
         DataError: An image is damaged or of another size.
     """
     if dtype not in DTYPES:
@@ -80,24 +71,23 @@ def embed_dataset(
         raise UserError("no frames to embed")
     out_dir = pathlib.Path(out_dir)
     params = variables["params"][IMAGE_BACKBONE]
+    keys = "\n".join(frame.key for frame in frames)
     plan = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "image": _relevant(image_config),
+        "format": embeddings.FORMAT,
+        "version": embeddings.FORMAT_VERSION,
+        "image": embeddings.relevant_fields(image_config),
         "weights_sha256": weights_sha256(params),
         "shape": list(model.feature_shape),
         "dtype": dtype,
         "frames_per_file": frames_per_file,
         "num_frames": len(frames),
-        "frames_sha256": _sha256("\n".join(f.key for f in frames).encode()),
+        "frames_sha256": hashlib.sha256(keys.encode()).hexdigest(),
     }
-    _agree_on_plan(out_dir, plan)
+    files.claim(out_dir / "plan.json", plan, "other embeddings")
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
     params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
-    chunks = [
-        frames[start : start + frames_per_file]
-        for start in range(0, len(frames), frames_per_file)
-    ]
+    starts = range(0, len(frames), frames_per_file)
+    chunks = [frames[start : start + frames_per_file] for start in starts]
     counts = {"frames": len(frames), "embedded": 0, "found": 0, "missing": 0}
     entries = []
     bar = tqdm(total=len(frames), unit="frame", desc="embed", disable=not progress)
@@ -106,78 +96,18 @@ def embed_dataset(
         for number, chunk in enumerate(chunks):
             name = record_files.file_name(number, len(chunks), "embeddings")
             entry = record_files.read_manifest_of(out_dir, name)
+            kind = "embedded" if entry is None else "found"
             if entry is None:
-                batches = reader(chunk)
-                run = ((keys, embed(params, images)) for keys, images in batches)
+                run = ((keys, embed(params, image)) for keys, image in reader(chunk))
                 entry = _write_file(out_dir, name, chunk, run, dtype, bar)
-                counts["embedded"] += len(entry.frames)
             else:
-                counts["found"] += len(entry.frames)
                 bar.update(len(chunk))
+            counts[kind] += len(entry.frames)
             counts["missing"] += len(entry.skipped)
-            entries.append(entry)
-    files = [dataclasses.asdict(entry) for entry in entries]
-    write_json(out_dir / MANIFEST, {**plan, "counts": counts, "files": files})
+            entries.append(dataclasses.asdict(entry))
+    content = {**plan, "counts": counts, "files": entries}
+    files.write_json(out_dir / MANIFEST, content)
     return counts
-
-
-def open_embeddings(
-    folder: str | os.PathLike, model_config: Mapping[str, Any] | None = None
-) -> ArrayRecords:
-    """Features `[h, w, C]` of a folder, by record; `index_of()` maps frame keys to them.
-
-    Args:
-        folder: What `radejax embed` wrote.
-        model_config: `config.model` that they must fit, or None.
-
-    Raises:
-        FileNotFoundError: There is no such folder, or it is not finished.
-        DataError: The manifest is damaged or of another version.
-        UserError: They come from another backbone.
-    """
-    path = pathlib.Path(folder) / MANIFEST
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
-        )
-    try:
-        manifest = read_json(path)
-        version = manifest["format"], manifest["version"]
-        if version != (FORMAT, FORMAT_VERSION):
-            raise DataError(
-                f"{path}: {version[0]} {version[1]}, this radejax reads {FORMAT} "
-                f"{FORMAT_VERSION}"
-            )
-        files = [record_files.RecordFile.from_dict(f) for f in manifest["files"]]
-        shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
-    except DataError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged manifest ({error!r})") from None
-    if model_config is not None:
-        wanted = _relevant(model_config["image"])
-        for name, value in wanted.items():
-            if manifest["image"].get(name) != value:
-                raise UserError(
-                    f"{folder}: embeddings of a backbone with {name} = "
-                    f"{manifest['image'].get(name)}, config.model.image.{name} is "
-                    f"{value}"
-                )
-    return ArrayRecords(folder, files, shape, dtype)
-
-
-def embeddings_sha256(folder: str | os.PathLike) -> str:
-    """Checksum of the weights that embeddings were made with."""
-    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
-
-
-def weights_sha256(params: Mapping[str, Any]) -> str:
-    """Checksum of a tree of weights: names, shapes and values."""
-    digest = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
-        digest.update(np.ascontiguousarray(leaf, np.float32).tobytes())
-    return digest.hexdigest()
 
 
 @dataclasses.dataclass
@@ -211,8 +141,7 @@ def _write_file(
     dtype: str,
     bar: tqdm,
 ) -> record_files.RecordFile:
-    writer = record_files.RecordFileWriter(folder, name)
-    try:
+    with record_files.RecordFileWriter(folder, name) as writer:
         for frame in frames:
             if frame.camera_path is None:
                 writer.skipped[frame.key] = "no front image"
@@ -223,31 +152,3 @@ def _write_file(
                 writer.write(key, row)
             bar.update(len(keys))
         return writer.commit()
-    except BaseException:
-        writer.discard()
-        raise
-
-
-def _agree_on_plan(out_dir: pathlib.Path, plan: Mapping[str, Any]) -> None:
-    """Writes the plan of a new folder; `UserError` if the folder has another one."""
-    path = out_dir / "plan.json"
-    if not path.exists():
-        out_dir.mkdir(parents=True, exist_ok=True)
-        write_json(path, dict(plan))
-        return
-    found = read_json(path)
-    for key, value in plan.items():
-        if found.get(key) != value:
-            raise UserError(
-                f"{out_dir} holds other embeddings ({key} is {found.get(key)} there, "
-                f"{value} now); choose another folder, or delete that one"
-            )
-
-
-def _relevant(image_config: Mapping[str, Any]) -> dict[str, Any]:
-    plain = {k: v for k, v in dict(image_config).items() if k not in _IRRELEVANT}
-    return json.loads(json.dumps(plain))
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()

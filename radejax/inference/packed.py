@@ -1,6 +1,6 @@
-"""Folders that hold a model: packed ones, and the checkpoints of a run.
+"""Models packed into a folder, to be given to others.
 
-A packed folder has the files that the Hugging Face Hub expects:
+It has the files that the Hugging Face Hub expects:
 
     config.json          model, grid, classes, decoding, and the config it was trained with
     model.safetensors    variables by name, "params/backbone/..."
@@ -26,11 +26,11 @@ import radejax
 from radejax import models
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.data.cameras import CameraOptions
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.inputs import CameraOptions
-from radejax.interop import image_backbone as camera_inputs
-from radejax.models import radenet
+from radejax.models import dinorade_config, radenet
 from radejax.models.dinorade import IMAGE_BACKBONE as BACKBONE
+from radejax.models.vit import ViT
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 FORMAT = "radejax-1"
@@ -38,102 +38,38 @@ FORMAT = "radejax-1"
 
 @dataclasses.dataclass(frozen=True)
 class LoadedModel:
-    """What `Detector` needs.
+    """A model with what is known of it, wherever it came from.
 
     Attributes:
         model: Without parameters.
         variables: Its parameters and other collections.
         grid: Of the sensor.
         settings: Keyword arguments of `Detector`.
-        config: The training config as plain values, or None.
-        labels: Label revision of the run's data, or None.
+        config: It was trained with, or None.
+        run: Of a checkpoint, where and with what the run was made, see
+            `radejax.runs.workdir.run_info`; else empty.
+        step: Of a checkpoint, or None.
     """
 
     model: nn.Module
     variables: Mapping[str, Any]
     grid: RadarGrid
     settings: Mapping[str, Any]
-    config: Mapping[str, Any] | None = None
-    labels: str | None = None
+    config: ConfigDict | None = None
+    run: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    step: int | None = None
 
 
-def load(
-    path: str | pathlib.Path,
-    *,
-    image_backbone: str | pathlib.Path | None = None,
-    step: int | str | None = None,
-) -> LoadedModel:
-    """Model of a packed folder, of a folder of checkpoints, of one of them, or of a run.
-
-    Args:
-        path: The folder.
-        image_backbone: DINOv3's folder from Hugging Face (torchvision's file for a
-            ResNet) where the folder is without the weights.
-        step: Of a run or of a folder of checkpoints: a number, or "best" by the run's
-            metric; the newest if None.
-
-    Raises:
-        FileNotFoundError: There is no model in the folder, or no such checkpoint.
-        UserError: A step of a folder with only one model.
-        DataError: A file is damaged, or config and weights do not fit.
-    """
-    path = pathlib.Path(path)
-    if not path.is_dir():
-        raise FileNotFoundError(f"no such folder: {path}")
-    if (path / WEIGHTS_FILE).is_file() and (path / CONFIG_FILE).is_file():
-        check_no_step(path, step)
-        loaded = read_packed(path)
-    elif (path / "checkpoints").is_dir():
-        return _of_run(path, image_backbone, step)
-    elif path.name.isdigit() and _has_checkpoint(path):
-        check_no_step(path, step)
-        loaded = _of_checkpoint(path.parent, int(path.name))
-    elif any(_has_checkpoint(child) for child in path.iterdir()):
-        loaded = _of_checkpoint(path, step)
-    else:
-        raise FileNotFoundError(
-            f"no model in {path}: expected {CONFIG_FILE} and {WEIGHTS_FILE}, the work "
-            "folder of a run, its checkpoints, or one of them"
-        )
-    if image_backbone is None:
-        return loaded
-    config = ConfigDict({"model": model_config(loaded.model)}, convert_dict=True)
-    part = camera_inputs.load_image_backbone(image_backbone, config)
-    frozen = {BACKBONE: part["params"][BACKBONE]}
-    variables = {
-        **loaded.variables,
-        "params": {**loaded.variables["params"], **frozen},
-    }
-    return dataclasses.replace(loaded, variables=variables)
-
-
-def check_no_step(path: pathlib.Path, step: int | str | None) -> None:
-    """`UserError` if a step is asked of what holds one model."""
-    if step is not None:
-        raise UserError(f"step {step} of {path}, which holds one model: give none")
-
-
-def settings_of_config(config: Any) -> dict[str, Any]:
-    """Keyword arguments of `Detector` that a config states."""
-    decode = dict(config["decode"])
-    return {
-        "classes": tuple(config["classes"]),
-        "azimuth_mapping": config["data"]["azimuth_mapping"],
-        "score_threshold": decode.pop("score_threshold"),
-        "nms_iou": decode.pop("nms_iou"),
-        "decode_options": decode,
-        "camera_options": CameraOptions.of_config(config["data"]),
-    }
-
-
-# Packed ------------------------------------------------------------------------------
+def is_packed(folder: pathlib.Path) -> bool:
+    """Whether a folder has the files of a packed model."""
+    return (folder / WEIGHTS_FILE).is_file() and (folder / CONFIG_FILE).is_file()
 
 
 def write_packed(
     folder: str | pathlib.Path,
     detector: Any,
     *,
-    training_config: Mapping[str, Any] | None = None,
+    training_config: ConfigDict | None = None,
     with_backbone: bool = False,
 ) -> dict[str, Any]:
     """Writes `config.json` and `model.safetensors`.
@@ -180,7 +116,7 @@ def write_packed(
         "camera": dataclasses.asdict(detector.camera_options),
         "grid": detector.grid.to_dict(),
         "left_out": left_out,
-        "training_config": training_config,
+        "training_config": training_config and json.loads(training_config.to_json()),
     }
     arrays = {
         name: np.ascontiguousarray(value)
@@ -226,7 +162,8 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
             "decode_options": decode,
             "camera_options": CameraOptions(**camera),
         },
-        content["training_config"],
+        content["training_config"]
+        and ConfigDict(content["training_config"], convert_dict=True),
     )
 
 
@@ -250,9 +187,6 @@ def model_config(model: nn.Module) -> dict[str, Any]:
 
 
 def _camera_fields(model: Any) -> dict[str, Any]:
-    from radejax.models import dinorade_config
-    from radejax.models.vit import ViT
-
     vit = model.vit or ViT()
     image = {
         "kind": "resnet50" if model.vit is None else "vit",
@@ -266,45 +200,3 @@ def _camera_fields(model: Any) -> dict[str, Any]:
     }
     axes = {name: getattr(model.axes, name) for name in dinorade_config.AXES_FIELDS}
     return {"image": image, "fusion": dict(model.fusion), "axes": axes}
-
-
-# Runs --------------------------------------------------------------------------------
-
-
-def _has_checkpoint(path: pathlib.Path) -> bool:
-    return path.name.isdigit() and (path / "state").is_dir()
-
-
-def _of_run(
-    path: pathlib.Path, image_backbone: Any, step: int | str | None
-) -> LoadedModel:
-    from radejax.runs.workdir import load_run  # training's rooms: not for packed models
-
-    run = load_run(path, step, image_backbone)
-    return LoadedModel(
-        models.build(run.config.model),
-        run.variables,
-        run.grid,
-        settings_of_config(run.config),
-        json.loads(run.config.to_json()),
-        run.paths and run.paths.labels,
-    )
-
-
-def _of_checkpoint(folder: pathlib.Path, step: int | str | None) -> LoadedModel:
-    """A checkpoint without its run: it carries config and grid itself."""
-    from radejax.training.checkpoints import BEST, Checkpoints
-
-    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
-        if step == "best":
-            step = checkpoints.best_step()
-        state, info, _ = checkpoints.restore_variables(step)
-    config = ConfigDict(info["config"], convert_dict=True)
-    params = state["ema_params"] if state.get("ema_params") else state["params"]
-    return LoadedModel(
-        models.build(config.model),
-        {"params": params, **(state.get("model_state") or {})},
-        RadarGrid.from_dict(info["grid"]),
-        settings_of_config(config),
-        info["config"],
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -14,59 +13,55 @@ import tqdm
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, Detections
-from radejax.data.kradar import KRadar
-from radejax.data.pipeline import make_loader
+from radejax.data.cameras import CameraInputs
+from radejax.data.frame_table import make_table
+from radejax.data.kradar import Frame
+from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
-from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
+from radejax.inference.inputs import check_backbone
+from radejax.inference.program import detect
 from radejax.training import processes, sharding
-from radejax.training.step import model_inputs
 
 
 class Predictor:
     """A model with decoding and NMS, compiled once for the devices of a mesh.
 
+    It needs `update` with the model's variables before its first call.
+
     Args:
-        config: Of the run: `model`, `classes`, `decode`, `data.azimuth_mapping`.
-        variables: Of the model; `update` takes others.
+        model: Radar or radar-camera detector.
         grid: Of the sensor.
-        score_threshold: Detections below are left out; `decode.score_threshold` if
-            None.
+        classes: Names in the order of the heatmap's channels.
+        decode: Keyword arguments of `radejax.detection.decode.decode`.
+        azimuth_mapping: "true", or "stretched" for official checkpoints.
         mesh: All devices if None.
-        model: What `config.model` describes, where it is at hand.
     """
 
     def __init__(
         self,
-        config: Any,
-        variables: Mapping[str, Any],
+        model: nn.Module,
         grid: RadarGrid,
         *,
-        score_threshold: float | None = None,
+        classes: Sequence[str],
+        decode: Mapping[str, Any],
+        azimuth_mapping: str = "true",
         mesh: jax.sharding.Mesh | None = None,
-        model: nn.Module | None = None,
     ) -> None:
-        model = models.build(config.model) if model is None else model
         self.mesh = sharding.make_mesh() if mesh is None else mesh
-        self.classes = tuple(config.classes)
-        options = dict(config.decode)
-        if score_threshold is not None:
-            options["score_threshold"] = score_threshold
-        self.update(variables)
-        self._run = jax.jit(
-            functools.partial(
-                _predict,
-                model,
-                models.map_grid(grid, model, config.data.azimuth_mapping),
-                options,
-            ),
-            # Every process gets all detections: they are small.
-            out_shardings=sharding.replicated(self.mesh),
-        )
+        self.classes = tuple(classes)
+        self.update(None)
+        map_grid = models.map_grid(grid, model, azimuth_mapping)
 
-    def update(self, variables: Mapping[str, Any]) -> None:
+        def predict(variables: Any, batch: Batch) -> tuple[Detections, jax.Array]:
+            inputs = batch.projection, batch.image, batch.camera
+            return detect(model, map_grid, decode, variables, *inputs), batch.frame
+
+        # Every process gets all detections: they are small.
+        self._run = jax.jit(predict, out_shardings=sharding.replicated(self.mesh))
+
+    def update(self, variables: Mapping[str, Any] | None) -> None:
         """Takes other variables of the same shapes; nothing is compiled again."""
         self._variables = jax.device_put(variables, sharding.replicated(self.mesh))
 
@@ -88,7 +83,7 @@ class Predictor:
             UserError: Images are given, and the variables are without the weights of
                 the image backbone.
         """
-        detector_inputs.check_backbone(batch.image, self._variables)
+        check_backbone(batch.image, self._variables)
         # Ground truth is not looked at; its shapes must not make it compile again.
         none = np.zeros((len(batch.frame), 0), np.float32)
         batch = batch.replace(boxes=none, classes=none, is_valid=none)
@@ -101,24 +96,13 @@ class Predictor:
         return found
 
 
-def _predict(
-    model: nn.Module,
-    grid: RadarGrid,
-    options: Mapping[str, Any],
-    variables: Any,
-    batch: Batch,
-) -> tuple[Detections, jax.Array]:
-    maps = model.apply(variables, *model_inputs(batch), train=False)
-    return decode(maps, grid, **options), batch.frame
-
-
 def predict_dataset(
     detector: Predictor | Detector,
     records: RecordSource,
-    frames: KRadar,
+    frames: Sequence[Frame],
     batch_size: int = 8,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    images: CameraInputs | None = None,
     progress: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> dict[str, np.ndarray]:
@@ -129,7 +113,7 @@ def predict_dataset(
         records: Projections of the frames.
         frames: Which frames, in which order.
         batch_size: Frames at once; rounded up to a multiple of the devices.
-        inputs: Further arguments of `make_loader`, see `camera_inputs`.
+        images: Of these frames, for a radar-camera model, see `data.cameras`.
         progress: Show a bar.
         should_stop: Asked before every batch.
 
@@ -144,22 +128,25 @@ def predict_dataset(
     if not len(frames):
         raise UserError("no frames to detect objects in")
     on_mesh = isinstance(detector, Predictor)
-    loader = make_loader(
+    table = make_table(
         records,
         frames,
-        batch_size=detector.rows(batch_size) if on_mesh else batch_size,
         max_objects=max(len(frame.boxes) for frame in frames) or 1,
         classes=detector.classes,
+        images=images,
+    )
+    options = LoaderOptions(
+        batch_size=detector.rows(batch_size) if on_mesh else batch_size,
         shuffle=False,
         num_epochs=1,
         drop_remainder=False,
         pad_remainder=on_mesh,  # a `Detector` does it itself
         process_index=None if on_mesh else 0,
         process_count=None if on_mesh else 1,
-        **(inputs or {}),
     )
+    loader = make_loader(table, options)
 
-    def detect(batch: Batch) -> tuple[Detections, Any]:
+    def start(batch: Batch) -> tuple[Detections, Any]:
         if on_mesh:
             return detector(batch)
         return detector(batch.projection, batch.image, batch.camera), batch.frame
@@ -175,7 +162,7 @@ def predict_dataset(
         for batch in loader:
             if should_stop is not None and should_stop():
                 raise processes.Stopped
-            started = detect(batch)
+            started = start(batch)
             # The devices work on this batch while the one before is taken apart.
             if pending is not None:
                 bar.update(_collect(parts, *pending, detector.classes))

@@ -1,24 +1,27 @@
-"""What a radar-camera run needs beside a radar run: images, cameras, backbone weights."""
+"""Weights of image backbones: DINOv3 from Hugging Face, ResNet-50 from torchvision."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+import flax.linen as nn
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
-from ml_collections import ConfigDict
+import numpy as np
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.data.cameras import frame_cameras
-from radejax.data.kradar.frame import Frame
-from radejax.inference.embed import embeddings_sha256, open_embeddings, weights_sha256
+from radejax.data.records.embeddings import embeddings_sha256
+from radejax.interop import dinov3_hf, resnet_torch
+from radejax.models import dinorade_config
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.models.lifting import ReferencePoints
+from radejax.models.vit import ViT
 
 PathLike = str | os.PathLike
 
@@ -26,115 +29,14 @@ PathLike = str | os.PathLike
 _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
 
 
-def has_camera(config: ConfigDict) -> bool:
-    """Whether the configured model looks at images."""
-    return config.model.name == "dinorade"
-
-
-def require_camera(config: ConfigDict) -> None:
-    """`UserError` unless the configured model looks at images."""
-    if not has_camera(config):
-        raise UserError(
-            f"config.model.name is {config.model.name!r}, which has no camera; expected "
-            "'dinorade', for example configs/dinorade.py"
-        )
-
-
-def loader_arguments(
-    config: ConfigDict, frames: Sequence[Frame], embeddings: PathLike | None = None
-) -> dict[str, Any]:
-    """Arguments of `radejax.data.pipeline.make_loader` for images and cameras.
-
-    Args:
-        config: Of the run; `model.image` and `data.camera` are read.
-        frames: Of a data set.
-        embeddings: Folder of `radejax embed`, in place of the images.
-
-    Returns:
-        Nothing for a model without a camera.
-
-    Raises:
-        UserError: Images, calibrations or embeddings are missing or of another size or
-            backbone.
-    """
-    if not has_camera(config):
-        if embeddings is not None:
-            raise UserError(
-                f"embeddings are given, but config.model.name is {config.model.name!r}, "
-                "which has no camera"
-            )
-        return {}
-    options, image = config.data.camera, config.model.image
-    features = None
-    if embeddings is not None:
-        _check_embeddable(config)
-        features = open_embeddings(embeddings, config.model)
-    arguments = {
-        "cameras": frame_cameras(
-            frames,
-            tuple(image.size),
-            projection=options.projection,
-            ego_from_lidar_m=options.ego_from_lidar_m,
-            resize=options.resize,
-            allow_missing=options.allow_missing,
-            embedded=() if features is None else features.index_of(),
-        ),
-        "allow_missing_images": options.allow_missing,
-        "image_size": tuple(image.size),
-        "resize_images": options.resize,
-    }
-    given = {"images": True} if features is None else {"features": features}
-    return {**arguments, **given}
-
-
-def _check_embeddable(config: ConfigDict) -> None:
-    if not config.model.image.freeze:
-        raise UserError(
-            "embeddings are what a frozen backbone makes of images, but "
-            "config.model.image.freeze is False"
-        )
-    if config.data.mirror_probability:
-        raise UserError(
-            "embeddings cannot be mirrored: set config.data.mirror_probability to 0"
-        )
-
-
-def require_images(
-    frames: Sequence[Frame], arguments: Mapping[str, Any], split: str = "train"
-) -> None:
-    """`UserError` if no frame has both an image and a calibration.
-
-    Args:
-        frames: Of the split.
-        arguments: Of `loader_arguments`; empty for models without a camera.
-        split: Its name, for the message.
-    """
-    cameras = arguments.get("cameras")
-    if cameras is None or any(camera.is_valid for camera in cameras):
-        return
-    lacking = {
-        "front image (cam-front/cam-front_*.png)": sum(
-            frame.camera_path is None for frame in frames
-        ),
-        "camera calibration (calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of "
-        "K-Radar's repository: --camera_calibration FOLDER)": sum(
-            frame.camera_calibration_path is None for frame in frames
-        ),
-    }
-    reasons = "; ".join(f"{n} have no {what}" for what, n in lacking.items() if n)
-    raise UserError(
-        f"no frame of the {split} split ({len(frames)}) can use the camera: {reasons}"
-    )
-
-
 def load_image_backbone(
-    path: PathLike | None, config: ConfigDict, embeddings: PathLike | None = None
-) -> Any:
-    """Pretrained part of the variables, for `radejax.models.dinorade.with_pretrained`.
+    path: PathLike | None, model: nn.Module, embeddings: PathLike | None = None
+) -> Mapping[str, Any] | None:
+    """Pretrained part of the variables, for `radejax.training.state.with_pretrained`.
 
     Args:
         path: A DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
-        config: Of the run; `model.image` says which kind is expected.
+        model: Says which kind is expected.
         embeddings: Folder of `radejax embed` that stands for the frozen part: what is
             left is the ResNet's last stage, and nothing of a DINOv3.
 
@@ -148,18 +50,17 @@ def load_image_backbone(
             embeddings are from; or the model has a frozen backbone and no weights are
             given.
     """
-    if not has_camera(config):
+    if not models.has_camera(model):
         if path is not None:
             raise UserError(
-                f"image backbone weights are given, but config.model.name is "
-                f"{config.model.name!r}, which has no camera"
+                "image backbone weights are given, but config.model.name is 'radenet', "
+                "which has no camera"
             )
         return None
-    image = config.model.image
-    if embeddings is not None and path is None and image.kind == "vit":
+    if embeddings is not None and path is None and model.vit is not None:
         return None
     if path is None:
-        if image.freeze:
+        if model.freeze:
             raise UserError(
                 "config.model.image.freeze is True, but no weights are given: "
                 "--image_backbone FOLDER (DINOv3 from Hugging Face: config.json and "
@@ -167,12 +68,10 @@ def load_image_backbone(
                 "with --config.model.image.freeze=False"
             )
         return None
-    if image.kind == "resnet50":
-        from radejax.interop import resnet_torch
-
+    if model.vit is None:
         part = resnet_torch.load(path)
     else:
-        part = {"params": {IMAGE_BACKBONE: _load_dinov3(path, config)}}
+        part = {"params": {IMAGE_BACKBONE: _load_dinov3(path, model.vit)}}
     if embeddings is not None:
         params = dict(part["params"])
         check_same_backbone(params.pop(IMAGE_BACKBONE), embeddings, path)
@@ -190,18 +89,15 @@ def check_same_backbone(params: Any, embeddings: PathLike, source: PathLike) -> 
         )
 
 
-def _load_dinov3(path: PathLike, config: ConfigDict) -> Any:
+def _load_dinov3(path: PathLike, configured: ViT) -> Any:
     """Parameters of the backbone in a Hugging Face folder."""
-    from radejax.interop import dinov3_hf
-
-    image = config.model.image
     model, variables = dinov3_hf.load(path)
-    configured = models.build(config.model).vit
     for name in (field.name for field in dataclasses.fields(model)):
         found, wanted = getattr(model, name), getattr(configured, name)
         if name in _FREE_FIELDS or found == wanted:
             continue
-        where = f"config.model.image.{name}" if name in image else "the configured one"
+        is_field = name in dinorade_config.IMAGE_FIELDS
+        where = f"config.model.image.{name}" if is_field else "the configured one"
         raise UserError(
             f"{path}: the backbone has {name} = {found}, {where} is {wanted}"
         )
@@ -238,6 +134,10 @@ def check_fits(model: DinoRade, variables: Mapping[str, Any], source: str) -> No
         )
 
 
-def missing_backbone(params: Mapping[str, Any], config: ConfigDict) -> bool:
-    """Whether parameters from a checkpoint lack the frozen backbone."""
-    return has_camera(config) and IMAGE_BACKBONE not in params
+def weights_sha256(params: Mapping[str, Any]) -> str:
+    """Checksum of a tree of weights: names, shapes and values."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf, np.float32).tobytes())
+    return digest.hexdigest()

@@ -22,7 +22,7 @@ def load(state_dict_or_path: Mapping[str, Any] | str | pathlib.Path) -> dict[str
     Returns:
         `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}`,
         without the 1x1 projection, which is DinoRADE's own: for
-        `radejax.models.dinorade.with_pretrained`.
+        `radejax.training.state.with_pretrained`.
 
     Raises:
         FileNotFoundError: There is no such file.

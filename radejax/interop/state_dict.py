@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pathlib
 import re
 from collections.abc import Iterable, Mapping
@@ -147,7 +148,7 @@ def read_state_dict(content_or_path: Any) -> tuple[Any, str]:
         FileNotFoundError: There is no such file.
         DataError: The file is damaged.
     """
-    if not isinstance(content_or_path, str | pathlib.Path):
+    if not isinstance(content_or_path, str | os.PathLike):
         return content_or_path, "state dict"
     path = pathlib.Path(content_or_path)
     if path.suffix == ".npz":

@@ -190,37 +190,6 @@ class DinoRade(nn.Module):
         return self.image_neck(features, jnp.asarray(has_image), train=train)
 
 
-def with_pretrained(
-    variables: Mapping[str, Any], part: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Variables with some of them replaced, such as a pretrained image backbone.
-
-    Args:
-        variables: Of a model: "params" and other collections.
-        part: The same tree or a part of it, e.g.
-            `{"params": {"image_backbone": params}}`. What `variables` lack is added.
-
-    Raises:
-        UserError: Shapes or structure differ.
-    """
-
-    def merge(old: Any, new: Any, path: str) -> Any:
-        if isinstance(new, Mapping) and isinstance(old, Mapping):
-            added = {
-                k: merge(old[k], v, f"{path}/{k}") if k in old else v
-                for k, v in new.items()
-            }
-            return {**old, **added}
-        shapes = [getattr(x, "shape", type(x).__name__) for x in (old, new)]
-        if shapes[0] != shapes[1]:
-            raise UserError(
-                f"pretrained {path.strip('/')} is {shapes[1]}, the model has {shapes[0]}"
-            )
-        return new
-
-    return merge(dict(variables), part, "")
-
-
 def num_parameters(variables: Mapping[str, Any]) -> tuple[int, int]:
     """Numbers of parameters outside and inside the image backbone."""
     sizes = [0, 0]

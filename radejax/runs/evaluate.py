@@ -1,49 +1,125 @@
-"""Evaluation of a run: detect on a split, score, tabulate, draw."""
+"""Evaluation of a model on data: detect on a split, score, tabulate, draw."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-import os
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import flax.linen as nn
+import jax
 import numpy as np
+from ml_collections import ConfigDict
 
+from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.encoding import decode as decode_array
-from radejax.data.frame_table import IMAGE_SIZE, read_left_image
-from radejax.data.kradar import KRadar
-from radejax.data.kradar.folders import read_grid
-from radejax.data.kradar.frame import Frame
-from radejax.data.records.projections import RecordSource, describe_grid
-from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.data.cameras import require_images
+from radejax.data.kradar import Frame, KRadar
+from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.report import Report, write_report
-from radejax.geometry.calibration import CameraCalibration
+from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.interop import image_backbone as camera_inputs
-from radejax.runs.camera_share import camera_share
-from radejax.runs.data import OtherData, project
-from radejax.runs.workdir import Run, load_run
+from radejax.runs import pictures
+from radejax.runs.data import Data, Sources, data_of_run
 from radejax.training import processes
-from radejax.visualize.camera_share import write_camera_share
 
 _log = logging.getLogger(__name__)
 
 
-def evaluate_run(
-    workdir: str | os.PathLike,
+def evaluate(
+    config: ConfigDict,
+    model: nn.Module,
+    variables: Mapping[str, Any],
+    data: Data,
+    workdir: pathlib.Path,
     *,
-    step: int | str | None = None,
+    out: pathlib.Path | None = None,
     split: str = "test",
-    out: str | os.PathLike | None = None,
-    num_pictures: int | None = None,
-    image_backbone: str | os.PathLike | None = None,
     exchange_images: int | None = None,
-    other: OtherData | None = None,
+    num_pictures: int | None = None,
+    step: int | None = None,
+) -> Report | None:
+    """Detects on a split as the config says, on all devices, and writes the report.
+
+    Args:
+        config: Of the run.
+        model: What `config.model` describes.
+        variables: Of the model.
+        data: To evaluate on.
+        workdir: Of the run.
+        out: Folder of the results; `evaluation` in the work folder if None.
+        split: "test", "train", "all" or a split file.
+        exchange_images: Seed; see `evaluate_run`.
+        num_pictures: Frames drawn; as the config says if None.
+        step: Of the variables, for `source.json`.
+
+    Returns:
+        The report that was written; None on all processes but the first, which return
+        when it is there.
+
+    Raises:
+        UserError: There are no frames of the split, or images to exchange.
+    """
+    frames, seen = _frames(data, split, exchange_images)
+    out = workdir / "evaluation" if out is None else out
+    predictor = make_predictor(config, model, data)
+    predictor.update(variables)
+    batch_size, images = config.evaluation.batch_size, data.images(seen)
+    predictions = predict_dataset(
+        predictor, data.records, seen, batch_size, images=images
+    )
+
+    def report() -> Report:
+        out.mkdir(parents=True, exist_ok=True)
+        source = source_of(data, split, exchange_images)
+        files.write_json(out / "source.json", {"step": step, **source})
+        drawer = pictures.FrameDrawer(
+            data.records,
+            frames,
+            predictions,
+            roi=config.evaluation.roi,
+            score_threshold=config.decode.score_threshold,
+        )
+        ground_truth, table = tables_from_frames(frames)
+        report = write_report(
+            ground_truth,
+            predictions,
+            table,
+            out,
+            report_options(config, workdir.name),
+            bootstrap=config.evaluation.bootstrap,
+            left_out_before=frames.summary().counts,
+            draw_frame=drawer,
+        )
+        _log.info("step %s, split %s\n%s", step, split, report.text)
+        if models.has_camera(model):
+            pictures.draw_camera_share(model, variables, data, frames, out)
+        count = config.evaluation.num_pictures if num_pictures is None else num_pictures
+        drawn = drawer.draw_spread(out / "pictures", count)
+        if drawn:
+            drawer.draw_scenes(out / "scenes.png")
+        if (workdir / "metrics.jsonl").exists():
+            pictures.draw_curves(workdir, out / "training.png")
+        _log.info("drew %d frames in %s", len(drawn), out / "pictures")
+        return report
+
+    return processes.main_only(report)
+
+
+def evaluate_run(
+    workdir: PathLike,
+    *,
+    step: Step = None,
+    split: str = "test",
+    out: PathLike | None = None,
+    num_pictures: int | None = None,
+    image_backbone: PathLike | None = None,
+    exchange_images: int | None = None,
+    other: Sources | None = None,
 ) -> Report | None:
     """Evaluates a run's checkpoint as its config says, on all devices.
 
@@ -54,105 +130,85 @@ def evaluate_run(
         out: Folder of the results; `evaluation` in the work folder if None, and
             `evaluation_<name>` for other data.
         num_pictures: Frames drawn; as the config says if None.
-        image_backbone: Weights of a frozen backbone, see `load_run`.
+        image_backbone: Weights of a frozen backbone, see `inference.open.load`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
             control of what a radar-camera model knows from the images. `out` then ends
             in `_exchanged`.
         other: Other data than the run's own; projected if they are not yet.
 
     Returns:
-        The report that was written; None on all processes but the first, which return
-        when it is there.
+        The report that was written; None on all processes but the first.
 
     Raises:
         UserError: There are no frames of the split, or images to exchange; the run has
             no data and none are given; other data do not fit the run, or `out` has
             results on others.
     """
-    run = load_run(workdir, step, image_backbone)
-    if other is not None:
-        run = with_other_data(run, other)
-    config = run.config
-    if run.paths is None:
-        raise UserError(
-            f"{run.workdir}: trained on frames that were never written, there is no "
-            "split to evaluate on; give --data ROOT, or use `radejax detect`"
-        )
-    frames = run.paths.open(config, None if split == "all" else split)
-    if not len(frames):
-        raise UserError(f"no frames of split {split} in {', '.join(run.paths.roots)}")
-    seen = frames
-    if exchange_images is not None:
-        camera_inputs.require_camera(config)
-        seen = with_images_exchanged(frames, exchange_images)
-    inputs = camera_inputs.loader_arguments(config, seen, run.paths.embeddings)
-    source = {
-        "step": run.step,
-        "split": split,
-        "exchange_images": exchange_images,
-        "label_version": config.data.label_version,
-        **dataclasses.asdict(run.paths),
-        "roots": list(run.paths.roots),  # as JSON has them
-    }
+    loaded = load(workdir, step=step, image_backbone=image_backbone)
+    workdir = pathlib.Path(workdir).absolute()
+    config, data = data_of_run(loaded, workdir, other)
     name = "evaluation" if other is None else f"evaluation_{other.name}"
     name += "" if exchange_images is None else "_exchanged"
     if other is not None:
-        camera_inputs.require_images(frames, inputs, split)
+        frames, _ = _frames(data, split, exchange_images)
+        require_images(frames, data.images(frames), split)
         if out is None:
-            _check_source(run.workdir / name, source)
-        processes.main_first(lambda: project(config, run.paths))
-    out = pathlib.Path(out or run.workdir / name)
-    records = RecordSource(run.paths.records, grid=run.grid)
-    options = config.evaluation
-    predictor = Predictor(
-        config, run.variables, run.grid, score_threshold=options.score_threshold
-    )
-    predictions = predict_dataset(
-        predictor, records, seen, options.batch_size, inputs=inputs
-    )
-    count = options.num_pictures if num_pictures is None else num_pictures
-    return processes.main_only(
-        lambda: _report(run, source, frames, records, predictions, out, count)
+            _check_source(workdir / name, source_of(data, split, exchange_images))
+        data.project()
+    return evaluate(
+        config,
+        loaded.model,
+        loaded.variables,
+        data,
+        workdir,
+        out=pathlib.Path(out or workdir / name),
+        split=split,
+        exchange_images=exchange_images,
+        num_pictures=num_pictures,
+        step=loaded.step,
     )
 
 
-def with_other_data(run: Run, other: OtherData) -> Run:
-    """A run with other data in place of its own; nothing is projected.
-
-    Raises:
-        UserError: They are of another radar grid, or without what a frozen image
-            backbone makes of their images.
-        FileNotFoundError: A folder is not there.
-    """
-    config, paths = run.config, other.paths(run.paths)
-    if other.label_version is not None:
-        config = config.copy_and_resolve_references()
-        config.data.label_version = other.label_version
-    grid = read_grid(list(map(pathlib.Path, paths.roots)))
-    if grid != run.grid:
-        raise UserError(
-            f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
-            f"{run.workdir} was trained on {describe_grid(run.grid)}"
-        )
-    is_blind = camera_inputs.missing_backbone(run.variables["params"], config)
-    if is_blind and paths.embeddings is None:
-        raise UserError(
-            f"{run.workdir} is without the weights of its image backbone: give "
-            "--image_backbone FOLDER, or --embeddings FOLDER of these images"
-        )
-    return dataclasses.replace(run, config=config, paths=paths)
+def source_of(
+    data: Data, split: str, exchange_images: int | None = None
+) -> dict[str, Any]:
+    """What results are of, plain values."""
+    return {
+        "split": split,
+        "exchange_images": exchange_images,
+        "label_version": data.options.label_version,
+        **dataclasses.asdict(data.paths),
+        "roots": list(data.paths.roots),  # as JSON has them
+    }
 
 
 def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     """`UserError` if a folder has results on other data than these."""
     if not (out / "source.json").exists():
         return
-    found = files.read_json(out / "source.json")
-    for name in ("roots", "labels", "label_version", "split"):
-        if (there := found.get(name)) != (here := source[name]):
-            raise UserError(
-                f"{out} has results of {name} {there}, these are of {here}: give --out"
-            )
+    names = ("roots", "labels", "label_version", "split")
+    found, wanted = (
+        {name: values.get(name) for name in names}
+        for values in (files.read_json(out / "source.json"), source)
+    )
+    files.require_same(found, wanted, f"{out} has other results", mend="give --out")
+
+
+def _frames(
+    data: Data, split: str, exchange_images: int | None
+) -> tuple[KRadar, Sequence[Frame]]:
+    """Frames of a split, and the same as the model is to see them."""
+    frames = data.split(None if split == "all" else split)
+    if not len(frames):
+        raise UserError(f"no frames of split {split} in {', '.join(data.paths.roots)}")
+    if exchange_images is None:
+        return frames, frames
+    if data.camera is None:
+        raise UserError(
+            "config.model.name is 'radenet', which has no camera; expected 'dinorade', "
+            "for example configs/dinorade.py"
+        )
+    return frames, with_images_exchanged(frames, exchange_images)
 
 
 def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
@@ -175,47 +231,25 @@ def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
     return exchanged
 
 
-def _report(
-    run: Run,
-    source: Mapping[str, Any],
-    frames: KRadar,
-    records: RecordSource,
-    predictions: Mapping[str, np.ndarray],
-    out: pathlib.Path,
-    num_pictures: int,
-) -> Report:
-    """Scores predictions, and writes and draws everything into `out`."""
-    config = run.config
-    out.mkdir(parents=True, exist_ok=True)
-    files.write_json(out / "source.json", source)
-    drawer = FrameDrawer(records, frames, predictions, config)
-    ground_truth, table = tables_from_frames(frames)
-    report = write_report(
-        ground_truth,
-        predictions,
-        table,
-        out,
-        report_options(config, run.workdir.name),
-        bootstrap=config.evaluation.bootstrap,
-        left_out_before=frames.summary().counts,
-        draw_frame=drawer,
+def make_predictor(
+    config: ConfigDict,
+    model: nn.Module,
+    data: Data,
+    mesh: jax.sharding.Mesh | None = None,
+) -> Predictor:
+    """Predictor with the score threshold of evaluations, still without variables."""
+    threshold = config.evaluation.score_threshold
+    return Predictor(
+        model,
+        data.records.grid,
+        classes=config.classes,
+        decode={**config.decode, "score_threshold": threshold},
+        azimuth_mapping=config.data.azimuth_mapping,
+        mesh=mesh,
     )
-    _log.info("step %d, split %s\n%s", run.step, source["split"], report.text)
-    if camera_inputs.has_camera(config):
-        shares = camera_share(
-            config, run.variables, records, frames, embeddings=run.paths.embeddings
-        )
-        write_camera_share(out, *shares, run.grid)
-    pictures = drawer.draw_spread(out / "pictures", num_pictures)
-    if pictures:
-        drawer.draw_scenes(out / "scenes.png")
-    if (run.workdir / "metrics.jsonl").exists():
-        draw_curves(run.workdir, out / "training.png")
-    _log.info("drew %d frames in %s", len(pictures), out / "pictures")
-    return report
 
 
-def report_options(config: Any, name: str) -> Options:
+def report_options(config: ConfigDict, name: str) -> Options:
     """How the config of a run says that it is evaluated, without intervals."""
     options = config.evaluation
     protocols = tuple(options.protocols)
@@ -229,146 +263,7 @@ def report_options(config: Any, name: str) -> Options:
         roi=tuple(options.roi),
         score_threshold=options.score_threshold,
         skip_empty=None if options.skip_empty == "none" else options.skip_empty,
-        label_version=config.data.label_version,
+        label_version=config.data.options.label_version,
         invalid_sizes="false_positive",
         bootstrap=0,
     )
-
-
-def record_positions(records: RecordSource, frames: KRadar) -> list[int]:
-    """Index of the record of every frame.
-
-    Raises:
-        UserError: Frames have no record; says how many and names the first.
-    """
-    index_of = records.index_of()
-    missing = [frame.key for frame in frames if frame.key not in index_of]
-    if missing:
-        raise UserError(
-            f"{len(missing)} of {len(frames)} frames have no record in "
-            f"{records.folder}, the first is {missing[0]}: project the data set again"
-        )
-    return [index_of[frame.key] for frame in frames]
-
-
-class FrameDrawer:
-    """Draws frames of a data set with their ground truth and predictions.
-
-    Args:
-        records: Projections.
-        frames: The data set.
-        predictions: Columns as `predict_dataset` returns; drawn are those above
-            `decode.score_threshold`, as a detector in use would show them.
-        config: Of the run.
-    """
-
-    def __init__(
-        self,
-        records: RecordSource,
-        frames: KRadar,
-        predictions: Mapping[str, np.ndarray],
-        config: Any,
-    ) -> None:
-        self._records = records
-        self._frames = frames
-        self._positions = record_positions(records, frames)
-        self._predictions = predictions
-        self._roi = tuple(config.evaluation.roi)
-        self._score_threshold = config.decode.score_threshold
-
-    def __call__(self, index: int, path: str | os.PathLike) -> None:
-        """Draws the frame at a position of the data set into a picture file."""
-        from radejax.visualize import bev
-
-        scene = self._scene(int(index))
-        frame = self._frames[int(index)]
-        title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
-        figure = bev.draw_frame(dataclasses.replace(scene, title=title))
-        bev.save_figure(figure, path)
-
-    def _scene(self, index: int) -> Any:
-        """The frame at a position with its boxes and image."""
-        from radejax.visualize.canvas import Scene
-
-        frame = self._frames[index]
-        mine = self._predictions["frame"] == index
-        mine &= self._predictions["score"] >= self._score_threshold
-        columns = {k: v[mine] for k, v in self._predictions.items()}
-        record = self._records[self._positions[index]]
-        image, camera = front_view(frame)
-        return Scene(
-            decode_array(record["projection"]),
-            self._records.grid,
-            ground_truth=(frame.boxes, list(frame.classes)),
-            predictions=(columns["box"], columns["score"], list(columns["cls"])),
-            roi=self._roi,
-            image=image,
-            camera=camera,
-            title=f"{frame.weather} ({frame.key})",
-        )
-
-    def draw_scenes(self, path: str | os.PathLike) -> None:
-        """Draws one frame of each weather, that with the most objects, side by side.
-
-        The layout of RADE-Net's Figure 4.
-        """
-        from radejax.visualize import bev
-        from radejax.visualize.scenes import draw_scenes
-
-        fullest: dict[str, int] = {}
-        for i, frame in enumerate(self._frames):
-            best = fullest.setdefault(frame.weather, i)
-            if len(frame.boxes) > len(self._frames[best].boxes):
-                fullest[frame.weather] = i
-        scenes = [self._scene(i) for i in fullest.values()]
-        figure = draw_scenes(scenes)
-        bev.save_figure(figure, path)
-
-    def draw_spread(self, folder: pathlib.Path, count: int) -> list[pathlib.Path]:
-        """Draws frames with objects, spread evenly over the data set."""
-        candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
-        if not candidates or count < 1:
-            return []
-        folder.mkdir(parents=True, exist_ok=True)
-        spread = np.linspace(0, len(candidates) - 1, min(count, len(candidates)))
-        paths = []
-        for index in np.array(candidates)[np.round(spread).astype(int)]:
-            frame = self._frames[index]
-            paths.append(folder / f"{frame.sequence:02d}_{frame.name}.png")
-            self(index, paths[-1])
-        return paths
-
-
-def draw_curves(workdir: pathlib.Path, path: pathlib.Path) -> None:
-    """Draws the losses of a run over its steps into a picture file."""
-    from radejax.visualize import bev, curves
-
-    figure = curves.draw_training(workdir / "metrics.jsonl", title=workdir.name)
-    bev.save_figure(figure, path)
-
-
-def read_camera(frame: Frame) -> CameraCalibration | None:
-    """Calibration of a frame's left front camera; None where there is no image."""
-    if frame.camera_path is None or frame.camera_calibration_path is None:
-        return None
-    return CameraCalibration.from_kradar(
-        frame.camera_calibration_path, ego_from_lidar_m=frame.radar_from_lidar_m
-    )
-
-
-def front_view(
-    frame: Frame,
-) -> tuple[np.ndarray | None, CameraCalibration | None]:
-    """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
-
-    Images of another size than the calibration's are resized to it. None where there is
-    none.
-
-    Raises:
-        DataError: A file is damaged.
-    """
-    camera = read_camera(frame)
-    if frame.camera_path is None:
-        return None, None
-    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
-    return read_left_image(frame.camera_path, size, resize=True), camera

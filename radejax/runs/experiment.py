@@ -1,9 +1,7 @@
-"""A whole run: data, records, training, evaluation. `workdir.py` says what is where."""
+"""A whole run: data, training, evaluation. `workdir.py` says what is where."""
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import hashlib
 import logging
 import pathlib
@@ -11,6 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import flax.linen as nn
 import jax
 from ml_collections import ConfigDict
 
@@ -18,70 +17,45 @@ from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data import pipeline
-from radejax.data.augment import Augmentation
-from radejax.data.kradar.frame import Frame
-from radejax.data.records.projections import RecordSource
-from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.embed import embeddings_sha256, weights_sha256
-from radejax.interop import image_backbone as camera_inputs
+from radejax.data.kradar import Frame
+from radejax.data.records.embeddings import embeddings_sha256
+from radejax.inference.open import PathLike, starting_weights
+from radejax.interop.image_backbone import weights_sha256
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.runs.data import DataPaths, prepare_data, saved_path
-from radejax.runs.workdir import (
-    PathLike,
-    checkpoint_info,
-    claim_workdir,
-    initial_variables,
-    load_run,
-    lock_workdir,
-    relative,
-    run_info,
-)
+from radejax.runs.data import Data, Sources, open_data
+from radejax.runs.evaluate import evaluate
+from radejax.runs.validation import Validation
+from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
 from radejax.training import loop, processes, sharding
-
-__all__ = [
-    "config_name",
-    "load_run",
-    "make_augmentation",
-    "run",
-    "train",
-]
 
 _log = logging.getLogger(__name__)
 
-
-def config_name(filename: str) -> str:
-    """Name of a run from its config: "configs/radenet.py:stem" gives "radenet-stem"."""
-    path, _, words = filename.partition(":")
-    return "-".join([pathlib.Path(path).stem, *filter(None, words.split(","))])
+_CLOSING = """Done in {minutes:.1f} minutes. Everything is in {folder}:
+  evaluation/      metrics.json, metrics.csv, tables, pictures
+  checkpoints/     the trained model
+  metrics.jsonl    losses by step (tensorboard --logdir {folder})
+Evaluate again:    python evaluate.py --workdir {folder}
+Boxes for a folder of frames:
+                   radejax detect --workdir {folder} --out boxes FOLDER"""
 
 
 def run(
     config: ConfigDict,
     *,
     name: str,
+    sources: Sources = Sources(),  # noqa: B008, frozen
     workdir: PathLike | None = None,
-    data: Sequence[str] | None = None,
-    labels: str | None = None,
-    records: str | None = None,
-    init_from: str | None = None,
-    embeddings: str | None = None,
-    image_backbone: str | None = None,
-    camera_calibration: str | None = None,
+    init_from: PathLike | None = None,
 ) -> pathlib.Path:
     """Everything from nothing to metrics; run again, it continues where it stopped.
 
     Args:
-        config: Complete configuration; with `seeds` one run of each, see
-            `seeds.run_seeds`.
+        config: Complete configuration of one seed; `seeds.run_seeds` takes several.
         name: Of the config, for the default work folder.
+        sources: What the user says of the data; without any they are simulated if the
+            config says how.
         workdir: `runs/<name>` if None.
-        data: K-Radar folders; None simulates them if the config says how.
-        labels: Label revision, see `KRadar`.
-        records: Folder of projected frames, beside the data if None.
         init_from: Weights to start from: official .pth file or another work folder.
-        embeddings: Folder of `radejax embed`, in place of images.
-        image_backbone: Weights of the image backbone, see `load_image_backbone`.
-        camera_calibration: Folder of camera calibrations, the roots' own if None.
 
     Returns:
         The work folder.
@@ -90,156 +64,94 @@ def run(
         UserError: The work folder belongs to another configuration or is in use, no
             data, or no space.
     """
-    if config.seeds:
-        from radejax.runs.seeds import run_seeds
-
-        return run_seeds(
-            config,
-            name=name,
-            workdir=workdir,
-            data=data,
-            labels=labels,
-            records=records,
-            init_from=init_from,
-            embeddings=embeddings,
-            image_backbone=image_backbone,
-            camera_calibration=camera_calibration,
-        )
     started = time.perf_counter()
-    workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
-    models.build(config.model)  # a config that cannot be built should fail first
-    with contextlib.ExitStack() as held:
-        processes.main_only(lambda: held.enter_context(lock_workdir(workdir)))
-        processes.main_first(lambda: claim_workdir(workdir, config))
-        paths = dataclasses.replace(
-            processes.main_first(
-                lambda: prepare_data(
-                    config,
-                    data=data,
-                    labels=labels,
-                    records=records,
-                    camera_calibration=camera_calibration,
-                )
-            ),
-            embeddings=saved_path(embeddings),
-            image_backbone=saved_path(image_backbone),
-        )
-        if _train_and_evaluate(config, workdir, paths, init_from):
-            minutes = (time.perf_counter() - started) / 60
-            _log.info(_CLOSING.format(minutes=minutes, workdir=relative(workdir)))
-    return workdir
-
-
-def _train_and_evaluate(
-    config: ConfigDict, workdir: pathlib.Path, paths: DataPaths, init_from: str | None
-) -> bool:
-    """False where a signal stopped it."""
-    has_test = len(paths.open(config, split="test")) > 0
-    if not has_test:
-        _log.warning(
-            "no frames of the test split in %s: the run is trained and not evaluated",
-            ", ".join(paths.roots),
-        )
-    info = run_info(workdir, paths, init_from)
-    if processes.is_main():
-        files.write_json(workdir / "run.json", info)
-    result = train(config, workdir, paths, info=info, init_from=init_from)
-    if not result.finished:
-        _log.info("stopped at step %d; run the same command to continue", result.step)
-        return False
-    if has_test:
-        from radejax.runs.evaluate import evaluate_run  # drawing, tables: not to train
-
-        evaluate_run(workdir)
-    return True
-
-
-_CLOSING = """Done in {minutes:.1f} minutes. Everything is in {workdir}:
-  evaluation/      metrics.json, metrics.csv, tables, pictures
-  checkpoints/     the trained model
-  metrics.jsonl    losses by step (tensorboard --logdir {workdir})
-Evaluate again:    python evaluate.py --workdir {workdir}
-Boxes for a folder of frames:
-                   radejax detect --workdir {workdir} --out boxes FOLDER"""
-
-
-# Training ----------------------------------------------------------------------------
+    folder = default_workdir(workdir, name)
+    model = models.build(config.model)  # what cannot be built fails first
+    with claimed(folder, config):
+        data = open_data(config, model, sources)
+        has_test = len(data.split("test")) > 0
+        if not has_test:
+            _log.warning(
+                "no frames of the test split in %s: the run is trained and not evaluated",
+                ", ".join(data.paths.roots),
+            )
+        result = train(model, data, folder, config, init_from)
+        if not result.finished:
+            _log.info(
+                "stopped at step %d; run the same command to continue", result.step
+            )
+            return folder
+        if has_test:
+            evaluate(config, model, result.state.eval_variables, data, folder)
+    minutes = (time.perf_counter() - started) / 60
+    _log.info(_CLOSING.format(minutes=minutes, folder=files.relative(folder)))
+    return folder
 
 
 def train(
+    model: nn.Module,
+    data: Data,
+    folder: pathlib.Path,
     config: ConfigDict,
-    workdir: pathlib.Path,
-    paths: DataPaths,
-    *,
-    info: Mapping[str, Any],
-    init_from: str | None = None,
+    init_from: PathLike | None = None,
 ) -> loop.TrainResult:
-    """Trains on the train split until the configured epochs are done."""
-    records = RecordSource(paths.records)
-    frames = paths.open(config, split="train")
+    """Trains on the train split until the configured epochs are done.
+
+    Args:
+        model: What `config.model` describes.
+        data: Of the run.
+        folder: Work folder.
+        config: Of the run.
+        init_from: Weights to start from: official .pth file or another work folder.
+
+    Raises:
+        UserError: No frames to train on or no usable image, or weights that do not fit.
+    """
+    frames = data.split("train")
     if not len(frames):
-        raise UserError(f"no frames of the train split in {', '.join(paths.roots)}")
+        raise UserError(
+            f"no frames of the train split in {', '.join(data.paths.roots)}"
+        )
     sharding.check_batch_size(
         config.train.batch_size,
         sharding.make_mesh(),
         "train.batch_size",
         config.train.num_accumulate,
     )
-    inputs = camera_inputs.loader_arguments(config, frames, paths.embeddings)
-    camera_inputs.require_images(frames, inputs)
-    loader = pipeline.make_loader(
-        records,
-        frames,
-        batch_size=config.train.batch_size // jax.process_count(),
-        max_objects=config.data.max_objects,
-        classes=config.classes,
-        seed=config.seed,
-        augment=make_augmentation(config.data, records.grid),
-        num_threads=config.data.num_threads,
-        num_workers=config.data.num_workers,
-        label_permutation_seed=config.data.label_permutation_seed,
-        **inputs,
+    rows = config.train.batch_size // jax.process_count()
+    loader = data.training_batches(frames, batch_size=rows, seed=config.seed)
+    variables, pretrained = starting_weights(
+        model,
+        init_from=init_from,
+        image_backbone_path=data.paths.image_backbone,
+        embeddings=data.paths.embeddings,
     )
-    evaluate = None
+    stays = _what_stays(frames, variables, pretrained, data.paths.embeddings, model)
+    info = run_info(folder, data.paths, init_from)
+    if processes.is_main():
+        files.write_json(folder / "run.json", info)
+    validation = None
     if config.train.evaluate_every_epochs:
-        from radejax.runs.validation import Validation  # above: it reads whole runs
-
-        evaluate = Validation(config, paths)
-    model, variables = models.build(config.model), None
-    if init_from is not None:
-        variables = initial_variables(init_from, config)
-    pretrained = None
-    if not _has_backbone(variables):
-        pretrained = camera_inputs.load_image_backbone(
-            paths.image_backbone, config, paths.embeddings
-        )
+        validation = Validation(config, model, data)
     return loop.train(
         model,
         variables,
         loader,
-        models.map_grid(records.grid, model, config.data.azimuth_mapping),
-        workdir,
-        config=config,
-        info=checkpoint_info(
-            config,
-            records.grid,
-            info,
-            _what_stays(frames, variables, pretrained, paths.embeddings, model),
-        ),
+        models.map_grid(data.records.grid, model, config.data.azimuth_mapping),
+        folder,
+        options=config.train,
+        loss=config.loss,
+        watch=config.watch,
+        seed=config.seed,
+        info=checkpoint_info(config, data.records.grid, info, stays),
         steps_per_epoch=pipeline.steps_per_epoch(
-            len(frames),
-            config.train.batch_size // jax.process_count(),
-            process_count=jax.process_count(),
+            len(frames), rows, process_count=jax.process_count()
         ),
         pretrained=pretrained,
-        evaluate=evaluate,
+        evaluate=validation,
         trace_folder=config.profile,
         frame_names=[frame.key for frame in frames],
     )
-
-
-def _has_backbone(variables: Mapping[str, Any] | None) -> bool:
-    return variables is not None and IMAGE_BACKBONE in variables["params"]
 
 
 def _what_stays(
@@ -247,7 +159,7 @@ def _what_stays(
     variables: Mapping[str, Any] | None,
     pretrained: Mapping[str, Any] | None,
     embeddings: str | None,
-    model: Any,
+    model: nn.Module,
 ) -> dict[str, Any]:
     """What a checkpoint does not hold and a run must not change on its way.
 
@@ -267,15 +179,3 @@ def _what_stays(
             digest = weights_sha256(source["params"][IMAGE_BACKBONE])
         stays["sha256 of the frozen image backbone"] = digest[:16]
     return stays
-
-
-def make_augmentation(data: ConfigDict, grid: RadarGrid) -> Augmentation | None:
-    """Random changes of training frames as `config.data` says; None for none."""
-    augmentation = Augmentation(
-        grid=grid,
-        mirror_probability=data.mirror_probability,
-        gain_db=data.gain_db,
-        gain_slope_db=data.gain_slope_db,
-    )
-    is_on = data.mirror_probability or data.gain_db or data.gain_slope_db
-    return augmentation if is_on else None

@@ -14,6 +14,8 @@ from tabulate import tabulate
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.runs.experiment import run
+from radejax.runs.workdir import PathLike, default_workdir
 from radejax.training import processes
 
 _log = logging.getLogger(__name__)
@@ -22,7 +24,7 @@ _KEYS = ("protocol", "condition", "cls", "space", "iou")
 
 
 def run_seeds(
-    config: ConfigDict, *, name: str, workdir: str | None = None, **options: Any
+    config: ConfigDict, *, name: str, workdir: PathLike | None = None, **options: Any
 ) -> pathlib.Path:
     """Runs a config with every seed of `config.seeds`, one after the other.
 
@@ -43,12 +45,10 @@ def run_seeds(
     Raises:
         UserError: Two seeds are equal; and as `experiment.run`.
     """
-    from radejax.runs.experiment import run  # which comes here for several seeds
-
     seeds = tuple(int(seed) for seed in config.seeds)
     if len(set(seeds)) < len(seeds):
         raise UserError(f"config.seeds has a seed twice: {list(seeds)}")
-    workdir = pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
+    workdir = default_workdir(workdir, name)
     tables = {}
     for seed in seeds:
         one = config.copy_and_resolve_references()

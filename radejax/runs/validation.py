@@ -8,18 +8,20 @@ import tempfile
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import flax.linen as nn
 import jax
 import numpy as np
+from ml_collections import ConfigDict
+from PIL import Image
 
 from radejax.core.errors import UserError
-from radejax.data.records.projections import RecordSource
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.predictions import tables_from_frames
+from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
-from radejax.inference.predict import Predictor, predict_dataset
-from radejax.interop import image_backbone
-from radejax.runs.data import DataPaths
-from radejax.runs.evaluate import FrameDrawer, report_options
+from radejax.inference.predict import predict_dataset
+from radejax.runs.data import Data
+from radejax.runs.evaluate import make_predictor, report_options
+from radejax.runs.pictures import FrameDrawer
 from radejax.training import processes
 from radejax.training.state import TrainState
 from radejax.training.watch import Scores
@@ -33,7 +35,8 @@ class Validation:
     Args:
         config: Of the run; `evaluation`, `decode`, `watch` and `train.best_metric` are
             read.
-        paths: Its data.
+        model: That is trained.
+        data: Of the run.
         mesh: All devices if None.
 
     Raises:
@@ -42,23 +45,23 @@ class Validation:
     """
 
     def __init__(
-        self, config: Any, paths: DataPaths, mesh: jax.sharding.Mesh | None = None
+        self,
+        config: ConfigDict,
+        model: nn.Module,
+        data: Data,
+        mesh: jax.sharding.Mesh | None = None,
     ) -> None:
-        self._config = config
-        self._mesh = mesh
-        self._records = RecordSource(paths.records)
-        self._frames = paths.open(config, "test")
+        self._config, self._records = config, data.records
+        self._frames = data.split("test")
         if not len(self._frames):
             raise UserError(
                 "no frames of the test split to evaluate on during training; set "
                 "train.evaluate_every_epochs=0"
             )
-        self._inputs = image_backbone.loader_arguments(
-            config, self._frames, paths.embeddings
-        )
+        self._images = data.images(self._frames)
         self._ground_truth, self._table = tables_from_frames(self._frames)
         self._options = report_options(config, "training")
-        self._predictor: Predictor | None = None
+        self._predictor = make_predictor(config, model, data, mesh)
         _check_best(config.train.best_metric, self._options)
 
     def __call__(
@@ -99,14 +102,6 @@ class Validation:
     def _predict(
         self, variables: Mapping[str, Any], should_stop: Callable[[], bool] | None
     ) -> dict[str, np.ndarray]:
-        if self._predictor is None:
-            self._predictor = Predictor(
-                self._config,
-                variables,
-                self._records.grid,
-                score_threshold=self._options.score_threshold,
-                mesh=self._mesh,
-            )
         self._predictor.update(variables)
         try:
             return predict_dataset(
@@ -114,7 +109,7 @@ class Validation:
                 self._records,
                 self._frames,
                 self._config.evaluation.batch_size,
-                inputs=self._inputs,
+                images=self._images,
                 progress=False,
                 should_stop=should_stop,
             )
@@ -134,9 +129,13 @@ class Validation:
         count = self._config.watch.num_pictures
         if not count:
             return {}
-        from PIL import Image
-
-        drawer = FrameDrawer(self._records, self._frames, predictions, self._config)
+        drawer = FrameDrawer(
+            self._records,
+            self._frames,
+            predictions,
+            roi=self._options.roi,
+            score_threshold=self._config.decode.score_threshold,
+        )
         pictures = {}
         with tempfile.TemporaryDirectory() as folder:
             for path in drawer.draw_spread(pathlib.Path(folder), count):

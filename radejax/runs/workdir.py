@@ -1,4 +1,4 @@
-"""The folder of a run: what it says of configuration and data, and the model in it.
+"""The folder of a run, and what is where in it.
 
 config.json      the configuration; a run never changes it
 run.json         where its data are, versions, command
@@ -13,9 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import json
-import logging
 import os
 import pathlib
 import shlex
@@ -27,115 +25,49 @@ import jax
 from ml_collections import ConfigDict
 
 import radejax
-from radejax import models
 from radejax.core import files
-from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.interop import image_backbone as camera_inputs
-from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.data import DataPaths, saved_path
-from radejax.training.checkpoints import BEST, Checkpoints
-
-_log = logging.getLogger(__name__)
+from radejax.training import processes
 
 PathLike = str | os.PathLike
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """A run as its work folder keeps it.
-
-    Attributes:
-        workdir: Its folder.
-        config: Its configuration.
-        paths: Its data; None of a run on frames that were never written.
-        grid: Of the sensor.
-        variables: Of the model, at `step`.
-        step: Of the checkpoint.
-    """
-
-    workdir: pathlib.Path
-    config: ConfigDict
-    paths: DataPaths | None
-    grid: RadarGrid
-    variables: Mapping[str, Any]
-    step: int
+def default_workdir(workdir: PathLike | None, name: str) -> pathlib.Path:
+    """Absolute path of the work folder: `runs/<name>` unless another is given."""
+    return pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
 
 
 @contextlib.contextmanager
-def lock_workdir(workdir: pathlib.Path) -> Iterator[None]:
+def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
     """Keeps a second training out of a work folder, which is made if missing.
 
-    The system releases the lock however the process ends.
-
     Raises:
-        UserError: Another process holds it.
+        UserError: Another process holds it, or it belongs to a run with another
+            configuration; names the fields that differ.
     """
-    workdir.mkdir(parents=True, exist_ok=True)
-    with (workdir / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"another training is at work in {relative(workdir)}: wait for its "
-                "end, or give another --workdir"
-            ) from None
-        except OSError as error:
-            _log.warning("no locks on the disk of %s (%s)", workdir, error.strerror)
-        yield
-
-
-def claim_workdir(workdir: pathlib.Path, config: ConfigDict) -> None:
-    """Writes the configuration into a work folder, or checks that it is the same.
-
-    Raises:
-        UserError: The folder belongs to a run with another configuration; names the
-            fields that differ.
-    """
-    path = workdir / "config.json"
     wanted = json.loads(config.to_json()) | {"profile": "", "seeds": []}
-    if path.exists():
-        found = files.read_json(path)
-        if found | {"watch": None} != wanted | {"watch": None}:
-            raise UserError(
-                f"{relative(workdir)} holds a run with another config: "
-                + "; ".join(differences(found, wanted))
-                + ". Give another --workdir, or remove that one"
+    with contextlib.ExitStack() as held:
+        processes.main_only(
+            lambda: held.enter_context(
+                files.lock(
+                    workdir / "lock",
+                    f"another training is at work in {files.relative(workdir)}: wait "
+                    "for its end, or give another --workdir",
+                )
             )
-        return
-    workdir.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, wanted)
-
-
-def load_config(workdir: PathLike) -> ConfigDict:
-    """Configuration of a run.
-
-    Raises:
-        FileNotFoundError: There is no run in that folder.
-    """
-    workdir = pathlib.Path(workdir)
-    if not (workdir / "config.json").exists():
-        raise FileNotFoundError(f"no run in {workdir}: config.json is missing")
-    return ConfigDict(files.read_json(workdir / "config.json"), convert_dict=True)
-
-
-def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
-    """What differs between two configurations, read from JSON: a line each."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        keys = sorted(set(found) | set(wanted))
-        return [
-            line
-            for key in keys
-            if found.get(key) != wanted.get(key)
-            for line in differences(found.get(key), wanted.get(key), f"{name}.{key}")
-        ]
-    return [f"{name} is {found!r} there and {wanted!r} here"]
-
-
-def relative(path: pathlib.Path) -> str:
-    """A path as messages name it: from the current folder where it is below that."""
-    here = pathlib.Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+        )
+        processes.main_first(
+            lambda: files.claim(
+                workdir / "config.json",
+                wanted,
+                "a run with another config",
+                mend="give another --workdir, or remove that one",
+                name="config",
+                ignore=("watch",),
+            )
+        )
+        yield
 
 
 def run_info(
@@ -167,7 +99,7 @@ def checkpoint_info(
     run: Mapping[str, Any],
     same: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """What every checkpoint of a run carries, plain values; `load_run` reads it.
+    """What every checkpoint of a run carries, plain values; `inference.open` reads it.
 
     Args:
         config: Of the run.
@@ -181,107 +113,3 @@ def checkpoint_info(
         "run": dict(run),
         "same": dict(same),
     }
-
-
-def load_run(
-    workdir: PathLike,
-    step: int | str | None = None,
-    image_backbone: PathLike | None = None,
-) -> Run:
-    """The model of a work folder.
-
-    A frozen image backbone is in no checkpoint: it comes from the file that the run was
-    trained with. A run that trained from embeddings, or whose backbone weights are not
-    where they were, is loaded without, for embedded images alone.
-
-    Args:
-        workdir: Of `train.py`.
-        step: Of the checkpoint, or "best" by `train.best_metric`; the newest if None.
-        image_backbone: Weights of a frozen backbone, in place of those that the run
-            was trained with.
-
-    Raises:
-        FileNotFoundError: No run there, or no such checkpoint.
-        UserError: The backbone given is not the one that the embeddings are from.
-    """
-    workdir = pathlib.Path(workdir).absolute()
-    config = load_config(workdir)
-    if not (workdir / "checkpoints").is_dir():
-        raise FileNotFoundError(
-            f"no checkpoints in {workdir}: the run has not trained yet"
-        )
-    folder = workdir / "checkpoints"
-    with Checkpoints(folder, best_metric=BEST, read_only=True) as checkpoints:
-        if step == "best":
-            step = checkpoints.best_step()
-        state, info, step = checkpoints.restore_variables(step)
-    params = state["ema_params"] if state.get("ema_params") else state["params"]
-    data, paths = info["run"].get("data"), None
-    if data is not None:
-        paths = DataPaths(**{**data, "roots": tuple(data["roots"])})
-    if camera_inputs.missing_backbone(params, config):
-        backbone = _frozen_backbone(config, info["run"], paths, image_backbone)
-        params = {**params, **backbone}
-    return Run(
-        workdir=workdir,
-        config=config,
-        paths=paths,
-        grid=RadarGrid.from_dict(info["grid"]),
-        variables={"params": params, **(state.get("model_state") or {})},
-        step=step,
-    )
-
-
-def _frozen_backbone(
-    config: ConfigDict,
-    info: Mapping[str, Any],
-    paths: DataPaths,
-    given: PathLike | None,
-) -> dict[str, Any]:
-    """`{"image_backbone": parameters}` of a run, empty where they are not at hand."""
-    source = given or paths.image_backbone
-    start = info.get("init_from")
-    if given is None and source is not None and not pathlib.Path(source).exists():
-        _log.warning("image backbone %s is gone: embedded images only", source)
-        source = None
-    if source is not None:
-        part = camera_inputs.load_image_backbone(source, config)
-    elif start is not None and pathlib.Path(start).exists() and not paths.embeddings:
-        part = initial_variables(start, config)
-    else:
-        return {}
-    params = part["params"].get(IMAGE_BACKBONE)
-    if params is None:
-        return {}
-    if paths.embeddings is not None and pathlib.Path(paths.embeddings).exists():
-        camera_inputs.check_same_backbone(params, paths.embeddings, source)
-    return {IMAGE_BACKBONE: params}
-
-
-def initial_variables(path: PathLike, config: ConfigDict) -> Mapping[str, Any]:
-    """Weights to start from: an official .pth file, or another run's newest.
-
-    Raises:
-        UserError: They do not fit the configured model; names what differs.
-    """
-    if pathlib.Path(path).is_dir():
-        other = load_run(path)
-        found, wanted = (json.loads(c.model.to_json()) for c in (other.config, config))
-        if lines := differences(found, wanted, "config.model"):
-            raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
-        return other.variables
-    if camera_inputs.has_camera(config):
-        from radejax.interop import dinorade_torch
-
-        _, variables = dinorade_torch.load(path)
-        camera_inputs.check_fits(models.build(config.model), variables, path)
-        return variables
-    from radejax.interop import radenet_torch
-
-    _, variables = radenet_torch.load(path, **_structure(config.model))
-    return variables
-
-
-def _structure(model: ConfigDict) -> dict[str, Any]:
-    """Fields that a state dict must agree with when a model is configured already."""
-    return {key: value for key, value in model.items() if key not in ("name",)}

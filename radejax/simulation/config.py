@@ -11,8 +11,6 @@ from typing import Any
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
-from radejax.simulation.radar.weather import WEATHERS
-from radejax.simulation.world.traffic import ENVIRONMENTS
 
 SIMULATOR_VERSION = 3
 """Raised whenever the same config gives other files than before."""
@@ -47,87 +45,70 @@ FULL_SIZE = {
 """Fields that make a config one of K-Radar's own sensors."""
 
 
-def default_config() -> dict[str, Any]:
-    """Values of the quickstart's data set: small, but with every kind of thing in it.
+@dataclasses.dataclass(frozen=True)
+class SimulationConfig:
+    """Checked values of a simulation; by default the quickstart's.
 
-    Returns:
-        A fresh dictionary of plain values:
+    Its data set is small, but with every kind of thing in it.
 
-        - `seed`: everything random follows from it.
-        - `scenes`: "procedural", or the path of a K-Radar label folder or zip.
-        - `train_sequences`, `test_sequences`: how many procedural ones; numbered from
-          1, training first. Conditions go round `CONDITIONS`.
-        - `sequences`: numbers of the sequences of real labels; None for all.
-        - `label_version`: version of real labels.
-        - `frames_per_sequence`: at 10 frames a second; 0 for all of real labels.
-        - `frame_stride`: use every n-th frame of real labels.
-        - `grid`: arguments of `RadarGrid.reduced`, or "kradar".
-        - `radar`: fields of `RadarParameters` that differ from its defaults.
-        - `output`: "tesseract" for K-Radar's files, "projection" for the projections
-          alone.
-        - `image_width`, `image_height`: of one of the two stereo images; 0 for none.
-        - `cover_lens`: let bad weather cover the lens, as often as in K-Radar.
-        - `lidar_to_radar_m`: radar position = LiDAR position + this; z as in K-Radar's
-          own loaders.
-        - `label_distance_m`: farther objects get no label.
+    Attributes:
+        seed: Everything random follows from it.
+        scenes: "procedural", or the path of a K-Radar label folder or zip.
+        train_sequences: How many procedural sequences, numbered from 1. Conditions go
+            round `CONDITIONS`.
+        test_sequences: As many after them.
+        sequences: Numbers of the sequences of real labels; None for all.
+        label_version: Version of real labels.
+        frames_per_sequence: At 10 frames a second; 0 for all of real labels.
+        frame_stride: Use every n-th frame of real labels.
+        grid: Arguments of `RadarGrid.reduced`, or "kradar".
+        radar: Fields of `RadarParameters` that differ from its defaults.
+        output: "tesseract" for K-Radar's files, "projection" for the projections alone.
+        image_width: Of one of the two stereo images; 0 for none.
+        image_height: The same.
+        cover_lens: Let bad weather cover the lens, as often as in K-Radar.
+        lidar_to_radar_m: Radar position = LiDAR position + this; z as in K-Radar's own
+            loaders.
+        label_distance_m: Farther objects get no label.
     """
-    return {
-        "seed": 0,
-        "scenes": "procedural",
-        # Many short sequences: frames of one sequence resemble each other, and a network
-        # learns more from 20 roads for 2 seconds than from 10 roads for 4.
-        "train_sequences": 20,
-        "test_sequences": 8,
-        "sequences": None,
-        "label_version": "v2.1",
-        "frames_per_sequence": 20,
-        "frame_stride": 1,
-        "grid": {
+
+    seed: int = 0
+    scenes: str = "procedural"
+    # Many short sequences: frames of one sequence resemble each other, and a network
+    # learns more from 20 roads for 2 seconds than from 10 roads for 4.
+    train_sequences: int = 20
+    test_sequences: int = 8
+    sequences: list[int] | None = None
+    label_version: str = "v2.1"
+    frames_per_sequence: int = 20
+    frame_stride: int = 1
+    grid: str | Mapping[str, Any] = dataclasses.field(
+        default_factory=lambda: {
             "num_doppler": 16,
             "num_range": 64,
             "num_elevation": 9,
             "num_azimuth": 56,
             "max_range_m": 75.6,
-        },
-        "radar": {"azimuth_elements": 40.0, "elevation_elements": 12.0},
-        "output": "tesseract",
-        "image_width": 320,
-        "image_height": 180,
-        "cover_lens": True,
-        "lidar_to_radar_m": [-2.54, 0.3, 0.7],
-        "label_distance_m": 90.0,
-    }
-
-
-@dataclasses.dataclass(frozen=True)
-class SimulationConfig:
-    """Checked values of a simulation; see `default_config` for the fields."""
-
-    seed: int
-    scenes: str
-    train_sequences: int
-    test_sequences: int
-    sequences: list[int] | None
-    label_version: str
-    frames_per_sequence: int
-    frame_stride: int
-    grid: Any
-    radar: Mapping[str, Any]
-    output: str
-    image_width: int
-    image_height: int
-    cover_lens: bool
-    lidar_to_radar_m: tuple[float, float, float]
-    label_distance_m: float
+        }
+    )
+    radar: Mapping[str, Any] = dataclasses.field(
+        default_factory=lambda: {"azimuth_elements": 40.0, "elevation_elements": 12.0}
+    )
+    output: str = "tesseract"
+    image_width: int = 320
+    image_height: int = 180
+    cover_lens: bool = True
+    lidar_to_radar_m: tuple[float, float, float] = (-2.54, 0.3, 0.7)
+    label_distance_m: float = 90.0
 
     @classmethod
-    def from_mapping(cls, config: Any) -> SimulationConfig:
-        """Checks a mapping (or ConfigDict) of plain values.
+    def from_mapping(cls, values: Mapping[str, Any]) -> SimulationConfig:
+        """Checks a mapping (or ConfigDict) of plain values, all of the fields.
 
         Raises:
             UserError: A field is unknown, missing or has a value out of range.
         """
-        values = plain(config)
+        values = plain(values)
         names = [f.name for f in dataclasses.fields(cls)]
         for key in values:
             if key not in names:
@@ -138,15 +119,14 @@ class SimulationConfig:
             if name not in values:
                 raise UserError(f"simulation field {name!r} is missing")
         values["lidar_to_radar_m"] = tuple(map(float, values["lidar_to_radar_m"]))
-        result = cls(**values)
-        result._check()
-        return result
+        return cls(**values)
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
+        is_procedural = self.scenes == "procedural"
         for name, least in (
             ("train_sequences", 0),
             ("test_sequences", 0),
-            ("frames_per_sequence", 1 if self.scenes == "procedural" else 0),
+            ("frames_per_sequence", 1 if is_procedural else 0),
             ("frame_stride", 1),
             ("image_width", 0),
             ("image_height", 0),
@@ -157,38 +137,43 @@ class SimulationConfig:
                     f"simulation.{name} must be an integer of at least {least},"
                     f" got {value!r}"
                 )
-        if not isinstance(self.scenes, str):
-            raise UserError(
-                "simulation.scenes must be 'procedural' or a path of labels,"
-                f" got {self.scenes!r}"
-            )
-        if self.scenes == "procedural" and (
-            self.train_sequences + self.test_sequences == 0
+        for is_wrong, text in (
+            (
+                not isinstance(self.scenes, str),
+                ".scenes must be 'procedural' or a path of labels,"
+                f" got {self.scenes!r}",
+            ),
+            (
+                is_procedural and self.train_sequences + self.test_sequences == 0,
+                " has no sequences: train_sequences is 0",
+            ),
+            (
+                is_procedural and self.sequences is not None,
+                ".sequences chooses sequences of real labels; procedural ones"
+                " are counted by train_sequences and test_sequences",
+            ),
+            (
+                self.output not in ("tesseract", "projection"),
+                f".output must be 'tesseract' or 'projection', got {self.output!r}",
+            ),
+            (
+                len(self.lidar_to_radar_m) != 3,
+                ".lidar_to_radar_m must be three numbers",
+            ),
         ):
-            raise UserError("simulation has no sequences: train_sequences is 0")
-        if self.scenes == "procedural" and self.sequences is not None:
-            raise UserError(
-                "simulation.sequences chooses sequences of real labels; procedural ones"
-                " are counted by train_sequences and test_sequences"
-            )
-        if self.output not in ("tesseract", "projection"):
-            raise UserError(
-                "simulation.output must be 'tesseract' or 'projection',"
-                f" got {self.output!r}"
-            )
-        if len(self.lidar_to_radar_m) != 3:
-            raise UserError("simulation.lidar_to_radar_m must be three numbers")
+            if is_wrong:
+                raise UserError(f"simulation{text}")
         self.make_grid()
         self.make_parameters()
 
     def make_grid(self) -> RadarGrid:
         """The radar's axes."""
-        if isinstance(self.grid, str):
-            if self.grid != "kradar":
-                raise UserError(
-                    f"simulation.grid must be 'kradar' or sizes, got {self.grid!r}"
-                )
+        if self.grid == "kradar":
             return RadarGrid.kradar()
+        if isinstance(self.grid, str):
+            raise UserError(
+                f"simulation.grid must be 'kradar' or sizes, got {self.grid!r}"
+            )
         try:
             return RadarGrid.reduced(**self.grid)
         except (TypeError, ValueError) as error:
@@ -216,10 +201,12 @@ class SimulationConfig:
 
     def conditions(self, number: int) -> tuple[str, str, str]:
         """Environment, time and weather of sequence `number` (from 1)."""
-        environment, time, weather = CONDITIONS[(number - 1) % len(CONDITIONS)]
-        assert environment in ENVIRONMENTS
-        assert weather in WEATHERS
-        return environment, time, weather
+        return CONDITIONS[(number - 1) % len(CONDITIONS)]
+
+
+def default_config() -> dict[str, Any]:
+    """Fields and defaults of `SimulationConfig` as fresh plain values."""
+    return plain(dataclasses.asdict(SimulationConfig()))
 
 
 def plain(config: Any) -> Any:

@@ -7,12 +7,12 @@ file is. A killed run goes on where it stopped and ends with the same bytes.
 from __future__ import annotations
 
 import concurrent.futures
-import io
 import json
 import logging
 import os
 import pathlib
-from typing import Any
+from collections.abc import Mapping
+from typing import IO, Any
 
 import numpy as np
 from PIL import Image
@@ -21,10 +21,11 @@ from tqdm import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar import write as kradar_write
+from radejax.geometry.calibration import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source
 from radejax.simulation.simulator import SequenceSimulator
-from radejax.simulation.sources import FrameSpec, SceneSource, make_source
 
 __all__ = ["default_config", "simulate_dataset"]
 
@@ -36,7 +37,7 @@ _log = logging.getLogger(__name__)
 
 
 def simulate_dataset(
-    config: Any,
+    config: Mapping[str, Any],
     root: str | os.PathLike,
     *,
     num_threads: int = 2,
@@ -67,17 +68,13 @@ def simulate_dataset(
     source = make_source(checked)
     num_frames, size = expected_size(checked, source)
     _log.info("%s: %d frames, about %.2g GB", root, num_frames, size / 1e9)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        _write_marker(root, checked, finished=False)
-        _remove_leftovers(root)
+    content = _marker(checked)
+    with files.disk_full(root / MARKER):
+        files.write_json(root / MARKER, content)
+        files.remove_stale(root)
         _write_common(root, checked, source)
         _write_frames(root, checked, source, num_threads, progress)
-        _write_marker(root, checked, finished=True)
-    except OSError as error:
-        if error.errno in (28, 122):  # no space left, quota exceeded
-            raise files.no_space_error(root / MARKER) from error
-        raise
+        files.write_json(root / MARKER, content | {"finished": True})
     return root
 
 
@@ -103,73 +100,46 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
                 " choose another folder"
             )
         return False
-    found = json.loads(marker.read_text())
-    if found["fingerprint"] != config.fingerprint():
-        changed = _changed_fields(found["config"], json.loads(config.to_json()))
-        raise UserError(
-            f"{root} holds a data set of another simulation config (differs in:"
-            f" {', '.join(changed) or 'version of the simulator'});"
-            " choose another folder or delete it"
-        )
-    return bool(found["finished"])
+    files.claim(
+        marker,
+        _marker(config),
+        "a data set of another simulation config",
+        ignore=("finished",),
+    )
+    return bool(files.read_json(marker)["finished"])
 
 
-def _changed_fields(old: dict, new: dict) -> list[str]:
-    return sorted(k for k in {*old, *new} if old.get(k) != new.get(k))
-
-
-def _write_marker(
-    root: pathlib.Path, config: SimulationConfig, *, finished: bool
-) -> None:
-    content = {
-        "fingerprint": config.fingerprint(),
-        "finished": finished,
+def _marker(config: SimulationConfig) -> dict[str, Any]:
+    """What an unfinished data set says of itself; the fingerprint has the version."""
+    return {
         "config": json.loads(config.to_json()),
+        "finished": False,
+        "fingerprint": config.fingerprint(),
     }
-    with files.atomic_write(root / MARKER) as file:
-        file.write(json.dumps(content, indent=1, sort_keys=True).encode())
 
 
-def _remove_leftovers(root: pathlib.Path) -> None:
-    """Removes temporary files of writers that were killed."""
-    for path in root.rglob(".*.tmp"):
-        process = path.name.split(".")[-2]
-        if process.isdigit() and not _is_alive(int(process)):
-            path.unlink(missing_ok=True)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # somebody else's
-        pass
-    return True
+def _cameras(config: SimulationConfig) -> tuple[CameraCalibration, ...]:
+    """Left and right camera, or none."""
+    if not config.image_width:
+        return ()
+    size = config.image_width, config.image_height
+    return stereo_calibration(config.lidar_to_radar_m, *size)
 
 
 def _write_common(
     root: pathlib.Path, config: SimulationConfig, source: SceneSource
 ) -> None:
     """Splits, sensor axes, camera calibrations."""
-    frames = [(n, spec) for n in source.numbers for spec in source.frames(n)]
-    kradar_write.write_splits(
-        root / "split",
-        *(
-            [(n, spec.name) for n, spec in frames if spec.split == split]
-            for split in ("train", "test")
-        ),
-    )
+    names = {"train": [], "test": []}
+    for number in source.numbers:
+        for spec in source.frames(number):
+            names[spec.split].append((number, spec.name))
+    kradar_write.write_splits(root / "split", **names)
     if config.grid != "kradar":
         kradar_write.write_grid(root, config.make_grid())
-    if config.image_width:
-        pair = stereo_calibration(
-            config.lidar_to_radar_m, config.image_width, config.image_height
-        )
-        for name, calibration in zip(("cam_front0", "cam_front1"), pair, strict=True):
-            path = root / "calib" / "common" / f"{name}.yml"
-            with files.atomic_write(path) as file:
-                file.write(calibration.to_kradar_text().encode("ascii"))
+    for index, calibration in enumerate(_cameras(config)):
+        path = root / "calib" / "common" / f"cam_front{index}.yml"
+        files.write_text(path, calibration.to_kradar_text())
 
 
 def _write_frames(
@@ -184,71 +154,62 @@ def _write_frames(
     bar = tqdm(total=total, unit="frame", desc="simulate", disable=not progress)
     with bar, concurrent.futures.ThreadPoolExecutor(max(num_threads, 1)) as pool:
         for number in source.numbers:
-            writer = _SequenceWriter(root, config, source, number)
-            missing = writer.missing_frames()
-            bar.update(len(writer.specs) - len(missing))
-            futures = [pool.submit(writer.write, spec) for spec in missing]
+            writer = _SequenceWriter(root / str(number), config, source, number)
+            bar.update(len(source.frames(number)) - len(writer.missing))
+            futures = [pool.submit(writer.write, spec) for spec in writer.missing]
             try:
                 for future in concurrent.futures.as_completed(futures):
                     future.result()
                     bar.update()
             except BaseException:
-                for future in futures:
-                    future.cancel()
+                pool.shutdown(wait=False, cancel_futures=True)
                 raise
 
 
 class _SequenceWriter:
-    """Writes frames of one sequence into `<root>/<number>/`."""
+    """Writes one sequence into a folder; makes its simulator if frames are missing.
+
+    Attributes:
+        missing: Frames without a label file.
+    """
 
     def __init__(
         self,
-        root: pathlib.Path,
+        folder: pathlib.Path,
         config: SimulationConfig,
         source: SceneSource,
         number: int,
     ) -> None:
-        self.config, self.source, self.number = config, source, number
-        self.folder = root / str(number)
-        self.specs = source.frames(number)
+        self.folder, self.config = folder, config
+        self.labels = folder / "info_label_v2_1"
+        specs = source.frames(number)
         kradar_write.write_description(
-            self.folder / "description.txt", *source.conditions(number)
+            folder / "description.txt", *source.conditions(number)
         )
-        radar_idx, lidar_idx, *_ = self.specs[0].indices
+        radar_idx, lidar_idx, *_ = specs[0].indices
         kradar_write.write_calibration(
-            self.folder / "info_calib" / "calib_radar_lidar.txt",
+            folder / "info_calib" / "calib_radar_lidar.txt",
             radar_idx - lidar_idx,
             *config.lidar_to_radar_m[:2],
         )
-
-    def missing_frames(self) -> list[FrameSpec]:
-        """Frames without a label file; makes the simulator if there are any."""
-        labels = self.folder / "info_label_v2_1"
-        there = set(os.listdir(labels)) if labels.is_dir() else set()
-        missing = [s for s in self.specs if f"{s.name}.txt" not in there]
-        if missing:
-            self._prepare()
-        return missing
-
-    def _prepare(self) -> None:
-        config = self.config
-        self.sequence = self.source.make(self.number)
+        there = {path.stem for path in self.labels.glob("*.txt")}
+        self.missing = [spec for spec in specs if spec.name not in there]
+        if not self.missing:
+            return
+        sequence, seed = source.make(number), config.seed
         self.simulator = SequenceSimulator(
-            self.sequence, config.make_grid(), config.make_parameters(), config.seed
+            sequence, config.make_grid(), config.make_parameters(), seed
         )
-        if config.image_width:
-            pair = stereo_calibration(
-                config.lidar_to_radar_m, config.image_width, config.image_height
-            )
+        if pair := _cameras(config):
             self.renderer = CameraRenderer(
-                self.sequence, pair, config.seed, cover_lens=config.cover_lens
+                sequence, pair, seed, cover_lens=config.cover_lens
             )
 
     def write(self, spec: FrameSpec) -> None:
         """One frame: radar, image, then labels."""
         config, simulator = self.config, self.simulator
         radar_idx, _, camera_idx, *_ = spec.indices
-        frame = self.sequence.frame(spec.scene_idx)
+        frame = simulator.sequence.frame(spec.scene_idx)
         given = simulator.radar_input(spec.scene_idx, frame)
         output = simulator.run(given, config.output)
         if config.output == "tesseract":
@@ -261,19 +222,14 @@ class _SequenceWriter:
         if config.image_width:
             path = self.folder / "cam-front" / f"cam-front_{camera_idx:05d}.png"
             with files.atomic_write(path) as file:
-                file.write(encode_png(self.renderer.render(frame)))
-        kradar_write.write_labels(
-            self.folder / "info_label_v2_1" / f"{spec.name}.txt",
-            spec.indices,
-            spec.timestamp_s,
-            simulator.labels(
-                frame, given, config.lidar_to_radar_m, config.label_distance_m
-            ),
+                write_png(file, self.renderer.render(frame))
+        labels = simulator.labels(
+            frame, given, config.lidar_to_radar_m, config.label_distance_m
         )
+        path = self.labels / f"{spec.name}.txt"
+        kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
 
 
-def encode_png(image: np.ndarray) -> bytes:
+def write_png(file: IO[bytes], image: np.ndarray) -> None:
     """PNG, fast rather than small."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
+    Image.fromarray(image).save(file, format="PNG", compress_level=1)

@@ -8,8 +8,7 @@ import numpy as np
 
 from radejax.data.kradar.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar import scattering, tensor, two_ray, weather
-from radejax.simulation.world import surroundings
+from radejax.simulation.radar import clutter, scattering, tensor, two_ray, weather
 from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame, Sequence
 
 MIN_SNR_DB = 10.0
@@ -69,27 +68,22 @@ class SequenceSimulator:
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
 
     def radar_input(self, index: int, frame: SceneFrame | None = None) -> RadarInput:
-        """Scatterers and noise of a frame: NumPy, ready for `radar.simulate`."""
+        """Scatterers and noise of a frame: NumPy, ready for `tensor.simulate`."""
         sequence, parameters = self.sequence, self.parameters
         frame = sequence.frame(index) if frame is None else frame
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
-        static = surroundings.scatter_surroundings(
-            frame, sequence, self._static_phase, parameters
-        )
-        ghosts = surroundings.scatter_ghosts(objects, frame, sequence)
+        static = clutter.scatter_surroundings(frame, self._static_phase, parameters)
+        ghosts = clutter.scatter_ghosts(objects, sequence.mirrors_m)
+        found = scattering.join([objects, static, ghosts])
+        count, is_mirrored = len(objects.power), np.ones(len(found.power), bool)
+        # The cross-section of the ground stands for what it returns as it lies there.
         is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
-        parts = [
-            self._on_the_way(part, mirrored)
-            for part, mirrored in (
-                (objects, True),
-                (static, ~is_ground),
-                (ghosts, True),
-            )
-        ]
-        power = np.bincount(parts[0].owner, parts[0].power, len(frame.boxes))
+        is_mirrored[count : count + len(is_ground)] = ~is_ground
+        found = self._on_the_way(found, is_mirrored)
+        power = np.bincount(objects.owner, found.power[:count], len(frame.boxes))
         return RadarInput(
             scatterers=scattering.to_scatterers(
-                parts, frame.ego_velocity_mps, parameters
+                found, frame.ego_velocity_mps, parameters.wavelength_m
             ),
             noise_power=weather.noise_profile(
                 sequence.weather, self.grid, parameters, frame.ego_velocity_mps
@@ -100,37 +94,23 @@ class SequenceSimulator:
         )
 
     def _on_the_way(
-        self, part: scattering.FrameScattering, mirrored: np.ndarray | bool
+        self, found: scattering.FrameScattering, is_mirrored: np.ndarray
     ) -> scattering.FrameScattering:
-        """Scatterers with what road and air do to their power and phase.
-
-        Args:
-            part: Scatterers.
-            mirrored: `[S]` or one bool: seen over the road too. The ground is not: its
-                cross-section stands for what it returns as it lies there.
-        """
+        """Scatterers with what air and, where `is_mirrored [S]`, road do to them."""
         sequence = self.sequence
-        distance = np.linalg.norm(part.position_m, axis=1)
         bounce = two_ray.bounce(
-            part.position_m,
+            found.position_m,
             sequence.ground_m,
             two_ray.SURFACES[sequence.weather],
             self.parameters.wavelength_m,
         )
-        bounce = np.where(mirrored, bounce, 1.0)
-        return dataclasses.replace(
-            part,
-            power=part.power
-            * weather.attenuation(sequence.weather, distance)
-            * np.square(np.abs(bounce)),
-            phase_rad=part.phase_rad + np.angle(bounce),
+        bounce = np.where(is_mirrored, bounce, 1.0)
+        distance = np.linalg.norm(found.position_m, axis=1)
+        air = weather.attenuation(sequence.weather, distance)
+        return found._replace(
+            power=found.power * air * np.square(np.abs(bounce)),
+            phase_rad=found.phase_rad + np.angle(bounce),
         )
-
-    def radar_frame(
-        self, index: int, output: tensor.Output = "projection", rows_per_step: int = 1
-    ) -> np.ndarray:
-        """One frame of the radar; see `radar.simulate`."""
-        return self.run(self.radar_input(index), output, rows_per_step)
 
     def run(
         self,
@@ -138,7 +118,7 @@ class SequenceSimulator:
         output: tensor.Output = "projection",
         rows_per_step: int = 1,
     ) -> np.ndarray:
-        """The radar frame of an input; see `radar.simulate`.
+        """The radar frame of an input; see `tensor.simulate`.
 
         A tesseract comes as a view of the rows that the device made, without a copy.
         """

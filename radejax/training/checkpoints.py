@@ -7,10 +7,11 @@ after it are set aside with a warning.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import pathlib
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import grain
@@ -43,13 +44,16 @@ def _is_worth_telling(record: logging.LogRecord) -> bool:
     return not any(text in str(record.msg) for text in _NO_NEWS)
 
 
+def _best_of(metrics: Mapping[str, float]) -> float:
+    return metrics[BEST]
+
+
 class Checkpoints:
-    """The checkpoints of one work folder.
+    """The checkpoints of one work folder, to be used in a `with` block.
 
     Args:
         folder: Made if missing.
-        max_to_keep: The newest few are kept; None keeps all.
-        best_metric: Also keep the checkpoint with the highest value of this metric.
+        max_to_keep: The newest few are kept, and the best; None keeps all.
         read_only: For evaluation: nothing is written or cleaned up.
     """
 
@@ -58,26 +62,18 @@ class Checkpoints:
         folder: str | pathlib.Path,
         *,
         max_to_keep: int | None = 2,
-        best_metric: str | None = None,
         read_only: bool = False,
     ) -> None:
         self.folder = pathlib.Path(folder).absolute()
-        self._best_metric = best_metric
-        kept = [policies.LatestN(n=max_to_keep)]
-        if best_metric is not None:
-            kept.append(
-                policies.BestN(
-                    get_metric_fn=lambda m: m[best_metric],
-                    n=1,
-                    keep_checkpoints_without_metrics=False,
-                )
-            )
+        newest = policies.LatestN(n=max_to_keep)
+        best = policies.BestN(
+            get_metric_fn=_best_of, n=1, keep_checkpoints_without_metrics=False
+        )
+        kept = policies.AnyPreservationPolicy([newest, best])
         logging.getLogger("absl").addFilter(_is_worth_telling)
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=None
-            if read_only
-            else policies.AnyPreservationPolicy(kept),
-            best_fn=(lambda m: m[best_metric]) if best_metric else None,
+            preservation_policy=None if read_only else kept,
+            best_fn=_best_of,
             create=not read_only,
             cleanup_tmp_directories=not read_only,
             read_only=read_only,
@@ -91,22 +87,19 @@ class Checkpoints:
         return sorted(self._manager.all_steps())
 
     def best_step(self) -> int:
-        """Step of the checkpoint with the highest `best_metric`.
+        """Step of the checkpoint with the highest metric `BEST`.
 
         Raises:
             FileNotFoundError: None was evaluated.
         """
-        values = {}
-        for step in self.steps():
-            metrics = self._manager.metrics(step)
-            if metrics is not None and self._best_metric in metrics:
-                values[step] = metrics[self._best_metric]
-        if not values:
+        self._manager.reload()
+        step = self._manager.best_step()
+        if step is None:
             raise FileNotFoundError(
                 f"no checkpoint in {self.folder} was evaluated: train with "
                 "--config.train.evaluate_every_epochs=1 to have a best one"
             )
-        return max(values, key=values.__getitem__)
+        return step
 
     def save(
         self,
@@ -124,14 +117,14 @@ class Checkpoints:
             state: Pytree of arrays.
             data_iterator: The grain iterator whose next batch belongs to `step`.
             info: Plain values: configuration, versions.
-            metrics: Of an evaluation at this step.
+            metrics: Of an evaluation at this step; `BEST` is one of them.
 
         Raises:
             DiskFullError: Earlier checkpoints stay intact.
         """
         if step in self._manager.all_steps():
             return
-        try:
+        with _told_if_full(self.folder):
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
@@ -141,9 +134,6 @@ class Checkpoints:
                 ),
                 metrics=dict(metrics) if metrics else None,
             )
-        # tensorstore's errors have no class of their own.
-        except Exception as error:
-            raise _disk_full(error, self.folder) from error
 
     def wait(self) -> None:
         """Returns when everything that was started is on disk.
@@ -151,11 +141,8 @@ class Checkpoints:
         Raises:
             DiskFullError: Earlier checkpoints stay intact.
         """
-        try:
+        with _told_if_full(self.folder):
             self._manager.wait_until_finished()
-        # tensorstore's errors have no class of their own.
-        except Exception as error:
-            raise _disk_full(error, self.folder) from error
 
     def restore(
         self, state: Any, data_iterator: Any
@@ -224,32 +211,28 @@ class Checkpoints:
             raise FileNotFoundError(
                 f"no checkpoint of step {step} in {self.folder}; there are {steps}"
             )
-        info = self._manager.restore(
-            step, args=ocp.args.Composite(info=ocp.args.JsonRestore())
-        )["info"]
-        return self._read_variables(self.folder / str(step) / "state"), info, step
-
-    def _read_variables(self, folder: pathlib.Path) -> dict[str, Any]:
-        """Variables of a saved state, whole on whatever devices there are.
-
-        The rest, such as the moments of the optimizer, is not read.
-        """
+        with ocp.PyTreeCheckpointer() as reader:
+            folder = self.folder / str(step) / "state"
+            saved = reader.metadata(folder).item_metadata.tree
+        # Whole on whatever devices there are; the optimizer's moments are not read.
         whole = sharding.replicated(sharding.make_mesh())
-        with ocp.PyTreeCheckpointer() as checkpointer:
-            saved = checkpointer.metadata(folder).item_metadata.tree
-            wanted = jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole),
-                {name: saved[name] for name in _VARIABLES if name in saved},
-            )
-            found = checkpointer.restore(
-                folder,
-                args=ocp.args.PyTreeRestore(
+        wanted = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole),
+            {name: saved[name] for name in _VARIABLES if name in saved},
+        )
+        found = self._manager.restore(
+            step,
+            args=ocp.args.Composite(
+                state=ocp.args.PyTreeRestore(
                     wanted,
                     restore_args=ocp.checkpoint_utils.construct_restore_args(wanted),
                     partial_restore=True,
                 ),
-            )
-        return jax.tree.map(np.asarray, {k: found.get(k) for k in _VARIABLES})
+                info=ocp.args.JsonRestore(),
+            ),
+        )
+        state = {name: found["state"].get(name) for name in _VARIABLES}
+        return jax.tree.map(np.asarray, state), found["info"], step
 
     def _restore_position(self, step: int, data_iterator: Any) -> None:
         """Sets the iterator to where it was, with any number of processes then and now.
@@ -275,16 +258,12 @@ class Checkpoints:
         processes.all_agree(True)  # the others wait until it is gone
         self._manager.reload()
 
-    def close(self) -> None:
-        """Waits for what is under way and releases the folder."""
-        self.wait()
-        self._manager.close()
-
     def __enter__(self) -> Checkpoints:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self.wait()
+        self._manager.close()
 
 
 def abstract_state(state: Any, sharding: Any) -> Any:
@@ -294,11 +273,15 @@ def abstract_state(state: Any, sharding: Any) -> Any:
     )
 
 
-def _disk_full(error: Exception, folder: pathlib.Path) -> Exception:
-    if files.is_no_space(error):
-        free = shutil.disk_usage(folder).free
-        return DiskFullError(
-            f"no space left for a checkpoint in {folder} ({free / 2**20:.0f} MiB free); "
-            "earlier checkpoints are intact, free some and run the same command again"
-        )
-    return error
+@contextlib.contextmanager
+def _told_if_full(folder: pathlib.Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # tensorstore's errors have no class of their own
+        if not files.is_no_space(error):
+            raise
+        free = shutil.disk_usage(folder).free / 2**20
+        raise DiskFullError(
+            f"no space left for a checkpoint in {folder} ({free:.0f} MiB free); earlier "
+            "checkpoints are intact, free some and run the same command again"
+        ) from error

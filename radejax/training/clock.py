@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import pathlib
 import time
+from collections.abc import Iterator
+from typing import Any
 
 import jax
 
@@ -19,25 +22,37 @@ PARTS = ("data", "compute", "host")
 class StepClock:
     """Splits the time of the loop into waiting for data, computing, and the rest.
 
-    Each `lap` counts the time since the one before. "data": no device had work because
-    the batch was not there; "compute": waiting for devices; "host": everything else in
-    the loop, such as placing batches and writing logs; "other" does not belong to steps.
+    "data": no device had work because the batch was not there; "compute": waiting for
+    devices; "host": everything that is not timed, such as placing batches and writing
+    logs; "other" does not belong to steps.
     """
 
     def __init__(self) -> None:
         self._mark = time.perf_counter()
         self._seconds = dict.fromkeys((*PARTS, "other"), 0.0)
 
-    def lap(self, part: str) -> float:
-        """Counts the time since the last lap for a part; returns it."""
+    @contextlib.contextmanager
+    def timing(self, part: str, behind: Any = None) -> Iterator[None]:
+        """Counts the time of a block for a part, and that before the block for "host".
+
+        Args:
+            part: "data", "compute" or "other".
+            behind: Tree of results under way. While devices still work on them nobody
+                waits for the block, and its time counts for "compute".
+        """
+        self._count("host")
+        yield
+        is_done = all(x.is_ready() for x in jax.tree.leaves(behind))
+        self._count(part if is_done else "compute")
+
+    def _count(self, part: str) -> None:
         now = time.perf_counter()
-        seconds = now - self._mark
-        self._seconds[part] += seconds
+        self._seconds[part] += now - self._mark
         self._mark = now
-        return seconds
 
     def take(self) -> dict[str, float]:
         """Seconds of every part of steps since the last call."""
+        self._count("host")
         taken = {part: self._seconds[part] for part in PARTS}
         self._seconds = dict.fromkeys(self._seconds, 0.0)
         return taken

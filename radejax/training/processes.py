@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import logging
+import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import jax
@@ -14,6 +17,8 @@ from jax.experimental import multihost_utils
 
 from radejax.core.errors import UserError
 from radejax.training import sharding
+
+_log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -91,29 +96,44 @@ class Stopped(Exception):
     """Something long, an evaluation, ends early because all processes should stop."""
 
 
-class AgreedStop:
-    """Tells all processes in the same step that one of them was asked to stop.
+@contextlib.contextmanager
+def stop_on_signal(mesh: jax.sharding.Mesh) -> Iterator[Callable[[], bool]]:
+    """Gives a function that tells all processes in the same step that all should stop.
 
-    A signal reaches processes in different steps, and those that go on would wait for
-    the others without end. Each step therefore sends a flag around, and reads the one
-    of the step before, which has arrived by then.
+    It is True once SIGTERM or SIGINT came to one of them, and to be called as often by
+    every process. A second signal interrupts at once. A signal reaches processes in
+    different steps, and those that go on would wait for the others without end. Each
+    call therefore sends a flag around, and reads the one of the call before, which has
+    arrived by then.
 
     Args:
-        event: Set when this process is asked to stop.
         mesh: Devices of all processes.
     """
+    event, before = threading.Event(), None
+    any_of = jax.jit(lambda x: x.any(), out_shardings=sharding.replicated(mesh))
 
-    def __init__(self, event: threading.Event, mesh: jax.sharding.Mesh) -> None:
-        self._event = event
-        self._mesh = mesh
-        self._sent: jax.Array | None = None
-        self._any = jax.jit(lambda x: x.any(), out_shardings=sharding.replicated(mesh))
+    def handle(number: int, _: object) -> None:
+        name = signal.Signals(number).name
+        if event.is_set():
+            raise KeyboardInterrupt(f"second {name}")
+        _log.warning("%s: saving a checkpoint, then stopping", name)
+        event.set()
 
-    def __call__(self) -> bool:
-        """True when all should stop; to be called as often by every process."""
+    def stop() -> bool:
+        nonlocal before
         if jax.process_count() == 1:
-            return self._event.is_set()
-        before = self._sent
-        rows = np.full(len(self._mesh.local_devices), self._event.is_set())
-        self._sent = self._any(sharding.put_batch(rows, self._mesh))
-        return before is not None and bool(before)
+            return event.is_set()
+        rows = np.full(len(mesh.local_devices), event.is_set())
+        found, before = before, any_of(sharding.put_batch(rows, mesh))
+        return found is not None and bool(found)
+
+    # Only a main thread may set handlers.
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGTERM, signal.SIGINT) if is_main_thread else ()
+    previous = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            # None: set outside Python, by jax.distributed; it cannot be put back.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -78,13 +78,9 @@ def make_schedule(
             f"train.warmup_steps={warmup_steps} must be less than the {num_steps} steps "
             "of the training"
         )
-    cosine = optax.cosine_decay_schedule(
-        learning_rate, num_steps - warmup_steps, final_learning_rate / learning_rate
+    return optax.warmup_cosine_decay_schedule(
+        0.0, learning_rate, warmup_steps, num_steps, final_learning_rate
     )
-    if warmup_steps == 0:
-        return cosine
-    warmup = optax.linear_schedule(0.0, learning_rate, warmup_steps)
-    return optax.join_schedules([warmup, cosine], [warmup_steps])
 
 
 def make_optimizer(
@@ -159,3 +155,34 @@ def merge_parameters(
         return dict(params)
     trees = [flax.traverse_util.flatten_dict(t, sep="/") for t in (params, frozen)]
     return flax.traverse_util.unflatten_dict({**trees[0], **trees[1]}, sep="/")
+
+
+def with_pretrained(
+    variables: Mapping[str, Any], part: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Variables with some of them replaced, such as a pretrained image backbone.
+
+    Args:
+        variables: Of a model: "params" and other collections.
+        part: The same tree or a part of it, e.g.
+            `{"params": {"image_backbone": params}}`. What `variables` lack is added.
+
+    Raises:
+        UserError: Shapes or structure differ.
+    """
+
+    def merge(old: Any, new: Any, path: str) -> Any:
+        if isinstance(new, Mapping) and isinstance(old, Mapping):
+            added = {
+                k: merge(old[k], v, f"{path}/{k}") if k in old else v
+                for k, v in new.items()
+            }
+            return {**old, **added}
+        shapes = [getattr(x, "shape", type(x).__name__) for x in (old, new)]
+        if shapes[0] != shapes[1]:
+            raise UserError(
+                f"pretrained {path.strip('/')} is {shapes[1]}, the model has {shapes[0]}"
+            )
+        return new
+
+    return merge(dict(variables), part, "")

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
+import logging
 import pathlib
 import re
-from collections.abc import Mapping
+import socket
+import time
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 import tensorboardX
 import tqdm
+from tensorboardX import summary
+from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from radejax.core import files
 from radejax.core.errors import DiskFullError, UserError
-from radejax.training.clock import StepClock
+from radejax.training import processes
+from radejax.training.checkpoints import BEST
+from radejax.training.clock import StepClock, seconds_since_start
+
+_log = logging.getLogger(__name__)
+
+Values = Mapping[str, float]
+Pictures = Mapping[str, np.ndarray]
+
+_ON_THE_BAR = ("focal", "gwd", "smooth_l1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,28 +45,33 @@ class Scores:
         pictures: `[H, W, 3]` uint8 by name, on the main process.
     """
 
-    values: Mapping[str, float]
+    values: Values
     best: float | None = None
-    pictures: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    pictures: Pictures = dataclasses.field(default_factory=dict)
+
+    def with_best(self) -> dict[str, float] | None:
+        """What a checkpoint keeps; None where it could not become the best."""
+        return None if self.best is None else {**self.values, BEST: self.best}
 
 
 class Watch:
-    """Logs of one run, consistent with the step it starts from.
+    """Logs of one run, consistent with the step it starts from; the main process's.
 
-    Records of steps after `start_step`, left by a run that was interrupted later than
-    its last checkpoint, are dropped: they will be written again.
+    `timing` is that of a `StepClock`, whose times are logged. Records of steps after
+    `start_step`, left by a run that was interrupted later than its last checkpoint, are
+    dropped: they will be written again.
 
     Args:
         folder: Work folder; `metrics.jsonl` and `tensorboard/` go there.
         start_step: Step of the restored state.
         num_steps: Of the whole training.
         frames_per_step: For the rate.
-        is_main: False on all processes but the first, which then log nothing.
         wandb_project: Also log to this project of Weights & Biases; None: do not.
         config: What Weights & Biases shows as the run's configuration.
 
     Raises:
         UserError: Weights & Biases is asked for and not installed.
+        DiskFullError: No space is left, here or in any of the methods.
     """
 
     def __init__(
@@ -60,57 +81,56 @@ class Watch:
         start_step: int,
         num_steps: int,
         frames_per_step: int,
-        is_main: bool = True,
         wandb_project: str | None = None,
         config: Mapping[str, Any] | None = None,
     ) -> None:
-        self._is_main = is_main
+        self._clock = StepClock()
+        self.timing = self._clock.timing
         self._frames_per_step = frames_per_step
-        self._jsonl = folder / "metrics.jsonl"
-        if is_main:
-            self._drop_records_after(start_step)
-        self._board = _Board(folder / "tensorboard", start_step) if is_main else None
+        self._start_step = self._last_step = start_step
+        self._logs: list[_Jsonl | _Board | _Wandb] = []
+        if processes.is_main():
+            self._logs.append(_Jsonl(folder / "metrics.jsonl", start_step))
+            if wandb_project is not None:
+                self._logs.append(_Wandb(wandb_project, folder, config))
+            self._logs.append(_Board(folder / "tensorboard", start_step))
         self._bar = tqdm.tqdm(
             total=num_steps,
             initial=start_step,
             desc="train",
             unit="step",
-            disable=not is_main,
+            disable=not processes.is_main(),
             dynamic_ncols=True,
         )
-        self._wandb = (
-            _start_wandb(wandb_project, folder, config)
-            if is_main and wandb_project is not None
-            else None
-        )
-        self._last_step = start_step
-        self.clock = StepClock()
 
-    def tick(self, step: int) -> None:
-        """Moves the bar."""
+    def tick(self, step: int, metrics: Any) -> None:
+        """Moves the bar; of the first step tells the time, and does not count it."""
         self._bar.update(step - self._bar.n)
+        if step == self._start_step + 1:
+            with self.timing("compute"):
+                jax.block_until_ready(metrics)
+            _log.info(
+                "first step %.1f s after the start, %.1f s of it to compile and run it",
+                seconds_since_start(),
+                self._clock.take()["compute"],
+            )
+            self._last_step = step
 
     def log(self, step: int, metrics: Mapping[str, Any], *, epoch: float) -> None:
         """Writes the metrics of a step, with rate and times since the last log."""
-        values = {k: float(np.asarray(v)) for k, v in metrics.items()}
-        self.clock.lap("compute")  # the metrics had to be waited for
+        with self.timing("compute"):  # the metrics have to be waited for
+            values = {k: float(np.asarray(v)) for k, v in metrics.items()}
         speed = self._speed(step)
         text = [f"{k} {v:.4g}" for k, v in values.items() if k in _ON_THE_BAR]
         if speed:
             text.append(f"{speed['frames_per_s']:.1f} frames/s")
             text.append(f"wait {speed['data_wait_share']:.0%}")
         self._bar.set_postfix_str(" ".join(text))
-        self.write(step, {**values, **speed, "epoch": epoch})
-
-    def start_timing(self, step: int) -> None:
-        """Forgets the time up to a step: the first one's is that of compiling."""
-        self.clock.lap("other")
-        self.clock.take()
-        self._last_step = step
+        self._write(step, {**values, **speed, "epoch": epoch}, {})
 
     def _speed(self, step: int) -> dict[str, float]:
         """Rate and times since the last log; nothing where no step was timed."""
-        seconds, steps = self.clock.take(), step - self._last_step
+        seconds, steps = self._clock.take(), step - self._last_step
         self._last_step = step
         elapsed = sum(seconds.values())
         if not steps or not elapsed:
@@ -123,129 +143,126 @@ class Watch:
 
     def log_scores(self, step: int, scores: Scores) -> None:
         """Writes what an evaluation found."""
-        self.write(step, scores.values)
-        if not self._is_main:
-            return
-        for name, picture in scores.pictures.items():
-            self._board.add_image(name, picture, step)
-        if self._wandb is not None and scores.pictures:
-            import wandb
+        self._write(step, scores.values, scores.pictures)
 
-            images = {k: wandb.Image(v) for k, v in scores.pictures.items()}
-            self._wandb.log(images, step=step)
-
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Writes values that belong to a step."""
-        if not self._is_main:
-            return
-        try:
-            with self._jsonl.open("a") as file:
-                file.write(json.dumps({"step": step, **values}) + "\n")
-        except OSError as error:
-            if files.is_no_space(error):
-                raise _disk_full(self._jsonl) from error
-            raise
-        for name, value in values.items():
-            self._board.add_scalar(name, value, step)
-        if self._wandb is not None:
-            self._wandb.log(dict(values), step=step)
-
-    def close(self) -> None:
-        self._bar.close()
-        if self._board is not None:
-            self._board.close()
-        if self._wandb is not None:
-            self._wandb.finish()
+    def _write(self, step: int, values: Values, pictures: Pictures) -> None:
+        for log in self._logs:
+            log.write(step, values, pictures)
 
     def __enter__(self) -> Watch:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._bar.close()
+        for log in self._logs:
+            log.close()
 
-    def _drop_records_after(self, step: int) -> None:
-        if not self._jsonl.exists():
-            return
+
+class _Jsonl:
+    """One line a step; pictures are left out."""
+
+    def __init__(self, path: pathlib.Path, start_step: int) -> None:
+        self._path = path
+        if path.exists():
+            self._drop_after(start_step)
+
+    def _drop_after(self, step: int) -> None:
         kept = []
-        for line in self._jsonl.read_text().splitlines():
+        for line in self._path.read_text().splitlines():
             try:
                 if json.loads(line)["step"] <= step:
                     kept.append(line + "\n")
             except json.JSONDecodeError:  # the line a killed run was writing
                 break
-        files.write_text(self._jsonl, "".join(kept))
+        files.write_text(self._path, "".join(kept))
+
+    def write(self, step: int, values: Values, _: Pictures) -> None:
+        with _told_if_full(self._path), self._path.open("a") as file:
+            file.write(json.dumps({"step": step, **values}) + "\n")
+
+    def close(self) -> None:
+        """Nothing is open between lines."""
 
 
 class _Board:
-    """TensorBoard's files, written by a thread of tensorboardX.
+    """TensorBoard's events, written at once.
 
-    On a full disk that thread ends, and a queue of limited length would then take no
-    more and block for ever: its length is not limited (0), and the thread looked at.
+    tensorboardX's `SummaryWriter` hands them to a thread, which ends on a full disk:
+    nobody is told, and what is handed over next waits for ever.
     """
 
     def __init__(self, folder: pathlib.Path, start_step: int) -> None:
         self._folder = folder
-        try:
-            self._writer = tensorboardX.SummaryWriter(
-                str(folder), purge_step=start_step + 1, max_queue=0
-            )
-        except OSError as error:
-            if files.is_no_space(error):
-                raise _disk_full(folder) from error
-            raise
-        self._events = self._writer.file_writer.event_writer
+        name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}"
+        with _told_if_full(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._records = tensorboardX.RecordWriter(str(folder / name))
+            self._add(file_version="brain.Event:2")
+            # TensorBoard drops what earlier starts wrote of this step and later ones.
+            begun = SessionLog(status=SessionLog.START)
+            self._add(step=start_step + 1, session_log=begun)
+            self._records.flush()
 
-    def add_scalar(self, name: str, value: float, step: int) -> None:
-        self._check()
-        self._writer.add_scalar(_board_name(name), value, step)
+    def _add(self, **fields: Any) -> None:
+        event = Event(wall_time=time.time(), **fields)
+        self._records.write(event.SerializeToString())
 
-    def add_image(self, name: str, picture: np.ndarray, step: int) -> None:
-        self._check()
-        self._writer.add_image(name, picture, step, dataformats="HWC")
+    def write(self, step: int, values: Values, pictures: Pictures) -> None:
+        with _told_if_full(self._folder):
+            for name, value in values.items():
+                name = re.sub(r"[^\w./-]", "_", name)  # TensorBoard takes no others
+                self._add(step=step, summary=summary.scalar(name, value))
+            for name, picture in pictures.items():
+                image = summary.image(name, picture, dataformats="HWC")
+                self._add(step=step, summary=image)
+            self._records.flush()
 
     def close(self) -> None:
-        if self._events._worker.is_alive():
-            self._writer.close()
-        else:  # the program's end would wait for the queue, and close what is full
-            self._events._event_queue.cancel_join_thread()
-            self._events._closed = True
-
-    def _check(self) -> None:
-        if not self._events._worker.is_alive():
-            raise _disk_full(self._folder)
+        with contextlib.suppress(OSError):  # said by `write`
+            self._records.close()
 
 
-def _disk_full(path: pathlib.Path) -> DiskFullError:
-    return DiskFullError(
-        f"no space left to write {path}; checkpoints are intact, free some and run the "
-        "same command again"
-    )
-
-
-_ON_THE_BAR = ("focal", "gwd", "smooth_l1")
-
-
-def _board_name(name: str) -> str:
-    """A name with the characters that TensorBoard takes."""
-    return re.sub(r"[^\w./-]", "_", name)
-
-
-def _start_wandb(
-    project: str, folder: pathlib.Path, config: Mapping[str, Any] | None
-) -> Any:
+class _Wandb:
     """The run of a work folder at Weights & Biases, continued if it is there."""
+
+    def __init__(
+        self, project: str, folder: pathlib.Path, config: Mapping[str, Any] | None
+    ) -> None:
+        try:
+            import wandb
+        except ImportError as error:
+            raise UserError(
+                "config.watch.wandb is set, and wandb is not installed: "
+                "pip install 'radejax[wandb]'"
+            ) from error
+        self._image = wandb.Image
+        self._run = wandb.init(
+            project=project,
+            name=folder.name,
+            id=hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:16],
+            resume="allow",
+            dir=str(folder),
+            config=dict(config or {}),
+        )
+
+    def write(self, step: int, values: Values, pictures: Pictures) -> None:
+        self._run.log(dict(values), step=step)
+        if pictures:
+            images = {k: self._image(v) for k, v in pictures.items()}
+            self._run.log(images, step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+@contextlib.contextmanager
+def _told_if_full(path: pathlib.Path) -> Iterator[None]:
     try:
-        import wandb
-    except ImportError as error:
-        raise UserError(
-            "config.watch.wandb is set, and wandb is not installed: "
-            "pip install 'radejax[wandb]'"
+        yield
+    except OSError as error:
+        if not files.is_no_space(error):
+            raise
+        raise DiskFullError(
+            f"no space left to write {path}; checkpoints are intact, free some and run "
+            "the same command again"
         ) from error
-    return wandb.init(
-        project=project,
-        name=folder.name,
-        id=hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:16],
-        resume="allow",
-        dir=str(folder),
-        config=dict(config or {}),
-    )

@@ -2,12 +2,14 @@
 
 import json
 import pathlib
+from types import SimpleNamespace
 
 import click.testing
 import numpy as np
 import pytest
 
 from radejax.cli import main
+from radejax.core.errors import UserError
 from radejax.data.kradar import write
 from radejax.data.kradar.labels import Label
 from radejax.evaluation.files import kitti
@@ -107,6 +109,38 @@ def test_evaluate_and_benchmark_want_one_source() -> None:
         result = _run(command)
         assert result.exit_code == 2
         assert "error: give one of" in result.output
+
+
+def test_evaluate_takes_flags_as_its_script_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from radejax.runs import evaluate
+
+    seen = []
+
+    def evaluate_run(workdir: str, **options: object) -> SimpleNamespace:
+        seen.append((workdir, options["step"], options["other"]))
+        return SimpleNamespace(metrics={}, files=[pathlib.Path("there/metrics.json")])
+
+    monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
+    flags = ("--checkpoint=best", "--data", "a,b", "--data=c", "--label_version=v1.0")
+    assert "Written to there" in _run("evaluate", "--workdir", "run", *flags).output
+    ((workdir, step, other),) = seen
+    assert (workdir, step) == ("run", "best")
+    assert (other.data, other.label_version) == (("a", "b", "c"), "v1.0")
+    _run("evaluate", "--workdir=run", "--split=train")
+    assert seen[1] == ("run", None, None)
+    wrong = _run("evaluate", "--workdir", "run", "--data=", "--debug")
+    assert "names no folder" in str(wrong.exception)
+    assert isinstance(wrong.exception, UserError)
+    for flags, message in (
+        (("--workdir", "run", "--roi=wide"), "--roi: config.evaluation of the run"),
+        (("--predictions", "x", "--step=3"), "--checkpoint: only with --workdir"),
+        (("--predictions", "x", "y", "z"), "unexpected arguments: y z"),
+        (("--compare", "a", "b", "--bootstrap=0"), "a comparison needs resamples"),
+    ):
+        wrong = _run("evaluate", *flags)
+        assert (wrong.exit_code, message in wrong.output) == (2, True), wrong.output
 
 
 def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> None:

@@ -2,12 +2,12 @@
 
 import pathlib
 
+import click.testing
 import numpy as np
 import pytest
 from PIL import Image
 
-from radejax.cli.overlay import draw_overlay
-from radejax.core.errors import UserError
+from radejax.cli.overlay import overlay
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 
@@ -20,10 +20,16 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return simulate_dataset(config, folder, progress=False)
 
 
+def _run(name: str, root: pathlib.Path, *arguments: object) -> click.testing.Result:
+    words = [name, "--data", str(root), *map(str, arguments)]
+    return click.testing.CliRunner().invoke(overlay, words)
+
+
 def test_the_first_frame_of_a_sequence_is_drawn(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    draw_overlay("1", [root], tmp_path / "first.png")
+    done = _run("1", root, "--out", tmp_path / "first.png")
+    assert done.exit_code == 0, done.output
     picture = np.asarray(Image.open(tmp_path / "first.png").convert("RGB"))
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
@@ -34,23 +40,26 @@ def test_the_first_frame_of_a_sequence_is_drawn(
     [
         ("first", "expected sequence/radar_lidar"),
         ("1/00000_00000", "no frame 00000_00000 in sequence 1; there are"),
-        ("7", r"no labels of sequences \[7\]"),
+        ("7", "no labels of sequences [7]"),
     ],
 )
 def test_a_frame_that_is_not_there_is_named(
     name: str, message: str, root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    with pytest.raises(UserError, match=message):
-        draw_overlay(name, [root], tmp_path / "none.png")
+    done = _run(name, root, "--out", tmp_path / "none.png")
+    assert done.exit_code == 2
+    assert message in done.output
 
 
 def test_slices_and_a_sequence_in_motion(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    assert draw_overlay("1", [root], tmp_path / "slices.png", slices=True) == 1
-    with Image.open(tmp_path / "slices.png") as picture:
+    slices = tmp_path / "slices.png"
+    assert _run("1", root, "--out", slices, "--slices").exit_code == 0
+    with Image.open(slices) as picture:
         width, height = picture.size
     assert width > 2.5 * height  # three planes side by side
-    assert draw_overlay("1", [root], tmp_path / "all.gif", max_frames=3) == 1
+    done = _run("1", root, "--out", tmp_path / "all.gif", "--max-frames", 3, "--json")
+    assert '"frames": 1' in done.output
     with Image.open(tmp_path / "all.gif") as picture:
         assert picture.format == "GIF"

@@ -1,19 +1,20 @@
 """Loads the slow reference and makes random scenes."""
 
-import importlib.util
 import pathlib
 
 import numpy as np
 import pytest
 
+from radejax.core import files
+from radejax.core.config import load_module
+from radejax.evaluation.files import predictions
+from radejax.evaluation.files.load import Source
+
 HERE = pathlib.Path(__file__).parent
 
 
 def _load(name):
-    spec = importlib.util.spec_from_file_location(f"eval_{name}", HERE / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(HERE / f"{name}.py")
 
 
 @pytest.fixture(scope="session")
@@ -46,3 +47,18 @@ def kradar_fixture(shared):
     predictions = {k: found[k] for k in ("frame", "box", "score", "score_unique")}
     ground_truth["cls"], predictions["cls"] = names[truth["cls"]], names[found["cls"]]
     return ground_truth, predictions, frames
+
+
+@pytest.fixture
+def stored(random_scene, tmp_path):
+    """Folder with predictions, ground truth and frames as files, and their `Source`."""
+    truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
+    predictions.write_table(tmp_path / "found.json", found, frames)
+    predictions.write_table(tmp_path / "truth.csv", truth, frames)
+    files.write_json(
+        tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
+    )
+    source = Source(
+        ground_truth=str(tmp_path / "truth.csv"), frames=str(tmp_path / "frames.json")
+    )
+    return tmp_path, source

@@ -69,7 +69,7 @@ def test_kradar_passes_differ():
     # overlaps prediction 0, gets nothing. Sinking to 0.5 adds no true positive then.
     pred, gt, iou = pairs((0, 0, 0.8), (1, 0, 0.6), (0, 1, 0.7))
     match = matching.match_kradar(
-        pred, gt, iou, np.array([0.5, 0.9]), np.zeros(2, int), 0.3
+        matching.Pairs(pred, gt, iou), np.array([0.5, 0.9]), np.zeros(2, int), 0.3
     )
     first = dict(zip(match.first_gt.tolist(), match.first_pred.tolist(), strict=True))
     assert first == {0: 1, 1: 0}
@@ -84,7 +84,9 @@ def test_a_prediction_that_displaces_another_adds_nothing():
     # overlaps nothing else: ground truth 1, that only knows prediction 1, stays alone.
     pred, gt, iou = pairs((0, 0, 0.5), (1, 0, 0.9), (1, 1, 0.6))
     score = np.array([0.9, 0.5])
-    match = matching.match_kradar(pred, gt, iou, score, np.zeros(2, int), 0.3)
+    match = matching.match_kradar(
+        matching.Pairs(pred, gt, iou), score, np.zeros(2, int), 0.3
+    )
     steps = dict(
         zip(match.event_pred.tolist(), match.event_delta.tolist(), strict=True)
     )
@@ -117,7 +119,9 @@ def test_second_pass_equals_a_loop_at_every_threshold(monkeypatch, seed, chunk):
     pred, gt = grid.reshape(2, -1)[:, rng.random(num_pred * num_gt) < 0.12]
     iou = np.round(rng.uniform(0.1, 1, pred.size), 1)
     score = np.round(rng.random(num_pred), 1)
-    match = matching.match_kradar(pred, gt, iou, score, np.zeros(num_gt, int), 0.3)
+    match = matching.match_kradar(
+        matching.Pairs(pred, gt, iou), score, np.zeros(num_gt, int), 0.3
+    )
     keep = iou > 0.3
     for threshold in np.unique(score):
         steps = match.event_delta[score[match.event_pred] >= threshold].sum()
@@ -129,21 +133,33 @@ def test_best_and_free_differ():
     # Both predictions prefer ground truth 0; only the free rule gives 1 the other one.
     pred, gt, iou = pairs((0, 0, 0.9), (1, 0, 0.8), (1, 1, 0.5))
     score = np.array([0.9, 0.8])
-    best = matching.match_best(pred, gt, iou, score, 0.3)
-    free = matching.match_free(pred, gt, iou, score, np.zeros(2, int), 2, 0.3)
+    best = matching.match_best(matching.Pairs(pred, gt, iou), score, 0.3)
+    free = matching.match_free(
+        matching.Pairs(pred, gt, iou), score, np.zeros(2, int), 2, 0.3
+    )
     assert best.tolist() == [0, -1]
     assert free.tolist() == [0, 1]
 
 
 def test_best_needs_the_threshold_of_the_best_one_only():
     pred, gt, iou = pairs((0, 0, 0.3), (0, 1, 0.3))
-    assert matching.match_best(pred, gt, iou, np.array([0.9]), 0.3).tolist() == [-1]
-    assert matching.match_best(pred, gt, iou, np.array([0.9]), 0.2).tolist() == [0]
+    assert matching.match_best(
+        matching.Pairs(pred, gt, iou), np.array([0.9]), 0.3
+    ).tolist() == [-1]
+    assert matching.match_best(
+        matching.Pairs(pred, gt, iou), np.array([0.9]), 0.2
+    ).tolist() == [0]
 
 
 def test_higher_score_wins_and_first_row_breaks_ties():
     pred, gt, iou = pairs((0, 0, 0.9), (1, 0, 0.5), (2, 0, 0.6))
     score = np.array([0.4, 0.8, 0.8])
-    assert matching.match_best(pred, gt, iou, score, 0.3).tolist() == [-1, 0, -1]
-    free = matching.match_free(pred, gt, iou, score, np.zeros(3, int), 1, 0.3)
+    assert matching.match_best(matching.Pairs(pred, gt, iou), score, 0.3).tolist() == [
+        -1,
+        0,
+        -1,
+    ]
+    free = matching.match_free(
+        matching.Pairs(pred, gt, iou), score, np.zeros(3, int), 1, 0.3
+    )
     assert free.tolist() == [-1, 0, -1]

@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError, UserError
-from radejax.geometry import calibration as camera_lib
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry import camera as camera_lib
+from radejax.geometry.calibration import (
+    CalibrationError,
+    CalibrationFileError,
+    CameraCalibration,
+)
 
 # The distortion and matrix of K-Radar's cameras.
 INTRINSICS = (567.720776478944, 577.2136917114258, 628.72078, 369.30687)
@@ -187,7 +189,7 @@ def test_batches_of_cameras_under_jit(image):
         forward_camera(yaw_deg=yaw, distortion=DISTORTION) for yaw in (88, 90, 93)
     ]
     points = rng.uniform([5, -3, -2], [60, 3, 2], (3, 6, 3))
-    batch = stack_cameras([c.camera(image) for c in calibrations])
+    batch = camera_lib.stack_cameras([c.camera(image) for c in calibrations])
     chex.assert_shape(batch.cam_from_ego, (3, 3, 4))
     pixels, depth = jax.jit(camera_lib.project)(jnp.asarray(points, jnp.float32), batch)
     for i, calibration in enumerate(calibrations):
@@ -222,12 +224,14 @@ def test_bad_calibrations(tmp_path):
     path = tmp_path / "cam_1.yml"
     text = forward_camera().to_kradar_text()
     path.write_text(text.replace("fx: ", "fx= "))
-    with pytest.raises(DataError, match=r"cam_1\.yml:1: expected 'key: number'"):
+    with pytest.raises(
+        CalibrationFileError, match=r"cam_1\.yml:1: expected 'key: number'"
+    ):
         CameraCalibration.from_kradar(path)
     path.write_text("\n".join(line for line in text.splitlines() if "k3" not in line))
-    with pytest.raises(DataError, match="lacks k3"):
+    with pytest.raises(CalibrationFileError, match="lacks k3"):
         CameraCalibration.from_kradar(path)
-    with pytest.raises(UserError, match="intrinsics must be"):
+    with pytest.raises(CalibrationError, match="intrinsics must be"):
         forward_camera(intrinsics=(1.0, 2.0))
-    with pytest.raises(UserError, match="raw, rectified, pinhole"):
+    with pytest.raises(CalibrationError, match="raw, rectified, pinhole"):
         forward_camera().camera("fisheye")

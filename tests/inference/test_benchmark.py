@@ -2,6 +2,7 @@
 
 import pytest
 
+from radejax.core.config import load_config
 from radejax.inference import benchmark
 
 from .. import small_models as small
@@ -24,7 +25,7 @@ def test_stages_add_up_and_are_shown() -> None:
 
 
 def test_untrained_models_are_those_of_their_configs() -> None:
-    detector = benchmark.untrained(str(small.CONFIGS / "quickstart.py"))
+    detector = benchmark.untrained(load_config(str(small.CONFIGS / "quickstart.py")))
     assert detector.grid.projection_shape[-1] == (
         detector.model.doppler_bins + detector.model.elevation_bins
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
+from radejax.data.cameras import CameraOptions
 from radejax.inference import packed
 from radejax.inference.detect_files import (
     detect_files,
@@ -15,8 +16,7 @@ from radejax.inference.detect_files import (
     front_images,
     output_name,
 )
-from radejax.inference.inputs import CameraOptions
-from radejax.inference.open import open_detector
+from radejax.inference.open import load
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 from .. import small_models as small
@@ -93,7 +93,7 @@ def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
     with pytest.raises(
         UserError, match=r"step best of .*packed, which holds one model"
     ):
-        open_detector(tmp_path / "packed", step="best")
+        load(tmp_path / "packed", step="best")
 
 
 def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:

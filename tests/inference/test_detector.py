@@ -12,6 +12,7 @@ from radejax.core.config import base_config
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import write
 from radejax.data.projection import project
+from radejax.evaluation.files.kitti import prediction_texts
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import dinorade_torch
 from radejax.visualize.canvas import as_objects
@@ -134,7 +135,7 @@ def test_detections_as_k_radars_text(
     detector: Detector, projections: np.ndarray
 ) -> None:
     found = detector(projections[:2])
-    texts = found.to_kitti(detector.classes)
+    texts = prediction_texts(found, detector.classes)
     assert [len(text.splitlines()) for text in texts] == found.is_valid.sum(1).tolist()
     words = texts[0].splitlines()[0].split(" ")
     assert words[0] in ("sed", "bus", "ped", "mot", "bic")
@@ -142,8 +143,8 @@ def test_detections_as_k_radars_text(
     expected = np.asarray(found.boxes[0, 0])[[5, 4, 3, 1, 2, 0, 6]]
     np.testing.assert_allclose(numbers[:7], expected, rtol=1e-6)
     assert numbers[7] == pytest.approx(float(found.scores[0, 0]))
-    nothing = detector(projections[:1], score_threshold=2.0).to_kitti(detector.classes)
-    assert nothing == ["dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"]
+    nothing = detector(projections[:1], score_threshold=2.0)
+    assert prediction_texts(nothing) == ["dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"]
 
 
 def test_official_state_dicts_are_told_apart() -> None:
@@ -163,7 +164,7 @@ def test_a_wrong_shape_names_what_was_expected(detector: Detector) -> None:
 
 
 def test_a_run_that_is_not_there(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no run in"):
+    with pytest.raises(FileNotFoundError, match="no model in"):
         Detector.from_workdir(tmp_path)
 
 

@@ -1,6 +1,5 @@
 """Packed models are read back as they were, without what may not be passed on."""
 
-import importlib.util
 import json
 import pathlib
 from typing import Any
@@ -9,11 +8,14 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
+from ml_collections import ConfigDict
 
 from radejax import Detector, UserError, models
+from radejax.core.config import load_module
 from radejax.core.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
+from radejax.inference.open import load
 
 from .. import small_models as small
 
@@ -25,7 +27,9 @@ def _equal(a: Any, b: Any) -> None:
 
 def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> None:
     detector = small.detector(nms_iou=0.2, azimuth_mapping="stretched")
-    content = packed.write_packed(tmp_path, detector, training_config={"seed": 3})
+    content = packed.write_packed(
+        tmp_path, detector, training_config=ConfigDict({"seed": 3})
+    )
     assert content["left_out"] == []
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "config.json",
@@ -36,7 +40,7 @@ def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> No
     assert loaded.classes == detector.classes
     assert (loaded.nms_iou, loaded.score_threshold) == (0.2, 0.1)
     _equal(loaded(small.projections(3)), detector(small.projections(3)))
-    assert packed.load(tmp_path).config == {"seed": 3}
+    assert load(tmp_path).config.to_dict() == {"seed": 3}
 
 
 @pytest.mark.slow
@@ -70,9 +74,7 @@ CONFIGS = [
 @pytest.mark.parametrize(("name", "words"), CONFIGS)
 def test_the_config_of_a_model_makes_the_same_model(name: str, words: str) -> None:
     path = small.CONFIGS / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     model = models.build(module.get_config(words).model)
     again = models.build(packed.model_config(model))
     assert again == model
@@ -80,7 +82,7 @@ def test_the_config_of_a_model_makes_the_same_model(name: str, words: str) -> No
 
 
 def test_damaged_and_absent_folders_are_named(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such folder"):
+    with pytest.raises(FileNotFoundError, match="no such file or folder"):
         Detector.from_checkpoint(tmp_path / "gone")
     with pytest.raises(FileNotFoundError, match="no model in"):
         Detector.from_checkpoint(tmp_path)
@@ -111,5 +113,5 @@ def test_bfloat16_computes_close_to_float32() -> None:
 
 def test_grid_survives_json_exactly(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
-    assert packed.load(tmp_path).grid == small.small_grid()
+    assert load(tmp_path).grid == small.small_grid()
     assert RadarGrid.kradar() != small.small_grid()

@@ -12,11 +12,11 @@ from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.data.records.job import project_dataset
-from radejax.data.records.projections import RecordSource
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
-from radejax.inference.predict import Predictor, predict_dataset
-from radejax.runs.data import DataPaths
+from radejax.inference.predict import predict_dataset
+from radejax.runs.data import Data, DataPaths
+from radejax.runs.evaluate import make_predictor
 from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import processes, sharding
@@ -42,26 +42,32 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
     config.evaluation.update(score_threshold=0.45, batch_size=3)
     config.watch.num_pictures = 1
-    paths = DataPaths((str(root),), None, str(folder / "records"))
-    frames = paths.open(config, "test")
-    project_dataset(frames, paths.records, num_workers=0, progress=False)
-    records = RecordSource(paths.records)
     model = models.build(config.model)
+    data = Data.open(
+        config, model, DataPaths((str(root),), None, str(folder / "records"))
+    )
+    project_dataset(data.frames, data.paths.records, num_workers=0, progress=False)
+    records = data.records
     inputs = np.zeros((1, *records.grid.projection_shape), np.float32)
     variables = jax.jit(model.init)(jax.random.key(0), inputs)
     return SimpleNamespace(
-        config=config, paths=paths, frames=frames, records=records, variables=variables
+        config=config,
+        model=model,
+        data=data,
+        frames=data.split("test"),
+        records=records,
+        variables=variables,
     )
+
+
+def _predictor(setup: SimpleNamespace, mesh: jax.sharding.Mesh | None = None) -> Any:
+    predictor = make_predictor(setup.config, setup.model, setup.data, mesh)
+    predictor.update(setup.variables)
+    return predictor
 
 
 def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
-    predictor = Predictor(
-        setup.config,
-        setup.variables,
-        setup.records.grid,
-        score_threshold=0.45,
-        mesh=sharding.make_mesh(num_devices),
-    )
+    predictor = _predictor(setup, sharding.make_mesh(num_devices))
     return predict_dataset(predictor, setup.records, setup.frames, 3, progress=False)
 
 
@@ -113,7 +119,7 @@ def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
 
     state = SimpleNamespace(eval_variables=setup.variables)
     with pytest.raises(processes.Stopped):
-        Validation(setup.config, setup.paths)(state, 7, should_stop)
+        Validation(setup.config, setup.model, setup.data)(state, 7, should_stop)
     assert asked == [True]
 
 
@@ -128,7 +134,7 @@ def test_images_need_the_weights_of_the_backbone() -> None:
 
 
 def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
-    predictor = Predictor(setup.config, setup.variables, setup.records.grid)
+    predictor = _predictor(setup)
     projection = np.zeros((8, *setup.records.grid.projection_shape), np.float16)
     none = np.zeros((8, 0), np.float32)
     batch = Batch(
@@ -145,7 +151,7 @@ def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -
 
 def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
     state = SimpleNamespace(eval_variables=setup.variables)
-    scores = Validation(setup.config, setup.paths)(state, 7)
+    scores = Validation(setup.config, setup.model, setup.data)(state, 7)
     name = "validation/map_3d_iou30/kradar_r40/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
     assert any(key.endswith("/Sedan") for key in scores.values)
@@ -154,7 +160,9 @@ def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> N
     (picture,) = scores.pictures.values()
     assert picture.dtype == np.uint8
     assert picture.shape[2] == 3
-    alone = Validation(setup.config, setup.paths, sharding.make_mesh(1))(state, 7)
+    alone = Validation(setup.config, setup.model, setup.data, sharding.make_mesh(1))(
+        state, 7
+    )
     assert alone.values == pytest.approx(scores.values)
 
 
@@ -162,4 +170,4 @@ def test_a_best_metric_that_is_not_measured_is_refused(setup: SimpleNamespace) -
     config = setup.config.copy_and_resolve_references()
     config.train.best_metric = "map_3d_iou70"
     with pytest.raises(UserError, match=r"'map_3d_iou70'.* map_3d_iou30, "):
-        Validation(config, setup.paths)
+        Validation(config, setup.model, setup.data)

@@ -3,13 +3,12 @@
 import json
 import pathlib
 
+import flax.linen as nn
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
-from radejax.inference import embed
 from radejax.interop import dinov3_hf, image_backbone, resnet_torch
 from radejax.models import build
 
@@ -19,17 +18,17 @@ STAGE = {"block": np.arange(2.0)}
 
 
 @pytest.fixture
-def resnet(monkeypatch: pytest.MonkeyPatch) -> ConfigDict:
+def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
     part = {
         "params": {"image_backbone": TRUNK, "image_neck": STAGE},
         "batch_stats": {"image_neck": STAGE},
     }
     monkeypatch.setattr(resnet_torch, "load", lambda path: part)
-    return load_config(f"{CONFIG}:rcw_resnet50")
+    return build(load_config(f"{CONFIG}:rcw_resnet50").model)
 
 
 def _write_manifest(folder, params):
-    content = {"weights_sha256": embed.weights_sha256(params)}
+    content = {"weights_sha256": image_backbone.weights_sha256(params)}
     (folder / "manifest.json").write_text(json.dumps(content))
 
 
@@ -51,17 +50,17 @@ def test_embeddings_of_other_weights_are_refused(resnet, tmp_path):
 
 
 def test_embeddings_stand_for_all_of_a_transformer(tmp_path):
-    config = load_config(str(CONFIG))
-    assert image_backbone.load_image_backbone(None, config, tmp_path) is None
+    model = build(load_config(str(CONFIG)).model)
+    assert image_backbone.load_image_backbone(None, model, tmp_path) is None
 
 
 def test_weights_with_other_constants_are_refused(monkeypatch):
-    config = load_config(str(CONFIG))
-    found = build(config.model).vit.clone(rope_theta=10.0)
+    model = build(load_config(str(CONFIG)).model)
+    found = model.vit.clone(rope_theta=10.0)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
     with pytest.raises(UserError, match=r"rope_theta = 10\.0, the configured one"):
-        image_backbone.load_image_backbone("folder", config)
-    same = build(config.model).vit.clone(attention="xla", layer_scale=0.5)
+        image_backbone.load_image_backbone("folder", model)
+    same = model.vit.clone(attention="xla", layer_scale=0.5)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (same, {"params": TRUNK}))
-    loaded = image_backbone.load_image_backbone("folder", config)
+    loaded = image_backbone.load_image_backbone("folder", model)
     assert loaded == {"params": {"image_backbone": TRUNK}}

@@ -1,7 +1,6 @@
 """Tests of radejax.models.dinorade."""
 
 import functools
-import importlib.util
 import pathlib
 
 import chex
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax.core.config import load_module
 from radejax.core.errors import UserError
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
@@ -292,11 +292,7 @@ def test_parameters_at_full_size(variant, trained, frozen):
 
 
 def config_module():
-    path = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
-    spec = importlib.util.spec_from_file_location("dinorade_config", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py")
 
 
 def test_configs_differ_where_paper_and_code_do():
@@ -361,15 +357,3 @@ def test_images_of_another_size_are_refused():
 def test_impossible_configs_are_refused(changes, message):
     with pytest.raises(UserError, match=message):
         small(**changes)
-
-
-def test_pretrained_parts_replace_their_like():
-    _, variables = model_and_variables()
-    part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}}}}
-    merged = dinorade.with_pretrained(variables, part)
-    assert (merged["params"]["image_neck"]["proj"]["bias"] == 7).all()
-    kept = variables["params"]["image_neck"]["proj"]["kernel"]
-    assert merged["params"]["image_neck"]["proj"]["kernel"] is kept
-    wrong = {"params": {"image_neck": {"proj": {"bias": np.zeros(9)}}}}
-    with pytest.raises(UserError, match=r"params/image_neck/proj/bias is \(9,\)"):
-        dinorade.with_pretrained(variables, wrong)

@@ -4,32 +4,32 @@ import pathlib
 
 import pytest
 
+from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.data.records.projections import RecordSource
-from radejax.runs.data import DataPaths, OtherData, prepare_data
+from radejax.runs.data import Data, DataPaths, Sources, open_data
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 
 def test_without_data_and_simulation_the_flag_is_named() -> None:
     with pytest.raises(UserError, match=r"give --data ROOT"):
-        prepare_data(base_config(), data=None, labels=None, records=None)
+        open_data(base_config(), None, Sources())
 
 
 @pytest.mark.parametrize("missing", ["data", "camera_calibration"])
 def test_a_missing_folder_is_named(missing: str, tmp_path: pathlib.Path) -> None:
     nowhere = str(tmp_path / "nowhere")
-    given = {"data": [str(tmp_path)]} | {
-        missing: [nowhere] if missing == "data" else nowhere
+    given = {"data": (str(tmp_path),)} | {
+        missing: (nowhere,) if missing == "data" else nowhere
     }
     with pytest.raises(FileNotFoundError, match=r"no such folder: .*nowhere"):
-        prepare_data(base_config(), labels=None, records=None, **given)
+        open_data(base_config(), None, Sources(**given))
 
 
-@pytest.mark.parametrize("data", [[], [""], "/data/kradar"])
+@pytest.mark.parametrize("data", [[""], "/data/kradar"])
 def test_no_list_of_folders_is_an_error(data: object) -> None:
     with pytest.raises(UserError, match="must be a list of folders"):
-        prepare_data(base_config(), data=data, labels=None, records=None)
+        open_data(base_config(), None, Sources(data=data))
 
 
 def test_frames_are_projected_beside_their_data_once(
@@ -41,21 +41,23 @@ def test_frames_are_projected_beside_their_data_once(
     simulate_dataset(simulation, tmp_path / "sim", progress=False)
     monkeypatch.chdir(tmp_path)
 
-    def prepare() -> DataPaths:
-        return prepare_data(base_config(), data=["sim"], labels=None, records=None)
+    def prepare() -> Data:
+        return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
-    paths = prepare()
+    config = base_config()
+    data = prepare()
+    paths = data.paths
     assert paths.roots == (str(tmp_path / "sim"),)
     assert paths.records == str(tmp_path / "sim" / "records")
-    assert len(RecordSource(paths.records)) == 4
-    assert len(paths.open(base_config(), "test")) == 2
+    assert len(data.records) == 4
+    assert len(data.split("test")) == 2
 
     def written() -> dict[pathlib.Path, int]:
         files = (tmp_path / "sim" / "records").iterdir()
         return {p: p.stat().st_mtime_ns for p in files if p.suffix != ".json"}
 
     before = written()
-    assert prepare() == paths
+    assert prepare().paths == paths
     assert written() == before
 
 
@@ -64,15 +66,15 @@ def test_other_data_keep_what_the_run_had_of_the_same_folders(
 ) -> None:
     own = DataPaths((str(tmp_path),), "l", "/fast/records", embeddings="/embeddings")
     for data in ((), (str(tmp_path),)):
-        found = OtherData(data=data, labels=str(tmp_path / "v2.zip")).paths(own)
+        found = Sources(data=data, labels=str(tmp_path / "v2.zip")).paths(own)
         assert found.records == "/fast/records"
         assert found.embeddings == "/embeddings"
         assert found.labels == str(tmp_path / "v2.zip")
     (tmp_path / "b").mkdir()
-    other = OtherData(data=(str(tmp_path / "b"),)).paths(own)
+    other = Sources(data=(str(tmp_path / "b"),)).paths(own)
     assert other == DataPaths((str(tmp_path / "b"),), None, str(tmp_path / "b/records"))
     with pytest.raises(UserError, match="must be a list of folders"):
-        OtherData(labels="x").paths(None)
+        Sources(labels="x").paths(None)
 
 
 def test_results_on_other_data_are_named_by_folder_and_labels(
@@ -80,8 +82,8 @@ def test_results_on_other_data_are_named_by_folder_and_labels(
 ) -> None:
     (tmp_path / "kradar").mkdir()
     monkeypatch.chdir(tmp_path / "kradar")
-    assert OtherData(data=("..",)).name == tmp_path.name
-    assert OtherData(data=(".",)).name == "kradar"
-    assert OtherData(data=("/a/b", "/c"), labels="/x/v1.zip").name == "b_v1"
-    assert OtherData(labels="/x/v1.zip").name == "v1"
-    assert OtherData(label_version="v1.1").name == "other"
+    assert Sources(data=("..",)).name == tmp_path.name
+    assert Sources(data=(".",)).name == "kradar"
+    assert Sources(data=("/a/b", "/c"), labels="/x/v1.zip").name == "b_v1"
+    assert Sources(labels="/x/v1.zip").name == "v1"
+    assert Sources(label_version="v1.1").name == "other"

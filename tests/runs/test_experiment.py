@@ -1,5 +1,6 @@
 """Work folders, names and messages of whole runs."""
 
+import collections
 import json
 import pathlib
 from types import SimpleNamespace
@@ -8,23 +9,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from radejax.core.config import base_config
+from radejax import models
+from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
-from radejax.inference.embed import weights_sha256
+from radejax.data.kradar import dataset
+from radejax.interop.image_backbone import weights_sha256
 from radejax.runs import experiment
-from radejax.runs.data import DataPaths
-from radejax.runs.workdir import lock_workdir
+from radejax.runs.data import Sources
+from radejax.runs.workdir import claimed
+from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.training import loop, sharding
 
-
-def test_names_of_runs() -> None:
-    assert experiment.config_name("configs/quickstart.py") == "quickstart"
-    assert experiment.config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
+CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 
 
 def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:
-    with lock_workdir(tmp_path), pytest.raises(UserError, match="another training"):
-        experiment.run(base_config(), name="x", workdir=tmp_path, data=[str(tmp_path)])
-    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+    folder, config = tmp_path / "run", base_config()
+    with (
+        claimed(folder, config),
+        pytest.raises(UserError, match="another training"),
+    ):
+        experiment.run(
+            config, name="x", workdir=folder, sources=Sources(data=(str(tmp_path),))
+        )
+    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "lock"]
 
 
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
@@ -38,12 +46,19 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
         said_before.append(caplog.text)
         return SimpleNamespace(finished=True, step=1)
 
-    monkeypatch.setattr(experiment, "prepare_data", lambda *_, **__: paths)
-    monkeypatch.setattr(DataPaths, "open", lambda *_, **__: [])
-    monkeypatch.setattr(experiment, "train", train)
-    paths = DataPaths(("/data",), None, "/records")
-    experiment.run(base_config(), name="x", workdir=tmp_path / "run")
-    assert "no frames of the test split in /data" in said_before[0]
+    simulation = default_config()
+    simulation.update(train_sequences=1, test_sequences=0, frames_per_sequence=2)
+    simulation["output"] = "projection"
+    root = simulate_dataset(simulation, tmp_path / "data", progress=False)
+    config = base_config()
+    config.train.batch_size = 2
+    monkeypatch.setattr(loop, "train", train)
+    mesh = sharding.make_mesh(1)
+    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    experiment.run(
+        config, name="x", workdir=tmp_path / "run", sources=Sources(data=(str(root),))
+    )
+    assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
 
 
@@ -73,3 +88,35 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same(
     assert stays(["1/a"], str(tmp_path), freeze=True) == frozen
     weights["w"] = weights["w"] + 1
     assert stays(["1/a"], freeze=True) != frozen
+
+
+def test_labels_are_read_once_and_the_model_is_built_once(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: collections.Counter = collections.Counter()
+    built = []
+    parse, build = dataset.parse_label_file, models.build
+
+    def count(*args: Any, where: str, **options: Any) -> Any:
+        parsed[where] += 1
+        return parse(*args, where=where, **options)
+
+    monkeypatch.setattr(dataset, "parse_label_file", count)
+    monkeypatch.setattr(models, "build", lambda c: built.append(c) or build(c))
+    mesh = sharding.make_mesh(1)
+    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
+    config.simulation.update(frames_per_sequence=2, output="projection")
+    config.model.update(widths=(8, 8), decoder_width=8, num_groups=4)
+    config.train.update(num_epochs=1, evaluate_every_epochs=1)
+    config.evaluation.num_pictures = 1
+    folder = experiment.run(
+        config,
+        name="x",
+        workdir=tmp_path / "run",
+        sources=Sources(data=(str(tmp_path / "data"),)),
+    )
+    assert (folder / "evaluation" / "metrics.json").exists()
+    assert len(parsed) == 6
+    assert set(parsed.values()) == {1}
+    assert len(built) == 1

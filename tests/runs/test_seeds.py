@@ -2,6 +2,8 @@
 
 import json
 import pathlib
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -10,7 +12,8 @@ from ml_collections import config_flags
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.runs import experiment, seeds
+from radejax.runs import seeds
+from radejax.runs.data import Sources
 
 HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
 
@@ -20,12 +23,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 ) -> None:
     aps = {0: 50.0, 1: 53.0, 2: 59.0}
     seen = []
-    whole = experiment.run
 
     def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
-        if config.seeds:
-            return whole(config, workdir=workdir, **options)
-        seen.append((config.seed, pathlib.Path(workdir).name, options["data"]))
+        assert not config.seeds
+        seen.append((config.seed, pathlib.Path(workdir).name, options["sources"]))
         folder = pathlib.Path(workdir) / "evaluation"
         folder.mkdir(parents=True)
         (folder / "metrics.csv").write_text(
@@ -36,11 +37,12 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         )
         return pathlib.Path(workdir)
 
-    monkeypatch.setattr(experiment, "run", run)
+    monkeypatch.setattr(seeds, "run", run)
     config = base_config()
     config.seeds = (0, 1, 2)
-    experiment.run(config, name="x", workdir=tmp_path / "runs", data=["d"])
-    assert seen == [(i, f"seed{i}", ["d"]) for i in range(3)]
+    sources = Sources(data=("d",))
+    seeds.run_seeds(config, name="x", workdir=tmp_path / "runs", sources=sources)
+    assert seen == [(i, f"seed{i}", sources) for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
     assert rows[0]["mean"] == pytest.approx(54.0)
@@ -57,6 +59,15 @@ def test_a_seed_twice_is_refused() -> None:
     config.seeds = (1, 2, 1)
     with pytest.raises(UserError, match=r"a seed twice: \[1, 2, 1\]"):
         seeds.run_seeds(config, name="x")
+
+
+def test_train_py_runs_several_seeds(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "train.py", "--config=configs/quickstart.py:short"]
+    command += ["--config.seeds=1,2,1", f"--workdir={tmp_path / 'run'}"]
+    root = pathlib.Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == "error: config.seeds has a seed twice: [1, 2, 1]\n"
 
 
 @pytest.mark.parametrize(("text", "expected"), [("0,1,2", (0, 1, 2)), ("(4,)", (4,))])

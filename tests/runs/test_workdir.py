@@ -15,36 +15,40 @@ from radejax.runs.data import DataPaths
 
 def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
     config = base_config()
-    workdir.claim_workdir(tmp_path / "run", config)
-    workdir.claim_workdir(tmp_path / "run", config)
-    loaded = workdir.load_config(tmp_path / "run")
-    assert json.loads(loaded.to_json()) == json.loads(config.to_json())
+    for _ in range(2):
+        with workdir.claimed(tmp_path / "run", config):
+            kept = json.loads((tmp_path / "run" / "config.json").read_text())
+            assert kept == json.loads(config.to_json())
 
 
 def test_another_config_is_refused_and_the_difference_named(
     tmp_path: pathlib.Path,
 ) -> None:
     config = base_config()
-    workdir.claim_workdir(tmp_path, config)
+    with workdir.claimed(tmp_path, config):
+        pass
     config.train.batch_size = 3
     config.seed = 5
-    with pytest.raises(
-        UserError,
-        match=r"config\.seed is 0 there and 5 here; "
-        r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
+    with (
+        pytest.raises(
+            UserError,
+            match=r"config\.seed is 0 there and 5 here; "
+            r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
+        ),
+        workdir.claimed(tmp_path, config),
     ):
-        workdir.claim_workdir(tmp_path, config)
+        pass
 
 
 def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
     folder = tmp_path / "run"
     with (
-        workdir.lock_workdir(folder),
+        workdir.claimed(folder, base_config()),
         pytest.raises(UserError, match=r"another training is at work in .*run: wait"),
-        workdir.lock_workdir(folder),
+        workdir.claimed(folder, base_config()),
     ):
         pass
-    with workdir.lock_workdir(folder):  # let go, though the file is there
+    with workdir.claimed(folder, base_config()):  # let go, though the file is there
         pass
 
 
@@ -60,17 +64,12 @@ def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) ->
         [sys.executable, "-c", code, str(tmp_path / "lock")], stdout=subprocess.PIPE
     ) as other:
         assert other.stdout.readline() == b"held\n"
-        with pytest.raises(UserError), workdir.lock_workdir(tmp_path):
+        with pytest.raises(UserError), workdir.claimed(tmp_path, base_config()):
             pass
         other.kill()
         other.wait()
-        with workdir.lock_workdir(tmp_path):
+        with workdir.claimed(tmp_path, base_config()):
             pass
-
-
-def test_no_run_in_a_folder(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no run in .*config\.json is missing"):
-        workdir.load_run(tmp_path)
 
 
 def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
@@ -81,24 +80,3 @@ def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
     again = workdir.run_info(tmp_path, paths)
     assert again["init_from"] == info["init_from"]
     assert again["data"]["roots"] == ("a",)
-
-
-def test_weights_of_another_run_need_the_same_model(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = base_config()
-    config.model.name = "radenet"
-    workdir.claim_workdir(tmp_path, config)
-    other = workdir.Run(
-        tmp_path, workdir.load_config(tmp_path), None, None, {"w": 1}, 3
-    )
-    monkeypatch.setattr(workdir, "load_run", lambda path: other)
-    # A config from JSON has lists where the other one has tuples.
-    config.model.widths = (8, 16)
-    other.config.model.widths = [8, 16]
-    assert workdir.initial_variables(tmp_path, config) == {"w": 1}
-    config.model.widths = (8, 32)
-    with pytest.raises(
-        UserError, match=r"widths is \[8, 16\] there and \[8, 32\] here"
-    ):
-        workdir.initial_variables(tmp_path, config)

@@ -12,7 +12,7 @@ from radejax.simulation.config import (
     default_config,
 )
 from radejax.simulation.radar.weather import WEATHERS
-from radejax.simulation.world.traffic import ENVIRONMENTS
+from radejax.simulation.world.environments import ENVIRONMENTS
 
 
 def test_default_has_every_weather_in_training_and_several_held_out():

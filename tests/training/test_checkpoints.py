@@ -71,7 +71,7 @@ def test_the_best_stays_and_those_without_metrics_are_no_news(
 ) -> None:
     iterator = _iterator()
     metrics = {2: {"best": 5.0}, 4: {"best": 3.0}}
-    with Checkpoints(tmp_path, max_to_keep=1, best_metric="best") as checkpoints:
+    with Checkpoints(tmp_path, max_to_keep=1) as checkpoints:
         for step in range(1, 6):
             checkpoints.save(
                 step, _state(step), iterator, info={}, metrics=metrics.get(step)
@@ -81,7 +81,7 @@ def test_the_best_stays_and_those_without_metrics_are_no_news(
         assert checkpoints.best_step() == 2
     assert "metric" not in caplog.text
     with (
-        Checkpoints(tmp_path / "other", best_metric="best") as checkpoints,
+        Checkpoints(tmp_path / "other") as checkpoints,
         pytest.raises(FileNotFoundError, match="was evaluated: train with"),
     ):
         checkpoints.best_step()

@@ -15,7 +15,7 @@ import pytest
 
 from radejax.core.errors import DataError, UserError
 from radejax.training import loop, processes, sharding
-from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
+from radejax.training.checkpoints import Checkpoints, abstract_state
 from radejax.training.watch import Scores
 
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -26,9 +26,15 @@ STEPS_PER_EPOCH = 4
 def run(tiny: Tiny) -> Any:
     """`train` on the tiny data, on one device unless told otherwise."""
 
-    def train(workdir: pathlib.Path, loader: Any = None, **options: Any) -> Any:
+    def train(
+        workdir: pathlib.Path, loader: Any = None, config: Any = None, **others: Any
+    ) -> Any:
+        config = tiny.config if config is None else config
         arguments = {
-            "config": tiny.config,
+            "options": config.train,
+            "loss": config.loss,
+            "watch": config.watch,
+            "seed": config.seed,
             "info": {"config": {"seed": 0}},
             "steps_per_epoch": STEPS_PER_EPOCH,
             "mesh": sharding.make_mesh(1),
@@ -39,7 +45,7 @@ def run(tiny: Tiny) -> Any:
             tiny.loader() if loader is None else loader,
             tiny.map_grid,
             workdir,
-            **(arguments | options),
+            **(arguments | others),
         )
 
     return train
@@ -294,9 +300,7 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
     rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
     name = "validation/ap_bev_iou30/exact"
     assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5]
-    with Checkpoints(
-        workdir / "checkpoints", best_metric=BEST, read_only=True
-    ) as checkpoints:
+    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
         assert checkpoints.steps() == [8, 12]
         assert checkpoints.best_step() == 8
 

@@ -1,6 +1,5 @@
 """The configs of both papers: what they say, and two steps of each at tiny size."""
 
-import importlib.util
 import pathlib
 from typing import Any
 
@@ -10,12 +9,13 @@ import numpy as np
 import pytest
 
 from radejax import models
+from radejax.core.config import load_module
 from radejax.core.structures import Batch
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.open import starting_weights
 from radejax.interop import radenet_torch
-from radejax.runs import experiment
 from radejax.training import loop, sharding
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step
@@ -33,10 +33,7 @@ ALL = [
 
 
 def _get(name: str, words: str = "") -> Any:
-    spec = importlib.util.spec_from_file_location(name, CONFIGS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.get_config(words)
+    return load_module(CONFIGS / f"{name}.py").get_config(words)
 
 
 @pytest.mark.parametrize(
@@ -154,14 +151,17 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
     state = radenet_torch.save(tiny.model, official)
     torch.save({k: torch.tensor(v) for k, v in state.items()}, workdir / "best.pth")
-    variables = experiment.initial_variables(str(workdir / "best.pth"), config)
+    variables, _ = starting_weights(tiny.model, init_from=workdir / "best.pth")
     result = loop.train(
         tiny.model,
         variables,
         tiny.loader(),
         tiny.map_grid,
         workdir,
-        config=config,
+        options=config.train,
+        loss=config.loss,
+        watch=config.watch,
+        seed=config.seed,
         info={},
         steps_per_epoch=2,
         mesh=sharding.make_mesh(1),

@@ -13,6 +13,7 @@ from radejax.training.state import (
     make_schedule,
     merge_parameters,
     split_parameters,
+    with_pretrained,
 )
 
 
@@ -101,3 +102,16 @@ def test_eval_variables_are_the_averaged_ones_where_there_are_any() -> None:
     assert state.eval_variables["params"]["w"][0] == 5.0
     assert "batch_stats" in state.eval_variables
     assert state.skipped_frames.shape == (3,)
+
+
+def test_pretrained_parts_replace_their_like() -> None:
+    proj = {"kernel": np.ones((3, 8)), "bias": np.zeros(8)}
+    variables = {"params": {"image_neck": {"proj": proj}, "heads": {}}}
+    part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}, "new": 1}}}
+    merged = with_pretrained(variables, part)
+    assert (merged["params"]["image_neck"]["proj"]["bias"] == 7).all()
+    assert merged["params"]["image_neck"]["proj"]["kernel"] is proj["kernel"]
+    assert merged["params"]["image_neck"]["new"] == 1
+    wrong = {"params": {"image_neck": {"proj": {"bias": np.zeros(9)}}}}
+    with pytest.raises(UserError, match=r"params/image_neck/proj/bias is \(9,\)"):
+        with_pretrained(variables, wrong)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DiskFullError, UserError
+from radejax.training import processes
 from radejax.training.watch import Scores, Watch
 
 
@@ -38,10 +39,11 @@ def test_records_after_the_restored_step_are_written_anew(
     assert 0 <= last["data_wait_share"] <= 1
 
 
-def test_other_processes_write_nothing(tmp_path: pathlib.Path) -> None:
-    with Watch(
-        tmp_path, start_step=0, num_steps=1, frames_per_step=1, is_main=False
-    ) as watch:
+def test_other_processes_write_nothing(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "is_main", lambda: False)
+    with _watch(tmp_path, 0) as watch:
         watch.log(1, {"focal": 1.0}, epoch=1.0)
     assert not list(tmp_path.iterdir())
 
@@ -59,17 +61,15 @@ def test_metrics_on_a_full_disk_are_one_clear_error(tmp_path: pathlib.Path) -> N
 
 
 @needs_full
-@pytest.mark.timeout(60)  # without a look at the thread it waits for ever
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.timeout(60)  # tensorboardX's own thread and queue would wait for ever
 def test_tensorboard_on_a_full_disk_is_an_error_and_blocks_nothing(
     tmp_path: pathlib.Path,
 ) -> None:
     with _watch(tmp_path, 0) as watch:
-        records = watch._board._events._ev_writer._py_recordio_writer
+        records = watch._logs[-1]._records
         records._writer.close()
-        records._writer = FULL.open("wb", buffering=0)
-        # More than what a queue of tensorboardX holds by default, before the thread
-        # comes to the first.
+        records._writer = FULL.open("wb")
+        # More than what a buffer holds.
         values = {f"value{i}": 1.0 for i in range(1000)}
 
         def log() -> None:

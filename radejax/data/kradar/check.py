@@ -15,7 +15,7 @@ from tqdm import tqdm
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import sequences
-from radejax.data.kradar.dataset import KRadar
+from radejax.data.kradar.dataset import KRadar, as_paths
 from radejax.data.kradar.findings import Findings, Summary
 from radejax.data.kradar.folders import SequenceFolder, find_sequences, read_grid
 from radejax.data.kradar.frame import Frame
@@ -135,8 +135,7 @@ def check_dataset(
         FileNotFoundError: A root or `labels` does not exist.
         UserError: There are neither sequence folders nor labels.
     """
-    is_one = isinstance(roots, str | os.PathLike)
-    paths = [pathlib.Path(root) for root in ([roots] if is_one else roots)]
+    paths = as_paths(roots)
     findings = Findings(strict=False)
     data = _open(paths, labels, version, findings)
     folders = data.folders if data is not None else find_sequences(paths)
@@ -146,7 +145,7 @@ def check_dataset(
         findings.problems += summary.problems
         findings.notes += summary.notes
         findings.counts.update(summary.counts)
-    splits = _splits(data, paths, labels, frames, findings)
+    splits = _splits(data, findings)
     by_sequence = collections.defaultdict(list)
     for frame in frames:
         by_sequence[frame.sequence].append(frame)
@@ -157,7 +156,7 @@ def check_dataset(
         rows = [
             _check_sequence(
                 number,
-                folders.get(number),
+                folders.get(number, SequenceFolder([])),
                 by_sequence[number],
                 splits,
                 (shape, deep, bar),
@@ -201,33 +200,26 @@ def _open(
     raise UserError(f"the labels have the layout of none of {', '.join(VERSIONS)}")
 
 
-def _splits(
-    data: KRadar | None,
-    paths: list[pathlib.Path],
-    labels: str | os.PathLike | None,
-    frames: Sequence[Frame],
-    findings: Findings,
-) -> dict[str, str]:
+def _splits(data: KRadar | None, findings: Findings) -> dict[str, str]:
     """Split of every frame key; frames in no split are reported."""
     if data is None:
         return {}
-    near = list(paths)
-    if labels is not None:
-        near += [pathlib.Path(labels), pathlib.Path(labels).parent]
-    keys = [(frame.sequence, frame.name) for frame in frames]
+    keys = [(frame.sequence, frame.name) for frame in data]
     found: dict[str, str] = {}
     for split in ("train", "test"):
-        for sequence, name in read_split_entries(split, near, keys, findings):
+        for sequence, name in read_split_entries(
+            split, data.split_folders, keys, findings
+        ):
             key = f"{sequence}/{name}"
             if key in found:
                 findings.report("split", key, f"in both {found[key]} and {split}")
             found[key] = split
-    for frame in frames:
+    for frame in data:
         if frame.key not in found:
             findings.report(
                 "split", frame.key, "labelled, but in neither train nor test"
             )
-    present, sequences_here = {f.key for f in frames}, {f.sequence for f in frames}
+    present, sequences_here = {f.key for f in data}, {f.sequence for f in data}
     for key in sorted(found.keys() - present):
         if int(key.split("/")[0]) in sequences_here:
             findings.report("label file missing", key, f"in split {found[key]}")
@@ -236,7 +228,7 @@ def _splits(
 
 def _check_sequence(
     number: int,
-    folder: SequenceFolder | None,
+    folder: SequenceFolder,
     frames: Sequence[Frame],
     splits: dict[str, str],
     how: tuple[tuple[int, ...], bool, tqdm],
@@ -244,38 +236,34 @@ def _check_sequence(
 ) -> SequenceHealth:
     """One row of the report; problems go to the findings."""
     split_counts = collections.Counter(splits.get(frame.key) for frame in frames)
-    files = {} if folder is None else folder.listing("radar_tesseract")
-    tesseracts = {name: path for name, path in files.items() if name.endswith(".mat")}
+    files = folder.listing("radar_tesseract")
+    tesseracts = [path for name, path in files.items() if name.endswith(".mat")]
     is_kradar = how[0] == RadarGrid.kradar().shape_drea
-    conditions = _check_conditions(number, folder, findings, is_kradar)
-    has_files = folder is not None
     return SequenceHealth(
         number,
-        conditions.environment,
-        conditions.time,
-        conditions.weather,
+        *dataclasses.astuple(_check_conditions(number, folder, findings, is_kradar)),
         len(frames),
         split_counts["train"],
         split_counts["test"],
         len(tesseracts),
-        sum(f.tesseract_path is None for f in frames) if has_files else len(frames),
+        sum(frame.tesseract_path is None for frame in frames),
         _check_tesseracts(tesseracts, how, findings),
-        len(folder.listing("DERA_tesseract")) if has_files else 0,
-        len(folder.listing("cam-front")) if has_files else 0,
-        sum(f.camera_path is None for f in frames) if has_files else len(frames),
+        len(folder.listing("DERA_tesseract")),
+        len(folder.listing("cam-front")),
+        sum(frame.camera_path is None for frame in frames),
         _check_calibration(number, folder, frames, findings),
     )
 
 
 def _check_tesseracts(
-    files: dict[str, pathlib.Path],
+    paths: Sequence[pathlib.Path],
     how: tuple[tuple[int, ...], bool, tqdm],
     findings: Findings,
 ) -> int:
     """Number of damaged tesseracts."""
     shape, deep, bar = how
     num_damaged = 0
-    for path in files.values():
+    for path in paths:
         try:
             check_tesseract(path, shape_drea=shape, deep=deep)
         except (DataError, OSError) as error:
@@ -286,11 +274,11 @@ def _check_tesseracts(
 
 
 def _check_conditions(
-    number: int, folder: SequenceFolder | None, findings: Findings, is_kradar: bool
+    number: int, folder: SequenceFolder, findings: Findings, is_kradar: bool
 ) -> sequences.Conditions:
     """Conditions of a sequence; a contradiction to K-Radar's own is noted."""
     published = sequences.KRADAR_CONDITIONS.get(number, sequences.UNKNOWN_CONDITIONS)
-    path = None if folder is None else folder.find(".", "description.txt")
+    path = folder.find(".", "description.txt")
     if path is None:
         return published
     try:
@@ -308,14 +296,12 @@ def _check_conditions(
 
 def _check_calibration(
     number: int,
-    folder: SequenceFolder | None,
+    folder: SequenceFolder,
     frames: Sequence[Frame],
     findings: Findings,
 ) -> str:
     """The offset in words; frame numbers that contradict the file are reported."""
-    path = (
-        None if folder is None else folder.find("info_calib", "calib_radar_lidar.txt")
-    )
+    path = folder.find("info_calib", "calib_radar_lidar.txt")
     if path is None:
         return "default"
     try:
@@ -337,8 +323,8 @@ def _count_classes(
     frames: Sequence[Frame], splits: dict[str, str]
 ) -> dict[tuple[str, str, str], int]:
     """Kept objects by split, weather and class."""
-    counts: collections.Counter[tuple[str, str, str]] = collections.Counter()
-    for frame in frames:
-        for cls in frame.classes:
-            counts[splits.get(frame.key, "none"), frame.weather, str(cls)] += 1
-    return dict(counts)
+    return collections.Counter(
+        (splits.get(frame.key, "none"), frame.weather, str(cls))
+        for frame in frames
+        for cls in frame.classes
+    )

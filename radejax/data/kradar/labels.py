@@ -40,7 +40,7 @@ _SEPARATOR = r"\s*,\s*"
 _BOX = _SEPARATOR.join(rf"({_NUMBER})" for _ in range(7))
 _FLAG, _ID, _CLASS = r"([A-Za-z]\w*)", r"(-?\d+)", r"([A-Za-z][^,*]*?)"
 _LEADING_FIELDS = {
-    "v1.0": (_ID, _CLASS),
+    "v1.0": (_ID + rf"(?:{_SEPARATOR}{_ID})?", _CLASS),  # with one or two ids
     "v1.1": (_FLAG, _ID, _ID, _CLASS),
     "v2.0": (_ID, _CLASS),
     "v2.1": (_FLAG, _ID, _CLASS),
@@ -51,12 +51,6 @@ _LINES = {
     )
     for version, fields in _LEADING_FIELDS.items()
 }
-# Version 1.0 comes with one or two ids.
-_LINES["v1.0"] = re.compile(
-    _SEPARATOR.join((r"\s*\*", _ID + rf"(?:{_SEPARATOR}{_ID})?", _CLASS, _BOX))
-    + r"\s*",
-    flags=re.ASCII,
-)
 _HEADER = re.compile(r"\*\s*idx\(([^)]*)\)=([\d_]+),\s*timestamp=([\d.]+)\s*")
 _TOOL_HEADER = re.compile(
     r"\*\s*radar idx: (\d+), lidar idx: (\d+), camera idx: (\d+), time: ([\d.]+)"

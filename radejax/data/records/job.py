@@ -11,7 +11,6 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import hashlib
-import json
 import math
 import multiprocessing
 import os
@@ -19,19 +18,18 @@ import pathlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
+from radejax.core import files as core_files
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import atomic_write
 from radejax.data.encoding import check_encoding, encode, num_clipped
+from radejax.data.kradar import Frame, KRadar
 from radejax.data.records import files
+from radejax.data.records.projections import Manifest, write_manifest
 from radejax.data.tesseract import project_file, read_projection_npy
-
-if TYPE_CHECKING:
-    from radejax.data.kradar import Frame, KRadar
-    from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid
 
 PLAN = "plan.json"
 
@@ -79,15 +77,18 @@ class ProjectionReport:
         return "\n".join(lines)
 
 
+_Source = tuple[str, pathlib.Path | None, pathlib.Path | None]
+"""Key, tesseract and released projection of a frame."""
+
+
 @dataclasses.dataclass(frozen=True)
 class _Task:
     """One file of records: picklable, without boxes and labels."""
 
     folder: pathlib.Path
     name: str
-    frames: tuple[tuple[str, pathlib.Path | None, pathlib.Path | None], ...]
-    shape_drea: tuple[int, ...]
-    projection_shape: tuple[int, ...]
+    frames: list[_Source]
+    grid: RadarGrid
     encoding: str
     skip_bad: bool
 
@@ -128,30 +129,36 @@ def project_dataset(
         DataError: A tesseract is missing or damaged, and not `skip_bad`.
     """
     began = time.perf_counter()
-    grid = _grid_of(frames, grid)
+    grid = grid or getattr(frames, "grid", None)
+    if grid is None:
+        raise UserError("a plain list of frames has no grid: give grid=")
     index, count = parse_shard(shard)
+    dtype = check_encoding(dtype)
     out_dir = pathlib.Path(out_dir)
     sources = [(f.key, f.tesseract_path, f.projection_path) for f in frames]
     if not sources:
         raise UserError("no frames to project")
     if frames_per_file < 1:
         raise UserError(f"frames_per_file must be at least 1, got {frames_per_file}")
-    chunks = [
-        tuple(sources[start : start + frames_per_file])
-        for start in range(0, len(sources), frames_per_file)
-    ]
-    names = [files.file_name(i, len(chunks)) for i in range(len(chunks))]
-    plan = _plan([key for key, *_ in sources], frames_per_file, grid, dtype)
-    _agree_on_plan(out_dir, plan)
-    shapes = (tuple(grid.shape_drea), tuple(grid.projection_shape))
+    keys = "\n".join(key for key, *_ in sources)
+    plan = {
+        "dtype": dtype,
+        "num_frames": len(sources),
+        "frames_per_file": frames_per_file,
+        "frames_sha256": hashlib.sha256(keys.encode()).hexdigest(),
+        "grid": grid.to_dict(),
+    }
+    core_files.claim(out_dir / PLAN, plan, "another projection")
+    starts = range(0, len(sources), frames_per_file)
+    names = [files.file_name(i, len(starts)) for i in range(len(starts))]
     tasks = [
-        _Task(out_dir, name, chunk, *shapes, plan["dtype"], skip_bad)
-        for name, chunk in list(zip(names, chunks, strict=True))[index::count]
-    ]
+        _Task(out_dir, name, sources[i : i + frames_per_file], grid, dtype, skip_bad)
+        for name, i in zip(names, starts, strict=True)
+    ][index::count]
     report = ProjectionReport(num_frames=sum(len(task.frames) for task in tasks))
     todo = [task for task in tasks if not _count_finished(task, report)]
     _run(todo, report, num_workers, progress)
-    report.is_complete = _finish(out_dir, names, grid, plan["dtype"], sources)
+    report.is_complete = _finish(out_dir, names, grid, dtype, sources)
     report.seconds = time.perf_counter() - began
     return report
 
@@ -166,50 +173,6 @@ def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
     if not 0 <= index < count:
         raise UserError(f"shard {index}/{count}: i must be from 0 to n - 1")
     return index, count
-
-
-def _grid_of(frames: Any, grid: RadarGrid | None) -> RadarGrid:
-    """The given grid, or that of the data set."""
-    own = getattr(frames, "grid", None)
-    if grid is None and own is None:
-        raise UserError("a plain list of frames has no grid: give grid=")
-    return grid if grid is not None else own
-
-
-def _plan(keys: list[str], frames_per_file: int, grid: RadarGrid, dtype: str) -> dict:
-    """What runs that share a folder must agree on."""
-    return {
-        "dtype": check_encoding(dtype),
-        "num_frames": len(keys),
-        "frames_per_file": frames_per_file,
-        "frames_sha256": hashlib.sha256("\n".join(keys).encode()).hexdigest(),
-        "grid": grid.to_dict(),
-    }
-
-
-def _agree_on_plan(out_dir: pathlib.Path, plan: dict) -> None:
-    """Writes the plan of a new folder; `UserError` if the folder has another one."""
-    path = out_dir / PLAN
-    try:
-        found = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        with atomic_write(path) as file:
-            file.write(json.dumps(plan).encode("ascii"))
-        return
-    except ValueError:
-        raise DataError(f"{path}: damaged plan; delete it") from None
-    except NotADirectoryError:
-        raise UserError(
-            f"{out_dir}: is a file, expected a folder for records"
-        ) from None
-    differing = [key for key in plan if found.get(key) != plan[key]]
-    if differing:
-        key = differing[0]
-        values = "" if key == "grid" else f": {found.get(key)} there, {plan[key]} now"
-        raise UserError(
-            f"{out_dir} holds another projection ({key} differs{values}); choose another "
-            "folder, or delete that one"
-        )
 
 
 def _count_finished(task: _Task, report: ProjectionReport) -> bool:
@@ -235,7 +198,9 @@ def _run(
     total = sum(len(task.frames) for task in tasks)
     bar = tqdm(total=total, unit="frame", desc="project", disable=not progress)
     if num_workers is None:
-        cells = sum(len(task.frames) * math.prod(task.shape_drea) for task in tasks)
+        cells = sum(
+            len(task.frames) * math.prod(task.grid.shape_drea) for task in tasks
+        )
         num_workers = (os.cpu_count() or 1) if cells > _SMALL_JOB_CELLS else 0
     reading = working = 0.0
     with bar:
@@ -323,13 +288,11 @@ def _project_task(
     """Projects one file of records; returns its manifest, reading and working time."""
     began = time.perf_counter()
     timings = {"reading": 0.0}
-    writer = files.RecordFileWriter(task.folder, task.name)
-    try:
-        for key, tesseract_path, projection_path in task.frames:
+    with files.RecordFileWriter(task.folder, task.name) as writer:
+        for source in task.frames:
+            key = source[0]
             try:
-                projection = _projection(
-                    key, tesseract_path, projection_path, task, timings
-                )
+                projection = _projection(source, task.grid, timings)
             except (DataError, FileNotFoundError, OSError) as error:
                 if not task.skip_bad:
                     raise DataError(
@@ -341,26 +304,16 @@ def _project_task(
                 writer.write(key, encode(projection, task.encoding))
             count_frame(1)
         entry = writer.commit()
-    except BaseException:
-        writer.discard()
-        raise
     return entry, timings["reading"], time.perf_counter() - began
 
 
-def _projection(
-    key: str,
-    tesseract_path: pathlib.Path | None,
-    projection_path: pathlib.Path | None,
-    task: _Task,
-    timings: dict[str, float],
-) -> Any:
+def _projection(source: _Source, grid: RadarGrid, timings: dict[str, float]) -> Any:
     """The projection of one frame, from its tesseract or, without one, from `.npy`."""
-    if tesseract_path is not None:
-        return project_file(tesseract_path, shape_drea=task.shape_drea, timings=timings)
-    if projection_path is not None:
-        return read_projection_npy(
-            projection_path, projection_shape=task.projection_shape
-        )
+    _, tesseract, npy = source
+    if tesseract is not None:
+        return project_file(tesseract, shape_drea=grid.shape_drea, timings=timings)
+    if npy is not None:
+        return read_projection_npy(npy, projection_shape=grid.projection_shape)
     raise FileNotFoundError("no tesseract in any root")
 
 
@@ -369,11 +322,9 @@ def _finish(
     names: list[str],
     grid: RadarGrid,
     dtype: str,
-    sources: list[tuple[str, pathlib.Path | None, pathlib.Path | None]],
+    sources: list[_Source],
 ) -> bool:
     """Writes the manifest of the folder if every file is there."""
-    from radejax.data.records.projections import Manifest, write_manifest
-
     entries = [files.read_manifest_of(out_dir, name) for name in names]
     if any(entry is None for entry in entries):
         return False

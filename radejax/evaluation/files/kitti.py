@@ -19,13 +19,14 @@ References:
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation.files.predictions import Columns
+from radejax.core.structures import Detections
+from radejax.evaluation.columns import Columns
 
 CLASS_KEYS = {
     "Sedan": "sed",
@@ -40,14 +41,17 @@ CLASS_NAMES = {key: name for name, key in CLASS_KEYS.items()}
 GT_HEADER = "0.00 0 0 50 50 150 150"
 PRED_HEADER = "-1 -1 0 50 50 150 150"
 DUMMY = "dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"
+DESCRIPTION = ("time", "environment", "weather")
+"""What the lines of a file in `desc` tell, as columns of the frame table."""
+
 BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # h w l y z x yaw of x y z l w h yaw
 
 
 def write_kitti(
     folder: str | pathlib.Path,
-    ground_truth: Mapping[str, np.ndarray],
-    predictions: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray],
+    ground_truth: Columns,
+    predictions: Columns,
+    frames: Columns,
     *,
     score_threshold: float = 0.0,
     conditions: Iterable[str] = ("weather", "environment", "time"),
@@ -71,10 +75,9 @@ def write_kitti(
         UserError: A class K-Radar has no key for.
     """
     root = pathlib.Path(folder) / f"{float(score_threshold)}"
-    score = np.asarray(predictions["score"], np.float64)
-    above = np.flatnonzero(score > score_threshold)
-    truth = _lines(ground_truth, np.arange(len(ground_truth["cls"])), None)
-    found = _lines(predictions, above, score)
+    above = np.flatnonzero(np.asarray(predictions["score"]) > score_threshold)
+    truth = _lines(ground_truth, range(len(ground_truth["cls"])), scored=False)
+    found = _lines(predictions, above, scored=True)
     kinds = [kind for kind in conditions if kind in frames]
     ids = np.asarray(frames["frame"]).tolist()
     listed: dict[pathlib.Path, list[str]] = {root / "all": []}
@@ -82,18 +85,17 @@ def write_kitti(
         if frame not in truth:
             continue
         tags = {kind: str(np.asarray(frames[kind])[position]) for kind in kinds}
-        description = "\n".join(
-            tags.get(kind, "unknown") for kind in ("time", "environment", "weather")
-        )
+        texts = {
+            "gts": "\n".join(truth[frame]) + "\n",
+            "preds": "\n".join(found.get(frame, [DUMMY])) + "\n",
+            "desc": "\n".join(tags.get(kind, "unknown") for kind in DESCRIPTION),
+        }
         for part in ("all", *tags.values()):
-            name = f"{position:06d}.txt"
             listed.setdefault(root / part, []).append(f"{position:06d}")
-            for kind, lines in (
-                ("gts", truth[frame]),
-                ("preds", found.get(frame, [DUMMY])),
-            ):
-                _write(root / part / kind / name, "\n".join(lines) + "\n")
-            _write(root / part / "desc" / name, description)
+            for kind, text in texts.items():
+                path = root / part / kind / f"{position:06d}.txt"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, encoding="utf-8")
     for part, names in listed.items():
         part.mkdir(parents=True, exist_ok=True)
         files.write_text(part / "val.txt", "".join(f"{name}\n" for name in names))
@@ -101,50 +103,43 @@ def write_kitti(
 
 
 def prediction_texts(
-    predictions: Mapping[str, np.ndarray], num_frames: int
+    detections: Detections, classes: Sequence[str] | None = None
 ) -> list[str]:
-    """Content of the prediction files of frames 0 to `num_frames - 1`.
+    """One text a frame as K-Radar's tools write predictions, without a final newline.
 
     Args:
-        predictions: Columns frame, box, cls and score; every row is written.
-        num_frames: Frames without predictions get the line "dummy".
+        detections: Of a batch; a frame without any gets the line "dummy".
+        classes: Names of the class indices; the detections' own if None.
 
     Raises:
-        UserError: A class K-Radar has no key for.
+        UserError: K-Radar has no key for a class.
     """
-    score = np.asarray(predictions["score"], np.float64)
-    found = _lines(predictions, np.arange(score.size), score)
+    columns = detections.to_columns(classes)
+    found = _lines(columns, range(len(columns["score"])), scored=True)
+    num_frames = detections.is_valid.shape[0]
     return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
 
 
-def _write(path: pathlib.Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-
-
 def _lines(
-    table: Mapping[str, np.ndarray], rows: np.ndarray, score: np.ndarray | None
+    table: Columns, rows: Iterable[int], *, scored: bool
 ) -> dict[int, list[str]]:
-    """Lines of every frame, in the order of the rows."""
+    """Lines of chosen rows by frame, as ground truth or as predictions."""
+    header = PRED_HEADER if scored else GT_HEADER
     box = np.asarray(table["box"], np.float64).reshape(-1, 7)
-    if score is None:
-        box = np.round(box, 2)
+    numbers = (box if scored else np.round(box, 2))[:, BOX_ORDER]
+    if scored:
+        score = np.asarray(table["score"], np.float64)
+        numbers = np.column_stack([numbers, score])
     frame, cls = np.asarray(table["frame"]).tolist(), np.asarray(table["cls"]).tolist()
     lines: dict[int, list[str]] = {}
-    for row in rows.tolist():
+    for row in rows:
         if cls[row] not in CLASS_KEYS:
             raise UserError(
                 f"K-Radar's tools have no key for class {cls[row]!r} (frame {frame[row]},"
                 f" row {row}); known: {', '.join(CLASS_KEYS)}"
             )
-        numbers = [repr(value) for value in box[row, BOX_ORDER].tolist()]
-        header = GT_HEADER
-        if score is not None:
-            numbers.append(repr(float(score[row])))
-            header = PRED_HEADER
-        lines.setdefault(frame[row], []).append(
-            " ".join([CLASS_KEYS[cls[row]], header, *numbers])
-        )
+        words = [CLASS_KEYS[cls[row]], header, *map(repr, numbers[row].tolist())]
+        lines.setdefault(frame[row], []).append(" ".join(words))
     return lines
 
 
@@ -170,19 +165,10 @@ def read_kitti(
     """
     root = _find_root(pathlib.Path(folder), condition)
     preds, gts = _part(root, "preds", "pred"), _part(root, "gts", "gt")
-    found = _read_folder(preds, scored=True)
-    truth = _read_folder(gts, scored=False) if gts else {}
-    numbers = sorted({*truth, *found})
-    return (
-        _columns(truth, scored=False),
-        _columns(found, scored=True),
-        _frame_table(numbers, _part(root, "desc")),
-    )
-
-
-def is_kitti(path: str | pathlib.Path) -> bool:
-    """Whether a path is a folder that `read_kitti` should try."""
-    return pathlib.Path(path).is_dir()
+    numbers, found = _read_folder(preds, scored=True)
+    others, truth = _read_folder(gts, scored=False)
+    frames = _frame_table(sorted({*numbers, *others}), _part(root, "desc"))
+    return truth, found, frames
 
 
 def _find_root(folder: pathlib.Path, condition: str) -> pathlib.Path:
@@ -211,21 +197,29 @@ def _part(root: pathlib.Path, *names: str) -> pathlib.Path | None:
     return next((root / name for name in names if (root / name).is_dir()), None)
 
 
-def _read_folder(folder: pathlib.Path, *, scored: bool) -> dict[int, list[tuple]]:
-    """(class, box, score) of every line by frame number."""
-    content = {}
-    for path in sorted(folder.glob("*.txt")):
+def _read_folder(
+    folder: pathlib.Path | None, *, scored: bool
+) -> tuple[list[int], Columns]:
+    """Numbers of the files in a folder, if there is one, and columns of all lines."""
+    numbers, rows = [], []
+    for path in sorted(folder.glob("*.txt")) if folder else ():
         if not path.stem.isdigit():
             raise DataError(
                 f"{path}: expected a file named by its number, as 000012.txt"
             )
+        numbers.append(int(path.stem))
         text = path.read_text(encoding="utf-8")
-        content[int(path.stem)] = [
-            row
-            for number, line in enumerate(text.splitlines(), 1)
-            if (row := _read_line(line, scored, f"{path}: line {number}"))
-        ]
-    return content
+        for number, line in enumerate(text.splitlines(), 1):
+            if row := _read_line(line, scored, f"{path}: line {number}"):
+                rows.append((numbers[-1], *row))
+    columns = {
+        "frame": np.array([row[0] for row in rows], np.int64),
+        "cls": np.array([row[1] for row in rows], dtype=str),
+        "box": np.array([row[2] for row in rows], np.float64).reshape(-1, 7),
+    }
+    if scored:
+        columns["score"] = np.array([row[3] for row in rows], np.float64)
+    return numbers, columns
 
 
 def _read_line(line: str, scored: bool, where: str) -> tuple | None:
@@ -244,27 +238,14 @@ def _read_line(line: str, scored: bool, where: str) -> tuple | None:
     return name, (x, y, z, length, width, height, yaw), score
 
 
-def _columns(content: Mapping[int, list[tuple]], *, scored: bool) -> Columns:
-    rows = [(frame, *row) for frame, listed in content.items() for row in listed]
-    columns = {
-        "frame": np.array([row[0] for row in rows], np.int64),
-        "cls": np.array([row[1] for row in rows], dtype=str),
-        "box": np.array([row[2] for row in rows], np.float64).reshape(-1, 7),
-    }
-    if scored:
-        columns["score"] = np.array([row[3] for row in rows], np.float64)
-    return columns
-
-
 def _frame_table(numbers: list[int], desc: pathlib.Path | None) -> Columns:
-    table: Columns = {"frame": np.array(numbers, np.int64)}
+    ids = {"frame": np.array(numbers, np.int64)}
     if desc is None:
-        return table
+        return ids
     tags = []
     for number in numbers:
         path = desc / f"{number:06d}.txt"
-        lines = path.read_text(encoding="utf-8").split() if path.is_file() else []
-        tags.append(lines if len(lines) == 3 else ["unknown"] * 3)
-    for index, kind in enumerate(("time", "environment", "weather")):
-        table[kind] = np.array([tag[index] for tag in tags], dtype=str)
-    return table
+        words = path.read_text(encoding="utf-8").split() if path.is_file() else []
+        tags.append(words if len(words) == 3 else ["unknown"] * 3)
+    columns = np.array(tags, dtype=str).reshape(-1, 3).T
+    return ids | dict(zip(DESCRIPTION, columns, strict=True))

@@ -11,44 +11,18 @@ import csv
 import io
 import json
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation.columns import BOX_FIELDS
-
-Columns = dict[str, np.ndarray]
-
-
-def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:
-    """Ground truth and frame table of a data set such as `radejax.data.kradar.dataset.KRadar`.
-
-    Args:
-        frames: Objects with sequence, name, weather, environment, time, boxes `[N, 7]`
-            (radar frame) and classes `[N]` (names).
-
-    Returns:
-        Ground-truth columns and frame columns; the frame id is the position.
-    """
-    frames = list(frames)
-    counts = [len(frame.boxes) for frame in frames]
-    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
-    cls = [str(name) for frame in frames for name in frame.classes]
-    ground_truth = {
-        "frame": np.repeat(np.arange(len(frames)), counts),
-        "box": np.concatenate(box) if box else np.zeros((0, 7)),
-        "cls": np.array(cls, dtype=str),
-    }
-    table = {"frame": np.arange(len(frames))}
-    for column in ("sequence", "name", "weather", "environment", "time"):
-        table[column] = np.array([getattr(frame, column) for frame in frames])
-    return ground_truth, table
+from radejax.core.structures import BOX_FIELDS
+from radejax.evaluation.columns import Columns, wanted_columns
 
 
-def frame_keys(frames: Mapping[str, np.ndarray]) -> list[str]:
+def frame_keys(frames: Columns) -> list[str]:
     """Key "sequence/name" of every frame; the id where these are not known."""
     if "name" not in frames:
         return [str(frame) for frame in np.asarray(frames["frame"]).tolist()]
@@ -67,10 +41,7 @@ def _strip(name: str) -> str:
 
 
 def read_table(
-    path: str | pathlib.Path,
-    frames: Mapping[str, np.ndarray] | None = None,
-    *,
-    scored: bool = True,
+    path: str | pathlib.Path, frames: Columns | None = None, *, scored: bool = True
 ) -> Columns:
     """Reads predictions (or, not `scored`, ground truth) from .npz, .json or .csv.
 
@@ -98,7 +69,7 @@ def read_table(
             " and folders in KITTI's layout"
         )
     columns = readers[path.suffix](path)
-    wanted = ("frame", "box", "cls", "score") if scored else ("frame", "box", "cls")
+    wanted = wanted_columns(scored)
     missing = [name for name in wanted if name not in columns]
     if missing:
         raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
@@ -110,10 +81,7 @@ def read_table(
 
 
 def find_frames(
-    named: np.ndarray | Sequence[Any],
-    frames: Mapping[str, np.ndarray] | None,
-    *,
-    where: str,
+    named: np.ndarray | Sequence[Any], frames: Columns | None, *, where: str
 ) -> np.ndarray:
     """Ids of frames that are named by id or by key.
 
@@ -158,38 +126,32 @@ def _read_json(path: pathlib.Path) -> Columns:
         columns = content
     else:
         columns = _columns_of_records(_records(content, path), path)
+    types = {"frame": None, "cls": None, "box": np.float64, "score": np.float64}
     try:
         return {
-            name: np.asarray(values)
-            if name in ("frame", "cls")
-            else np.asarray(values, np.float64)
-            for name, values in columns.items()
-            if name in ("frame", "box", "cls", "score")
+            name: np.asarray(columns[name], dtype)
+            for name, dtype in types.items()
+            if name in columns
         }
     except (ValueError, TypeError) as error:
         raise DataError(f"{path}: a box or score is not a number: {error}") from error
 
 
-def _records(content: Any, path: pathlib.Path) -> list[dict]:
+def _records(content: Any, path: pathlib.Path) -> Iterator[dict]:
     """Flat records of a list of records or of a mapping frame -> list of records."""
-    if isinstance(content, dict):
-        return [
-            {"frame": frame, **record}
-            for frame, listed in content.items()
-            for record in _as_list(listed, f"{path}: frame {frame!r}")
-        ]
-    return _as_list(content, str(path))
+    is_by_frame = isinstance(content, dict)
+    for frame, listed in content.items() if is_by_frame else [(None, content)]:
+        if not isinstance(listed, list) or any(
+            not isinstance(item, dict) for item in listed
+        ):
+            where = f"{path}: frame {frame!r}" if is_by_frame else str(path)
+            raise DataError(
+                f"{where}: expected a list of objects with frame, cls, box and score"
+            )
+        yield from ({"frame": frame, **r} if is_by_frame else r for r in listed)
 
 
-def _as_list(value: Any, where: str) -> list[dict]:
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise DataError(
-            f"{where}: expected a list of objects with frame, cls, box and score"
-        )
-    return value
-
-
-def _columns_of_records(records: list[dict], path: pathlib.Path) -> dict[str, list]:
+def _columns_of_records(records: Iterator[dict], path: pathlib.Path) -> dict[str, list]:
     columns: dict[str, list] = {"frame": [], "cls": [], "box": [], "score": []}
     for row, record in enumerate(records):
         box = record.get("box", [record.get(name) for name in BOX_FIELDS])
@@ -205,7 +167,7 @@ def _columns_of_records(records: list[dict], path: pathlib.Path) -> dict[str, li
         columns["box"].append(box)
         columns["score"].append(record.get("score"))
     lacking = [row for row, score in enumerate(columns["score"]) if score is None]
-    if lacking and len(lacking) < len(records):
+    if lacking and len(lacking) < len(columns["score"]):
         raise DataError(f"{path}: row {lacking[0]}: lacks 'score'")
     if lacking:
         del columns["score"]
@@ -242,9 +204,7 @@ def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float
 
 
 def write_table(
-    path: str | pathlib.Path,
-    table: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray] | None = None,
+    path: str | pathlib.Path, table: Columns, frames: Columns | None = None
 ) -> None:
     """Writes columns as .npz, .json or .csv; `read_table` gives the same back.
 
@@ -279,14 +239,9 @@ def write_table(
 
 
 def _csv_text(columns: Columns) -> str:
+    flat = columns | dict(zip(BOX_FIELDS, columns["box"].T, strict=True))
+    names = [name for name in ("frame", "cls", *BOX_FIELDS, "score") if name in flat]
+    rows = zip(*(flat[name].tolist() for name in names), strict=True)
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    scored = "score" in columns
-    writer.writerow(["frame", "cls", *BOX_FIELDS, *(["score"] * scored)])
-    rows = zip(columns["frame"].tolist(), columns["cls"].tolist(), strict=True)
-    for index, (frame, cls) in enumerate(rows):
-        numbers = [repr(value) for value in columns["box"][index].tolist()]
-        if scored:
-            numbers.append(repr(float(columns["score"][index])))
-        writer.writerow([frame, cls, *numbers])
+    csv.writer(buffer, lineterminator="\n").writerows([names, *rows])
     return buffer.getvalue()

@@ -8,14 +8,16 @@ counts as often as its sequence was drawn, which all protocols handle exactly.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
-from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.columns import Columns
+from radejax.evaluation.evaluation_set import EvaluationSet, Terms
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import SPACES
 
 LEVEL = 0.95
@@ -57,21 +59,19 @@ def resample(
     NaN where a resample has no object of a class; the mean is over classes that occur.
     """
     chosen = protocols.get_protocol(protocol)
-    skip = chosen.skip_empty if skip_empty == PROTOCOL_DEFAULT else skip_empty
+    skip = chosen.frame_rule(skip_empty)
+    terms = Terms(chosen, space, iou, float(score_threshold))
     num_classes = len(data.classes)
     among = weights.any(axis=0)
     ap = np.full((len(weights), num_classes + 1), np.nan)
     for row, weight in enumerate(weights):
         by_class = data.frame_weights(skip, weight)
         for cls in range(num_classes):
-            curve = data.curve(
-                chosen, space, iou, cls, by_class[:, cls], score_threshold, among
-            )
+            curve = data.curve(terms, cls, by_class[:, cls], among)
             if curve.num_gt:
                 ap[row, cls] = curve.ap
-        present = ap[row, :num_classes]
-        present = present[~np.isnan(present)]
-        ap[row, num_classes] = present.mean() if present.size else np.nan
+        present = ap[row, ~np.isnan(ap[row])]
+        ap[row, -1] = present.mean() if present.size else np.nan
     return ap
 
 
@@ -116,10 +116,6 @@ class Comparison:
     p_adjusted: float
     is_real: bool
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return dataclasses.asdict(self)
-
 
 def compare(
     data_a: EvaluationSet,
@@ -153,20 +149,15 @@ def compare(
     weights = sequence_weights(sequence, resamples=resamples, seed=seed)
     everything = np.ones((1, len(sequence)), np.int16)
     raw = []
-    for protocol in protocol_names:
-        for space in spaces:
-            for iou in iou_thresholds:
-                terms = (protocol, space, float(iou))
-                options = {"score_threshold": score_threshold}
-                whole = [
-                    resample(data, everything, *terms, **options)[0]
-                    for data in (data_a, data_b)
-                ]
-                samples = [
-                    resample(data, weights, *terms, **options)
-                    for data in (data_a, data_b)
-                ]
-                raw += _compare_classes(data_a.classes, terms, whole, samples)
+    for terms in itertools.product(protocol_names, spaces, map(float, iou_thresholds)):
+        whole, samples = (
+            [
+                resample(data, chosen, *terms, score_threshold=score_threshold)
+                for data in (data_a, data_b)
+            ]
+            for chosen in (everything, weights)
+        )
+        raw += _compare_classes(data_a.classes, terms, whole, samples)
     return _holm(raw)
 
 
@@ -177,7 +168,7 @@ def _compare_classes(
     protocol, space, iou = terms
     result = []
     for index, name in enumerate((*classes, "mean")):
-        ap_a, ap_b = float(whole[0][index]), float(whole[1][index])
+        ap_a, ap_b = (float(ap[0, index]) for ap in whole)
         if np.isnan(ap_a):
             continue
         gaps = samples[1][:, index] - samples[0][:, index]
@@ -233,7 +224,7 @@ def check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
 
 def add_intervals(
     data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
+    frames: Columns,
     terms: Sequence[tuple[str, str, float]],
     *,
     resamples: int,

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from radejax.evaluation import matching, overlap, protocols
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.result import SPACES
-from radejax.visualize.curves import calibration_bins
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
@@ -43,46 +44,6 @@ def matched_objects(data: EvaluationSet, space: str, iou: float) -> np.ndarray:
     return data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
 
 
-def slice_numbers(
-    data: EvaluationSet,
-    cls: int,
-    gt_mask: np.ndarray,
-    pred_mask: np.ndarray,
-    match: np.ndarray,
-    operating_score: float,
-) -> Slice:
-    """AP, precision and recall of one class over chosen objects and predictions.
-
-    Args:
-        data: The evaluation set.
-        cls: Class index.
-        gt_mask: `[N]` objects in the slice.
-        pred_mask: `[M]` predictions in the slice.
-        match: `[M]` from `matched_objects`.
-        operating_score: Precision and recall are of predictions above this score.
-    """
-    order = np.lexsort((data.pred.row, -data.pred.score))
-    order = order[(data.pred.cls[order] == cls) & pred_mask[order]]
-    score, is_tp = data.pred.score[order], match[order] >= 0
-    num_gt = int((gt_mask & (data.gt.cls == cls)).sum())
-    curve = protocols.pooled_curve(
-        score=score,
-        is_tp=is_tp,
-        weight=np.ones(order.size, np.int64),
-        num_gt=num_gt,
-        curve="exact",
-    )
-    above = score > operating_score
-    num_det, found = int(above.sum()), int(is_tp[above].sum())
-    return Slice(
-        curve.ap,
-        found / num_det if num_det else float("nan"),
-        found / num_gt if num_gt else float("nan"),
-        num_gt,
-        num_det,
-    )
-
-
 def by_distance(
     data: EvaluationSet,
     space: str,
@@ -101,39 +62,65 @@ def by_distance(
     far = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
     if far_gt.size:
         far = np.where(match >= 0, far_gt[match], far)
-    result = {}
+    bands = {}
     for low, high in itertools.pairwise(edges_m):
-        in_gt, in_pred = ((d >= low) & (d < high) for d in (far_gt, far))
         band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
-        for cls, name in enumerate(data.classes):
-            result[band, name] = slice_numbers(
-                data, cls, in_gt, in_pred, match, operating_score
-            )
-    return result
+        bands[band] = [(d >= low) & (d < high) for d in (far_gt, far)]
+    return _by_slice(data, bands, match, operating_score)
 
 
 def by_condition(
     data: EvaluationSet,
-    conditions: dict[str, np.ndarray],
+    conditions: Mapping[str, np.ndarray],
     space: str,
     iou: float,
     *,
     operating_score: float = 0.3,
 ) -> dict[tuple[str, str], Slice]:
     """Numbers by (condition, class); a condition is a `[F]` mask of frames."""
-    match = matched_objects(data, space, iou)
-    return {
-        (condition, name): slice_numbers(
-            data,
-            cls,
-            mask[data.gt.frame],
-            mask[data.pred.frame],
-            match,
-            operating_score,
-        )
-        for condition, mask in conditions.items()
-        for cls, name in enumerate(data.classes)
+    masks = {
+        name: (mask[data.gt.frame], mask[data.pred.frame])
+        for name, mask in conditions.items()
     }
+    match = matched_objects(data, space, iou)
+    return _by_slice(data, masks, match, operating_score)
+
+
+def _by_slice(
+    data: EvaluationSet,
+    masks: Mapping[str, Sequence[np.ndarray]],
+    match: np.ndarray,
+    operating_score: float,
+) -> dict[tuple[str, str], Slice]:
+    """Numbers by (slice, class).
+
+    Args:
+        data: The evaluation set.
+        masks: `[N]` objects and `[M]` predictions in each slice.
+        match: `[M]` from `matched_objects`.
+        operating_score: Precision and recall are of predictions above this score.
+    """
+    result = {}
+    for (name, (in_gt, in_pred)), (cls, cls_name) in itertools.product(
+        masks.items(), enumerate(data.classes)
+    ):
+        order = data.by_score[cls]
+        order = order[in_pred[order]]
+        score, is_tp = data.pred.score[order], match[order] >= 0
+        num_gt = int((in_gt & (data.gt.cls == cls)).sum())
+        curve = protocols.pooled_curve(
+            score=score,
+            is_tp=is_tp,
+            weight=np.ones_like(order),
+            num_gt=num_gt,
+            curve="exact",
+        )
+        above = score > operating_score
+        num_det, found = int(above.sum()), int(is_tp[above].sum())
+        precision = found / num_det if num_det else math.nan
+        recall = found / num_gt if num_gt else math.nan
+        result[name, cls_name] = Slice(curve.ap, precision, recall, num_gt, num_det)
+    return result
 
 
 def calibration(
@@ -146,6 +133,9 @@ def calibration(
         "precision" per bin (NaN where empty), and "error", the mean of
         |precision - score| weighted by count (expected calibration error).
     """
+    # Here, for it loads matplotlib, and the numbers of a training run need none of that.
+    from radejax.visualize.curves import calibration_bins
+
     is_match = matched_objects(data, space, iou) >= 0
     edges = np.linspace(0, 1, num_bins + 1)
     result = {}
@@ -162,7 +152,7 @@ def calibration(
             "count": count.tolist(),
             "score": score.tolist(),
             "precision": precision.tolist(),
-            "error": error / total if total else float("nan"),
+            "error": error / total if total else math.nan,
         }
     return result
 
@@ -196,18 +186,16 @@ def box_errors(
     result = {}
     for cls, name in enumerate(data.classes):
         mine = data.pred.cls[rows] == cls
-        count = int(mine.sum())
-        numbers: dict[str, float] = {"count": count}
+        numbers = result[name] = {"count": int(mine.sum())}
         for what, values in errors.items():
-            numbers[f"{what}_mean"] = float(values[mine].mean()) if count else np.nan
-            numbers[f"{what}_median"] = (
-                float(np.median(values[mine])) if count else np.nan
-            )
-        numbers["reversed"] = (
-            float((turn[mine] > np.pi / 2).mean()) if count else np.nan
-        )
-        result[name] = numbers
+            numbers[f"{what}_mean"] = _or_nan(np.mean, values[mine])
+            numbers[f"{what}_median"] = _or_nan(np.median, values[mine])
+        numbers["reversed"] = _or_nan(np.mean, turn[mine] > np.pi / 2)
     return result
+
+
+def _or_nan(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    return float(statistic(values)) if values.size else math.nan
 
 
 def confusion(
@@ -220,16 +208,13 @@ def confusion(
     that were not found.
     """
     num_classes = len(data.classes)
-    rows = np.flatnonzero(data.pred.score > operating_score)
-    pred = data.pred.take(rows)
+    pred = data.pred.take(data.pred.score > operating_score)
     first, second = overlap.candidate_pairs(
         pred.frame, data.gt.frame, pred.box, data.gt.box
     )
-    iou_pairs = overlap.pair_iou(pred.box[first], data.gt.box[second])
-    values = iou_pairs[SPACES.index(space)]
-    match = matching.match_free(
-        first, second, values, pred.score, pred.frame, len(data.gt), iou
-    )
+    ious = overlap.pair_iou(pred.box[first], data.gt.box[second])
+    pairs = matching.Pairs(first, second, ious[SPACES.index(space)])
+    match = matching.match_free(pairs, pred.score, pred.frame, len(data.gt), iou)
     table = np.zeros((num_classes + 1, num_classes + 1), np.int64)
     hit = match >= 0
     np.add.at(table, (data.gt.cls[match[hit]], pred.cls[hit]), 1)
@@ -258,19 +243,19 @@ def worst_frames(
     match = matched_objects(data, space, iou)
     above = data.pred.score > operating_score
     num = data.frame.size
-    objects = np.bincount(data.gt.frame, minlength=num)
     found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)
     false = np.bincount(data.pred.frame[above & (match < 0)], minlength=num)
-    missed = objects - found
+    missed = data.gt_count.sum(axis=1) - found
     order = np.lexsort((np.arange(num), -missed, -(missed + false)))[:count]
+    columns = {
+        "index": np.arange(num),
+        "frame": data.frame,
+        "missed": missed,
+        "false": false,
+        "found": found,
+    }
     return [
-        {
-            "index": int(i),
-            "frame": int(data.frame[i]),
-            "missed": int(missed[i]),
-            "false": int(false[i]),
-            "found": int(found[i]),
-        }
+        {name: int(column[i]) for name, column in columns.items()}
         for i in order
         if missed[i] + false[i] > 0
     ]

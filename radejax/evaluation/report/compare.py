@@ -1,116 +1,19 @@
-"""What `evaluate.py` does with files: find frames and ground truth, evaluate, compare."""
+"""What `evaluate.py` does with files: evaluate them, and compare several."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
 import pathlib
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files import kitti, predictions
-from radejax.evaluation.files.predictions import Columns
+from radejax.evaluation.files.load import PathLike, Source, load
 from radejax.evaluation.report import bootstrap, paper_tables, tables
 from radejax.evaluation.report.measure import Options, measure, repair_sizes
-from radejax.evaluation.report.report import Report, evaluate_predictions, plain
-
-PathLike = str | os.PathLike
-
-
-@dataclasses.dataclass(frozen=True)
-class Source:
-    """Where ground truth and frames come from.
-
-    Attributes:
-        data: Root folders of K-Radar, or none.
-        labels: Folder or zip of a label revision.
-        label_version: v1.0, v1.1, v2.0 or v2.1.
-        split: "train", "test", a split file, or None for every frame.
-        ground_truth: File of ground truth instead, with `frames`.
-        frames: JSON file of the frame table (columns) for `ground_truth`.
-    """
-
-    data: tuple[str, ...] = ()
-    labels: str | None = None
-    label_version: str = "v2.1"
-    split: str | None = "test"
-    ground_truth: str | None = None
-    frames: str | None = None
-
-
-def load(
-    path: PathLike, source: Source, classes: Sequence[str]
-) -> tuple[Columns, Columns, Columns, dict[str, int]]:
-    """Ground truth, predictions, frame table and counts of what loading left out.
-
-    Args:
-        path: Predictions: a .npz, .json or .csv file, a folder in KITTI's layout, or the
-            folder of an earlier report.
-        source: Ground truth; a KITTI folder and a report bring their own.
-        classes: Classes to load from labels.
-
-    Raises:
-        UserError: No ground truth anywhere.
-        FileNotFoundError: Names what is missing.
-        DataError: Malformed content.
-    """
-    path = pathlib.Path(path)
-    if (path / "predictions.npz").is_file():
-        frames = _read_frames(path / "frames.json")
-        truth = predictions.read_table(path / "ground_truth.npz", frames, scored=False)
-        found = predictions.read_table(path / "predictions.npz", frames)
-        return truth, found, frames, {}
-    left_out: dict[str, int] = {}
-    if source.ground_truth:
-        frames = _read_frames(pathlib.Path(source.frames)) if source.frames else None
-        truth = predictions.read_table(source.ground_truth, frames, scored=False)
-    elif source.data or source.labels:
-        truth, frames, left_out = _from_kradar(source, classes)
-    elif path.is_dir():
-        return (*kitti.read_kitti(path), left_out)
-    else:
-        raise UserError(
-            f"{path} holds predictions only: say where the ground truth is, with --data,"
-            " --labels or --ground_truth"
-        )
-    is_folder = path.is_dir()
-    found = (
-        kitti.read_kitti(path)[1] if is_folder else predictions.read_table(path, frames)
-    )
-    if frames is None:
-        both = np.concatenate([truth["frame"], found["frame"]])
-        frames = {"frame": np.unique(both)}
-    return truth, found, frames, left_out
-
-
-def _read_frames(path: pathlib.Path) -> Columns:
-    """A frame table written by `report.write_report`."""
-    content = files.read_json(path)
-    if not isinstance(content, dict) or "frame" not in content:
-        raise UserError(f"{path}: expected an object of columns with 'frame'")
-    return {name: np.asarray(column) for name, column in content.items()}
-
-
-def _from_kradar(
-    source: Source, classes: Sequence[str]
-) -> tuple[Columns, Columns, dict[str, int]]:
-    """Ground truth and frames of K-Radar's labels, and what reading them left out."""
-    from radejax.data.kradar import KRadar
-
-    data = KRadar(
-        list(source.data) or None,
-        source.labels,
-        version=source.label_version,
-        split=source.split,
-        classes=classes,
-    )
-    truth, frames = predictions.tables_from_frames(data)
-    left_out = {f"labels: {what}": int(count) for what, count in data.counts.items()}
-    return truth, frames, left_out
+from radejax.evaluation.report.report import Report, plain, write_report
 
 
 def evaluate_files(
@@ -121,7 +24,7 @@ def evaluate_files(
     options = dataclasses.replace(
         options, left_out_before={**left_out, **options.left_out_before}
     )
-    return evaluate_predictions(truth, found, frames, out_dir, options)
+    return write_report(truth, found, frames, out_dir, options)
 
 
 def compare_files(
@@ -174,7 +77,7 @@ def compare_files(
             "runs": list(runs),
             "resamples": resamples,
             "options": options.to_dict(),
-            "rows": [row.to_dict() for row in rows],
+            "rows": [dataclasses.asdict(row) for row in rows],
         }
         out_dir = pathlib.Path(out_dir)
         out_dir.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,33 +12,25 @@ import numpy as np
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation import protocols
-from radejax.evaluation.evaluation_set import PROTOCOL_DEFAULT, EvaluationSet
+from radejax.evaluation.columns import Columns
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.result import Result, mean_ap
 
+ENVIRONMENTS = (
+    "urban highway countryside alleyway parkinglots shoulder mountain university"
+)
 ORDER = {
-    "weather": (
-        "normal",
-        "overcast",
-        "fog",
-        "rain",
-        "sleet",
-        "lightsnow",
-        "heavysnow",
-    ),
-    "environment": (
-        "urban",
-        "highway",
-        "countryside",
-        "alleyway",
-        "parkinglots",
-        "shoulder",
-        "mountain",
-        "university",
-    ),
+    "weather": WEATHERS,
+    "environment": tuple(ENVIRONMENTS.split()),
     "time": ("day", "night"),
 }
 """K-Radar's tags in the order of its papers."""
+
+_OF_RESULT = ("num_gt", "num_det", "num_frames", "score_threshold")
+_OF_RESULT += ("skip_empty", "roi", "label_version")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +78,13 @@ class Options:
     left_out_before: Mapping[str, int] = dataclasses.field(default_factory=dict)
     draw_frame: Callable[[int, Any], None] | None = None
 
+    @property
+    def main_protocols(self) -> tuple[str, ...]:
+        """Protocols shown in full on the console: the usual ones, or else the first."""
+        usual = ("exact", "kradar_r40", "coco101")
+        chosen = tuple(name for name in usual if name in self.protocols)
+        return chosen or self.protocols[:1]
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a report, without callbacks."""
         values = dataclasses.asdict(dataclasses.replace(self, draw_frame=None))
@@ -115,34 +115,32 @@ class Measured:
         """AP, or None where the class does not occur, whatever the protocol says."""
         return self.result.ap if self.result.is_defined else None
 
+    @property
+    def key(self) -> tuple[str, str, str, str, float]:
+        """Protocol, condition, class, space and IoU threshold."""
+        made = self.result
+        return made.protocol, self.condition, made.cls, made.space, made.iou
+
     def to_dict(self) -> dict[str, Any]:
         """A row of metrics.json and metrics.csv."""
-        result = self.result
+        made = self.result
         return {
-            "name": f"{result.cls}/{self.condition}/{result.metric}",
-            "protocol": result.protocol,
+            "name": f"{made.cls}/{self.condition}/{made.metric}",
+            "protocol": made.protocol,
             "kind": self.kind,
             "condition": self.condition,
-            "cls": result.cls,
-            "space": result.space,
-            "iou": result.iou,
+            "cls": made.cls,
+            "space": made.space,
+            "iou": made.iou,
             "ap": self.shown,
             "ap_low": self.low,
             "ap_high": self.high,
-            "ap_official": None if math.isnan(result.ap) else result.ap,
-            "num_gt": result.num_gt,
-            "num_det": result.num_det,
-            "num_frames": result.num_frames,
-            "score_threshold": result.score_threshold,
-            "skip_empty": result.skip_empty,
-            "roi": result.roi,
-            "label_version": result.label_version,
+            "ap_official": None if math.isnan(made.ap) else made.ap,
+            **{name: getattr(made, name) for name in _OF_RESULT},
         }
 
 
-def condition_masks(
-    frames: Mapping[str, np.ndarray], kind: str
-) -> dict[str, np.ndarray]:
+def condition_masks(frames: Columns, kind: str) -> dict[str, np.ndarray]:
     """`[F]` masks by value of a column of the frame table, K-Radar's values first."""
     if kind not in frames:
         return {}
@@ -156,7 +154,7 @@ def condition_masks(
 
 def measure(
     data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
+    frames: Columns,
     options: Options,
     *,
     kinds: Sequence[str] = ("weather",),
@@ -170,41 +168,33 @@ def measure(
         masks = condition_masks(frames, kind)
         conditions += [(kind, name, mask) for name, mask in masks.items()]
     rows = []
-    for protocol in options.protocols:
-        for kind, name, mask in conditions:
-            results = data.results(
-                protocol,
-                iou_thresholds=options.iou_thresholds,
-                skip_empty=options.skip_empty,
-                score_threshold=options.score_threshold,
-                weights=mask,
-                curves=False,
-            )
-            rows += [
-                Measured(kind, name, result) for result in with_means(results, data)
-            ]
-    return rows
-
-
-def with_means(results: Sequence[Result], data: EvaluationSet) -> list[Result]:
-    """Results with a row "mean" after the classes of each space and IoU threshold."""
-    step = len(data.classes)
-    rows: list[Result] = []
-    for start in range(0, len(results), step):
-        group = list(results[start : start + step])
-        mean = dataclasses.replace(
-            group[0],
-            cls="mean",
-            ap=mean_ap(group),
-            num_gt=sum(result.num_gt for result in group),
-            num_det=sum(result.num_det for result in group),
-            num_frames=max(result.num_frames for result in group),
-            precision=np.zeros(0),
-            recall=np.zeros(0),
-            score=np.zeros(0),
+    for protocol, (kind, name, mask) in itertools.product(
+        options.protocols, conditions
+    ):
+        results = data.results(
+            protocol,
+            iou_thresholds=options.iou_thresholds,
+            skip_empty=options.skip_empty,
+            score_threshold=options.score_threshold,
+            weights=mask,
+            curves=False,
         )
-        rows += [*group, mean]
+        for start in range(0, len(results), len(data.classes)):
+            group = results[start : start + len(data.classes)]
+            rows += [Measured(kind, name, made) for made in (*group, _mean(group))]
     return rows
+
+
+def _mean(group: Sequence[Result]) -> Result:
+    """The row "mean" of the classes of one space and IoU threshold, without a curve."""
+    return dataclasses.replace(
+        group[0],
+        cls="mean",
+        ap=mean_ap(group),
+        num_gt=sum(result.num_gt for result in group),
+        num_det=sum(result.num_det for result in group),
+        num_frames=max(result.num_frames for result in group),
+    )
 
 
 def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
@@ -212,8 +202,7 @@ def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
     counts = {**options.left_out_before, **data.left_out}
     low = data.pred.score <= options.score_threshold
     counts[f"predictions: score not above {options.score_threshold:g}"] = int(low.sum())
-    has_object = data.gt_count.sum(axis=1) > 0
-    empty = ~has_object
+    empty = data.gt_count.sum(axis=1) == 0
     counts["frames: without ground truth (left out by skip=frame)"] = int(empty.sum())
     counts["predictions: in frames without ground truth (left out by skip=frame)"] = (
         int((empty[data.pred.frame] & ~low).sum())
@@ -225,9 +214,7 @@ def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
     return counts
 
 
-def repair_sizes(
-    predictions: Mapping[str, np.ndarray], rule: str
-) -> tuple[Mapping[str, np.ndarray], int]:
+def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
     """Predictions with sizes that an untrained network may produce made harmless.
 
     Args:

@@ -3,70 +3,79 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from radejax.core import files
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report import breakdown
-from radejax.visualize.canvas import new_figure
-from radejax.visualize.curves import draw_calibration, draw_precision_recall
+from radejax.evaluation.report.measure import Options, condition_masks
+from radejax.evaluation.result import SPACES, Result
 
 
-def precision_recall(
-    data: EvaluationSet,
-    masks: Mapping[str, np.ndarray],
-    path: pathlib.Path,
-    *,
-    iou: float,
-    space: str = "3d",
-    score_threshold: float = 0.0,
-) -> None:
-    """One panel per class, one curve per condition, in the recommended protocol.
+def draw(
+    data: EvaluationSet, frames: Columns, options: Options, out_dir: pathlib.Path
+) -> list[pathlib.Path]:
+    """Draws precision and recall in both spaces, and calibration in 3D.
 
     Args:
         data: The evaluation set.
-        masks: `[F]` frame masks by condition; "all" is drawn too.
-        path: Picture to write.
-        iou: IoU threshold.
-        space: "bev" or "3d".
-        score_threshold: Score cut.
+        frames: Frame table; a curve per weather is drawn where it says them.
+        options: The first IoU threshold and the score cut count.
+        out_dir: Folder of the pictures.
+
+    Returns:
+        The pictures.
     """
-    curves: dict[str, dict[str, tuple]] = {name: {} for name in data.classes}
-    for name, mask in {"all": np.ones(data.frame.size, bool), **masks}.items():
-        results = data.results(
-            RECOMMENDED,
-            iou_thresholds=iou,
-            spaces=space,
-            score_threshold=score_threshold,
-            weights=mask,
-        )
-        for result in results:
-            if result.is_defined:
-                label = f"{name}, AP {result.ap:.1f}"
-                curves[result.cls][label] = (result.recall, result.precision)
-    columns = min(len(curves), 3)
-    rows = -(-len(curves) // columns)
+    # Here, as matplotlib takes a second to load and not every report has pictures.
+    from radejax.visualize.canvas import save_figure
+    from radejax.visualize.curves import draw_calibration
+
+    iou = options.iou_thresholds[0]
+    masks = {
+        "all": np.ones(data.frame.size, bool),
+        **condition_masks(frames, "weather"),
+    }
+    written = []
+    for space in SPACES:
+        results = {
+            name: data.results(
+                RECOMMENDED,
+                iou_thresholds=iou,
+                spaces=space,
+                score_threshold=options.score_threshold,
+                weights=mask,
+            )
+            for name, mask in masks.items()
+        }
+        figure = _precision_recall(results, f"{space}, IoU {iou:g}")
+        path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
+        written.append(save_figure(figure, path, dpi=110))
+    match = breakdown.matched_objects(data, "3d", iou)
+    axis = draw_calibration(data.pred.score, match >= 0, title=f"3d, IoU {iou:g}")
+    return [*written, save_figure(axis.figure, out_dir / "calibration.png", dpi=110)]
+
+
+def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Any:
+    """Figure with one panel per class, one curve per condition."""
+    from radejax.visualize.canvas import new_figure
+    from radejax.visualize.curves import draw_precision_recall
+
+    panels = list(zip(*results.values(), strict=True))  # results of a class each
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
     figure = new_figure(4.6 * columns, 4.0 * rows, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).reshape(-1)
-    for axis in axes[len(curves) :]:
+    for axis in axes[len(panels) :]:
         axis.set_axis_off()
-    for axis, (cls, lines) in zip(axes, curves.items(), strict=False):
-        draw_precision_recall(lines, ax=axis, title=f"{cls}, {space}, IoU {iou:g}")
-    _save(figure, path)
-
-
-def calibration(
-    data: EvaluationSet, path: pathlib.Path, *, iou: float, space: str = "3d"
-) -> None:
-    """How often predictions of a score are right, all classes together."""
-    match = breakdown.matched_objects(data, space, iou)
-    axis = draw_calibration(data.pred.score, match >= 0, title=f"{space}, IoU {iou:g}")
-    _save(axis.figure, path)
-
-
-def _save(figure: object, path: pathlib.Path) -> None:
-    with files.atomic_path(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:], dpi=110)
+    for axis, panel in zip(axes, panels, strict=False):
+        lines = {
+            f"{name}, AP {result.ap:.1f}": (result.recall, result.precision)
+            for name, result in zip(results, panel, strict=True)
+            if result.is_defined
+        }
+        draw_precision_recall(lines, ax=axis, title=f"{panel[0].cls}, {terms}")
+    return figure

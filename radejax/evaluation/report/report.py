@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import itertools
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -13,17 +14,16 @@ import numpy as np
 
 from radejax.core import files
 from radejax.evaluation import protocols
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files import predictions as predictions_io
+from radejax.evaluation.files.predictions import write_table
 from radejax.evaluation.report import (
     bootstrap,
     breakdown,
-    details,
     measure,
     paper_tables,
-)
-from radejax.evaluation.report import (
-    tables as layouts,
+    plots,
+    tables,
 )
 from radejax.evaluation.report.measure import Measured, Options
 from radejax.evaluation.result import SPACES
@@ -46,12 +46,13 @@ class Report:
     files: list[pathlib.Path]
 
 
-def evaluate_predictions(
-    ground_truth: Mapping[str, np.ndarray],
-    predictions: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray],
+def write_report(
+    ground_truth: Columns,
+    predictions: Columns,
+    frames: Columns,
     out_dir: str | pathlib.Path,
     options: Options | None = None,
+    **changes: Any,
 ) -> Report:
     """Evaluates a run in every protocol and writes its report.
 
@@ -62,23 +63,12 @@ def evaluate_predictions(
             weather, environment and time.
         out_dir: Folder of the report; made if missing, files in it are replaced.
         options: What to compute.
+        **changes: Fields of `Options` given by name.
 
     Raises:
         UserError: Wrong options or missing columns.
         DataError: A bad row, named by table, frame and row.
     """
-    return write_report(ground_truth, predictions, frames, out_dir, options)
-
-
-def write_report(
-    ground_truth: Mapping[str, np.ndarray],
-    predictions: Mapping[str, np.ndarray],
-    frames: Mapping[str, np.ndarray],
-    out_dir: str | pathlib.Path,
-    options: Options | None = None,
-    **changes: Any,
-) -> Report:
-    """As `evaluate_predictions`; `changes` are fields of `Options` given by name."""
     options = dataclasses.replace(options or Options(), **changes)
     predictions, repaired = measure.repair_sizes(predictions, options.invalid_sizes)
     data = EvaluationSet(
@@ -99,37 +89,31 @@ def write_report(
         repaired
     )
     text = console_text(metrics, rows, options)
+    found_tables = all_tables(rows, metrics, options)
     out_dir = pathlib.Path(out_dir)
     out_dir.mkdir(parents=True, exist_ok=True)
-    written = [
-        _write(out_dir / "metrics.json", files.write_json, plain(metrics)),
-        _write(out_dir / "metrics.csv", files.write_text, csv_text(rows)),
-        _write(out_dir / "report.txt", files.write_text, text),
-    ]
     # The inputs stay with the report, so that two reports can be compared later.
-    for name, table in (("predictions", predictions), ("ground_truth", ground_truth)):
-        keys = frames if "name" in frames else None
-        predictions_io.write_table(out_dir / f"{name}.npz", table, keys)
-        written.append(out_dir / f"{name}.npz")
-    written.append(_write(out_dir / "frames.json", files.write_json, _lists(frames)))
-    tables = all_tables(rows, metrics, options)
-    for style, name in (("markdown", "tables.md"), ("latex", "tables.tex")):
-        content = "\n".join(table.render(style) for table in tables)
-        written.append(_write(out_dir / name, files.write_text, content))
+    columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
+    files.write_json(out_dir / "metrics.json", plain(metrics))
+    files.write_json(out_dir / "frames.json", columns)
+    texts = {
+        "metrics.csv": csv_text(rows),
+        "report.txt": text,
+        "tables.md": "\n".join(table.render("markdown") for table in found_tables),
+        "tables.tex": "\n".join(table.render("latex") for table in found_tables),
+    }
+    for name, content in texts.items():
+        files.write_text(out_dir / name, content)
+    inputs = {"predictions.npz": predictions, "ground_truth.npz": ground_truth}
+    for name, table in inputs.items():
+        write_table(out_dir / name, table, frames if "name" in frames else None)
+    names = ("metrics.json", "frames.json", *texts, *inputs)
+    written = [out_dir / name for name in names]
     written += _draw(data, frames, metrics, out_dir, options)
     return Report(text, metrics, rows, written)
 
 
-def _write(path: pathlib.Path, write: Any, content: Any) -> pathlib.Path:
-    write(path, content)
-    return path
-
-
-def _lists(frames: Mapping[str, np.ndarray]) -> dict[str, list]:
-    return {name: np.asarray(column).tolist() for name, column in frames.items()}
-
-
-def why_no_intervals(frames: Mapping[str, np.ndarray], options: Options) -> str | None:
+def why_no_intervals(frames: Columns, options: Options) -> str | None:
     """The reason for not computing intervals, or None."""
     if not options.bootstrap:
         return "none asked for"
@@ -141,59 +125,42 @@ def why_no_intervals(frames: Mapping[str, np.ndarray], options: Options) -> str 
 
 
 def with_intervals(
-    data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
-    rows: list[Measured],
-    options: Options,
+    data: EvaluationSet, frames: Columns, rows: list[Measured], options: Options
 ) -> list[Measured]:
     """The rows with 95 % intervals: all over all frames, the main ones per weather."""
     main = (protocols.RECOMMENDED, "kradar_r40", options.paper_protocol)
     weathers = measure.condition_masks(frames, "weather")
-    found = {}
-    for names, masks in (
-        ([name for name in options.protocols if name in main], weathers),
-        ([name for name in options.protocols if name not in main], {}),
-    ):
+    found, none = {}, (None, None)
+    for name in options.protocols:
         found |= bootstrap.add_intervals(
             data,
             frames,
-            [
-                (name, space, iou)
-                for name in names
-                for space in SPACES
-                for iou in options.iou_thresholds
-            ],
+            list(itertools.product([name], SPACES, options.iou_thresholds)),
             resamples=options.bootstrap,
             seed=options.seed,
-            masks=masks,
+            masks=weathers if name in main else {},
             skip_empty=options.skip_empty,
             score_threshold=options.score_threshold,
         )
     result = []
     for row in rows:
-        made = row.result
-        key = (made.protocol, row.condition, made.cls, made.space, made.iou)
-        low, high = found.get(key, (None, None)) if made.is_defined else (None, None)
+        low, high = found.get(row.key, none) if row.result.is_defined else none
         result.append(dataclasses.replace(row, low=low, high=high))
     return result
 
 
 def collect(
-    data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
-    rows: list[Measured],
-    options: Options,
+    data: EvaluationSet, frames: Columns, rows: list[Measured], options: Options
 ) -> dict[str, Any]:
     """Everything of metrics.json, as plain values (NaN where nothing is defined)."""
-    iou = options.iou_thresholds[0]
-    cut = options.operating_score
-    slices = {"distance": breakdown.by_distance(data, "3d", iou, operating_score=cut)}
+    iou, cut = options.iou_thresholds[0], options.operating_score
+    terms = {"space": "3d", "iou": iou, "operating_score": cut}
+    slices = {"distance": breakdown.by_distance(data, **terms)}
     for kind in ("weather", "environment", "time"):
-        masks = measure.condition_masks(frames, kind)
-        if masks:
-            slices[kind] = breakdown.by_condition(
-                data, masks, "3d", iou, operating_score=cut
-            )
+        if masks := measure.condition_masks(frames, kind):
+            slices[kind] = breakdown.by_condition(data, masks, **terms)
+    confusion = breakdown.confusion(data, "bev", iou, operating_score=cut)
+    worst = breakdown.worst_frames(data, **terms, count=options.worst_frames)
     return {
         "run": options.run,
         "options": options.to_dict(),
@@ -209,10 +176,10 @@ def collect(
             "protocol": f"{protocols.RECOMMENDED}, 3d, IoU {iou:g}, score > {cut:g}",
             **{
                 kind: [
-                    {kind: key[0], "cls": key[1], **dataclasses.asdict(values)}
-                    for key, values in numbers.items()
+                    {kind: name, "cls": cls, **dataclasses.asdict(values)}
+                    for (name, cls), values in found.items()
                 ]
-                for kind, numbers in slices.items()
+                for kind, found in slices.items()
             },
         },
         "calibration": breakdown.calibration(data, "3d", iou),
@@ -221,75 +188,58 @@ def collect(
             "labels": [*data.classes, "none"],
             "rows": "true class",
             "columns": "predicted class",
-            "counts": breakdown.confusion(
-                data, "bev", iou, operating_score=cut
-            ).tolist(),
+            "counts": confusion.tolist(),
         },
-        "worst_frames": _name_frames(
-            breakdown.worst_frames(
-                data, "3d", iou, count=options.worst_frames, operating_score=cut
-            ),
-            frames,
-        ),
+        "worst_frames": [entry | _name(frames, entry["index"]) for entry in worst],
     }
 
 
-def _name_frames(worst: list[dict], frames: Mapping[str, np.ndarray]) -> list[dict]:
-    """Adds name and sequence of the frame table."""
-    for entry in worst:
-        for column in ("name", "sequence"):
-            if column in frames:
-                value = np.asarray(frames[column])[entry["index"]]
-                entry[column] = value.item() if hasattr(value, "item") else str(value)
-    return worst
+def _name(frames: Columns, index: int) -> dict[str, Any]:
+    """Name and sequence of a frame, as far as the frame table has them."""
+    known = [column for column in ("name", "sequence") if column in frames]
+    return {column: np.asarray(frames[column]).item(index) for column in known}
 
 
 def all_tables(
     rows: list[Measured], metrics: Mapping[str, Any], options: Options
-) -> list[layouts.Table]:
+) -> list[tables.Table]:
     """Beside the published ones, then every protocol and IoU threshold, then details."""
-    table = layouts.index(rows)
+    table = tables.index(rows)
     result = paper_tables.beside_published(table, options)
-    for space in ("3d", "bev"):
-        for iou in options.iou_thresholds:
-            result.append(layouts.protocols_at_a_glance(table, options, space, iou))
-    for protocol in options.protocols:
-        for iou in options.iou_thresholds:
-            result.append(layouts.class_by_weather(table, options, protocol, iou))
-    return [*result, *details.detail_tables(metrics)]
+    for space, iou in itertools.product(tables.SPACE_TITLES, options.iou_thresholds):
+        result.append(tables.protocols_at_a_glance(table, options, space, iou))
+    for protocol, iou in itertools.product(options.protocols, options.iou_thresholds):
+        result.append(tables.class_by_weather(table, options, protocol, iou))
+    return [*result, *tables.detail_tables(metrics)]
 
 
 def console_text(
     metrics: Mapping[str, Any], rows: list[Measured], options: Options
 ) -> str:
     """What a reader needs on one screen."""
-    table = layouts.index(rows)
+    table = tables.index(rows)
     iou = options.iou_thresholds[0]
+    # The usual two thresholds for the first protocol; the others stay short.
+    first, *others = options.main_protocols
+    shown = [(first, level) for level in options.iou_thresholds[:2]]
+    shown += [(protocol, iou) for protocol in others]
+    built = [tables.class_by_weather(table, options, *terms) for terms in shown]
+    built.append(tables.protocols_at_a_glance(table, options, "3d", iou))
+    if any(row.low is not None for row in rows):
+        built.append(tables.intervals(table, options, iou))
+    built += [
+        tables.slice_table(metrics["slices"], "distance"),
+        tables.error_table(metrics["box_errors"]),
+        tables.confusion_table(metrics["confusion"]),
+    ]
     parts = [
         f"{options.run}: {metrics['num_frames']} frames, {metrics['num_ground_truth']}"
-        f" objects, {metrics['num_predictions']} predictions\n"
+        f" objects, {metrics['num_predictions']} predictions\n",
+        *(built_table.render() for built_table in built),
+        f"Intervals: {metrics['intervals']}\n",
+        "Left out, or kept with a remark:",
+        *(f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()),
     ]
-    shown = [p for p in ("exact", "kradar_r40", "coco101") if p in options.protocols]
-    shown = shown or list(options.protocols[:1])
-    for protocol in shown:
-        # The usual two thresholds for the first protocol; the others stay short.
-        for level in options.iou_thresholds[:2] if protocol == shown[0] else (iou,):
-            grid = layouts.class_by_weather(table, options, protocol, level)
-            parts.append(grid.render())
-    parts.append(layouts.protocols_at_a_glance(table, options, "3d", iou).render())
-    if any(row.low is not None for row in rows):
-        parts.append(layouts.intervals(table, options, iou).render())
-    slices = metrics["slices"]
-    parts += [
-        details.slice_table(
-            slices["distance"], "distance", slices["protocol"]
-        ).render(),
-        details.error_table(metrics["box_errors"]).render(),
-        details.confusion_table(metrics["confusion"]).render(),
-    ]
-    parts.append(f"Intervals: {metrics['intervals']}\n")
-    parts.append("Left out, or kept with a remark:")
-    parts += [f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()]
     return "\n".join(parts) + "\n"
 
 
@@ -318,7 +268,7 @@ def plain(value: Any) -> Any:
 
 def _draw(
     data: EvaluationSet,
-    frames: Mapping[str, np.ndarray],
+    frames: Columns,
     metrics: Mapping[str, Any],
     out_dir: pathlib.Path,
     options: Options,
@@ -326,28 +276,11 @@ def _draw(
     """Curves, and pictures of the worst frames if somebody can draw them."""
     written = []
     if options.plots:
-        from radejax.evaluation.report import plots  # matplotlib takes a second to load
-
-        masks = measure.condition_masks(frames, "weather")
-        iou = options.iou_thresholds[0]
-        for space in SPACES:
-            path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
-            plots.precision_recall(
-                data,
-                masks,
-                path,
-                iou=iou,
-                space=space,
-                score_threshold=options.score_threshold,
-            )
-            written.append(path)
-        plots.calibration(data, out_dir / "calibration.png", iou=iou)
-        written.append(out_dir / "calibration.png")
+        written += plots.draw(data, frames, options, out_dir)
     if options.draw_frame is not None:
         folder = out_dir / "worst_frames"
         folder.mkdir(exist_ok=True)
         for rank, entry in enumerate(metrics["worst_frames"]):
-            path = folder / f"{rank:02d}_frame_{entry['frame']}.png"
-            options.draw_frame(entry["frame"], path)
-            written.append(path)
+            written.append(folder / f"{rank:02d}_frame_{entry['frame']}.png")
+            options.draw_frame(entry["frame"], written[-1])
     return written

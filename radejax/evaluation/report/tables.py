@@ -1,26 +1,38 @@
-"""Tables of a report, as text, Markdown and LaTeX."""
+"""Tables of a report, as text, Markdown and LaTeX.
+
+APs come from measured rows by key (`index`); what lies behind them (slices, box errors,
+calibration, confusion, worst frames) from the content of metrics.json.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from tabulate import tabulate
 
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.report.bootstrap import Comparison
 from radejax.evaluation.report.measure import Measured, Options
 
-TITLES = {
-    "all": "Total",
-    "normal": "Normal",
-    "overcast": "Overcast",
-    "fog": "Fog",
-    "rain": "Rain",
-    "sleet": "Sleet",
-    "lightsnow": "Light Snow",
-    "heavysnow": "Heavy Snow",
+TITLES = {"all": "Total"} | {
+    name: name.replace("snow", " snow").title() for name in WEATHERS
 }
 SPACE_TITLES = {"3d": "3D", "bev": "BEV"}
+"""Titles of the spaces, in the order of the papers."""
+
+ERRORS = (
+    ("center_m", "Center m", 2),
+    ("z_m", "z m", 2),
+    ("length_m", "Length m", 2),
+    ("width_m", "Width m", 2),
+    ("height_m", "Height m", 2),
+    ("heading_deg", "Heading deg", 1),
+    ("axis_deg", "Axis deg", 1),
+)
+STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 Key = tuple[str, str, str, str, float]  # protocol, condition, class, space, IoU
 
 
@@ -31,21 +43,18 @@ class Table:
     Attributes:
         title: One line that says what the numbers are.
         header: `[K]` column titles.
-        rows: Rows of `K` strings.
+        rows: Rows of `K` strings or counts.
     """
 
     title: str
     header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    rows: Sequence[Sequence[str | int]]
 
     def render(self, style: str = "text") -> str:
         """As "text", "markdown" or "latex"."""
-        name = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}[
-            style
-        ]
         align = ["left", *["right"] * (len(self.header) - 1)]
         body = tabulate(
-            self.rows, self.header, name, disable_numparse=True, colalign=align
+            self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         if style == "latex":
             return f"% {self.title}\n{body}\n"
@@ -55,17 +64,7 @@ class Table:
 
 def index(rows: Sequence[Measured]) -> dict[Key, Measured]:
     """Measured rows by (protocol, condition, class, space, IoU)."""
-    return {
-        (
-            row.result.protocol,
-            row.condition,
-            row.result.cls,
-            row.result.space,
-            row.result.iou,
-        ): row
-        for row in rows
-        if row.kind in ("all", "weather")
-    }
+    return {row.key: row for row in rows if row.kind in ("all", "weather")}
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
@@ -75,10 +74,23 @@ def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str
     return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
 
 
+def numbers(values: Iterable[float | None], digits: int = 2) -> list[str]:
+    """Values as cells of a table."""
+    return [number(value, digits=digits) for value in values]
+
+
 def shown(rows: Mapping[Key, Measured], key: Key) -> float | None:
     """AP of a key; None where the class does not occur or nothing was measured."""
     row = rows.get(key)
     return None if row is None else row.shown
+
+
+def terms(rows: Mapping[Key, Measured], protocol: str) -> str:
+    """Score cut, frame rule, label version and region, once per table."""
+    for key, row in rows.items():
+        if key[0] == protocol:
+            return ", " + ", ".join(row.result.metric.split("/")[2:])
+    return ""
 
 
 def class_by_weather(
@@ -90,14 +102,11 @@ def class_by_weather(
     conditions += [name for name in present if name not in TITLES]
     body = []
     for cls in (*options.classes, "mean"):
-        cells = [
-            " / ".join(
-                number(shown(rows, (protocol, condition, cls, space, iou)))
-                for space in ("3d", "bev")
-            )
-            for condition in conditions
-        ]
-        body.append([cls, *cells])
+        pairs = (
+            [shown(rows, (protocol, name, cls, space, iou)) for space in SPACE_TITLES]
+            for name in conditions
+        )
+        body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
     return Table(
         f"AP 3D / BEV at IoU {iou:g}, {protocol}{terms(rows, protocol)}",
         ["Class", *(TITLES.get(name, name) for name in conditions)],
@@ -105,90 +114,150 @@ def class_by_weather(
     )
 
 
-def terms(rows: Mapping[Key, Measured], protocol: str) -> str:
-    """Score cut, frame rule, label version and region, once per table."""
-    for key, row in rows.items():
-        if key[0] == protocol:
-            return ", " + ", ".join(row.result.metric.split("/")[2:])
-    return ""
-
-
 def protocols_at_a_glance(
     rows: Mapping[Key, Measured], options: Options, space: str, iou: float
 ) -> Table:
     """Protocols by classes, all weathers: how much the protocol matters."""
-    body = [
-        [
-            protocol,
-            *(
-                number(shown(rows, (protocol, "all", cls, space, iou)))
-                for cls in (*options.classes, "mean")
-            ),
-        ]
-        for protocol in options.protocols
-    ]
+    classes = (*options.classes, "mean")
+    body = []
+    for protocol in options.protocols:
+        values = (shown(rows, (protocol, "all", cls, space, iou)) for cls in classes)
+        body.append([protocol, *numbers(values)])
     return Table(
         f"AP {SPACE_TITLES[space]} at IoU {iou:g} in every protocol, all weathers",
-        ["Protocol", *options.classes, "mean"],
+        ["Protocol", *classes],
         body,
     )
 
 
 def intervals(rows: Mapping[Key, Measured], options: Options, iou: float) -> Table:
     """AP with its 95 % interval over sequences, all weathers."""
-    chosen = [p for p in ("exact", "kradar_r40", "coco101") if p in options.protocols]
+    classes = (*options.classes, "mean")
     body = []
-    for protocol in chosen or options.protocols[:1]:
-        for space in ("3d", "bev"):
-            cells = []
-            for cls in (*options.classes, "mean"):
-                row = rows.get((protocol, "all", cls, space, iou))
-                if row is None or row.shown is None:
-                    cells.append("-")
-                elif row.low is None:
-                    cells.append(number(row.shown))
-                else:
-                    low, high = number(row.low, digits=1), number(row.high, digits=1)
-                    cells.append(f"{number(row.shown, digits=1)} [{low}, {high}]")
-            body.append([protocol, SPACE_TITLES[space], *cells])
+    for protocol, space in itertools.product(options.main_protocols, SPACE_TITLES):
+        keys = ((protocol, "all", cls, space, iou) for cls in classes)
+        cells = (_with_interval(rows.get(key)) for key in keys)
+        body.append([protocol, SPACE_TITLES[space], *cells])
     return Table(
         f"AP at IoU {iou:g} with 95 % intervals ({options.bootstrap} resamples of"
         " sequences)",
-        ["Protocol", "AP", *options.classes, "mean"],
+        ["Protocol", "AP", *classes],
         body,
     )
+
+
+def _with_interval(row: Measured | None) -> str:
+    if row is None or row.shown is None or row.low is None:
+        return number(None if row is None else row.shown)
+    ap, low, high = numbers((row.shown, row.low, row.high), digits=1)
+    return f"{ap} [{low}, {high}]"
 
 
 def comparison(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
     """Two runs and which of their differences are real."""
-    body = [
-        [
-            row.cls,
-            row.protocol,
-            SPACE_TITLES[row.space],
-            f"{row.iou:g}",
-            number(row.ap_a),
-            number(row.ap_b),
-            number(row.difference, signed=True),
-            f"[{number(row.low, signed=True)}, {number(row.high, signed=True)}]",
-            f"{row.p_adjusted:.3f}",
-            "real" if row.is_real else "not shown",
-        ]
-        for row in rows
+    header = [
+        "Class",
+        "Protocol",
+        "AP",
+        "IoU",
+        "A",
+        "B",
+        "B - A",
+        "95 %",
+        "p",
+        "Difference",
     ]
+    body = []
+    for row in rows:
+        gap, low, high = (
+            number(value, signed=True) for value in (row.difference, row.low, row.high)
+        )
+        cells = [row.cls, row.protocol, SPACE_TITLES[row.space], f"{row.iou:g}"]
+        cells += [*numbers((row.ap_a, row.ap_b)), gap, f"[{low}, {high}]"]
+        cells += [f"{row.p_adjusted:.3f}", "real" if row.is_real else "not shown"]
+        body.append(cells)
+    title = (
+        f"B = {run_b} against A = {run_a}: 95 % intervals over sequences, p after Holm"
+    )
+    return Table(title, header, body)
+
+
+# Behind the APs -----------------------------------------------------------------------
+
+
+def detail_tables(metrics: Mapping[str, Any]) -> list[Table]:
+    """Every table of what lies behind the APs, from the content of metrics.json."""
+    kinds = [kind for kind in metrics["slices"] if kind != "protocol"]
+    return [
+        *(slice_table(metrics["slices"], kind) for kind in kinds),
+        error_table(metrics["box_errors"]),
+        calibration_table(metrics["calibration"]),
+        confusion_table(metrics["confusion"]),
+        worst_table(metrics["worst_frames"]),
+    ]
+
+
+def slice_table(slices: Mapping[str, Any], kind: str) -> Table:
+    """AP, precision and recall per slice and class; slices without anything are left."""
     return Table(
-        f"B = {run_b} against A = {run_a}: 95 % intervals over sequences, p after Holm",
+        f"By {kind}, {slices['protocol']}",
+        [kind.capitalize(), "Class", "AP", "Precision", "Recall", "Objects"],
         [
-            "Class",
-            "Protocol",
-            "AP",
-            "IoU",
-            "A",
-            "B",
-            "B - A",
-            "95 %",
-            "p",
-            "Difference",
+            [
+                entry[kind],
+                entry["cls"],
+                *numbers(entry[name] for name in ("ap", "precision", "recall")),
+                entry["num_gt"],
+            ]
+            for entry in slices[kind]
+            if entry["num_gt"] or entry["num_det"]
         ],
+    )
+
+
+def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
+    """Median errors of matched boxes, and how many headings are reversed."""
+    body = []
+    for cls, found in errors.items():
+        medians = (
+            number(found[f"{key}_median"], digits=digits) for key, _, digits in ERRORS
+        )
+        body.append([cls, found["count"], *medians, number(found["reversed"])])
+    return Table(
+        "Median errors of matched boxes (all scores); reversed: heading off by more"
+        " than 90 deg",
+        ["Class", "Matches", *(title for _, title, _ in ERRORS), "Reversed"],
         body,
     )
+
+
+def calibration_table(bins: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Precision of predictions by score, and the calibration error."""
+    first = next(iter(bins.values()))
+    edges = zip(first["low"], first["high"], strict=True)
+    return Table(
+        "Share of predictions that are right, by score",
+        ["Class", *(f"{low:g}-{high:g}" for low, high in edges), "Error"],
+        [
+            [cls, *numbers(found["precision"]), number(found["error"], digits=3)]
+            for cls, found in bins.items()
+        ],
+    )
+
+
+def confusion_table(confusion: Mapping[str, Any]) -> Table:
+    """True classes by predicted ones."""
+    labels = confusion["labels"]
+    return Table(
+        "Confusion: true class in rows, predicted class in columns; none: missed,"
+        " or nothing there",
+        ["", *labels],
+        [[label, *row] for label, row in zip(labels, confusion["counts"], strict=True)],
+    )
+
+
+def worst_table(worst: list[dict]) -> Table:
+    """Frames with the most mistakes."""
+    header = ["Frame", "Name", "Sequence", "Missed", "False", "Found"]
+    rows = [[entry.get(name.lower(), "") for name in header] for entry in worst]
+    return Table("Frames with the most mistakes", header, rows)

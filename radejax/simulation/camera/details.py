@@ -6,7 +6,7 @@ face; it lies within the object's box and is painted right after its block.
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,8 @@ FRONT, REAR, LEFT, RIGHT, TOP = range(5)
 """Faces of a block, in the order of `shapes`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Detail:
-    """A rectangle on a face.
+class Detail(NamedTuple):
+    """A rectangle on a face, or columns `[K, ...]` of many.
 
     Attributes:
         block: Index of the block.
@@ -43,16 +42,17 @@ _DARK = (36.0, 38.0, 42.0)
 _HAIR = (48.0, 38.0, 32.0)
 
 
+def _pair(block, face, u, v, color, other=None) -> list[Detail]:
+    """At u, and mirrored across the middle of the same or of another face."""
+    mirrored = Detail(
+        block, face if other is None else other, (1.0 - u[1], 1.0 - u[0]), v, color
+    )
+    return [Detail(block, face, u, v, color), mirrored]
+
+
 def _sides(block, u, v, color) -> list[Detail]:
     """On both sides; u runs from the rear to the front."""
-    back = (1.0 - u[1], 1.0 - u[0])
-    return [Detail(block, LEFT, u, v, color), Detail(block, RIGHT, back, v, color)]
-
-
-def _pair(block, face, u, v, color) -> list[Detail]:
-    """At u and mirrored across the middle of a front or rear."""
-    other = (1.0 - u[1], 1.0 - u[0])
-    return [Detail(block, face, u, v, color), Detail(block, face, other, v, color)]
+    return _pair(block, LEFT, u, v, color, RIGHT)
 
 
 def _wheel(block, center, half_u, low, high) -> list[Detail]:

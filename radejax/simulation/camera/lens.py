@@ -116,19 +116,14 @@ def cover_lens(
     """
     if level == "clear":
         return image
-    size = image.size
-    veil_color = (int(205 * light), int(208 * light), int(212 * light))
-    veil = Image.new("RGB", size, veil_color)
+    veil = Image.new("RGB", image.size, tuple(int(c * light) for c in (205, 208, 212)))
     if level == "full":
-        blurred = _blurred(image, 40)
-        return Image.blend(blurred, veil, 0.88 if is_snow else 0.65)
-    share, strength = {"partial": (0.25, 0.35), "heavy": (0.75, 0.6)}[level]
-    mask = _drop_mask(size, share, rng)
-    soiled = _blurred(image, 14 if level == "partial" else 24)
-    soiled = Image.blend(soiled, veil, strength if is_snow else 0.4 * strength)
-    if level == "heavy":
-        image = _blurred(image, 3)
-    return Image.composite(soiled, image, mask)
+        return Image.blend(_blurred(image, 40), veil, 0.88 if is_snow else 0.65)
+    is_heavy = level == "heavy"
+    mask = _drop_mask(image.size, 0.75 if is_heavy else 0.25, rng)
+    strength = (0.6 if is_heavy else 0.35) * (1.0 if is_snow else 0.4)
+    soiled = Image.blend(_blurred(image, 24 if is_heavy else 14), veil, strength)
+    return Image.composite(soiled, _blurred(image, 3) if is_heavy else image, mask)
 
 
 def _blurred(image: Image.Image, factor: float) -> Image.Image:

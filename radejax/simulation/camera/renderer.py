@@ -14,9 +14,8 @@ from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
 from radejax.geometry.calibration import CameraCalibration
-from radejax.simulation.camera import lens, scenery, shapes
-from radejax.simulation.radar.scattering import is_blocked
-from radejax.simulation.world.scene import SceneFrame, Sequence
+from radejax.simulation.camera import lens, panels, shapes
+from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
 
 # K-Radar's values for the pair (see the calibration files of the data set).
 _INTRINSICS = (567.7208, 577.2137, 628.7208, 369.3069)
@@ -36,6 +35,8 @@ _GRASS = np.array([96, 112, 66.0])
 _WITH_LAMPS = [CLASSES.index(name) for name in ("Sedan", "Bus or Truck", "Motorcycle")]
 _SNOW = np.array([214, 218, 222.0])
 _MARKING = np.array([226, 226, 220.0])
+_HEADLIGHT = (0.16, (255, 250, 225))
+_REAR_LIGHT = (0.05, (230, 40, 30))
 
 
 def stereo_calibration(
@@ -152,92 +153,65 @@ class CameraRenderer:
             headlights=is_night,
         )
 
-    def level(self, frame: SceneFrame) -> str:
-        """State of the lens, one of `lens.LEVELS`."""
-        if not self.cover_lens:
-            return "clear"
-        return lens.cover_level(
-            self.seed, self.sequence.name, frame.index, self.sequence.weather
-        )
-
     def render(self, frame: SceneFrame) -> np.ndarray:
         """`[H, 2 W, 3]` uint8 image of the pair, left half first."""
         return np.concatenate([self._one(frame, side) for side in (0, 1)], axis=1)
-
-    def object_mask(self, frame: SceneFrame, side: int = 0) -> np.ndarray:
-        """`[H, W]` int32: which box of the frame each pixel shows, -1 for none."""
-        calibration = self.calibrations[side]
-        canvas = Image.new("I", (calibration.width, calibration.height), -1)
-        draw = ImageDraw.Draw(canvas)
-        for polygon in self._polygons(frame, calibration):
-            draw.polygon(polygon.points, fill=int(polygon.box))
-        return np.asarray(canvas)
 
     def _one(self, frame: SceneFrame, side: int) -> np.ndarray:
         """`[H, W, 3]` image of one camera."""
         calibration = self.calibrations[side]
         canvas = Image.fromarray(self._background(frame, self.grounds[side]))
         draw = ImageDraw.Draw(canvas)
-        for polygon in self._polygons(frame, calibration):
+        for polygon in self.polygons(frame, side):
             draw.polygon(polygon.points, fill=polygon.color)
         if self.light.headlights:
             self._lamps(frame, calibration, draw)
-        numbers = [self.seed, self.sequence.name, side]
-        rng = np.random.default_rng([*numbers, frame.index, 5])
+        name, index, air = self.sequence.name, frame.index, self.air
         brightness = 0.45 if self.light.headlights else 1.0
-        canvas = lens.add_precipitation(canvas, self.air, brightness, rng)
-        block = np.random.default_rng([*numbers, frame.index // lens.BLOCK_FRAMES, 6])
-        level = self.level(frame)
-        is_snow = self.air.is_snow
-        return np.asarray(lens.cover_lens(canvas, level, is_snow, brightness, block))
+        rng = np.random.default_rng([self.seed, name, side, index, 5])
+        canvas = lens.add_precipitation(canvas, air, brightness, rng)
+        if self.cover_lens:
+            weather, block = self.sequence.weather, index // lens.BLOCK_FRAMES
+            level = lens.cover_level(self.seed, name, index, weather)
+            rng = np.random.default_rng([self.seed, name, side, block, 6])
+            canvas = lens.cover_lens(canvas, level, air.is_snow, brightness, rng)
+        return np.asarray(canvas)
 
-    def _polygons(self, frame, calibration) -> list[shapes.Polygon]:
-        panels = scenery.make_panels(
-            frame,
-            shapes.camera_position(calibration),
-            self.sequence.ground_m,
-            self.air.white,
-        )
+    def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:
+        """What one camera sees of objects and roadside, far ones first."""
+        calibration = self.calibrations[side]
+        origin, white = shapes.camera_position(calibration), self.air.white
+        roadside = panels.make_panels(frame, origin, self.sequence.ground_m, white)
+        classes, colors = [CLASSES[c] for c in frame.cls], self.colors[frame.track]
         return shapes.visible_polygons(
-            frame.boxes,
-            [CLASSES[c] for c in frame.cls],
-            self.colors[frame.track],
-            calibration,
-            self.light,
-            panels=panels,
+            frame.boxes, classes, colors, calibration, self.light, roadside
         )
 
     def _lamps(self, frame, calibration, draw) -> None:
         """Rear lights and headlights of vehicles by night, where nothing hides them."""
         vehicles = np.flatnonzero(np.isin(frame.cls, _WITH_LAMPS))
-        box = frame.boxes[np.repeat(vehicles, 2)]  # two lamps each
-        cos, sin = np.cos(box[:, 6]), np.sin(box[:, 6])
-        end = np.where(box[:, 0] * cos + box[:, 1] * sin < 0, 1.0, -1.0)
-        along = end * box[:, 3] / 2.0
-        across = np.tile([-0.75, 0.75], len(vehicles)) * box[:, 4] / 2.0
-        lamps = box[:, :3] + np.stack(
-            [along * cos - across * sin, along * sin + across * cos, -0.15 * box[:, 5]],
-            axis=1,
-        )
+        x, y, z, length, width, height, yaw = frame.boxes[np.repeat(vehicles, 2)].T
+        is_front = rotate(x, y, -yaw)[0] < 0  # the end that looks at us
+        along = np.where(is_front, 1.0, -1.0) * length / 2.0
+        across = np.tile([-0.75, 0.75], len(vehicles)) * width / 2.0
+        dx, dy = rotate(along, across, yaw)
+        lamps = np.stack([x + dx, y + dy, z - 0.15 * height], 1)
         origin = shapes.camera_position(calibration)
         obstacles = frame.boxes - np.r_[origin, np.zeros(4)]
         hidden = is_blocked(lamps - origin, obstacles, np.repeat(vehicles, 2))
         pixels, depth = calibration.project_ego(lamps)
         shown = calibration.in_image(pixels, depth) & (depth < 90.0) & ~hidden
         for i in np.flatnonzero(shown):
-            is_front = end[i] > 0
-            size = 0.16 if is_front else 0.05
+            size, color = _HEADLIGHT if is_front[i] else _REAR_LIGHT
             radius = calibration.intrinsics[0] * size / (depth[i] + 2.0) + 0.4
             u, v = pixels[i].tolist()
-            color = (255, 250, 225) if is_front else (230, 40, 30)
             draw.ellipse((u - radius, v - radius, u + radius, v + radius), fill=color)
 
     def _background(self, frame: SceneFrame, ground: Ground) -> np.ndarray:
         """`[H, W, 3]` uint8 ground, road with markings, and sky."""
         fade = np.clip(ground.up * 2.5, 0.0, 1.0)[..., None]
         image = self.sky * (1.0 - 0.35 * fade)
-        hits = ground.hits
-        image[hits] = self._ground_color(frame, ground)
+        image[ground.hits] = self._ground_color(frame, ground)
         return np.clip(image, 0, 255).astype(np.uint8)
 
     def _ground_color(self, frame: SceneFrame, ground: Ground) -> np.ndarray:
@@ -246,7 +220,7 @@ class CameraRenderer:
         x, y, depth = ground.x_m, ground.y_m, ground.depth_m
         verge = _VERGE.get(sequence.environment, _GRASS)
         verge = verge + self.air.white * (_SNOW - verge)
-        left = y - 0.5 * sequence.road.curvature_per_m * x * x + sequence.ego_left_m
+        left = y - 0.5 * sequence.road.curvature_per_m * x * x
         along = x + frame.ego_along_m
         grain = _hash_noise(np.floor(along * 3.0), np.floor(left * 3.0)) - 0.5
         color = np.broadcast_to(verge, (x.size, 3)) + 24.0 * grain[:, None]

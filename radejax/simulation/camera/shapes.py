@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,16 +67,15 @@ _PAINT = np.array(
 _CLOTHES = np.array(
     [(40, 44, 60), (120, 30, 40), (60, 90, 130), (190, 190, 186), (200, 140, 40)], float
 )
-_FACES = (
-    ((0, 3, 7, 4), (1.0, 0.0, 0.0)),  # front
-    ((2, 1, 5, 6), (-1.0, 0.0, 0.0)),  # rear
-    ((1, 0, 4, 5), (0.0, 1.0, 0.0)),  # left
-    ((3, 2, 6, 7), (0.0, -1.0, 0.0)),  # right
-    ((4, 7, 6, 5), (0.0, 0.0, 1.0)),  # top
+_VERTICES = np.array(  # corners of a block: front, rear, left, right, top
+    [(0, 3, 7, 4), (2, 1, 5, 6), (1, 0, 4, 5), (3, 2, 6, 7), (4, 7, 6, 5)]
 )
+_NORMALS = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)], float)
 _EDGE_PARTS = 3
 _DETAIL_M = 60.0
 """Farther objects show no details: a plate is two pixels wide there."""
+_NEAR_M = 0.3
+"""Faces nearer than this are cut away."""
 _SUN = np.array([0.35, 0.45, 0.82])
 
 
@@ -151,9 +151,7 @@ def visible_polygons(
     colors: np.ndarray,
     calibration: CameraCalibration,
     light: Light,
-    *,
     panels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
-    near_m: float = 0.3,
 ) -> list[Polygon]:
     """Faces that look at the camera, far objects first.
 
@@ -163,35 +161,25 @@ def visible_polygons(
         colors: `[N, 2, 3]` of `object_colors`.
         calibration: The camera.
         light: Brightness and haze.
-        panels: Surroundings of `scenery.make_panels`.
-        near_m: Faces nearer than this are cut away.
+        panels: Surroundings of `panels.make_panels`.
     """
-    origin = camera_position(calibration)
-    faces, normals, depth, block_depth, owner, rgb = _faces(
-        boxes, classes, colors, origin
-    )
-    shown = ((faces.mean(1) - origin) * normals).sum(1) < 0
-    rgb = rgb * (0.62 + 0.38 * np.maximum(normals @ _SUN, 0.0))[:, None]
+    faces = _object_faces(boxes, classes, colors, camera_position(calibration))
     if panels is not None:
-        corners, panel_depth, panel_rgb = panels
-        faces, rgb = np.concatenate([faces, corners]), np.concatenate([rgb, panel_rgb])
-        depth = np.concatenate([depth, panel_depth])
-        block_depth = np.concatenate([block_depth, panel_depth])
-        owner = np.concatenate([owner, np.full(len(corners), -1)])
-        shown = np.concatenate([shown, np.ones(len(corners), bool)])
-    chosen = np.flatnonzero(shown)
-    if not len(chosen):
-        return []
-    chosen = chosen[np.lexsort((-block_depth[chosen], -depth[chosen]))]
-    center = faces[chosen].mean(1)
-    rgb = light.apply(rgb[chosen], center[:, 0], center[:, 1], depth[chosen])
-    rgb = np.clip(rgb, 0, 255).astype(int).tolist()
-    outlines = _project_faces(faces[chosen], calibration, near_m)
-    return [
-        Polygon(points, tuple(color), float(depth[face]), int(owner[face]))
-        for points, color, face in zip(outlines, rgb, chosen, strict=True)
-        if points
-    ]
+        corners, depth, color = panels
+        roadside = Faces(corners, color, depth, depth, np.full(len(depth), -1))
+        faces = Faces(*map(np.concatenate, zip(faces, roadside, strict=True)))
+    order = np.lexsort((-faces.block_depth_m, -faces.depth_m))
+    faces = Faces(*(column[order] for column in faces))
+    center = faces.corners.mean(1)
+    color = light.apply(faces.color, center[:, 0], center[:, 1], faces.depth_m)
+    rows = zip(
+        _project_faces(faces.corners, calibration),
+        np.clip(color, 0, 255).astype(int).tolist(),
+        faces.depth_m.tolist(),
+        faces.box.tolist(),
+        strict=True,
+    )
+    return [Polygon(points, tuple(rgb), *rest) for points, rgb, *rest in rows if points]
 
 
 def camera_position(calibration: CameraCalibration) -> np.ndarray:
@@ -201,75 +189,82 @@ def camera_position(calibration: CameraCalibration) -> np.ndarray:
     )
 
 
-def _faces(boxes, classes, colors, origin):
-    """All faces of all objects in front of the camera.
+class Faces(NamedTuple):
+    """Quadrilaterals in the radar's frame.
 
-    Returns:
-        Corners `[F, 4, 3]`, normals `[F, 3]`, distance of the object `[F]`, distance
-        of the block `[F]`, index of the box `[F]`, colours `[F, 3]`.
+    Attributes:
+        corners: `[F, 4, 3]`.
+        color: `[F, 3]` red, green, blue in white light.
+        depth_m: `[F]` distance of the object.
+        block_depth_m: `[F]` distance of the block.
+        box: `[F]` index of the box, -1 for none.
     """
-    parts = [[np.zeros((0, 4, 3))], [np.zeros((0, 3))], [], [], [], [np.zeros((0, 3))]]
-    vertices = np.array([v for v, _ in _FACES])
-    normals = np.array([n for _, n in _FACES])
+
+    corners: np.ndarray
+    color: np.ndarray
+    depth_m: np.ndarray
+    block_depth_m: np.ndarray
+    box: np.ndarray
+
+
+def _object_faces(boxes, classes, colors, origin) -> Faces:
+    """Faces that look at the camera, of all objects in front of it."""
+    flat, vector = np.zeros(0), np.zeros((0, 3))
+    parts = [(np.zeros((0, 4, 3)), vector, flat, flat, flat.astype(int), vector)]
     for index in np.flatnonzero(boxes[:, 0] > -3.0):
         box, cls = boxes[index], classes[index]
         cos, sin = np.cos(box[6]), np.sin(box[6])
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         corners = _BLOCK_CORNERS[cls] * box[3:6] / 2.0 @ turn.T + box[:3]  # [K, 8, 3]
         depth = np.linalg.norm(box[:3] - origin)
-        block = np.repeat(np.arange(len(corners)), len(_FACES))
-        face = np.tile(np.arange(len(_FACES)), len(corners))
-        quads = corners[:, vertices].reshape(-1, 4, 3)
-        rgb = np.array(
-            [_role_color(role, colors[index]) for *_, role, _ in BLOCKS[cls]]
-        )[block]
+        block = np.repeat(np.arange(len(corners)), len(_NORMALS))
+        face = np.tile(np.arange(len(_NORMALS)), len(corners))
+        quads = corners[:, _VERTICES].reshape(-1, 4, 3)
+        roles = _ROLE_COLORS | {"body": colors[index, 0], "legs": colors[index, 1]}
+        color = np.array([roles[role] for *_, role, _ in BLOCKS[cls]], float)[block]
         if depth < _DETAIL_M:  # after their blocks, so that they are painted on them
             d = _DETAIL_TABLES[cls]
-            chosen = quads[d.block * len(_FACES) + d.face]
+            chosen = quads[d.block * len(_NORMALS) + d.face]
             quads = np.concatenate([quads, details.on_faces(chosen, d.u, d.v)])
             block, face = np.r_[block, d.block], np.r_[face, d.face]
-            rgb = np.concatenate([rgb, d.color])
-        block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)
-        parts[0].append(quads)
-        parts[1].append(normals[face] @ turn.T)
-        parts[2].append(np.full(len(quads), depth))
-        parts[3].append(block_depth[block])
-        parts[4].append(np.full(len(quads), index))
-        parts[5].append(rgb)
-    return [np.concatenate(p) if p else np.zeros(0) for p in parts]
+            color = np.concatenate([color, d.color])
+        block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)[block]
+        same = np.full(len(quads), depth), np.full(len(quads), index)
+        normal = _NORMALS[face] @ turn.T
+        parts.append((quads, color, same[0], block_depth, same[1], normal))
+    *columns, normal = map(np.concatenate, zip(*parts, strict=True))
+    faces = Faces(*columns)
+    sunlit = 0.62 + 0.38 * np.maximum(normal @ _SUN, 0.0)
+    faces = faces._replace(color=faces.color * sunlit[:, None])
+    shown = ((faces.corners.mean(1) - origin) * normal).sum(1) < 0
+    return Faces(*(column[shown] for column in faces))
 
 
-def _role_color(role: str, colors: np.ndarray) -> np.ndarray:
-    """Colour of a block: the object's own two, or a fixed one."""
-    own = {"body": colors[0], "legs": colors[1]}
-    return np.asarray(own.get(role, _ROLE_COLORS.get(role)), float)
-
-
-def _project_faces(faces, calibration, near_m) -> list[list[tuple[float, float]]]:
+def _project_faces(
+    faces: np.ndarray, calibration: CameraCalibration
+) -> list[list[tuple[float, float]]]:
     """Pixels of faces `[F, 4, 3]` cut at the near plane; edges bend with the lens.
 
-    A face wholly nearer than the plane gives an empty list.
+    A face wholly nearer than the plane, or off the image, gives an empty list.
     """
     camera = calibration.camera("raw")
     following = np.roll(faces, -1, axis=1)
     part = np.linspace(0.0, 1.0, _EDGE_PARTS, endpoint=False)[:, None]
-    outline = faces[:, :, None] + part * (following - faces)[:, :, None]
-    outline = outline.reshape(len(faces), -1, 3)
-    pixels, depth = project(outline, camera)
+    outlines = faces[:, :, None] + part * (following - faces)[:, :, None]
+    outlines = outlines.reshape(len(faces), -1, 3)
     size = np.array([calibration.width, calibration.height], float)
     result = []
-    for i in range(len(faces)):
-        points = pixels[i]
-        if depth[i].min() < near_m:
-            if depth[i].max() < near_m:
-                result.append([])
-                continue
-            points, _ = project(_cut_near(outline[i], depth[i], near_m), camera)
-        if (points.max(0) < 0).any() or (points.min(0) > size).any():
-            result.append([])  # off the image
+    for points, depth, outline in zip(
+        *project(outlines, camera), outlines, strict=True
+    ):
+        if depth.max() < _NEAR_M:
+            result.append([])
             continue
+        if depth.min() < _NEAR_M:
+            points, _ = project(_cut_near(outline, depth, _NEAR_M), camera)
+        is_off = (points.max(0) < 0).any() or (points.min(0) > size).any()
         points = np.clip(points, -2.0 * size, 3.0 * size)
-        result.append(list(map(tuple, points.tolist())))
+        result.append([] if is_off else list(map(tuple, points.tolist())))
     return result
 
 
@@ -277,22 +272,17 @@ def _cut_near(outline, depth, near_m) -> np.ndarray:
     """Polygon `[P, 3]` cut at a depth (Sutherland and Hodgman)."""
     kept = []
     for i in range(len(outline)):
-        j = (i + 1) % len(outline)
-        if depth[i] >= near_m:
-            kept.append(outline[i])
-        if (depth[i] >= near_m) != (depth[j] >= near_m):
-            part = (near_m - depth[i]) / (depth[j] - depth[i])
-            kept.append(outline[i] + part * (outline[j] - outline[i]))
+        here, there = depth[i - 1], depth[i]
+        if here >= near_m:
+            kept.append(outline[i - 1])
+        if (here >= near_m) != (there >= near_m):
+            part = (near_m - here) / (there - here)
+            kept.append(outline[i - 1] + part * (outline[i] - outline[i - 1]))
     return np.array(kept)
 
 
 _BLOCK_CORNERS = {name: blocks_of(name) for name in BLOCKS}
 _DETAIL_TABLES = {
-    name: details.Detail(
-        *(
-            np.array([getattr(detail, f.name) for detail in details.DETAILS[name]])
-            for f in dataclasses.fields(details.Detail)
-        )
-    )
+    name: details.Detail(*map(np.array, zip(*details.DETAILS[name], strict=True)))
     for name in BLOCKS
 }

@@ -24,12 +24,14 @@ References:
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
-from radejax.simulation.world.scene import SceneFrame
+from radejax.simulation.world.scene import SceneFrame, is_blocked, rotate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +72,7 @@ _BACK_LEAK = 0.02
 """Power of a scatterer on a face turned away, which the body shields."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ObjectScatterers:
+class ObjectScatterers(NamedTuple):
     """Scattering centers of all objects of a sequence, in the frames of their boxes.
 
     Attributes:
@@ -109,24 +110,19 @@ def make_object_scatterers(
         Centers of all objects, object by object. The cross-section of an object,
         averaged over aspects, is its class's times a log-normal factor.
     """
-    parts = [
+    flat, vector = np.zeros(0), np.zeros((0, 3))
+    none = ObjectScatterers(flat.astype(int), vector, vector, *[flat] * 5)
+    parts = (
         _one_object(i, CLASSES[c], size, rng)
         for i, (c, size) in enumerate(zip(cls, size_m, strict=True))
-    ]
-    fields = [f.name for f in dataclasses.fields(ObjectScatterers)]
-    if not parts:
-        vector = np.zeros((0, 3))
-        flat = np.zeros(0)
-        return ObjectScatterers(
-            flat.astype(int), vector, vector, flat, flat, flat, flat, flat
-        )
-    return ObjectScatterers(*(np.concatenate([p[f] for p in parts]) for f in fields))
+    )
+    return ObjectScatterers(*map(np.concatenate, zip(none, *parts, strict=True)))
 
 
 def _one_object(
     index: int, cls: str, size_m: np.ndarray, rng: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """Fields of `ObjectScatterers` for one object."""
+) -> ObjectScatterers:
+    """Scattering centers of one object."""
     law = CLASS_SCATTERING[cls]
     length, width, height = size_m
     count = law.num_points
@@ -144,9 +140,9 @@ def _one_object(
     position = np.stack(
         [np.where(is_end, sign, along), np.where(is_end, along, sign), up], 1
     )
-    normal = np.zeros((count, 3))
-    normal[:, 0] = np.where(is_end, sign, 0.0)
-    normal[:, 1] = np.where(is_end, 0.0, sign)
+    normal = np.stack(
+        [np.where(is_end, sign, 0.0), np.where(is_end, 0.0, sign), np.zeros(count)], 1
+    )
     weight = rng.exponential(1.0, count)
     is_micro = rng.random(count) < law.micro
     micro = np.where(is_micro, rng.uniform(0.4, 1.0, count), 0.0)
@@ -155,16 +151,16 @@ def _one_object(
     rcs_db = law.rcs_dbsm + law.spread_db * rng.normal()
     # The log-normal factor has mean exp(s^2 / 2): the class's mean stays exact.
     rcs_db -= law.spread_db**2 * np.log(10.0) / 20.0
-    return {
-        "track": np.full(count, index),
-        "position": position,
-        "normal": normal,
-        "power_m2": weight / mean * 10.0 ** (rcs_db / 10.0),
-        "glint": glint,
-        "phase_rad": rng.uniform(0.0, 2.0 * np.pi, count),
-        "micro": micro,
-        "micro_phase_rad": rng.uniform(0.0, 2.0 * np.pi, count),
-    }
+    return ObjectScatterers(
+        track=np.full(count, index),
+        position=position,
+        normal=normal,
+        power_m2=weight / mean * 10.0 ** (rcs_db / 10.0),
+        glint=glint,
+        phase_rad=rng.uniform(0.0, 2.0 * np.pi, count),
+        micro=micro,
+        micro_phase_rad=rng.uniform(0.0, 2.0 * np.pi, count),
+    )
 
 
 def _aspect_mean(normal: np.ndarray, weight: np.ndarray, glint: np.ndarray) -> float:
@@ -193,8 +189,7 @@ def face_gain(cosine: np.ndarray, glint: np.ndarray) -> np.ndarray:
     return np.where(cosine > 0, facing**2 + flash, 0.0) + _BACK_LEAK
 
 
-@dataclasses.dataclass(frozen=True)
-class FrameScattering:
+class FrameScattering(NamedTuple):
     """Scatterers of a frame before phases: positions, velocities and powers.
 
     Attributes:
@@ -212,6 +207,15 @@ class FrameScattering:
     owner: np.ndarray
 
 
+def join(parts: Iterable[FrameScattering]) -> FrameScattering:
+    """Scatterers of several kinds together; of none, none."""
+    flat = np.zeros(0)
+    none = FrameScattering(
+        np.zeros((0, 3)), np.zeros((0, 2)), flat, flat, flat.astype(int)
+    )
+    return FrameScattering(*map(np.concatenate, zip(none, *parts, strict=True)))
+
+
 def scatter_objects(
     frame: SceneFrame, centers: ObjectScatterers, parameters: RadarParameters
 ) -> tuple[FrameScattering, np.ndarray]:
@@ -222,18 +226,14 @@ def scatter_objects(
         occluded by other boxes.
     """
     boxes = frame.boxes
-    owner_of_track = np.full(int(centers.track.max(initial=-1)) + 2, -1)
+    owner_of_track = np.full(int(centers.track.max(initial=-1)) + 1, -1)
     owner_of_track[frame.track] = np.arange(len(boxes))
-    owner = owner_of_track[centers.track]
-    used = np.flatnonzero(owner >= 0)
-    owner = owner[used]
+    used = np.flatnonzero(owner_of_track[centers.track] >= 0)
+    owner = owner_of_track[centers.track[used]]
     box = boxes[owner]  # [S, 7]
-    cos, sin = np.cos(box[:, 6]), np.sin(box[:, 6])
 
     def turn(v: np.ndarray) -> np.ndarray:
-        return np.stack(
-            [cos * v[:, 0] - sin * v[:, 1], sin * v[:, 0] + cos * v[:, 1], v[:, 2]], 1
-        )
+        return np.stack([*rotate(v[:, 0], v[:, 1], box[:, 6]), v[:, 2]], 1)
 
     position = box[:, :3] + turn(centers.position[used] * box[:, 3:6] / 2.0)
     normal = turn(centers.normal[used])
@@ -262,44 +262,6 @@ def scatter_objects(
 _ON_FOOT = [CLASSES.index("Pedestrian")]
 
 
-def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.ndarray:
-    """True where the straight way from the radar to a point crosses a box.
-
-    Args:
-        targets: `[S, 3]` points.
-        boxes: `[N, 7]` obstacles.
-        owner: `[S]` index of a box that does not block (the point's own), or -1.
-
-    Returns:
-        `[S]` bool.
-    """
-    if not len(boxes) or not len(targets):
-        return np.zeros(len(targets), bool)
-    cos, sin = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
-
-    def into_boxes(p: np.ndarray) -> np.ndarray:  # [S, 3] -> [S, N, 3]
-        q = p[:, None] - boxes[None, :, :3]
-        return np.stack(
-            [
-                cos * q[..., 0] + sin * q[..., 1],
-                -sin * q[..., 0] + cos * q[..., 1],
-                q[..., 2],
-            ],
-            -1,
-        )
-
-    start = into_boxes(np.zeros((1, 3)))
-    ray = into_boxes(targets) - start
-    ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
-    half = boxes[:, 3:6] / 2.0
-    near, far = (-half - start) / ray, (half - start) / ray
-    enter = np.minimum(near, far).max(-1)
-    leave = np.maximum(near, far).min(-1)
-    crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
-    crosses &= np.arange(len(boxes))[None] != owner[:, None]
-    return crosses.any(1)
-
-
 def received_power(
     position_m: np.ndarray, rcs_m2: np.ndarray, parameters: RadarParameters
 ) -> np.ndarray:
@@ -310,47 +272,40 @@ def received_power(
     return 10.0 ** (parameters.gain_db / 10.0) * rcs_m2 * pattern / distance**4
 
 
+CAPACITY_STEP = 512
+"""`Scatterers` are padded to a multiple of this, so that frames share compiled code."""
+
+
 def to_scatterers(
-    parts: list[FrameScattering],
-    ego_velocity_mps: np.ndarray,
-    parameters: RadarParameters,
-    *,
-    capacity_step: int = 512,
+    found: FrameScattering, ego_velocity_mps: np.ndarray, wavelength_m: float
 ) -> Scatterers:
     """What the radar measures of scatterers: polar positions, range rate, amplitude.
 
     Args:
-        parts: Objects, surroundings, ghosts.
+        found: Objects, surroundings, ghosts.
         ego_velocity_mps: `[2]` of the radar over ground.
-        parameters: The sensor.
-        capacity_step: The result is padded to a multiple of this, so that frames
-            share compiled code.
+        wavelength_m: Of the sensor.
 
     Returns:
         float32 NumPy arrays. The phase of an amplitude is that of the reflection plus
         `4 pi R / wavelength`, so it turns as the object moves, and neighbours on one
         object add up or cancel from frame to frame.
     """
-    position = np.concatenate([p.position_m for p in parts])
-    velocity = np.concatenate([p.velocity_mps for p in parts]) - ego_velocity_mps
-    power = np.concatenate([p.power for p in parts])
-    phase = np.concatenate([p.phase_rad for p in parts])
+    position, amplitude = found.position_m, np.sqrt(found.power)
+    velocity = found.velocity_mps - ego_velocity_mps
     distance = np.maximum(np.linalg.norm(position, axis=1), 1e-3)
-    phase = phase + np.mod(4.0 * np.pi * distance / parameters.wavelength_m, 2 * np.pi)
-    amplitude = np.sqrt(power)
-    values = (
-        distance,
-        -np.arctan2(position[:, 1], position[:, 0]),
-        np.arcsin(np.clip(position[:, 2] / distance, -1.0, 1.0)),
-        (velocity * position[:, :2]).sum(1) / distance,
-        np.stack([amplitude * np.cos(phase), amplitude * np.sin(phase)], 1),
+    way = np.mod(4.0 * np.pi * distance / wavelength_m, 2 * np.pi)
+    phase = found.phase_rad + way
+    columns = np.stack(
+        [
+            distance,
+            -np.arctan2(position[:, 1], position[:, 0]),
+            np.arcsin(np.clip(position[:, 2] / distance, -1.0, 1.0)),
+            (velocity * position[:, :2]).sum(1) / distance,
+            amplitude * np.cos(phase),
+            amplitude * np.sin(phase),
+        ]
     )
-    capacity = -(-max(len(distance), 1) // capacity_step) * capacity_step
-    return Scatterers(*(_padded(v, capacity) for v in values))
-
-
-def _padded(values: np.ndarray, capacity: int) -> np.ndarray:
-    """float32 with zeros appended along the first axis."""
-    result = np.zeros((capacity, *values.shape[1:]), np.float32)
-    result[: len(values)] = values
-    return result
+    missing = -len(distance) % CAPACITY_STEP if len(distance) else CAPACITY_STEP
+    columns = np.pad(columns, ((0, 0), (0, missing))).astype(np.float32)
+    return Scatterers(*columns[:4], columns[4:].T)

@@ -20,15 +20,13 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
 
 Output = Literal["tesseract", "rows", "projection"]
 
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
-
-TPM_OFFSET_DB = 1.2
-TPM_SPAN_DB = 184.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,6 +142,9 @@ def angle_response(
     )
 
 
+@functools.partial(
+    jax.jit, static_argnames=("grid", "parameters", "output", "rows_per_step")
+)
 def simulate(
     scatterers: Scatterers,
     noise_power: jax.Array,
@@ -173,37 +174,15 @@ def simulate(
     Returns:
         float32 array as `output` says.
     """
-    made = "projection" if output == "projection" else "rows"
-    result = _simulate(
-        scatterers, noise_power, key, grid, parameters, made, rows_per_step
+    pedestal = parameters.array_pedestal
+    arrays = (
+        (grid.elevation_rad, scatterers.elevation_rad, parameters.elevation_elements),
+        (grid.azimuth_rad, scatterers.azimuth_rad, parameters.azimuth_elements),
     )
-    return jnp.transpose(result, TESSERACT_OF_ROWS) if output == "tesseract" else result
-
-
-@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
-def _simulate(scatterers, noise_power, key, grid, parameters, output, rows_per_step):
-    """The compiled body of `simulate`."""
+    elevation, azimuth = (angle_response(*a, pedestal) for a in arrays)  # [E S], [A S]
+    noise_bases = [array_noise_basis(axis, n, pedestal) for axis, _, n in arrays]
     doppler = doppler_response(scatterers.velocity_mps, grid)  # [D, S]
-    elevation = angle_response(
-        grid.elevation_rad,
-        scatterers.elevation_rad,
-        parameters.elevation_elements,
-        parameters.array_pedestal,
-    )  # [E, S]
-    azimuth = angle_response(
-        grid.azimuth_rad,
-        scatterers.azimuth_rad,
-        parameters.azimuth_elements,
-        parameters.array_pedestal,
-    )  # [A, S]
     in_range = range_response(scatterers.range_m, grid, parameters)  # [R, S]
-    noise_elevation, noise_azimuth = (
-        array_noise_basis(axis, elements, parameters.array_pedestal)
-        for axis, elements in (
-            (grid.elevation_rad, parameters.elevation_elements),
-            (grid.azimuth_rad, parameters.azimuth_elements),
-        )
-    )  # [E, M], [A, N]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
     _, kept = lax.top_k(jnp.abs(in_range) * magnitude[None], num_kept)  # [R, K]
@@ -211,32 +190,27 @@ def _simulate(scatterers, noise_power, key, grid, parameters, output, rows_per_s
     def row(inputs):
         index, weight, noise, row_idx = inputs
         amplitude = scatterers.amplitude[index] * weight[index][:, None]  # [K, 2]
-        left = (elevation[:, None, index] * doppler[None, :, index]).reshape(
-            -1, num_kept
-        )  # [E D, K]
+        left = elevation[:, None, index] * doppler[None, :, index]
         right = jnp.concatenate(
-            [
-                azimuth[:, index].T * amplitude[:, :1],
-                azimuth[:, index].T * amplitude[:, 1:],
-            ],
-            axis=1,
+            [azimuth[:, index].T * amplitude[:, i : i + 1] for i in (0, 1)], axis=1
         )  # [K, 2 A]
-        field = jnp.dot(left, right, precision=lax.Precision.HIGHEST)
-        field = field.reshape(grid.num_elevation, grid.num_doppler, 2, -1)
-        field += _noise_field(noise, key, row_idx, noise_elevation, noise_azimuth)
+        field = jnp.dot(
+            left.reshape(-1, num_kept), right, precision=lax.Precision.HIGHEST
+        ).reshape(grid.num_elevation, grid.num_doppler, 2, -1)
+        field += _noise_field(noise, key, row_idx, *noise_bases)
         power = jnp.square(field).sum(axis=2)  # [E, D, A]
-        return power if output == "rows" else _project_row(power)
+        return _project_row(power) if output == "projection" else power
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
-    if rows_per_step == 1:
-        return lax.map(row, rows)
-    return lax.map(row, rows, batch_size=rows_per_step)
+    one_by_one = rows_per_step == 1  # without a batch's axis
+    result = lax.map(row, rows, batch_size=None if one_by_one else rows_per_step)
+    return jnp.transpose(result, TESSERACT_OF_ROWS) if output == "tesseract" else result
 
 
 def _project_row(power: jax.Array) -> jax.Array:
     """`[A, D+E]` normalised maxima of one range row `[E, D, A]`."""
     maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
-    return (10.0 * jnp.log10(maxima + 1e-10) + TPM_OFFSET_DB) / TPM_SPAN_DB
+    return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
 
 def array_noise_basis(

@@ -3,12 +3,13 @@
 A `Sequence` is a list of tracks (boxes that keep their identity, moving or parked) and
 of static reflectors in a fixed world frame, and the path of the ego vehicle through
 it; `Sequence.frame` gives what the sensors see at one instant, in the ego frame.
-Procedural worlds (`traffic`) and real labels (`real_scenes`) both end here.
+Procedural worlds (`traffic`) and real labels (`replay`) both end here.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -127,14 +128,12 @@ class Sequence:
         environment: K-Radar's road type.
         time: "day" or "night".
         weather: One of K-Radar's seven.
-        ego_pose: `[F, 3]` world x, y and heading of the radar.
-        ego_along_m: `[F]` position along the road.
-        ego_velocity_mps: `[F, 2]` in the radar's own axes.
+        ego_along_m: `[F]` position of the radar along the road's centerline.
+        ego_speed_mps: `[F]` straight ahead.
         tracks: Objects.
         reflectors: Static surroundings.
-        road: Centerline; the ego drives at `ego_left_m` of it.
+        road: Centerline, on which the ego drives.
         lanes_m: Borders of the lanes, metres left of the centerline.
-        ego_left_m: Lateral position of the ego on its road.
         ground_m: Height of the ground in the radar's frame (negative).
         mirrors_m: Rails and walls that reflect like mirrors: metres left of the
             centerline.
@@ -144,58 +143,60 @@ class Sequence:
     environment: str
     time: str
     weather: str
-    ego_pose: np.ndarray
     ego_along_m: np.ndarray
-    ego_velocity_mps: np.ndarray
+    ego_speed_mps: np.ndarray
     tracks: Tracks
     reflectors: Reflectors
     road: Road
     lanes_m: tuple[float, ...]
-    ego_left_m: float
     ground_m: float
     mirrors_m: tuple[float, ...] = ()
 
-    @property
-    def num_frames(self) -> int:
-        return self.ego_pose.shape[0]
+    @functools.cached_property
+    def ego_pose(self) -> np.ndarray:
+        """`[F, 3]` world x, y and heading of the radar."""
+        return np.stack(self.road.position(self.ego_along_m, 0.0), 1)
 
     def frame(self, index: int, max_distance_m: float = 150.0) -> SceneFrame:
         """What surrounds the radar at frame `index`, up to a distance."""
         pose, tracks, fixed = self.ego_pose[index], self.tracks, self.reflectors
-        ego = _to_ego(tracks.position_m[index], pose)
-        is_near = tracks.is_present[index] & (
-            np.hypot(ego[:, 0], ego[:, 1]) < max_distance_m
+        centers = _to_ego(tracks.position_m[index], pose)
+        chosen = np.flatnonzero(
+            tracks.is_present[index]
+            & (np.hypot(centers[:, 0], centers[:, 1]) < max_distance_m)
         )
-        chosen = np.flatnonzero(is_near)
         yaw = wrap_angle(tracks.yaw_rad[index] - pose[2])
-        boxes = np.concatenate([ego, tracks.size_m[index], yaw[:, None]], 1)[chosen]
-        velocity = _rotate(tracks.velocity_mps[index, chosen], -pose[2])
-
+        boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = _to_ego(fixed.position_m, pose)
         distance = np.hypot(points[:, 0], points[:, 1])
         # Behind the radar its own vehicle shields; two metres off nothing stands.
         seen = np.flatnonzero(
             (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
         )
-        reflectors = Reflectors(
-            position_m=points[seen],
-            rcs_dbsm=fixed.rcs_dbsm[seen],
-            normal_rad=fixed.normal_rad[seen] - pose[2],
-            kind=fixed.kind[seen],
-        )
+        velocity = tracks.velocity_mps[index, chosen]
         return SceneFrame(
-            boxes=boxes,
-            velocity_mps=velocity,
+            boxes=boxes[chosen],
+            velocity_mps=np.stack(rotate(*velocity.T, -pose[2]), 1),
             cls=tracks.cls[chosen],
             track=chosen,
             track_id=tracks.track_id[chosen],
-            ego_velocity_mps=self.ego_velocity_mps[index],
-            reflectors=reflectors,
+            ego_velocity_mps=np.array([self.ego_speed_mps[index], 0.0]),
+            reflectors=Reflectors(
+                position_m=points[seen],
+                rcs_dbsm=fixed.rcs_dbsm[seen],
+                normal_rad=fixed.normal_rad[seen] - pose[2],
+                kind=fixed.kind[seen],
+            ),
             reflector_idx=seen,
             index=index,
             time_s=index * FRAME_PERIOD_S,
             ego_along_m=float(self.ego_along_m[index]),
         )
+
+
+def travelled(speed_mps: np.ndarray, period_s: Any = FRAME_PERIOD_S) -> np.ndarray:
+    """`[F]` metres since the first frame at speeds `[F]`, held for a period each."""
+    return np.concatenate([[0.0], np.cumsum((speed_mps * period_s)[:-1])])
 
 
 def class_index(name: str) -> int:
@@ -210,21 +211,46 @@ def class_index(name: str) -> int:
     return CLASSES.index(single)
 
 
+def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """True where the straight way from the origin to a point crosses a box.
+
+    Args:
+        targets: `[S, 3]` points.
+        boxes: `[N, 7]` obstacles.
+        owner: `[S]` index of a box that does not block (the point's own), or -1.
+
+    Returns:
+        `[S]` bool.
+    """
+
+    def into_boxes(p: np.ndarray) -> np.ndarray:  # [S, 3] -> [S, N, 3]
+        x, y, z = np.moveaxis(p[:, None] - boxes[None, :, :3], -1, 0)
+        return np.stack([*rotate(x, y, -boxes[:, 6]), z], -1)
+
+    start = into_boxes(np.zeros((1, 3)))
+    ray = into_boxes(targets) - start
+    ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
+    half = boxes[:, 3:6] / 2.0
+    near, far = (-half - start) / ray, (half - start) / ray
+    enter = np.minimum(near, far).max(-1)
+    leave = np.maximum(near, far).min(-1)
+    crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
+    crosses &= np.arange(len(boxes))[None] != owner[:, None]
+    return crosses.any(1)
+
+
 def wrap_angle(angle_rad: Any) -> Any:
     """The same angle in [-pi, pi)."""
     return np.mod(np.asarray(angle_rad) + np.pi, 2.0 * np.pi) - np.pi
 
 
-def _rotate(vectors: np.ndarray, angle_rad: float) -> np.ndarray:
-    """`[N, 2]` vectors turned counter-clockwise."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.stack(
-        [c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]],
-        1,
-    )
+def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
+    """Vectors in the ground plane turned counter-clockwise."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return cos * x - sin * y, sin * x + cos * y
 
 
 def _to_ego(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """`[N, 3]` world points in the frame of the radar at `pose` (x, y, heading)."""
-    flat = _rotate(points[:, :2] - pose[:2], -pose[2])
-    return np.concatenate([flat, points[:, 2:]], 1)
+    x, y, z = points.T
+    return np.stack([*rotate(x - pose[0], y - pose[1], -pose[2]), z], 1)

@@ -6,24 +6,18 @@ Vehicles of a lane keep the lane's speed, so they keep their distances.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
+from radejax.simulation.world.environments import ENVIRONMENTS, GROUND_M, SIGHT_M
+from radejax.simulation.world.roadside import make_surroundings
 from radejax.simulation.world.scene import (
     FRAME_PERIOD_S,
     Road,
     Sequence,
     Tracks,
     class_index,
+    travelled,
 )
-from radejax.simulation.world.surroundings import make_surroundings
-
-GROUND_M = -0.9
-"""The ground in the radar's frame: K-Radar's radar is mounted at bumper height."""
-
-SIGHT_M = 130.0
-"""How far ahead of the ego objects are placed."""
 
 # Length, width, height in metres and their standard deviations.
 SIZES = {
@@ -33,89 +27,6 @@ SIZES = {
     "Motorcycle": ((2.1, 0.8, 1.55), (0.12, 0.06, 0.1)),
     "Bicycle": ((1.75, 0.6, 1.65), (0.08, 0.05, 0.08)),
 }
-
-
-@dataclasses.dataclass(frozen=True)
-class Environment:
-    """One of K-Radar's road types.
-
-    Attributes:
-        speed_mps: Range of ego speeds.
-        lane_width_m: Width of a lane.
-        lanes_left: Lanes of our direction left of the ego's.
-        lanes_right: Lanes of our direction right of the ego's.
-        lanes_oncoming: Lanes of the other direction.
-        median_m: Strip between the directions.
-        gap_m: Mean free distance between vehicles of a lane.
-        trucks: Share of buses and trucks in traffic.
-        two_wheelers: Share of motorcycles in traffic.
-        parked_per_100m: Vehicles parked along each side.
-        pedestrians_per_100m: People on both pavements together.
-        bicycles_per_100m: Bicycles along the right edge.
-        max_curvature: Largest curvature of the road in 1/m.
-        walls: Probability of a wall or house front on each side.
-        wall_m: Distance of walls from the edge of the road.
-        rails: Probability of a guard rail on each side.
-        trees_per_100m: Trees and poles on each side.
-        perpendicular: True if parked vehicles stand across the road.
-    """
-
-    speed_mps: tuple[float, float]
-    lane_width_m: float = 3.3
-    lanes_left: int = 0
-    lanes_right: int = 0
-    lanes_oncoming: int = 1
-    median_m: float = 0.5
-    gap_m: float = 22.0
-    trucks: float = 0.15
-    two_wheelers: float = 0.08
-    parked_per_100m: float = 3.0
-    pedestrians_per_100m: float = 3.0
-    bicycles_per_100m: float = 1.0
-    max_curvature: float = 0.001
-    walls: float = 0.3
-    wall_m: float = 8.0
-    rails: float = 0.0
-    trees_per_100m: float = 6.0
-    perpendicular: bool = False
-
-
-ENVIRONMENTS = {
-    "urban": Environment(
-        (6.0, 14.0), lanes_left=1, lanes_oncoming=2, walls=0.6, parked_per_100m=4.0
-    ),
-    "highway": Environment(
-        (21.0, 28.0), 3.5, 1, 1, 3, 2.0, 28.0, 0.22, 0.05, 0.0, 0.0, 0.0, 0.0006,
-        0.2, 8.0, 0.9, 3.0,
-    ),
-    "alleyway": Environment(
-        (2.0, 5.0), 3.0, gap_m=30.0, trucks=0.1, parked_per_100m=7.0,
-        pedestrians_per_100m=6.0, bicycles_per_100m=2.0, walls=0.95, wall_m=3.5,
-        trees_per_100m=4.0,
-    ),
-    "university": Environment(
-        (3.0, 8.0), 3.0, gap_m=30.0, trucks=0.12, parked_per_100m=4.0,
-        pedestrians_per_100m=7.0, bicycles_per_100m=3.0, walls=0.4, wall_m=14.0,
-        trees_per_100m=9.0,
-    ),
-    "countryside": Environment(
-        (11.0, 17.0), gap_m=30.0, parked_per_100m=0.7, pedestrians_per_100m=0.8,
-        walls=0.05, trees_per_100m=8.0, max_curvature=0.002,
-    ),
-    "mountain": Environment(
-        (8.0, 14.0), gap_m=30.0, parked_per_100m=0.7, pedestrians_per_100m=0.5,
-        walls=0.5, wall_m=5.0, rails=0.6, max_curvature=0.006,
-    ),
-    "parkinglots": Environment(
-        (1.0, 3.0), 3.4, gap_m=35.0, trucks=0.08, parked_per_100m=20.0,
-        pedestrians_per_100m=4.0, walls=0.3, wall_m=12.0, perpendicular=True,
-    ),
-    "shoulder": Environment(
-        (0.0, 0.0), 3.5, 2, 0, 2, 2.0, 30.0, 0.25, 0.05, 0.7, 0.7, 0.0, 0.0006,
-        0.2, 10.0, 0.7, 4.0,
-    ),
-}  # fmt: skip
-"""K-Radar's eight road types."""
 
 
 def make_sequence(
@@ -141,11 +52,10 @@ def make_sequence(
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * FRAME_PERIOD_S
     speed = rng.uniform(*law.speed_mps) * _speed_wave(clock, rng)
-    along = np.concatenate([[0.0], np.cumsum(speed[:-1] * FRAME_PERIOD_S)])
-    x, y, heading = road.position(along, 0.0)
+    along = travelled(speed)
     traffic = _Traffic(law, road, clock, along, speed, rng)
     edges = traffic.fill()
-    surroundings, mirrors = make_surroundings(
+    reflectors, mirrors = make_surroundings(
         law, road, along[-1] + SIGHT_M, edges, rng, GROUND_M
     )
     return Sequence(
@@ -153,14 +63,12 @@ def make_sequence(
         environment=environment,
         time=time,
         weather=weather,
-        ego_pose=np.stack([x, y, heading], 1),
         ego_along_m=along,
-        ego_velocity_mps=np.stack([speed, np.zeros_like(speed)], 1),
+        ego_speed_mps=speed,
         tracks=traffic.tracks(),
-        reflectors=surroundings,
+        reflectors=reflectors,
         road=road,
         lanes_m=traffic.lane_borders,
-        ego_left_m=0.0,
         ground_m=GROUND_M,
         mirrors_m=mirrors,
     )
@@ -178,25 +86,25 @@ class _Traffic:
     def __init__(self, law, road, clock, ego_along, ego_speed, rng):
         self.law, self.road, self.rng = law, road, rng
         self.clock, self.ego_along, self.ego_speed = clock, ego_along, ego_speed
-        self.paths: list[tuple] = []  # (cls, size, along [F], left [F], turn, speed)
+        self.paths: list[
+            tuple
+        ] = []  # (cls, size, along [F], left [F], speed [F], turn)
         self.lane_borders: tuple[float, ...] = ()
 
     def fill(self) -> tuple[float, float]:
         """Adds everybody; returns the right and left edges of the road."""
-        law, width = self.law, self.law.lane_width_m
-        rng = self.rng
+        law, rng, width = self.law, self.rng, self.law.lane_width_m
+        stands = self.ego_speed.max() == 0.0  # on the shoulder
         lanes = range(-law.lanes_right, law.lanes_left + 1)
         for lane in lanes:
             factor = 1.0 if lane == 0 else 1.0 + 0.08 * lane + rng.normal() * 0.05
             speed = self.ego_speed * factor
-            if self.ego_speed.max() == 0.0:  # we stand on the shoulder
+            if stands:
                 speed = np.full_like(self.clock, 0.0 if lane == 0 else 23.0 + 2 * lane)
             self._lane(lane * width, speed, 1.0, is_ego_lane=lane == 0)
         border = (law.lanes_left + 0.5) * width + law.median_m
+        mean = 23.0 if stands else max(float(self.ego_speed.mean()), 4.0)
         for lane in range(law.lanes_oncoming):
-            mean = max(float(self.ego_speed.mean()), 4.0)
-            if self.ego_speed.max() == 0.0:
-                mean = 23.0
             speed = np.full_like(self.clock, mean * rng.uniform(0.85, 1.15))
             self._lane(border + (lane + 0.5) * width, speed, -1.0)
         right = -(law.lanes_right + 0.5) * width
@@ -206,58 +114,54 @@ class _Traffic:
             + [border + i * width for i in range(law.lanes_oncoming + 1)]
         )
         reach = 5.2 if law.perpendicular else 2.4
-        parks = law.parked_per_100m > 0.0
-        if parks:
+        pavement = 1.2
+        if law.parked_per_100m > 0.0:
             self._parked(right - reach / 2, -1.0)
             self._parked(left + reach / 2, 1.0)
-        pavement = (reach if parks else 0.0) + 1.2
+            pavement += reach
         self._walkers(right - pavement, left + pavement)
         self._cyclists(right + 0.5)
         return right - pavement - 1.0, left + pavement + 1.0
 
+    def _add(self, cls: str, size: np.ndarray, along, left, speed, turn: float) -> None:
+        """An object whose places and speeds are one number or one a frame."""
+        path = (np.broadcast_to(v, self.clock.shape) for v in (along, left, speed))
+        self.paths.append((cls, size, *path, turn))
+
     def _size(self, cls: str) -> np.ndarray:
         mean, deviation = SIZES[cls]
-        return np.array(mean) + np.array(deviation) * self.rng.normal(size=3).clip(
-            -2, 2
-        )
+        return mean + np.array(deviation) * self.rng.normal(size=3).clip(-2, 2)
 
     def _vehicle_class(self) -> str:
-        draw = self.rng.random()
-        if draw < self.law.trucks:
+        draw, law = self.rng.random(), self.law
+        if draw < law.trucks:
             return "Bus or Truck"
-        return (
-            "Motorcycle" if draw < self.law.trucks + self.law.two_wheelers else "Sedan"
-        )
+        return "Motorcycle" if draw < law.trucks + law.two_wheelers else "Sedan"
 
     def _lane(self, left_m, speed, direction, *, is_ego_lane=False) -> None:
         """A file of vehicles that keep their distances."""
-        way = (
-            np.concatenate([[0.0], np.cumsum(speed[:-1] * FRAME_PERIOD_S)]) * direction
-        )
+        rng = self.rng
+        way = travelled(speed) * direction
         relative = way - self.ego_along
-        first = -30.0 - max(relative.max(), 0.0)
+        along = -30.0 - max(relative.max(), 0.0) + rng.uniform(0.0, 20.0)
         last = SIGHT_M - min(relative.min(), 0.0)
-        along = first + self.rng.uniform(0.0, 20.0)
         while along < last:
             cls = self._vehicle_class()
             size = self._size(cls)
-            along += size[0] / 2.0
-            beside_ego = is_ego_lane and -8.0 < along - size[0] / 2 < 7.0
-            if not beside_ego and not (is_ego_lane and -8.0 < along < 7.0):
-                sway = 0.15 * np.sin(self.clock * 0.7 + self.rng.uniform(0, 6.3))
-                shift = self.rng.normal() * 0.2 + (
-                    self.rng.uniform(-0.8, 0.8) if cls == "Motorcycle" else 0.0
-                )
-                self.paths.append(
-                    (cls, size, along + way, left_m + shift + sway,
-                     0.0 if direction > 0 else np.pi, speed)
-                )  # fmt: skip
-            along += size[0] / 2.0 + 4.0 + self.rng.exponential(self.law.gap_m)
+            rear, along = along, along + size[0] / 2.0
+            if not (is_ego_lane and (-8.0 < rear < 7.0 or -8.0 < along < 7.0)):
+                sway = 0.15 * np.sin(self.clock * 0.7 + rng.uniform(0, 6.3))
+                shift = rng.normal() * 0.2
+                if cls == "Motorcycle":
+                    shift += rng.uniform(-0.8, 0.8)
+                turn = 0.0 if direction > 0 else np.pi
+                self._add(cls, size, along + way, left_m + shift + sway, speed, turn)
+            along += size[0] / 2.0 + 4.0 + rng.exponential(self.law.gap_m)
 
     def _parked(self, left_m: float, side: float) -> None:
         """Vehicles at rest along the edge."""
-        rng, still = self.rng, np.zeros_like(self.clock)
-        along = self.rng.uniform(-20.0, 0.0)
+        rng = self.rng
+        along = rng.uniform(-20.0, 0.0)
         while along < self.ego_along[-1] + SIGHT_M:
             cls = "Bus or Truck" if rng.random() < 0.1 else "Sedan"
             size = self._size(cls)
@@ -269,32 +173,29 @@ class _Traffic:
                 footprint = size[0]
             turn += rng.normal() * 0.04 + (np.pi if rng.random() < 0.15 else 0.0)
             along += footprint / 2.0
-            path = along + still
-            self.paths.append((cls, size, path, left_m + still, turn, still))
+            self._add(cls, size, along, left_m, 0.0, turn)
             spacing = 100.0 / self.law.parked_per_100m - footprint
             along += footprint / 2 + 0.7 + rng.exponential(max(spacing, 0.3))
 
     def _walkers(self, right_m: float, left_m: float) -> None:
         """People along the pavements, some of them crossing the road."""
-        rng, law = self.rng, self.law
+        rng = self.rng
         length = self.ego_along[-1] + 80.0
-        for _ in range(rng.poisson(law.pedestrians_per_100m * length / 100.0)):
-            start = rng.uniform(6.0, length)
+        for _ in range(rng.poisson(self.law.pedestrians_per_100m * length / 100.0)):
+            along = rng.uniform(6.0, length)
             pace = rng.uniform(0.9, 1.7)
             size = self._size("Pedestrian")
             walked = pace * self.clock
-            if rng.random() < 0.15 and start > 25.0:
-                side = rng.choice([-1.0, 1.0])
+            crosses = rng.random() < 0.15 and along > 25.0
+            side = rng.choice([-1.0, 1.0])
+            if crosses:
                 left = (right_m if side > 0 else left_m) + side * walked
                 turn = side * np.pi / 2
-                along = start + 0.0 * walked
             else:
-                side = rng.choice([-1.0, 1.0])
-                left = rng.choice([right_m, left_m]) + rng.normal() * 0.4 + 0.0 * walked
+                left = rng.choice([right_m, left_m]) + rng.normal() * 0.4
                 turn = 0.0 if side > 0 else np.pi
-                along = start + side * walked
-            moving = np.full_like(self.clock, pace)
-            self.paths.append(("Pedestrian", size, along, left, turn, moving))
+                along = along + side * walked
+            self._add("Pedestrian", size, along, left, pace, turn)
 
     def _cyclists(self, left_m: float) -> None:
         """Bicycles along the right edge of the road."""
@@ -303,18 +204,16 @@ class _Traffic:
         for _ in range(rng.poisson(self.law.bicycles_per_100m * length / 100.0)):
             pace = rng.uniform(3.0, 6.0)
             along = rng.uniform(8.0, length) + pace * self.clock
-            left = left_m + rng.normal() * 0.2 + 0.0 * along
-            moving = np.full_like(self.clock, pace)
-            size = self._size("Bicycle")
-            self.paths.append(("Bicycle", size, along, left, 0.0, moving))
+            left = left_m + rng.normal() * 0.2
+            self._add("Bicycle", self._size("Bicycle"), along, left, pace, 0.0)
 
     def tracks(self) -> Tracks:
-        """All paths as boxes in the world frame, nearer ones first."""
-        count = len(self.clock)
-        if not self.paths:
-            return _no_tracks(count)
+        """All paths as boxes in the world frame, nearer ones first.
+
+        There are some: every road type has oncoming traffic.
+        """
         paths = sorted(self.paths, key=lambda p: abs(p[2][0]))
-        cls, size, along, left, turn, speed = zip(*paths, strict=True)
+        cls, size, along, left, speed, turn = zip(*paths, strict=True)
         size = np.stack(size)
         along, left, speed = (np.stack(v, 1) for v in (along, left, speed))  # [F, N]
         x, y, heading = self.road.position(along, left)
@@ -325,21 +224,8 @@ class _Traffic:
             yaw_rad=yaw,
             velocity_mps=np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], -1),
             is_present=np.abs(along - self.ego_along[:, None]) < SIGHT_M + 20.0,
-            size_m=np.broadcast_to(size, (count, *size.shape)),
+            size_m=np.broadcast_to(size, (len(x), *size.shape)),
             cls=np.array([class_index(c) for c in cls]),
             track_id=np.arange(1, len(paths) + 1),
             label_cls=cls,
         )
-
-
-def _no_tracks(num_frames: int) -> Tracks:
-    return Tracks(
-        np.zeros((num_frames, 0, 3)),
-        np.zeros((num_frames, 0)),
-        np.zeros((num_frames, 0, 2)),
-        np.zeros((num_frames, 0), bool),
-        np.zeros((num_frames, 0, 3)),
-        np.zeros(0, int),
-        np.zeros(0, int),
-        (),
-    )

@@ -1,5 +1,4 @@
 import json
-import types
 
 import numpy as np
 import pytest
@@ -90,27 +89,6 @@ def test_npz_with_class_indices(tmp_path):
         score=[0.5],
     )
     assert predictions.read_table(tmp_path / "p.npz")["cls"].tolist() == ["Bicycle"]
-
-
-def test_tables_from_frames():
-    frame = types.SimpleNamespace(
-        sequence=3,
-        name="00001_00001",
-        weather="fog",
-        environment="urban",
-        time="day",
-        boxes=np.ones((2, 7)),
-        classes=["Sedan", "Bicycle"],
-    )
-    empty = types.SimpleNamespace(
-        **{**vars(frame), "boxes": np.zeros((0, 7)), "classes": [], "weather": "rain"}
-    )
-    truth, table = predictions.tables_from_frames([empty, frame])
-    assert truth["frame"].tolist() == [1, 1]
-    assert truth["cls"].tolist() == ["Sedan", "Bicycle"]
-    assert table["weather"].tolist() == ["rain", "fog"]
-    none, _ = predictions.tables_from_frames([])
-    assert none["box"].shape == (0, 7)
 
 
 def test_wrong_files_are_named(tmp_path):

@@ -8,8 +8,8 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.evaluation.files import kitti, predictions
+from radejax.evaluation.files.load import Source
 from radejax.evaluation.report import compare as commands
-from radejax.evaluation.report.compare import Source
 from radejax.evaluation.report.measure import Options
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
@@ -19,21 +19,6 @@ OPTIONS = Options(roi=None, plots=False, protocols=("exact", "kradar_r40"))
 @pytest.fixture(scope="module")
 def scene(random_scene):
     return random_scene(8, num_frames=30, num_objects=90)
-
-
-@pytest.fixture
-def stored(scene, tmp_path):
-    """Predictions, ground truth and frames as files."""
-    truth, found, frames = scene
-    predictions.write_table(tmp_path / "found.json", found, frames)
-    predictions.write_table(tmp_path / "truth.csv", truth, frames)
-    commands.files.write_json(
-        tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
-    )
-    source = Source(
-        ground_truth=str(tmp_path / "truth.csv"), frames=str(tmp_path / "frames.json")
-    )
-    return tmp_path, source
 
 
 def ap(report):
@@ -103,46 +88,12 @@ def test_comparison_of_two_reports(stored, scene):
         commands.compare_files([folder / "few"], None, Source(), OPTIONS)
 
 
-def test_ground_truth_has_to_come_from_somewhere(stored, scene):
-    folder, source = stored
-    with pytest.raises(UserError, match="say where the ground truth is"):
-        commands.load(folder / "found.json", Source(), ("Sedan",))
-    with pytest.raises(FileNotFoundError, match=r"none\.json"):
-        commands.load(folder / "none.json", source, ("Sedan",))
-    (folder / "frames.json").write_text("[]")
-    with pytest.raises(UserError, match="expected an object of columns"):
-        commands.load(folder / "found.json", source, ("Sedan",))
-    kitti.write_kitti(folder / "kitti", *scene)
+def test_frames_without_sequences_cannot_be_compared(scene, tmp_path):
+    kitti.write_kitti(tmp_path / "kitti", *scene)
     with pytest.raises(UserError, match="the frames do not say"):
         commands.compare_files(
-            [folder / "kitti", folder / "kitti"], None, Source(), OPTIONS
+            [tmp_path / "kitti", tmp_path / "kitti"], None, Source(), OPTIONS
         )
-
-
-def test_ground_truth_by_id_without_a_frame_table(scene, tmp_path):
-    truth, found, _ = scene
-    predictions.write_table(tmp_path / "found.npz", found)
-    predictions.write_table(tmp_path / "truth.npz", truth)
-    source = Source(ground_truth=str(tmp_path / "truth.npz"))
-    _, _, frames, _ = commands.load(tmp_path / "found.npz", source, ("Sedan",))
-    both = np.union1d(truth["frame"], found["frame"])
-    np.testing.assert_array_equal(frames["frame"], both)
-
-
-def test_labels_of_kradar(shared, tmp_path):
-    folder = shared / "data" / "kradar"
-    source = Source(labels=str(folder / "labels_v2_1.zip"), split="test")
-    first = (folder / "split" / "test.txt").read_text().splitlines()[0]
-    header = "frame,cls,x,y,z,l,w,h,yaw,score\n"
-    line = f"{first.replace(',', '/')},Sedan,20,0,0,4,2,1.5,0,0.5\n"
-    (tmp_path / "p.csv").write_text(header + line)
-    truth, found, frames, left_out = commands.load(
-        tmp_path / "p.csv", source, ("Sedan",)
-    )
-    assert frames["frame"].size == 17536
-    assert found["frame"].tolist() == [0]
-    assert truth["frame"].size > 10000
-    assert any(name.startswith("labels: ") for name in left_out)
 
 
 def run(*arguments, **settings):

@@ -1,6 +1,8 @@
 import csv
 import json
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -211,7 +213,7 @@ def test_conditions_are_in_the_papers_order():
 def test_frames_with_ids_only(scene, tmp_path):
     truth, found, frames = scene
     only = {"frame": frames["frame"]}
-    made = report.evaluate_predictions(
+    made = report.write_report(
         truth, found, only, tmp_path, Options(protocols=("exact",), **TERMS)
     )
     assert {row.condition for row in made.rows} == {"all"}
@@ -241,3 +243,10 @@ def test_curves_are_drawn(scene, tmp_path):
     for path in made.files:
         if path.suffix == ".png":
             assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_matplotlib_waits_until_something_is_drawn():
+    code = "import sys, radejax.evaluation.report.compare as _; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert b"radejax.evaluation.report.report" in done.stdout
+    assert b"matplotlib" not in done.stdout

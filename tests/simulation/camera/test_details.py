@@ -23,24 +23,22 @@ def test_the_whole_face_is_the_face():
 
 @pytest.mark.parametrize("cls", CLASSES)
 def test_details_stay_in_the_box(cls):
-    vertices = np.array([v for v, _ in shapes._FACES])
     corners = shapes.blocks_of(cls)
     for detail in details.DETAILS[cls]:
-        face = corners[detail.block][vertices[detail.face]][None]
+        face = corners[detail.block][shapes._VERTICES[detail.face]][None]
         quad = details.on_faces(face, np.array([detail.u]), np.array([detail.v]))
         assert np.abs(quad).max() <= 1.0 + 2e-2, detail
 
 
 @pytest.mark.parametrize("name", ["Sedan", "Bus or Truck"])
 def test_vehicles_are_the_same_on_both_sides(name):
-    vertices = np.array([v for v, _ in shapes._FACES])
     corners = shapes.blocks_of(name)
 
     def places(face):
         found = []
         for d in details.DETAILS[name]:
             if d.face == face:
-                quad = corners[d.block][vertices[face]][None]
+                quad = corners[d.block][shapes._VERTICES[face]][None]
                 found.append(details.on_faces(quad, np.array([d.u]), np.array([d.v])))
         return np.sort(np.abs(np.concatenate(found).mean(1)), axis=0)
 

@@ -25,3 +25,33 @@ def test_points_seen_from_a_turned_ego_by_hand():
     points = np.array([[10.0, 8.0, 0.5], [9.0, 5.0, 0.0]])
     seen = scene._to_ego(points, pose)
     np.testing.assert_allclose(seen, [[3.0, 0.0, 0.5], [0.0, 1.0, 0.0]], atol=1e-12)
+
+
+class TestOcclusion:
+    BOX = np.array([[20.0, 0.0, 0.0, 4.0, 2.0, 2.0, 0.0]])
+
+    @pytest.mark.parametrize(
+        ("point", "expected"),
+        [
+            ([40.0, 0.0, 0.0], True),  # straight behind
+            ([40.0, 3.0, 0.0], False),  # passes beside: 1.5 m off at the box
+            ([40.0, 1.7, 0.0], True),
+            ([10.0, 0.0, 0.0], False),  # in front
+            ([40.0, 0.0, 4.4], False),  # over it: 1.98 m high at 18 m, 2.4 at 22
+            ([-40.0, 0.0, 0.0], False),  # the other way
+        ],
+    )
+    def test_by_hand(self, point, expected):
+        blocked = scene.is_blocked(np.array([point]), self.BOX, np.array([-1]))
+        assert blocked.tolist() == [expected]
+
+    def test_turned_box(self):
+        turned = self.BOX.copy()
+        turned[0, 6] = np.pi / 2  # now 4 m across: 1.7 m off centre is inside
+        point = np.array([[40.0, 3.4, 0.0]])
+        assert scene.is_blocked(point, turned, np.array([-1]))[0]
+        assert not scene.is_blocked(point, self.BOX, np.array([-1]))[0]
+
+    def test_own_box_does_not_block(self):
+        inside = np.array([[22.0, 0.0, 0.0]])
+        assert not scene.is_blocked(inside, self.BOX, np.array([0]))[0]

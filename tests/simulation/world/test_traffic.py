@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from radejax.geometry.rotated_iou import bev_intersection_np
+from radejax.simulation.world.environments import ENVIRONMENTS
 from radejax.simulation.world.scene import FRAME_PERIOD_S, Road
-from radejax.simulation.world.traffic import ENVIRONMENTS, make_sequence
+from radejax.simulation.world.traffic import make_sequence
 
 
 def sequence(environment="urban", seed=0, num_frames=20):

@@ -1,10 +1,10 @@
 """The classical detector on maps with known answers."""
 
+import cfar
 import numpy as np
 import pytest
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation import baseline
 from radejax.simulation.radar import tensor
 from radejax.simulation.radar.tensor import RadarParameters
 
@@ -12,7 +12,7 @@ GRID = RadarGrid.reduced(
     num_doppler=8, num_range=64, num_elevation=5, num_azimuth=56, max_range_m=75.6
 )
 PARAMETERS = RadarParameters(azimuth_elements=40.0, elevation_elements=12.0)
-SETTINGS = baseline.CfarSettings()
+SETTINGS = cfar.CfarSettings()
 
 
 def projection_of(*targets):
@@ -34,17 +34,17 @@ def projection_of(*targets):
 
 
 def test_local_mean_by_hand():
-    settings = baseline.CfarSettings(guard_cells=1, training_cells=1)
+    settings = cfar.CfarSettings(guard_cells=1, training_cells=1)
     power = np.full((7, 7), 1.0)
     power[3, 3] = 1000.0  # in the guard: does not count
     power[1, 3] = 17.0  # one of 16 training cells: mean (15 + 17) / 16 = 2
-    mean = baseline.local_mean_db(10 * np.log10(power), settings)
+    mean = cfar.local_mean_db(10 * np.log10(power), settings)
     assert mean[3, 3] == pytest.approx(10 * np.log10(2.0))
 
 
 def test_finds_cars_where_they_are():
     projection = projection_of((20.0, -0.2, 8.0), (40.0, 0.3, 8.0))
-    found = baseline.detect(projection, GRID, PARAMETERS)
+    found = cfar.detect(projection, GRID, PARAMETERS)
     cars = found["box"][found["cls"] == "Sedan"]
     for distance, azimuth in ((20.0, -0.2), (40.0, 0.3)):
         near_side = np.array([distance * np.cos(azimuth), -distance * np.sin(azimuth)])
@@ -62,19 +62,19 @@ def test_finds_cars_where_they_are():
     ],
 )
 def test_cross_section_chooses_the_class(rcs_db, cls):
-    found = baseline.detect(projection_of((15.6, 0.0, rcs_db)), GRID, PARAMETERS)
+    found = cfar.detect(projection_of((15.6, 0.0, rcs_db)), GRID, PARAMETERS)
     assert found["cls"][0] == cls
 
 
 def test_noise_alone_gives_next_to_nothing():
-    found = baseline.detect(projection_of((15.0, 0.0, -200.0)), GRID, PARAMETERS)
+    found = cfar.detect(projection_of((15.0, 0.0, -200.0)), GRID, PARAMETERS)
     assert len(found["score"]) == 0
     assert found["box"].shape == (0, 7)
 
 
 def test_near_peaks_become_one_and_scores_descend():
     projection = projection_of((30.0, 0.0, 8.0), (32.0, 0.0, 5.0), (50.0, 0.4, 8.0))
-    found = baseline.detect(projection, GRID, PARAMETERS)
+    found = cfar.detect(projection, GRID, PARAMETERS)
     assert (np.diff(found["score"]) <= 0).all()
     near = np.hypot(found["box"][:, 0] - 32.0, found["box"][:, 1]) < 6.0
     assert near.sum() == 1
@@ -86,7 +86,7 @@ class TestFit:
         # first candidate is the weakest car. People end at their lower quartile.
         names = ["Sedan"] * 5 + ["Pedestrian"] * 5
         values = [8.0, 9.0, 10.0, 11.0, 12.0, -8.0, -7.0, -6.0, -5.0, -4.0]
-        steps = baseline.fit_rcs_steps(names, values)
+        steps = cfar.fit_rcs_steps(names, values)
         assert steps == (("Sedan", 8.0), ("Pedestrian", -7.0))
 
     def test_rare_classes_count_only_if_balanced(self):
@@ -94,26 +94,26 @@ class TestFit:
         # 20 one of two trucks is lost: 1 error, 1/2.
         names = ["Bus or Truck"] * 2 + ["Sedan"] * 6
         values = [11.5, 20.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0]
-        plain = dict(baseline.fit_rcs_steps(names, values))
-        even = dict(baseline.fit_rcs_steps(names, values, balanced=True))
+        plain = dict(cfar.fit_rcs_steps(names, values))
+        even = dict(cfar.fit_rcs_steps(names, values, balanced=True))
         assert plain["Bus or Truck"] == 20.0
         assert even["Bus or Truck"] == 11.5
 
     def test_classes_that_overlap_keep_a_gap(self):
         names = ["Motorcycle"] * 3 + ["Bicycle"] * 3
-        steps = baseline.fit_rcs_steps(names, [1.0, 2.0, 3.0, 0.0, 5.0, -9.0])
+        steps = cfar.fit_rcs_steps(names, [1.0, 2.0, 3.0, 0.0, 5.0, -9.0])
         assert steps[1][1] <= steps[0][1] - 1.0
 
     def test_no_objects_no_steps(self):
-        assert baseline.fit_rcs_steps([], []) == ()
+        assert cfar.fit_rcs_steps([], []) == ()
 
 
 def test_apparent_cross_section_of_a_point_is_its_own():
     projection = projection_of((20.4, 0.0, 8.0))
     box = np.array([[20.4, 0.0, -0.9, 4.0, 2.0, 1.5, 0.0], [60.0, 0, 0, 4, 2, 2, 0]])
     nowhere = np.array([[-20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
-    found = baseline.object_rcs_db(projection, box, GRID, PARAMETERS)
+    found = cfar.object_rcs_db(projection, box, GRID, PARAMETERS)
     # Half a bin off in range (Hann) and angle costs at most 1.4 + 1.4 dB.
     assert 5.0 < found[0] < 8.5
     assert found[1] < 0.0  # noise
-    assert np.isnan(baseline.object_rcs_db(projection, nowhere, GRID, PARAMETERS)[0])
+    assert np.isnan(cfar.object_rcs_db(projection, nowhere, GRID, PARAMETERS)[0])

@@ -7,7 +7,6 @@ knowing its step.
 
 from __future__ import annotations
 
-import collections
 import concurrent.futures
 import functools
 import threading
@@ -22,8 +21,8 @@ from radejax.core.structures import Batch
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.radar import tensor
+from radejax.simulation.scene_sources import make_source
 from radejax.simulation.simulator import RadarInput, SequenceSimulator
-from radejax.simulation.sources import make_source
 
 _CACHED_SEQUENCES = 64
 
@@ -71,7 +70,6 @@ class OnlineBatches:
         self._seed, self._rows_per_step = seed, rows_per_step
         self.step, self.num_cut = start_step, 0
         self._pool = concurrent.futures.ThreadPoolExecutor(max(num_threads, 1))
-        self._ahead: collections.deque = collections.deque()
         self._lock = threading.Lock()
         self._simulator = functools.lru_cache(_CACHED_SEQUENCES)(self._make_simulator)
 
@@ -79,19 +77,20 @@ class OnlineBatches:
         return self
 
     def __next__(self) -> Batch:
-        """The next batch; the following one is prepared meanwhile."""
-        while len(self._ahead) < 2:
-            self._ahead.append(self._submit(self.step + len(self._ahead)))
-        batch = self._assemble([f.result() for f in self._ahead.popleft()])
+        """The next batch."""
         self.step += 1
-        return batch
+        return self.batch(self.step - 1)
 
     def batch(self, step: int) -> Batch:
         """The batch of any step: a pure function of config, seed and step."""
-        return self._assemble([f.result() for f in self._submit(step)])
+        rng = np.random.default_rng([self._seed, step])
+        chosen = rng.integers(len(self._specs), size=self._batch_size)
+        rows = range(self._batch_size)
+        frames = self._pool.map(self._frame, chosen.tolist(), [step] * len(rows), rows)
+        return self._assemble(list(frames))
 
     def loader(self) -> grain.DatasetIterator:
-        """The same batches as an iterator whose position a checkpoint keeps."""
+        """The same batches, prepared ahead, at a position that a checkpoint keeps."""
         steps = grain.MapDataset.range(np.iinfo(np.int32).max)
         reading = grain.ReadOptions(num_threads=2, prefetch_buffer_size=2)
         return iter(steps.map(self.batch).to_iter_dataset(reading))
@@ -100,14 +99,6 @@ class OnlineBatches:
     def frame_names(self) -> list[str]:
         """Sequence and frame that each index of `Batch.frame` stands for."""
         return [f"{number}/{spec.name}" for number, spec in self._specs]
-
-    def _submit(self, step: int) -> list[concurrent.futures.Future]:
-        rng = np.random.default_rng([self._seed, step])
-        chosen = rng.integers(len(self._specs), size=self._batch_size)
-        return [
-            self._pool.submit(self._frame, int(index), step, row)
-            for row, index in enumerate(chosen)
-        ]
 
     def _make_simulator(self, number: int) -> SequenceSimulator:
         return SequenceSimulator(
@@ -160,17 +151,12 @@ class OnlineBatches:
 @functools.partial(jax.jit, static_argnums=(3, 4, 5))
 def _simulate_batch(scatterers, noise, keys, grid, parameters, rows_per_step):
     """`[B, R, A, D+E]` projections of a batch."""
-
-    def one(scatterers, noise, key):
-        return tensor.simulate(
-            scatterers,
-            noise,
-            key,
-            grid=grid,
-            parameters=parameters,
-            rows_per_step=rows_per_step,
-        )
-
+    one = functools.partial(
+        tensor.simulate,
+        grid=grid,
+        parameters=parameters,
+        rows_per_step=rows_per_step,
+    )
     return jax.vmap(one)(scatterers, noise, keys)
 
 

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
+from online_batches import OnlineBatches
 
 from radejax.simulation.config import default_config
-from radejax.simulation.online import OnlineBatches
 from radejax.simulation.simulator import SequenceSimulator
 
 CONFIG = default_config() | {
@@ -64,7 +64,7 @@ def test_frame_differs_from_the_simulator_by_noise_only(source):
     simulator = SequenceSimulator(
         source._source.make(number), source.grid, source._parameters, 0
     )
-    expected = simulator.radar_frame(spec.scene_idx)
+    expected = simulator.run(simulator.radar_input(spec.scene_idx))
     found = np.asarray(batch.projection[0])
     bright = expected > 0.65
     assert bright.any()

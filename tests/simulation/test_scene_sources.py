@@ -3,7 +3,7 @@
 import pytest
 
 from radejax.simulation.config import SimulationConfig, default_config
-from radejax.simulation.sources import ProceduralSource, make_source
+from radejax.simulation.scene_sources import ProceduralSource, make_source
 
 
 @pytest.fixture

@@ -1,13 +1,11 @@
-"""Rails, walls and ghosts."""
+"""Walls and ghosts."""
 
 import numpy as np
 import pytest
 
-from radejax.simulation.radar import scattering
+from radejax.simulation.radar import clutter, scattering
 from radejax.simulation.radar.tensor import RadarParameters
-from radejax.simulation.world import surroundings
-from radejax.simulation.world.scene import REFLECTOR_KINDS, Reflectors, Road, SceneFrame
-from radejax.simulation.world.traffic import ENVIRONMENTS
+from radejax.simulation.world.scene import REFLECTOR_KINDS, Reflectors, SceneFrame
 
 
 def frame_with(boxes=(), reflectors=None):
@@ -30,24 +28,6 @@ def frame_with(boxes=(), reflectors=None):
     )
 
 
-def test_highway_has_rails_that_follow_the_road():
-    rng = np.random.default_rng(0)
-    found, mirrors = surroundings.make_surroundings(
-        ENVIRONMENTS["highway"], Road(0.002), 120.0, (-6.0, 16.0), rng, -0.9
-    )
-    rail = found.kind == REFLECTOR_KINDS.index("rail")
-    assert mirrors[0] == pytest.approx(-6.6)
-    x, y, z = found.position_m[rail].T
-    radius = np.hypot(x, y - 500.0)
-    expected = np.array([500.0 + 6.6, 500.0 - 16.6])
-    assert (np.abs(radius[:, None] - expected).min(1) < 1e-6).all()
-    np.testing.assert_allclose(z, -0.3)
-    # Their normals point at the road, across its direction.
-    toward = np.stack([np.cos(found.normal_rad[rail]), np.sin(found.normal_rad[rail])])
-    center = np.stack([-x, 500.0 - y]) / radius
-    assert (np.abs((toward * center).sum(0)) > 1 - 1e-9).all()
-
-
 def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
     reflectors = Reflectors(
         np.array([[20.0, 0.1, 0.0], [20.0, 12.0, 0.0]]),
@@ -56,13 +36,13 @@ def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
         np.full(2, REFLECTOR_KINDS.index("wall")),
     )
     parameters = RadarParameters(pattern_exponent=0.0)
-    free = surroundings.scatter_surroundings(
-        frame_with(reflectors=reflectors), None, np.zeros(2), parameters
+    free = clutter.scatter_surroundings(
+        frame_with(reflectors=reflectors), np.zeros(2), parameters
     )
     assert free.power[0] > 5.0 * free.power[1]
     truck = [10.0, 0.0, 0.0, 8.0, 2.5, 3.0, 0.0]
-    hidden = surroundings.scatter_surroundings(
-        frame_with([truck], reflectors), None, np.zeros(2), parameters
+    hidden = clutter.scatter_surroundings(
+        frame_with([truck], reflectors), np.zeros(2), parameters
     )
     loss = 10 * np.log10(hidden.power / free.power)
     np.testing.assert_allclose(loss, [scattering.OCCLUDED_DB, 0.0], atol=1e-9)
@@ -72,10 +52,6 @@ PARAMETERS = RadarParameters(pattern_exponent=0.0)
 
 
 class TestGhosts:
-    class Wall:
-        mirrors_m = (6.0,)
-        ego_left_m = 0.0
-
     def test_mirror_image_position_velocity_and_loss(self):
         part = scattering.FrameScattering(
             np.array([[20.0, 2.0, 0.0], [20.0, 8.0, 0.0], [90.0, 0.0, 0.0]]),
@@ -84,21 +60,17 @@ class TestGhosts:
             np.zeros(3),
             np.zeros(3, int),
         )
-        ghosts = surroundings.scatter_ghosts(part, frame_with(), self.Wall())
+        ghosts = clutter.scatter_ghosts(part, (6.0,))
         # Only the first: the second is behind the wall, the third too far.
         np.testing.assert_allclose(ghosts.position_m, [[20.0, 10.0, 0.0]])
         np.testing.assert_allclose(ghosts.velocity_mps, [[3.0, 1.0]])
-        expected = 10 ** (surroundings.MIRROR_DB / 10) * (404.0 / 500.0) ** 2
+        expected = 10 ** (clutter.MIRROR_DB / 10) * (404.0 / 500.0) ** 2
         assert ghosts.power[0] == pytest.approx(expected)
         assert ghosts.owner.tolist() == [-1]
 
     def test_without_walls_no_ghosts(self):
-        class Open:
-            mirrors_m = ()
-            ego_left_m = 0.0
-
         part = scattering.FrameScattering(
             np.ones((1, 3)), np.ones((1, 2)), np.ones(1), np.zeros(1), np.zeros(1, int)
         )
-        ghosts = surroundings.scatter_ghosts(part, frame_with(), Open())
+        ghosts = clutter.scatter_ghosts(part, ())
         assert len(ghosts.power) == 0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radejax.simulation.camera import scenery
+from radejax.simulation.camera import panels
 from radejax.simulation.world.scene import REFLECTOR_KINDS
 from radejax.simulation.world.traffic import make_sequence
 
@@ -14,7 +14,7 @@ def test_rails_follow_the_road_and_trees_face_the_camera():
     )  # fmt: skip
     frame = scene.frame(0)
     origin = np.array([-2.5, 0.3, 0.7])
-    corners, depth, colors = scenery.make_panels(frame, origin, -0.9, 0.0)
+    corners, depth, colors = panels.make_panels(frame, origin, -0.9, 0.0)
     assert corners.shape[1:] == (4, 3)
     assert len(corners) == len(depth) == len(colors) > 20
     assert corners[..., 2].min() == -0.9
@@ -37,6 +37,6 @@ def test_snow_whitens_trees():
         rng=np.random.default_rng(1),
     )  # fmt: skip
     frame, origin = scene.frame(0), np.zeros(3)
-    green = scenery.make_panels(frame, origin, -0.9, 0.0)[2]
-    white = scenery.make_panels(frame, origin, -0.9, 0.9)[2]
+    green = panels.make_panels(frame, origin, -0.9, 0.0)[2]
+    white = panels.make_panels(frame, origin, -0.9, 0.9)[2]
     assert white.mean() > green.mean() + 20.0

@@ -1,11 +1,11 @@
-"""Tests of radejax.visualize.reference_points."""
+"""Reference points of the radar on an image."""
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from reference_points import draw_reference_points
 
 from radejax.geometry.calibration import CameraCalibration
-from radejax.visualize.reference_points import draw_reference_points
 
 matplotlib.use("agg")
 

@@ -10,8 +10,8 @@ from radejax.data.kradar import KRadar, read_labels, write
 from radejax.data.kradar.labels import Label
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.dataset import simulate_dataset
-from radejax.simulation.sources import LabelSource
-from radejax.simulation.world import real_scenes
+from radejax.simulation.scene_sources import LabelSource
+from radejax.simulation.world import replay
 
 OFFSET = (-2.54, 0.3, 0.7)
 NUM_FRAMES = 16
@@ -94,7 +94,7 @@ class TestScene:
         assert found[9] == pytest.approx(0.0, abs=1e-4)
 
     def test_ego_speed_is_that_at_which_parked_cars_stand(self, source):
-        speed = source.make(3).ego_velocity_mps[:, 0]
+        speed = source.make(3).ego_speed_mps
         np.testing.assert_allclose(speed, 10.0, atol=1e-4)
 
     def test_ids_of_two_classes_are_two_tracks_and_no_id_is_one_frame(self, source):
@@ -107,11 +107,11 @@ class TestScene:
         tracks = source.make(3).tracks
         tracks.position_m[8, tracks.track_id == 7] += [500.0, 0.0, 0.0]
         clock = 0.1 * np.arange(NUM_FRAMES)
-        relative = real_scenes.relative_velocity(tracks, clock)
-        assert np.abs(relative).max() < real_scenes.MAX_SPEED_MPS
+        relative = replay.relative_velocity(tracks, clock)
+        assert np.abs(relative).max() < replay.MAX_SPEED_MPS
 
     def test_without_vehicles_the_road_type_decides_the_speed(self):
-        empty = real_scenes.collect_tracks([], OFFSET)
+        empty = replay.collect_tracks([], OFFSET)
         assert empty.position_m.shape == (0, 0, 3)
 
 
@@ -165,7 +165,7 @@ def test_all_of_kradar_makes_scenes(shared):
     assert len(source.numbers) == 58
     for number in source.numbers:
         scene = source.make(number)
-        speed = scene.ego_velocity_mps[:, 0]
+        speed = scene.ego_speed_mps
         assert (speed >= 0).all()
         assert (speed <= 40).all()
         assert -1.6 < scene.ground_m < 0.3

@@ -13,15 +13,21 @@ import dataclasses
 import numpy as np
 
 from radejax.data.kradar import Frame
-from radejax.simulation.world import traffic
+from radejax.simulation.world.environments import (
+    ENVIRONMENTS,
+    GROUND_M,
+    SIGHT_M,
+    Environment,
+)
+from radejax.simulation.world.roadside import make_surroundings
 from radejax.simulation.world.scene import (
     FRAME_PERIOD_S,
     Road,
     Sequence,
     Tracks,
     class_index,
+    travelled,
 )
-from radejax.simulation.world.surroundings import make_surroundings
 
 MAX_SPEED_MPS = 60.0
 """Faster relative motion is taken for a swap of identities."""
@@ -47,36 +53,30 @@ def make_real_sequence(
     clock = np.array([f.header.timestamp_s for f in frames])
     relative = relative_velocity(tracks, clock)
     environment = frames[0].environment
-    law = traffic.ENVIRONMENTS.get(environment, traffic.ENVIRONMENTS["urban"])
+    law = ENVIRONMENTS.get(environment, ENVIRONMENTS["urban"])
     speed = infer_ego_speed(tracks, relative, law.speed_mps)
     periods = np.diff(clock, append=clock[-1] + FRAME_PERIOD_S).clip(0.02, 1.0)
-    along = np.concatenate([[0.0], np.cumsum(speed[:-1] * periods[:-1])])
-    pose = np.stack([along, np.zeros_like(along), np.zeros_like(along)], 1)
-    ego_velocity = np.stack([speed, np.zeros_like(speed)], 1)
+    along = travelled(speed, periods)
     ground = _ground_height(tracks)
     edges = _road_edges(tracks, law)
     reflectors, mirrors = make_surroundings(
-        law, Road(), along[-1] + traffic.SIGHT_M, edges, rng, ground
+        law, Road(), along[-1] + SIGHT_M, edges, rng, ground
     )
-    world = tracks.position_m + pose[:, None] * (1.0, 1.0, 0.0)
+    # The road is straight along x: there the labels' frame moves with the ego.
+    world = tracks.position_m + along[:, None, None] * (1.0, 0.0, 0.0)
+    velocity = relative + speed[:, None, None] * (1.0, 0.0)
     lanes = np.arange(-law.lanes_right - 0.5, law.lanes_left + 1.0)
     return Sequence(
         name=frames[0].sequence,
         environment=environment,
         time=frames[0].time,
         weather=frames[0].weather,
-        ego_pose=pose,
         ego_along_m=along,
-        ego_velocity_mps=ego_velocity,
-        tracks=dataclasses.replace(
-            tracks,
-            position_m=world,
-            velocity_mps=relative + ego_velocity[:, None],
-        ),
+        ego_speed_mps=speed,
+        tracks=dataclasses.replace(tracks, position_m=world, velocity_mps=velocity),
         reflectors=reflectors,
         road=Road(),
         lanes_m=tuple((lanes * law.lane_width_m).tolist()),
-        ego_left_m=0.0,
         ground_m=ground,
         mirrors_m=mirrors,
     )
@@ -142,11 +142,12 @@ def relative_velocity(tracks: Tracks, clock: np.ndarray) -> np.ndarray:
     too_fast = np.hypot(velocity[..., 0], velocity[..., 1]) > MAX_SPEED_MPS
     velocity[too_fast] = 0.0
     weight = (usable & ~too_fast).astype(float)[..., None]
-    pad = ((1, 1), (0, 0), (0, 0))
-    summed, weights = np.pad(velocity * weight, pad), np.pad(weight, pad)
-    summed = summed[:-2] + summed[1:-1] + summed[2:]
-    weights = weights[:-2] + weights[1:-1] + weights[2:]
-    smooth = summed / np.maximum(weights, 1.0)
+
+    def sum_of_three(values: np.ndarray) -> np.ndarray:
+        padded = np.pad(values, ((1, 1), (0, 0), (0, 0)))
+        return padded[:-2] + padded[1:-1] + padded[2:]
+
+    smooth = sum_of_three(velocity * weight) / np.maximum(sum_of_three(weight), 1.0)
     return np.where(weight > 0, smooth, 0.0)
 
 
@@ -169,10 +170,8 @@ def infer_ego_speed(
     known = lower > 0.3 * usual  # slow vehicles ahead alone say little
     speed = np.where(known, lower, usual)
     speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
-    half = 10
-    padded = np.pad(speed, half, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
-    return np.median(windows, axis=1)
+    padded = np.pad(speed, 10, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 21), axis=1)
 
 
 def _ground_height(tracks: Tracks) -> float:
@@ -185,11 +184,11 @@ def _ground_height(tracks: Tracks) -> float:
         np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1]) < 30.0
     )
     if not near.any():
-        return traffic.GROUND_M
+        return GROUND_M
     return float(np.clip(np.median(bottom[near]), -1.4, -0.4))
 
 
-def _road_edges(tracks: Tracks, law: traffic.Environment) -> tuple[float, float]:
+def _road_edges(tracks: Tracks, law: Environment) -> tuple[float, float]:
     """Lateral bounds of the labelled objects near the road, right and left."""
     left = tracks.position_m[..., 1][tracks.is_present]
     left = left[np.abs(left) < 18.0]

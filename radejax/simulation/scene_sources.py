@@ -6,15 +6,16 @@ simulating anything, and makes the scene of one sequence when asked.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
-from typing import Protocol
 
 import numpy as np
 
 from radejax.core.errors import UserError
 from radejax.data.kradar import Frame, KRadar, sequences
+from radejax.data.kradar.labels import LabelHeader
 from radejax.simulation.config import SimulationConfig
-from radejax.simulation.world.real_scenes import make_real_sequence
+from radejax.simulation.world.replay import make_real_sequence
 from radejax.simulation.world.scene import FRAME_PERIOD_S, Sequence
 from radejax.simulation.world.traffic import make_sequence
 
@@ -43,41 +44,17 @@ class FrameSpec:
         return f"{self.indices[0]:05d}_{self.indices[1]:05d}"
 
 
-class SceneSource(Protocol):
-    """What `dataset` needs of a kind of scenes."""
-
-    numbers: list[int]
-
-    def conditions(self, number: int) -> tuple[str, str, str]:
-        """Environment, time and weather of a sequence."""
-
-    def frames(self, number: int) -> list[FrameSpec]:
-        """Frames of a sequence, in order."""
-
-    def make(self, number: int) -> Sequence:
-        """The scene of a sequence."""
-
-
-def make_source(config: SimulationConfig) -> SceneSource:
-    """The source that a config names."""
-    if config.scenes == "procedural":
-        return ProceduralSource(config)
-    return LabelSource(config)
-
-
 class ProceduralSource:
     """Invented sequences numbered from 1, the training ones first."""
 
     def __init__(self, config: SimulationConfig) -> None:
         self._config = config
-        self.numbers = list(
-            range(1, config.train_sequences + config.test_sequences + 1)
-        )
-
-    def conditions(self, number: int) -> tuple[str, str, str]:
-        return self._config.conditions(number)
+        count = config.train_sequences + config.test_sequences
+        self.numbers = list(range(1, count + 1))
+        self.conditions = config.conditions
 
     def frames(self, number: int) -> list[FrameSpec]:
+        """Frames of a sequence, in order."""
         config = self._config
         rng = np.random.default_rng([config.seed, number, 3])
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
@@ -94,6 +71,7 @@ class ProceduralSource:
         ]
 
     def make(self, number: int) -> Sequence:
+        """The scene of a sequence."""
         environment, time, weather = self.conditions(number)
         return make_sequence(
             number,
@@ -118,48 +96,55 @@ class LabelSource:
             field_of_view=False,
             sequence_numbers=config.sequences,
         )
-        self._frames: dict[int, list[Frame]] = {}
+        self._frames: dict[int, list[Frame]] = collections.defaultdict(list)
         for frame in data:
-            self._frames.setdefault(frame.sequence, []).append(frame)
+            self._frames[frame.sequence].append(frame)
         if not self._frames:
             raise UserError(f"{config.scenes}: no frames of the chosen sequences")
         self.numbers = sorted(self._frames)
-        self.summary = data.summary()
 
     def conditions(self, number: int) -> tuple[str, str, str]:
+        """Environment, time and weather of a sequence."""
         frame = self._frames[number][0]
         return frame.environment, frame.time, frame.weather
 
     def frames(self, number: int) -> list[FrameSpec]:
+        """Frames of a sequence, in order."""
         config, frames = self._config, self._frames[number]
         names = [f.name for f in frames]
         train = set(sequences.split_by_rule(names, "train"))
         chosen = range(0, len(frames), config.frame_stride)
         if config.frames_per_sequence:
             chosen = chosen[: config.frames_per_sequence]
-        specs = []
-        for index in chosen:
-            header = frames[index].header
-            numbers = (
-                header.radar,
-                header.lidar,
-                header.camera_front,
-                header.lidar_long,
-                header.camera_lrr,
+        return [
+            FrameSpec(
+                scene_idx=index,
+                indices=_header_indices(frames[index].header),
+                timestamp_s=frames[index].header.timestamp_s,
+                split="train" if names[index] in train else "test",
             )
-            specs.append(
-                FrameSpec(
-                    scene_idx=index,
-                    indices=tuple(header.lidar if n is None else n for n in numbers),
-                    timestamp_s=header.timestamp_s,
-                    split="train" if names[index] in train else "test",
-                )
-            )
-        return specs
+            for index in chosen
+        ]
 
     def make(self, number: int) -> Sequence:
+        """The scene of a sequence."""
         return make_real_sequence(
             self._frames[number],
             lidar_to_radar_m=self._config.lidar_to_radar_m,
             rng=np.random.default_rng([self._config.seed, number]),
         )
+
+
+def _header_indices(header: LabelHeader) -> tuple[int, ...]:
+    """Frame numbers of `FrameSpec`; old labels name some sensors only."""
+    camera, long_lidar = header.camera_front, header.lidar_long
+    numbers = header.radar, header.lidar, camera, long_lidar, header.camera_lrr
+    return tuple(header.lidar if n is None else n for n in numbers)
+
+
+SceneSource = ProceduralSource | LabelSource
+
+
+def make_source(config: SimulationConfig) -> SceneSource:
+    """The source that a config names."""
+    return (ProceduralSource if config.scenes == "procedural" else LabelSource)(config)

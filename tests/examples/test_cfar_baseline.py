@@ -1,22 +1,18 @@
-"""The scripts of `examples/`, on data of their own making."""
+"""The classical detector from a data set to its report."""
 
-import importlib.util
 import json
-import os
 import pathlib
-import subprocess
 
+import cfar_baseline as module
 import numpy as np
 import pytest
+from cfar import detect
 
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
 from radejax.data.records.projections import RecordSource
-from radejax.simulation.baseline import detect
 from radejax.simulation.dataset import default_config, simulate_dataset
-
-EXAMPLES = pathlib.Path(__file__).resolve().parents[1] / "examples"
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +31,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return root
 
 
-def load(name: str):
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
-    module = load("cfar_baseline")
     report = module.run_baseline(data, tmp_path, protocols=("exact",))
     assert "Sedan from" in capsys.readouterr().out
     assert (tmp_path / "report.txt").read_text() == report.text
@@ -64,42 +52,3 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     expected = detect(projection, records.grid, module.PARAMETERS, settings)
     assert len(expected["score"]) > 0
     np.testing.assert_array_equal(found["box"][found["frame"] == last], expected["box"])
-
-
-@pytest.mark.parametrize(
-    ("status", "is_evaluated", "is_requeued"),
-    [
-        (0, True, False),
-        (0, False, True),  # stopped while training
-        (143, False, True),  # stopped while evaluating
-        (143, True, True),  # ... and drawing
-        (1, False, False),
-        (2, True, False),
-    ],
-)
-def test_a_slurm_job_goes_back_into_the_queue_where_it_was_stopped(
-    status: int, is_evaluated: bool, is_requeued: bool, tmp_path: pathlib.Path
-) -> None:
-    programs = {
-        "srun": f"#!/bin/sh\nexit {status}\n",
-        "scontrol": f"#!/bin/sh\necho $* > {tmp_path}/requeued\n",
-    }
-    for name, text in programs.items():
-        (tmp_path / name).write_text(text)
-        (tmp_path / name).chmod(0o755)
-    if is_evaluated:
-        (tmp_path / "evaluation").mkdir()
-        (tmp_path / "evaluation" / "metrics.json").touch()
-    ended = subprocess.run(
-        ["bash", EXAMPLES / "slurm.sh"],
-        env={
-            "PATH": f"{tmp_path}:{os.environ['PATH']}",
-            "DATA": "d",
-            "WORKDIR": str(tmp_path),
-            "SLURM_JOB_ID": "7",
-        },
-    )
-    assert ended.returncode == status
-    assert (tmp_path / "requeued").exists() == is_requeued
-    if is_requeued:
-        assert (tmp_path / "requeued").read_text() == "requeue 7\n"

@@ -20,8 +20,9 @@ import numpy as np
 from scipy import ndimage
 
 from radejax.core.structures import CLASSES
+from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar.tensor import TPM_OFFSET_DB, TPM_SPAN_DB, RadarParameters
+from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.world.traffic import SIZES
 
 
@@ -35,7 +36,6 @@ class CfarSettings:
         training_cells: Half width of the surroundings beyond the guard.
         peak_drop_db: A cluster ends where power falls this far below its peak.
         merge_m: Clusters whose peaks are nearer become one.
-        min_score: Clusters below this score are left out.
         rcs_steps: Smallest apparent cross-section in dBsm of each class, the largest
             first; weaker clusters are clutter. A cell holds a part of an object's power
             only. `fit_rcs_steps` finds them on a training split; the defaults are those
@@ -47,7 +47,6 @@ class CfarSettings:
     training_cells: int = 6
     peak_drop_db: float = 12.0
     merge_m: float = 4.5
-    min_score: float = 0.0
     rcs_steps: tuple[tuple[str, float], ...] = (
         ("Bus or Truck", 9.0),
         ("Sedan", -5.0),
@@ -134,7 +133,7 @@ def apparent_rcs_db(power_db, range_m, parameters: RadarParameters):
 
 def _power_db(projection: np.ndarray, grid: RadarGrid) -> np.ndarray:
     """`[R, A]` range-azimuth map in dB."""
-    return projection[..., : grid.num_doppler].max(-1) * TPM_SPAN_DB - TPM_OFFSET_DB
+    return projection[..., : grid.num_doppler].max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
 
 
 def detect(
@@ -143,7 +142,7 @@ def detect(
     parameters: RadarParameters,
     settings: CfarSettings | None = None,
     *,
-    box_center_z_m: float = -1.6,
+    ground_m: float = -1.6,
 ) -> dict[str, np.ndarray]:
     """Boxes in one projection.
 
@@ -152,7 +151,7 @@ def detect(
         grid: Its axes.
         parameters: Gain and noise of the radar, for cross-sections.
         settings: Thresholds; None for the defaults.
-        box_center_z_m: Height of the ground in the ego frame, on which boxes stand.
+        ground_m: Height of the ground in the ego frame, on which boxes stand.
 
     Returns:
         Columns `box [K, 7]` (ego frame), `cls [K]` class names and `score [K]` in
@@ -168,14 +167,11 @@ def detect(
         name = next((n for n, least in settings.rcs_steps if rcs >= least), None)
         if name is None:
             continue
-        near, sideways = _extent(power_db, excess_db, r, a, grid, settings)
-        boxes.append(_fit_box(name, near, sideways, box_center_z_m))
+        near = _near_side(power_db, r, a, grid, settings)
+        boxes.append(_fit_box(name, near, ground_m))
         names.append(name)
         scores.append(1.0 - np.exp(-max(excess_db[r, a], 0.0) / 20.0))
     order = np.argsort(-np.array(scores), kind="stable")
-    order = (
-        order[np.array(scores)[order] >= settings.min_score] if len(order) else order
-    )
     return {
         "box": np.array(boxes, float).reshape(-1, 7)[order],
         "cls": np.array(names, dtype=np.str_)[order],
@@ -220,29 +216,24 @@ def find_peaks(
     return [tuple(cells[i]) for i in kept]
 
 
-def _extent(power_db, excess_db, r, a, grid, settings) -> tuple[np.ndarray, float]:
-    """Ground position of the near side of a cluster, and its width across, metres."""
+def _near_side(power_db, r, a, grid, settings) -> np.ndarray:
+    """Ground position `[2]` of the near side of the cluster around a peak."""
     level = power_db[r, a] - settings.peak_drop_db
     first = r
     while first > 0 and r - first < 4 and power_db[first - 1, a] > level:
         first -= 1
+    row, level = power_db[r], power_db[r, a] - 3.0
     left, right = a, a
-    while left > 0 and power_db[r, left - 1] > power_db[r, a] - 3.0:
+    while left > 0 and row[left - 1] > level:
         left -= 1
-    while (
-        right < grid.num_azimuth - 1 and power_db[r, right + 1] > power_db[r, a] - 3.0
-    ):
+    while right < grid.num_azimuth - 1 and row[right + 1] > level:
         right += 1
     # The window smears a point over two bins on either side.
     near = min(first + 1.5, r)
-    place = grid.cell_to_ego(float(near), 0.5 * (left + right))
-    across = (right - left + 1) * grid.azimuth_step_rad * grid.range_m[r]
-    return np.asarray(place), float(across)
+    return np.asarray(grid.cell_to_ego(float(near), 0.5 * (left + right)))
 
 
-def _fit_box(
-    name: str, near: np.ndarray, across: float, ground_m: float
-) -> list[float]:
+def _fit_box(name: str, near: np.ndarray, ground_m: float) -> list[float]:
     """A box of the class's mean size, driving along x, whose near side is seen."""
     length, width, height = SIZES[name][0]
     x, y = near

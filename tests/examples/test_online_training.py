@@ -5,17 +5,18 @@ import json
 import jax
 import numpy as np
 import pytest
+from online_training import train_online
 
 from radejax import Detector
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
-from radejax.online_training import train_online
-from radejax.runs.data import OtherData
+from radejax.runs.data import Sources
 from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import sharding
+from radejax.training.checkpoints import Checkpoints
 
-from . import small_models as small
+from .. import small_models as small
 
 
 def _config(num_epochs=2):
@@ -41,16 +42,15 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     # Stops after the first checkpoint, as if killed, and goes on.
     saved = []
 
-    def stop(self, step, *args, original=None):
-        original(self, step, *args)
+    save = Checkpoints.save
+
+    def stop(self, step, *args, **options):
+        save(self, step, *args, **options)
         saved.append(step)
         raise KeyboardInterrupt
 
-    from radejax.training import loop
-
-    original = loop._Run._save
     with monkeypatch.context() as patch:
-        patch.setattr(loop._Run, "_save", lambda *a: stop(*a, original=original))
+        patch.setattr(Checkpoints, "save", stop)
         with pytest.raises(KeyboardInterrupt):
             train_online(_config(), parts, num_sequences=2)
     assert saved == [1]
@@ -64,13 +64,13 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     with pytest.raises(UserError, match=r"never written, .* give --data ROOT"):
         evaluate_run(whole)
     data = simulate_dataset(_config().simulation, tmp_path / "data", progress=False)
-    evaluate_run(whole, other=OtherData(data=(str(data),)), num_pictures=0)
+    evaluate_run(whole, other=Sources(data=(str(data),)), num_pictures=0)
     assert (whole / "evaluation_data" / "metrics.json").exists()
     finer = default_config() | {"train_sequences": 0, "test_sequences": 1}
     finer |= {"frames_per_sequence": 1, "output": "projection"}
     data = simulate_dataset(finer, tmp_path / "finer", progress=False)
     with pytest.raises(UserError, match=r"the radar has 16 x 64 .* trained on 4 x 16"):
-        evaluate_run(whole, other=OtherData(data=(str(data),)))
+        evaluate_run(whole, other=Sources(data=(str(data),)))
     assert not (data / "records").exists()
     rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
     assert len({row["focal"] for row in rows if "focal" in row}) == 4

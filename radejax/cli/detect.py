@@ -1,0 +1,55 @@
+"""`radejax detect`: boxes of every frame below some folders."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import click
+
+from radejax.cli import entry, options
+
+
+@click.command(cls=options.Command)
+@options.roots
+@click.option(
+    "--model",
+    "--workdir",
+    "source",
+    required=True,
+    type=options.EXISTING,
+    help="Run of train.py, or what `radejax export` takes.",
+)
+@click.option("--out", required=True, type=options.FOLDER, help="Folder of the boxes.")
+@click.option("--step", type=options.STEP, help="Of a run; the newest by default.")
+@click.option("--score-threshold", type=float, help="Instead of the config's.")
+@click.option("--nms-iou", type=float, help="Instead of the config's.")
+@click.option("--batch-size", type=options.COUNT, default=8, show_default=True)
+@click.option(
+    "--labels", type=options.EXISTING, help="Revision that names frames' images."
+)
+@click.option("--image-backbone", type=options.EXISTING)
+def detect(
+    roots: tuple[pathlib.Path, ...],
+    source: pathlib.Path,
+    out: pathlib.Path,
+    as_json: bool,
+    **settings: Any,
+) -> None:
+    """Find boxes in every frame below the folders; one JSON file a frame.
+
+    The model is a run, its checkpoints, one of them, an exported folder or an official
+    .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
+    files, or such a file itself. No labels are needed; a radar-camera model finds a
+    frame's image by its label file, and goes by the radar alone without.
+
+    Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
+    """
+    from radejax.inference.detect_files import detect_files
+
+    entry.set_up_jax()
+    count = detect_files(source, roots, out, **settings)
+    text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
+    if "radar_alone" in count:
+        text += f"; {count['radar_alone']} without an image, from the radar alone"
+    options.echo_result(as_json, {**count, "out": str(out)}, text)

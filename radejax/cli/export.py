@@ -1,0 +1,70 @@
+"""`radejax export`: a model as a folder that works elsewhere."""
+
+from __future__ import annotations
+
+import pathlib
+
+import click
+
+from radejax.cli import entry, options
+
+
+@click.command(cls=options.Command)
+@click.argument("source", type=options.EXISTING)
+@click.option("--out", required=True, type=options.FOLDER, help="Folder to write.")
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["stablehlo", "huggingface"]),
+    default="stablehlo",
+    show_default=True,
+)
+@click.option(
+    "--platforms", default="cpu,cuda,tpu", show_default=True, help="Of the program."
+)
+@click.option(
+    "--image-backbone",
+    type=options.EXISTING,
+    help="Weights of the image backbone, where SOURCE is without.",
+)
+@click.option(
+    "--with-backbone",
+    is_flag=True,
+    help="Keep the image transformer's weights. DINOv3's may not be passed on.",
+)
+def export(
+    source: pathlib.Path,
+    out: pathlib.Path,
+    kind: str,
+    platforms: str,
+    image_backbone: pathlib.Path | None,
+    with_backbone: bool,
+    as_json: bool,
+) -> None:
+    """Write a model as a folder that works elsewhere.
+
+    SOURCE is the work folder of a run, its checkpoints, one of them, an exported folder
+    or an official .pth file. "stablehlo" needs jax alone to run, for any batch size;
+    "huggingface" is weights, config and model card. Detector.from_checkpoint reads both.
+
+    Example: radejax export runs/quickstart --out exported
+    """
+    from radejax.inference import export as exporting
+    from radejax.inference.detector import Detector
+    from radejax.inference.open import load
+
+    entry.set_up_jax()
+    loaded = load(source, image_backbone=image_backbone)
+    detector = Detector.from_loaded(loaded)
+    done = exporting.export(
+        detector,
+        out,
+        kind=kind,
+        platforms=tuple(platforms.split(",")),
+        training_config=loaded.config,
+        with_backbone=with_backbone,
+    )
+    text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
+    if done["left_out"]:
+        text += f", without {', '.join(done['left_out'])}"
+    options.echo_result(as_json, done, text)

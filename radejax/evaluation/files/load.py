@@ -1,0 +1,125 @@
+"""Ground truth, predictions and frames, from wherever they lie, as columns."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.data.kradar import KRadar
+from radejax.evaluation.columns import Columns
+from radejax.evaluation.files import kitti, predictions
+
+PathLike = str | os.PathLike
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """Where ground truth and frames come from.
+
+    Attributes:
+        data: Root folders of K-Radar, or none.
+        labels: Folder or zip of a label revision.
+        label_version: v1.0, v1.1, v2.0 or v2.1.
+        split: "train", "test", a split file, or None for every frame.
+        ground_truth: File of ground truth instead, with `frames`.
+        frames: JSON file of the frame table (columns) for `ground_truth`.
+    """
+
+    data: tuple[str, ...] = ()
+    labels: str | None = None
+    label_version: str = "v2.1"
+    split: str | None = "test"
+    ground_truth: str | None = None
+    frames: str | None = None
+
+
+def load(
+    path: PathLike, source: Source, classes: Sequence[str]
+) -> tuple[Columns, Columns, Columns, dict[str, int]]:
+    """Ground truth, predictions, frame table and counts of what loading left out.
+
+    Args:
+        path: Predictions: a .npz, .json or .csv file, a folder in KITTI's layout, or the
+            folder of an earlier report.
+        source: Ground truth; a KITTI folder and a report bring their own.
+        classes: Classes to load from labels.
+
+    Raises:
+        UserError: No ground truth anywhere.
+        FileNotFoundError: Names what is missing.
+        DataError: Malformed content.
+    """
+    path = pathlib.Path(path)
+    if (path / "predictions.npz").is_file():
+        frames = _read_frames(path / "frames.json")
+        truth = predictions.read_table(path / "ground_truth.npz", frames, scored=False)
+        found = predictions.read_table(path / "predictions.npz", frames)
+        return truth, found, frames, {}
+    frames, left_out = None, {}
+    if source.ground_truth:
+        frames = _read_frames(source.frames) if source.frames else None
+        truth = predictions.read_table(source.ground_truth, frames, scored=False)
+    elif source.data or source.labels:
+        data = KRadar(
+            list(source.data) or None,
+            source.labels,
+            version=source.label_version,
+            split=source.split,
+            classes=classes,
+        )
+        truth, frames = tables_from_frames(data)
+        left_out = {f"labels: {what}": int(n) for what, n in data.counts.items()}
+    elif path.is_dir():
+        return (*kitti.read_kitti(path), left_out)
+    else:
+        raise UserError(
+            f"{path} holds predictions only: say where the ground truth is, with --data,"
+            " --labels or --ground_truth"
+        )
+    is_kitti = path.is_dir()
+    found = (
+        kitti.read_kitti(path)[1] if is_kitti else predictions.read_table(path, frames)
+    )
+    if frames is None:
+        frames = {"frame": np.union1d(truth["frame"], found["frame"])}
+    return truth, found, frames, left_out
+
+
+def _read_frames(path: PathLike) -> Columns:
+    """A frame table written by `report.write_report`."""
+    content = files.read_json(path)
+    if not isinstance(content, dict) or "frame" not in content:
+        raise UserError(f"{path}: expected an object of columns with 'frame'")
+    return {name: np.asarray(column) for name, column in content.items()}
+
+
+def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:
+    """Ground truth and frame table of a data set such as `radejax.data.kradar.dataset.KRadar`.
+
+    Args:
+        frames: Objects with sequence, name, weather, environment, time, boxes `[N, 7]`
+            (radar frame) and classes `[N]` (names).
+
+    Returns:
+        Ground-truth columns and frame columns; the frame id is the position.
+    """
+    frames = list(frames)
+    counts = [len(frame.boxes) for frame in frames]
+    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
+    cls = [str(name) for frame in frames for name in frame.classes]
+    ground_truth = {
+        "frame": np.repeat(np.arange(len(frames)), counts),
+        "box": np.concatenate(box) if box else np.zeros((0, 7)),
+        "cls": np.array(cls, dtype=str),
+    }
+    table = {"frame": np.arange(len(frames))}
+    for column in ("sequence", "name", "weather", "environment", "time"):
+        table[column] = np.array([getattr(frame, column) for frame in frames])
+    return ground_truth, table

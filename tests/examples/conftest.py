@@ -1,0 +1,7 @@
+"""Examples import each other by name, as `python examples/x.py` lets them."""
+
+import pathlib
+import sys
+
+EXAMPLES = pathlib.Path(__file__).resolve().parents[2] / "examples"
+sys.path.insert(0, str(EXAMPLES))
