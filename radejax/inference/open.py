@@ -25,6 +25,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
 from radejax.inference.packed import LoadedModel
 from radejax.interop import dinorade_torch, image_backbone, radenet_torch
+from radejax.interop.state_dict import read_state_dict
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training.checkpoints import Checkpoints
@@ -106,7 +107,7 @@ def load_torch(
     """
     content = path_or_state_dict
     if isinstance(content, str | os.PathLike):
-        content = dinorade_torch.read(pathlib.Path(content))
+        content, _ = read_state_dict(content)
     settings: dict[str, Any] = {"azimuth_mapping": "stretched"}
     if dinorade_torch.is_dinorade(content):
         model, variables = dinorade_torch.load(

@@ -12,12 +12,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-import safetensors.numpy
-
 from radejax.core.errors import DataError, UserError
-from radejax.interop import dinov3_hf, radenet_torch, resnet_torch, torch_file
-from radejax.interop.state_dict import StateDictReader, to_numpy
+from radejax.interop import dinov3_hf, radenet_torch, resnet_torch
+from radejax.interop.state_dict import StateDictReader, read_state_dict, to_numpy
 from radejax.models.dinorade import DinoRade
 from radejax.models.lifting import LiftingAxes
 from radejax.models.radenet import FIELDS as RADAR_FIELDS
@@ -58,11 +55,8 @@ def load(
         UserError: An override is unknown.
         DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
     """
-    source = "state dict"
-    if isinstance(state_dict_or_path, str | pathlib.Path):
-        source = str(state_dict_or_path)
-        state_dict_or_path = read(source)
-    tensors = _find(state_dict_or_path, source)
+    content, source = read_state_dict(state_dict_or_path)
+    tensors = _find(content, source)
     known = set(RADAR_FIELDS) | set(_FUSION_FIELDS)
     if unknown := sorted(set(model_overrides) - known):
         raise UserError(f"unknown model fields {unknown}; available: {sorted(known)}")
@@ -296,17 +290,6 @@ def is_dinorade(content: Any) -> bool:
         (isinstance(name, str) and "rad_backbone." in name) or is_dinorade(value)
         for name, value in content.items()
     )
-
-
-def read(path: str | pathlib.Path) -> Any:
-    """Content of a `.pth`, `.pt`, `.npz` or `.safetensors` file."""
-    path = pathlib.Path(path)
-    if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            return dict(arrays)
-    if path.suffix == ".safetensors":
-        return safetensors.numpy.load_file(path)
-    return torch_file.read(path)
 
 
 def _find(content: Any, source: str) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from radejax.interop.radenet_names import (
     torch_names,
     torch_shapes,
 )
+from radejax.interop.state_dict import read_state_dict, to_numpy
 from radejax.models.radenet import FIELDS, RadeNet, from_config
 
 StateDict = Mapping[str, Any]
@@ -50,11 +51,8 @@ def load(
         UserError: An override is no field of the model or impossible.
         DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
     """
-    source = "state dict"
-    if isinstance(state_dict_or_path, str | pathlib.Path):
-        source = str(state_dict_or_path)
-        state_dict_or_path = _read(pathlib.Path(state_dict_or_path))
-    tensors = _find_state_dict(state_dict_or_path, source)
+    content, source = read_state_dict(state_dict_or_path)
+    tensors = _find_state_dict(content, source)
     if unknown := sorted(set(model_overrides) - set(FIELDS)):
         raise UserError(f"unknown model fields {unknown}; available: {sorted(FIELDS)}")
     model = from_config(infer_config(tensors, **model_overrides))
@@ -136,7 +134,7 @@ def _to_params(model: RadeNet, tensors: StateDict, source: str) -> dict[str, Any
         )
     flat = {
         path: np.array(
-            from_torch_layout(name, _to_numpy(tensors[name])), np.float32, order="C"
+            from_torch_layout(name, to_numpy(tensors[name])), np.float32, order="C"
         )
         for path, name in torch_names(model).items()
     }
@@ -231,15 +229,6 @@ def _common_size(
 # Files -------------------------------------------------------------------------------
 
 
-def _read(path: pathlib.Path) -> Any:
-    if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            return dict(arrays)
-    if path.suffix == ".safetensors":
-        return safetensors.numpy.load_file(path)
-    return torch_file.read(path)
-
-
 _WRITERS: dict[str, Callable[[pathlib.Path, dict[str, np.ndarray]], None]] = {
     ".pth": torch_file.write,
     ".pt": torch_file.write,
@@ -282,9 +271,3 @@ def _state_dicts(content: Any, key: str) -> Any:
 def _some_names(mapping: Mapping[str, Any]) -> str:
     names = [str(name) for name in mapping]
     return f"{names[:5]}{' and others' if len(names) > 5 else ''}"
-
-
-def _to_numpy(value: Any) -> np.ndarray:
-    if hasattr(value, "detach"):  # a torch tensor; bfloat16 has no NumPy counterpart
-        value = value.detach().cpu().float().numpy()
-    return np.asarray(value)

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from radejax.core.errors import DataError
-from radejax.interop import torch_file
-from radejax.interop.state_dict import StateDictReader
+from radejax.interop.state_dict import StateDictReader, read_state_dict
 
 DEPTHS = (3, 4, 6, 3)
 WIDTH = 64
@@ -29,9 +28,7 @@ def load(state_dict_or_path: Mapping[str, Any] | str | pathlib.Path) -> dict[str
         FileNotFoundError: There is no such file.
         DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
     """
-    source, tensors = "state dict", state_dict_or_path
-    if isinstance(tensors, str | pathlib.Path):
-        source, tensors = str(tensors), torch_file.read(tensors)
+    tensors, source = read_state_dict(state_dict_or_path)
     if not isinstance(tensors, Mapping):
         raise DataError(f"{source} holds {type(tensors).__name__}, not a state dict")
     reader = StateDictReader(tensors, source)

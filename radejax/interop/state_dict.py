@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import pathlib
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
 
 from radejax.core.errors import DataError
+from radejax.interop import torch_file
 
 _SHOWN = 20
 
@@ -131,6 +135,28 @@ class StateDictReader:
 
     def _bias(self, name: str, features: int, use_bias: bool) -> dict[str, np.ndarray]:
         return {"bias": self.take(f"{name}.bias", (features,))} if use_bias else {}
+
+
+def read_state_dict(content_or_path: Any) -> tuple[Any, str]:
+    """Content, and what error messages call it.
+
+    Args:
+        content_or_path: Tensors by name, perhaps nested; or a file: `.pth`, `.pt` (read
+            without torch), `.npz` or `.safetensors`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is damaged.
+    """
+    if not isinstance(content_or_path, str | os.PathLike):
+        return content_or_path, "state dict"
+    path = pathlib.Path(content_or_path)
+    if path.suffix == ".npz":
+        with np.load(path) as arrays:
+            return dict(arrays), str(path)
+    if path.suffix == ".safetensors":
+        return safetensors.numpy.load_file(path), str(path)
+    return torch_file.read(path), str(path)
 
 
 def to_numpy(tensor: Any) -> np.ndarray:

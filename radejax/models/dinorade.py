@@ -18,17 +18,14 @@ from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
 from radejax.geometry.camera import Camera
 from radejax.models import radenet
-from radejax.models.backbone import Backbone
 from radejax.models.camera_neck import CameraNeck
 from radejax.models.fusion import Fusion
-from radejax.models.heads import Heads
 from radejax.models.image import normalize
 from radejax.models.lifting import (
     LiftingAxes,
     ReferencePoints,
     reference_points,
 )
-from radejax.models.neck import Neck
 from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
 from radejax.models.vit import ViT
 
@@ -65,26 +62,9 @@ class DinoRade(nn.Module):
 
     def setup(self) -> None:
         radar, dtype = self.radar, jnp.dtype(self.radar.dtype)
-        stage, blocks = radenet.remat_stage(radar.remat), radar.remat != "none"
-        self.backbone = stage(Backbone)(
-            radar.doppler_bins,
-            radar.widths,
-            radar.decoder_width,
-            radar.num_groups,
-            radar.cbam,
-            radar.input_stem,
-            dtype=dtype,
-            remat=blocks,
-        )
-        self.neck = stage(Neck)(radar.neck, radar.num_groups, dtype, blocks)
-        self.heads = stage(Heads)(
-            radar.num_classes,
-            radar.heads,
-            radar.num_groups,
-            dtype,
-            blocks,
-            radar.heatmap_prior,
-        )
+        blocks = radar.remat != "none"
+        backbone, neck, heads = radenet.radar_parts(radar)
+        self.backbone, self.neck, self.heads = backbone(), neck(), heads()
         if self.vit is None:
             self.image_backbone = ResNetTrunk(self.resnet_width, dtype=dtype)
             self.image_neck = ResNetNeck(
@@ -130,10 +110,7 @@ class DinoRade(nn.Module):
                 camera do not fit together.
         """
         radar = self.radar
-        _check_projection(projection, radar)
-        padded = radenet.pad_to_multiple(
-            projection.astype(jnp.dtype(radar.dtype)), radar.pad_multiple
-        )
+        padded = radenet.padded_input(projection, radar)
         camera_map = reference = None
         if image is not None and camera is not None:
             reference = self._reference(camera, padded.shape)
@@ -147,10 +124,7 @@ class DinoRade(nn.Module):
         elevation = padded[..., radar.doppler_bins :]
         x = self.image_fusion(x, elevation, camera_map, reference, train=train)
         maps = self.heads(self.neck(x))
-        if radar.crop_output:
-            r, a = projection.shape[1:3]
-            maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
-        return maps
+        return radenet.cropped_output(maps, projection, radar)
 
     def embed(self, image: jax.Array) -> jax.Array:
         """What the image backbone makes of images: `__call__` takes it in their place.
@@ -214,16 +188,6 @@ class DinoRade(nn.Module):
         if has_image is None:
             has_image = jnp.ones(b, bool)
         return self.image_neck(features, jnp.asarray(has_image), train=train)
-
-
-def _check_projection(projection: jax.Array, radar: radenet.RadeNet) -> None:
-    channels = radar.doppler_bins + radar.elevation_bins
-    if projection.ndim != 4 or projection.shape[-1] != channels:
-        raise UserError(
-            f"projection must be [B, R, A, {channels}] with {radar.doppler_bins} "
-            f"Doppler and {radar.elevation_bins} elevation channels, got "
-            f"{projection.shape}"
-        )
 
 
 def num_parameters(variables: Mapping[str, Any]) -> tuple[int, int]:

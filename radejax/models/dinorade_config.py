@@ -8,21 +8,12 @@ from typing import Any
 from radejax.core.errors import UserError
 from radejax.models import radenet
 from radejax.models.dinorade import DinoRade
+from radejax.models.fusion import Fusion
 from radejax.models.lifting import MARGIN_PX, LiftingAxes
 from radejax.models.resnet import STRIDE
 from radejax.models.vit import ViT
 
-FUSION_FIELDS = (
-    "num_heads",
-    "num_points",
-    "num_elevation",
-    "weighting",
-    "gate",
-    "invalid",
-    "necks",
-    "dropout",
-    "chunk_size",
-)
+FUSION_FIELDS = radenet.own_fields(Fusion, without=("num_groups", "dtype", "remat"))
 """Fields of `config.model.fusion`."""
 
 IMAGE_FIELDS = (

@@ -6,6 +6,8 @@ References:
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -80,47 +82,65 @@ class RadeNet(nn.Module):
             Maps on the padded bins, or on the projection's if `crop_output`.
         """
         del train
-        channels = self.doppler_bins + self.elevation_bins
-        if projection.ndim != 4 or projection.shape[-1] != channels:
-            raise ValueError(
-                f"projection must be [B, R, A, {channels}] with {self.doppler_bins} "
-                f"Doppler and {self.elevation_bins} elevation channels, got "
-                f"{projection.shape}"
-            )
-        dtype = jnp.dtype(self.dtype)
-        x = pad_to_multiple(projection.astype(dtype), self.pad_multiple)
-        stage = remat_stage(self.remat)
-        blocks = self.remat != "none"
-        x = stage(Backbone)(
-            self.doppler_bins,
-            self.widths,
-            self.decoder_width,
-            self.num_groups,
-            self.cbam,
-            self.input_stem,
-            dtype=dtype,
-            remat=blocks,
-            name="backbone",
-        )(x)
-        x = stage(Neck)(self.neck, self.num_groups, dtype, blocks, name="neck")(x)
-        maps = stage(Heads)(
-            self.num_classes,
-            self.heads,
-            self.num_groups,
-            dtype,
-            blocks,
-            self.heatmap_prior,
-            name="heads",
-        )(x)
-        if self.crop_output:
-            r, a = projection.shape[1:3]
-            maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
+        x = padded_input(projection, self)
+        backbone, neck, heads = radar_parts(self)
+        maps = heads(name="heads")(neck(name="neck")(backbone(name="backbone")(x)))
+        return cropped_output(maps, projection, self)
+
+
+def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
+    """What makes backbone, neck and heads, which DinoRADE has as well."""
+    stage = nn.remat if radar.remat == "full" else lambda module: module
+    shared = {
+        "num_groups": radar.num_groups,
+        "dtype": jnp.dtype(radar.dtype),
+        "remat": radar.remat != "none",
+    }
+    backbone = functools.partial(
+        stage(Backbone),
+        doppler_bins=radar.doppler_bins,
+        widths=radar.widths,
+        decoder_width=radar.decoder_width,
+        cbam=radar.cbam,
+        input_stem=radar.input_stem,
+        **shared,
+    )
+    neck = functools.partial(stage(Neck), kind=radar.neck, **shared)
+    heads = functools.partial(
+        stage(Heads),
+        num_classes=radar.num_classes,
+        kind=radar.heads,
+        heatmap_prior=radar.heatmap_prior,
+        **shared,
+    )
+    return backbone, neck, heads
+
+
+def padded_input(projection: jax.Array, radar: RadeNet) -> jax.Array:
+    """The projection in the dtype of the computation, padded for the backbone.
+
+    Raises:
+        UserError: It is not a batch of projections of the model's channels.
+    """
+    channels = radar.doppler_bins + radar.elevation_bins
+    if projection.ndim != 4 or projection.shape[-1] != channels:
+        raise UserError(
+            f"projection must be [B, R, A, {channels}] with {radar.doppler_bins} "
+            f"Doppler and {radar.elevation_bins} elevation channels, got "
+            f"{projection.shape}"
+        )
+    dtype = jnp.dtype(radar.dtype)
+    return pad_to_multiple(projection.astype(dtype), radar.pad_multiple)
+
+
+def cropped_output(
+    maps: DetectionMaps, projection: jax.Array, radar: RadeNet
+) -> DetectionMaps:
+    """The maps, on the projection's bins if `crop_output`."""
+    if not radar.crop_output:
         return maps
-
-
-def remat_stage(remat: str) -> Callable[[type[nn.Module]], type[nn.Module]]:
-    """What makes a large part of a model forget its inside, where `remat` says so."""
-    return nn.remat if remat == "full" else lambda module: module
+    r, a = projection.shape[1:3]
+    return jax.tree.map(lambda m: m[:, :r, :a], maps)
 
 
 def pad_to_multiple(x: jax.Array, multiple: int) -> jax.Array:
@@ -129,23 +149,16 @@ def pad_to_multiple(x: jax.Array, multiple: int) -> jax.Array:
     return jnp.pad(x, ((0, 0), (0, pad_range), (0, pad_azimuth), (0, 0)))
 
 
-FIELDS = (
-    "num_classes",
-    "doppler_bins",
-    "elevation_bins",
-    "widths",
-    "decoder_width",
-    "num_groups",
-    "cbam",
-    "input_stem",
-    "neck",
-    "heads",
-    "pad_multiple",
-    "crop_output",
-    "dtype",
-    "remat",
-    "heatmap_prior",
-)
+def own_fields(
+    module: type[nn.Module], without: tuple[str, ...] = ()
+) -> tuple[str, ...]:
+    """Attributes that a module's class declares itself, less some of them."""
+    left_out = {"parent", "name", *without}
+    names = (field.name for field in dataclasses.fields(module))
+    return tuple(name for name in names if name not in left_out)
+
+
+FIELDS = own_fields(RadeNet)
 """Fields of a model config beside `name`."""
 
 _CHOICES = {

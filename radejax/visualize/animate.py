@@ -45,7 +45,7 @@ def animate(
 
     Frames are drawn as they are needed, so a generator keeps memory constant::
 
-        animate((draw_frame(p, grid) for p in projections), "sequence.gif")
+        animate((draw_frame(scene) for scene in scenes), "sequence.gif")
 
     Args:
         figures: Figures, or images `[H, W, 3]` uint8, of one size.
