@@ -39,7 +39,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import processes, sharding
+from radejax.training import processes
 
 _log = logging.getLogger(__name__)
 
@@ -252,15 +252,9 @@ class Data:
             seed: Of order and augmentation.
 
         Raises:
-            UserError: As `images`, or no frame has a usable one; the batch does not fit
-                the devices, or the frames are fewer.
+            UserError: As `images`, or no frame has a usable one; fewer frames than one
+                batch.
         """
-        sharding.check_batch_size(
-            train.batch_size,
-            sharding.make_mesh(),
-            "train.batch_size",
-            train.num_accumulate,
-        )
         images, options = self.images(frames), self.options
         require_images(frames, images)
         table = make_table(

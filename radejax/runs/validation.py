@@ -61,8 +61,8 @@ class Validation:
                 "train.evaluate_every_epochs=0"
             )
         self._images = data.images(self._frames)
-        self._ground_truth, self._table = tables_from_frames(self._frames)
         self._predictor = make_predictor(config, model, data, mesh)
+        self._ground_truth, self._table = tables_from_frames(self._frames)
 
     def __call__(
         self,
