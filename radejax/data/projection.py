@@ -64,7 +64,7 @@ def project(tesseract: np.ndarray, *, dtype: Any = np.float32) -> np.ndarray:
     if tesseract.T.flags.c_contiguous:
         return project_columns(tesseract.T, dtype=dtype)
     rows = [_project_slab(row, _row_maxima) for row in tesseract.swapaxes(0, 1)]
-    return np.stack(rows).astype(dtype, copy=False)
+    return np.stack(rows).astype(dtype, order="C", copy=False)
 
 
 def project_columns(
@@ -81,7 +81,7 @@ def project_columns(
         `[R, A, D+E]` projection.
     """
     levels = [_project_slab(column, _column_maxima) for column in columns]
-    return np.stack(levels, axis=1).astype(dtype, copy=False)
+    return np.stack(levels, axis=1).astype(dtype, order="C", copy=False)
 
 
 def _project_slab(slab: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.ndarray:
