@@ -15,7 +15,6 @@ outputs.
 
 import argparse
 import functools
-import importlib.util
 import pathlib
 import resource
 import sys
@@ -26,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from tabulate import tabulate
 
+from radejax.core.config import load_module
 from radejax.geometry.calibration import CameraCalibration
 from radejax.models import build
 from radejax.models.deformable_attention import DeformableAttention
@@ -54,9 +54,7 @@ CALIBRATION = CameraCalibration.from_angles(
 
 def full_size_config(variant, dtype):
     path = pathlib.Path(__file__).parents[1] / "configs" / "dinorade.py"
-    spec = importlib.util.spec_from_file_location("dinorade_config", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     config = module.get_config(variant)
     config.model.dtype = dtype
     return config.model

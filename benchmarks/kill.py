@@ -13,7 +13,6 @@ projection, and evaluation on the way is off. tests/test_quickstart.py kills at 
 
 import argparse
 import collections
-import importlib.util
 import json
 import multiprocessing
 import pathlib
@@ -26,6 +25,7 @@ import jax
 import numpy as np
 
 from radejax.cli import entry
+from radejax.core.config import load_module
 from radejax.runs import experiment
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
@@ -40,9 +40,7 @@ PROCESSES.set_forkserver_preload(
 def make_config(steps):
     """The quickstart in so small that most of a start is not training."""
     path = REPOSITORY / "configs" / "quickstart.py"
-    spec = importlib.util.spec_from_file_location("quickstart", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     config = module.get_config("short")
     config.simulation.update(train_sequences=2, frames_per_sequence=5)
     config.model.update(

@@ -21,7 +21,8 @@ import types
 import numpy as np
 from absl import flags
 
-from radejax.data.pipeline import make_loader
+from radejax.data.frame_table import make_table
+from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.files import RecordFileWriter, file_name
 from radejax.data.records.projections import Manifest, RecordSource, write_manifest
 from radejax.geometry.radar_grid import RadarGrid
@@ -84,9 +85,8 @@ def time_loader(
     records: RecordSource, batch_size: int, num_frames: int, **how
 ) -> float:
     """Frames per second of the pipeline, after the first batches."""
-    loader = make_loader(
-        records, make_frames(records), batch_size=batch_size, max_objects=32, **how
-    )
+    table = make_table(records, make_frames(records), max_objects=32)
+    loader = make_loader(table, LoaderOptions(batch_size, **how))
     for _ in range(3):
         next(loader)
     steps = num_frames // batch_size
@@ -98,9 +98,8 @@ def time_loader(
 
 def watch_memory(records: RecordSource, batch_size: int, num_frames: int) -> None:
     """Prints resident memory every tenth of a long run."""
-    loader = make_loader(
-        records, make_frames(records), batch_size=batch_size, max_objects=32
-    )
+    table = make_table(records, make_frames(records), max_objects=32)
+    loader = make_loader(table, LoaderOptions(batch_size))
     steps = num_frames // batch_size
     began = time.perf_counter()
     for step in range(steps):

@@ -51,7 +51,6 @@ def benchmark_memory(tesseract: np.ndarray, repeats: int) -> None:
             "maxima first (numpy)": lambda: maxima_first(tesseract),
             "project": lambda: project(tesseract),
             "project, float16": lambda: project(tesseract, dtype=np.float16),
-            "project, 2 threads": lambda: project(tesseract, num_threads=2),
             "project, row-major": lambda: project(row_major),
             "one pass (sum)": lambda: tesseract.sum(),
         },

@@ -27,7 +27,8 @@ from tabulate import tabulate
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.structures import Batch
-from radejax.data.pipeline import make_loader
+from radejax.data.frame_table import make_table
+from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.radenet import REMAT
 from radejax.training import loop, sharding
@@ -99,12 +100,10 @@ def train(config, grid, steps, num_devices, folder):
     records = write_records(
         folder / "records", 4 * config.train.batch_size, grid, "float16"
     )
-    loader = make_loader(
-        records,
-        make_frames(records),
-        batch_size=config.train.batch_size,
-        max_objects=config.data.max_objects,
+    table = make_table(
+        records, make_frames(records), max_objects=config.data.max_objects
     )
+    loader = make_loader(table, LoaderOptions(config.train.batch_size))
     model = models.build(config.model)
     config.train.update(
         num_epochs=steps, log_every_steps=1, checkpoint_every_steps=10**6

@@ -22,25 +22,20 @@ The image backbone's weights are not part of a config: they are given to the pro
 that trains.
 """
 
-import importlib.util
 import pathlib
 import types
 
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, load_module, parse_words
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 
 
 def _radenet() -> types.ModuleType:
     """The config of the radar branch, whose presets hold here too."""
-    path = pathlib.Path(__file__).with_name("radenet.py")
-    spec = importlib.util.spec_from_file_location("radenet_config", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(pathlib.Path(__file__).with_name("radenet.py"))
 
 
 VARIANTS = {

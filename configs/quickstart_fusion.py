@@ -11,24 +11,19 @@ Words: `radar` for the model without the camera; `short` makes a run of two minu
 learns next to nothing, to see that everything works.
 """
 
-import importlib.util
 import pathlib
 import types
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, load_module, parse_words
 from radejax.models.lifting import LiftingAxes
 from radejax.simulation.config import SimulationConfig, default_config
 
 
 def _neighbour(name: str) -> types.ModuleType:
     """Another config of this folder."""
-    path = pathlib.Path(__file__).with_name(f"{name}.py")
-    spec = importlib.util.spec_from_file_location(f"{name}_config", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(pathlib.Path(__file__).with_name(f"{name}.py"))
 
 
 def get_config(arg: str | None = None) -> ConfigDict:

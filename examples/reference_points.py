@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from radejax.cli import entry
-from radejax.data.frame_table import read_left_image
+from radejax.data.images import read_left_image
 from radejax.data.kradar import read_labels
 from radejax.geometry.calibration import EGO_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid

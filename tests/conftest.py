@@ -1,6 +1,5 @@
 """Settings shared by all tests."""
 
-import importlib.util
 import os
 import pathlib
 import tempfile
@@ -14,6 +13,8 @@ from absl import flags
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax
+
+from radejax.core.config import load_module
 
 # Programs that several tests or processes compile are compiled once in a session; the
 # workers of pytest-xdist inherit the folder.
@@ -43,11 +44,7 @@ def shared() -> pathlib.Path:
 @pytest.fixture(scope="session")
 def make() -> types.ModuleType:
     """Recipes of the radar-camera golden files: seeded weights and inputs."""
-    path = GOLDEN / "dinorade_make.py"
-    spec = importlib.util.spec_from_file_location("dinorade_make", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(GOLDEN / "dinorade_make.py")
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """Untrained detectors of a few thousand parameters, with and without a camera."""
 
 import functools
-import importlib.util
 import pathlib
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from radejax import Detector, models
-from radejax.core.config import base_config
+from radejax.core.config import base_config, load_module
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
@@ -45,9 +44,7 @@ def radar_config() -> ConfigDict:
 
 def camera_config() -> ConfigDict:
     """The whole DinoRADE in small."""
-    spec = importlib.util.spec_from_file_location("dinorade", CONFIGS / "dinorade.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(CONFIGS / "dinorade.py")
     config = _shrink(module.get_config())
     config.model.image.update(
         size=IMAGE_SIZE, hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16

@@ -1,6 +1,5 @@
 """The scripts of `examples/`, on data of their own making."""
 
-import importlib.util
 import json
 import os
 import pathlib
@@ -9,6 +8,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from radejax.core.config import load_module
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
@@ -36,10 +36,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 def load(name: str):
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(EXAMPLES / f"{name}.py")
 
 
 def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):

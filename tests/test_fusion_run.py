@@ -1,7 +1,6 @@
 """Radar-camera runs from images and from embeddings, with a frozen backbone from files."""
 
 import dataclasses
-import importlib.util
 import json
 import logging
 import pathlib
@@ -13,9 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 from radejax.cli.main import main
-from radejax.core.config import load_config
+from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
-from radejax.data.frame_table import make_table
+from radejax.data.cameras import require_images
+from radejax.data.records import embeddings as embeddings_records
 from radejax.data.records.projections import RecordSource
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
@@ -23,7 +23,7 @@ from radejax.inference.detector import Detector
 from radejax.interop import image_backbone
 from radejax.models import build
 from radejax.runs import experiment
-from radejax.runs.data import OtherData
+from radejax.runs.data import OtherData, camera_inputs
 from radejax.runs.evaluate import evaluate_run, predict_dataset
 from radejax.training import sharding
 
@@ -187,58 +187,38 @@ def test_a_backbone_that_is_gone_leaves_embedded_images(
 def test_images_that_are_not_embedded_are_an_error(data, embeddings):
     run = experiment.load_run(data.runs / "images")
     frames = list(run.paths.open(run.config, "test"))
-    records = RecordSource(run.paths.records)
     other = [dataclasses.replace(frames[0], name="99999_99999"), *frames[1:]]
-    inputs = image_backbone.loader_arguments(run.config, other, embeddings)
     with pytest.raises(
         UserError, match=r"1 of 4 frames have an image that .* `radejax embed`"
     ):
-        make_table(
-            _Renamed(records, other[0].key, frames[0].key),
-            other,
-            max_objects=50,
-            cameras=inputs["cameras"],
-            features=inputs["features"],
-        )
+        camera_inputs(run.config, other, embeddings)
     # Embedded images need no files.
     gone = [dataclasses.replace(frame, camera_path=None) for frame in frames]
-    inputs = image_backbone.loader_arguments(run.config, gone, embeddings)
-    assert all(camera.is_valid for camera in inputs["cameras"])
-    inputs = image_backbone.loader_arguments(run.config, gone)
+    inputs = camera_inputs(run.config, gone, embeddings)
+    assert all(camera.is_valid for camera in inputs.cameras)
+    inputs = camera_inputs(run.config, gone)
     with pytest.raises(UserError, match=r"\(4\) can use the camera: 4 have no front"):
-        image_backbone.require_images(gone, inputs)
-
-
-class _Renamed:
-    """Records in which one frame has another key."""
-
-    def __init__(self, records, key, old):
-        self._index = {**records.index_of(), key: records.index_of()[old]}
-        self.manifest = records.manifest
-        self.folder = records.folder
-
-    def index_of(self):
-        return self._index
+        require_images(gone, inputs)
 
 
 def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path):
     config = small_config()
     config.model.image.standardize = False
-    with pytest.raises(UserError, match=r"standardize = True, .* is False"):
-        embed.open_embeddings(embeddings, config.model)
+    with pytest.raises(UserError, match=r"standardize is True there and False here"):
+        embeddings_records.open_embeddings(embeddings, config.model.image)
     config = small_config()
     config.data.mirror_probability = 0.5
     with pytest.raises(UserError, match="cannot be mirrored"):
-        image_backbone.loader_arguments(config, [], embeddings)
+        camera_inputs(config, [], embeddings)
     config = small_config()
     config.model.image.freeze = False
     with pytest.raises(UserError, match="freeze is False"):
-        image_backbone.loader_arguments(config, [], embeddings)
+        camera_inputs(config, [], embeddings)
     with pytest.raises(FileNotFoundError, match="radejax embed"):
-        embed.open_embeddings(tmp_path)
+        embeddings_records.open_embeddings(tmp_path)
     (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
-    with pytest.raises(DataError, match="other 1"):
-        embed.open_embeddings(tmp_path)
+    with pytest.raises(DataError, match="other version 1"):
+        embeddings_records.open_embeddings(tmp_path)
 
 
 def test_weights_that_do_not_fit_are_refused(data, tmp_path):
@@ -267,8 +247,8 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     )
 
     def boxes(frames):
-        inputs = image_backbone.loader_arguments(run.config, frames)
-        found = predict_dataset(detector, records, frames, 4, inputs=inputs)
+        inputs = camera_inputs(run.config, frames)
+        found = predict_dataset(detector, records, frames, 4, images=inputs)
         return {i: found["box"][found["frame"] == i] for i in range(len(frames))}
 
     seen = boxes(frames)
@@ -283,7 +263,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
 
     run.config.data.camera.allow_missing = False
     with pytest.raises(UserError, match="1 of 4 frames"):
-        image_backbone.loader_arguments(run.config, blind)
+        camera_inputs(run.config, blind)
 
 
 def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
@@ -338,9 +318,7 @@ def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
 
 def _example(name, *arguments):
     path = CONFIG.parents[1] / "examples" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     result = CliRunner().invoke(module.main, [str(a) for a in arguments])
     assert result.exit_code == 0, result.output
     return result.stdout
@@ -435,6 +413,6 @@ def test_embed_command(data, from_images, tmp_path):
     result = CliRunner().invoke(main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout.splitlines()[-1])["embedded"] == 12
-    half = embed.open_embeddings(tmp_path / "out")
+    half = embeddings_records.open_embeddings(tmp_path / "out")
     assert half.dtype == np.float32
     assert half.shape == (2, 6, 96)

@@ -141,7 +141,7 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     assert source["split"] == "test"
     for flag, message in (
         ("--roi=wide", "--roi: config.evaluation of the run says that"),
-        ("--split=train", "has results of split test, these are of train: give --out"),
+        ("--split=train", "split is 'test' there and 'train' here; give --out"),
         ("--data=", "--data names no folder"),
         (f"--data={tmp_path / 'nowhere'}", "no such folder"),
     ):

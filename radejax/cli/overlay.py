@@ -11,10 +11,10 @@ import tqdm
 
 from radejax.core.errors import UserError
 from radejax.core.structures import WIDE_ROI
+from radejax.data.images import front_view
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.frame import Frame
-from radejax.data.tesseract import project_file, read_projection_npy
-from radejax.runs.evaluate import front_view
+from radejax.data.tesseract import read_projection
 from radejax.visualize import animate, bev, projections
 
 ANIMATIONS = (".gif", ".mp4")
@@ -90,18 +90,3 @@ def draw_overlay(
     found = found[:max_frames]
     animate.animate(map(draw, tqdm.tqdm(found, desc="draw", unit="frame")), out)
     return len(found)
-
-
-def read_projection(frame: Frame, grid: Any) -> Any:
-    """`[R, A, D+E]` float32 projection of a frame: from its tesseract, or the released one.
-
-    Raises:
-        UserError: The frame has neither.
-    """
-    if frame.tesseract_path is not None:
-        return project_file(frame.tesseract_path, shape_drea=grid.shape_drea)
-    if frame.projection_path is None:
-        raise UserError(f"frame {frame.key} has no tesseract or projection")
-    shape = grid.projection_shape
-    found = read_projection_npy(frame.projection_path, projection_shape=shape)
-    return found.astype("float32")

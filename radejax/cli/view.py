@@ -11,11 +11,11 @@ import jax
 import numpy as np
 import tqdm
 
-from radejax.cli.overlay import read_projection
 from radejax.core.errors import UserError
+from radejax.data.images import front_view
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.frame import Frame
-from radejax.runs.evaluate import front_view
+from radejax.data.tesseract import read_projection
 from radejax.visualize.viewer import ViewerFrame, write_recording
 
 

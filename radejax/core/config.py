@@ -7,7 +7,9 @@ same fields. Values are plain and resolved: no paths, no devices, nothing comput
 from __future__ import annotations
 
 import importlib.util
+import os
 import pathlib
+import types
 from collections.abc import Collection
 
 from ml_collections import ConfigDict
@@ -45,6 +47,14 @@ def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:
     return chosen
 
 
+def load_module(path: str | os.PathLike) -> types.ModuleType:
+    """The module of a Python file that is in no package, such as a config file."""
+    spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def load_config(path_and_words: str) -> ConfigDict:
     """The config of a file such as "configs/radenet.py:stem".
 
@@ -55,10 +65,8 @@ def load_config(path_and_words: str) -> ConfigDict:
     path, _, words = path_and_words.partition(":")
     if not pathlib.Path(path).is_file():
         raise FileNotFoundError(f"no such config file: {path}")
-    spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.get_config(words) if words else module.get_config()
+    get_config = load_module(path).get_config
+    return get_config(words) if words else get_config()
 
 
 def base_config() -> ConfigDict:

@@ -1,21 +1,30 @@
-"""Files that are either whole or not there."""
+"""Files that are either whole or not there, and folders that belong to one job."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
+import logging
 import os
 import pathlib
-from collections.abc import Iterator
+import socket
+from collections.abc import Collection, Iterator, Mapping
 from typing import IO, Any
 
-from radejax.core.errors import DataError, DiskFullError
+from radejax.core.errors import DataError, DiskFullError, UserError
+
+_log = logging.getLogger(__name__)
+
+_LONG = 80  # characters of a value that a message shows
+
+# Whole files -------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
-    """An open binary file that becomes `path` when the block ends without an error.
+def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
+    """A temporary path to write to, which becomes `path` at the end of the block.
 
     Missing parent folders are made. After an error or a kill `path` is what it was;
     the error also removes the temporary file.
@@ -25,58 +34,23 @@ def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = temporary_path(path)
     try:
-        with open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
+        with disk_full(path):
+            yield temporary
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+    except BaseException:
         temporary.unlink(missing_ok=True)
-        if is_no_space(error):
-            raise no_space_error(path) from error
         raise
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
-    """As `atomic_write` for libraries that want a path: a temporary one to write to.
-
-    Raises:
-        DiskFullError: No space is left on the disk; what was written is removed.
-    """
-    path = pathlib.Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if is_no_space(error):
-            raise no_space_error(path) from error
-        raise
-
-
-def is_no_space(error: BaseException) -> bool:
-    """True if an error says that the disk is full or a quota is used up.
-
-    Libraries in C++ keep the system's message but not its number.
-    """
-    numbers = (errno.ENOSPC, errno.EDQUOT)
-    if isinstance(error, OSError) and error.errno in numbers:
-        return True
-    return any(os.strerror(number) in str(error) for number in numbers)
-
-
-def no_space_error(path: str | os.PathLike) -> DiskFullError:
-    """The one-line error for a full disk or an exhausted quota."""
-    return DiskFullError(
-        f"no space left on the disk of {pathlib.Path(path).parent}; nothing half-"
-        "written was kept, run the same command again with space to continue"
-    )
+def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
+    """As `atomic_path`: an open binary file that becomes `path`."""
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        yield file
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
@@ -101,3 +75,178 @@ def read_json(path: str | os.PathLike) -> Any:
         return json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path} is not valid JSON: {error}") from error
+
+
+def temporary_path(path: pathlib.Path) -> pathlib.Path:
+    """Where this process writes what is to become `path`, for `remove_stale` to know."""
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
+
+
+def remove_stale(folder: pathlib.Path, name: str = "*") -> None:
+    """Removes temporary files that killed processes of this machine left.
+
+    Args:
+        folder: Looked at with all folders in it.
+        name: Of the files that they were to become; may have wildcards.
+    """
+    host = socket.gethostname()
+    for path in folder.rglob(f".{name}.{host}.*.tmp"):
+        process = path.name.split(".")[-2]
+        if process.isdecimal() and not is_running(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def is_running(process: int) -> bool:
+    """True if a process of this machine, by its number, could still be writing."""
+    try:
+        os.kill(process, 0)
+        stat = pathlib.Path(f"/proc/{process}/stat").read_text()
+    except ProcessLookupError:
+        return False
+    except OSError:  # not ours, or no /proc here
+        return True
+    # In containers nobody may collect the dead: "pid (name) Z ..." is one of them.
+    return stat.rpartition(")")[2].split()[0] != "Z"
+
+
+# Full disks --------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def disk_full(path: str | os.PathLike, message: str | None = None) -> Iterator[None]:
+    """Turns errors on a full disk into one line; a `with` block or a decorator.
+
+    Args:
+        path: Of the file that is written in the block.
+        message: In place of that the file was not kept.
+
+    Raises:
+        DiskFullError: No space is left, or a quota is used up.
+    """
+    try:
+        yield
+    except Exception as error:
+        if not is_no_space(error):
+            raise
+        raise DiskFullError(
+            message
+            or f"no space left on the disk of {pathlib.Path(path).parent}; nothing half-"
+            "written was kept, run the same command again with space to continue"
+        ) from error
+
+
+def is_no_space(error: BaseException) -> bool:
+    """True if an error says that the disk is full or a quota is used up.
+
+    Libraries in C++ keep the system's message but not its number.
+    """
+    numbers = (errno.ENOSPC, errno.EDQUOT)
+    if isinstance(error, OSError) and error.errno in numbers:
+        return True
+    return any(os.strerror(number) in str(error) for number in numbers)
+
+
+# Whose folder it is ------------------------------------------------------------------
+
+
+def claim(
+    path: str | os.PathLike,
+    wanted: Mapping[str, Any],
+    what: str,
+    *,
+    mend: str = "choose another folder, or delete that one",
+    name: str = "",
+    ignore: Collection[str] = (),
+) -> None:
+    """Makes a folder the place of one job, or checks that it is this job's already.
+
+    Args:
+        path: JSON file in the folder, which says what the job is; written with its
+            folder if there is none.
+        wanted: What it must say, values that JSON has.
+        what: Is in the folder where it says something else: "another projection".
+        mend: What to do then.
+        name: Of the whole, before the fields' names in the message.
+        ignore: Fields that may differ.
+
+    Raises:
+        UserError: The folder is another job's; names the fields that differ. Or it is
+            a file.
+        DataError: The JSON file is damaged.
+    """
+    path = pathlib.Path(path)
+    if path.parent.is_file():
+        raise UserError(f"{path.parent} is a file, expected a folder")
+    try:
+        found = read_json(path)
+    except FileNotFoundError:
+        write_json(path, wanted)
+        return
+    require_same(
+        {field: value for field, value in found.items() if field not in ignore},
+        {field: value for field, value in wanted.items() if field not in ignore},
+        f"{relative(path.parent)} holds {what}",
+        mend=mend,
+        name=name,
+    )
+
+
+def require_same(
+    found: Mapping[str, Any],
+    wanted: Mapping[str, Any],
+    what: str,
+    *,
+    mend: str,
+    name: str = "",
+) -> None:
+    """`UserError` "what: field is ... there and ... here; mend" where two differ."""
+    if lines := differences(found, json.loads(json.dumps(wanted)), name):
+        raise UserError(f"{what}: {'; '.join(lines)}; {mend}")
+
+
+def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
+    """What differs between two trees of values, as read from JSON: a line each."""
+    if found == wanted:
+        return []
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        return [
+            line
+            for key in sorted(set(found) | set(wanted))
+            for line in differences(
+                found.get(key), wanted.get(key), f"{name}.{key}".removeprefix(".")
+            )
+        ]
+    if max(len(repr(found)), len(repr(wanted))) > _LONG:
+        return [f"{name} differs"]
+    return [f"{name} is {found!r} there and {wanted!r} here"]
+
+
+@contextlib.contextmanager
+def lock(path: str | os.PathLike, message: str) -> Iterator[None]:
+    """Keeps other processes out of a block while one is in it.
+
+    The system releases the lock however the process ends.
+
+    Args:
+        path: File that is locked; made with its folder if missing, and left there.
+        message: Of the error.
+
+    Raises:
+        UserError: Another process holds it.
+    """
+    path = pathlib.Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(message) from None
+        except OSError as error:
+            _log.warning("no locks on the disk of %s (%s)", path.parent, error.strerror)
+        yield
+
+
+def relative(path: pathlib.Path) -> str:
+    """A path as messages name it: from the current folder where it is below that."""
+    here = pathlib.Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)

@@ -76,6 +76,15 @@ class Augmentation:
         return sample
 
 
+def make_augmentation(
+    grid: RadarGrid, *, mirror_probability: float, gain_db: float, gain_slope_db: float
+) -> Augmentation | None:
+    """An `Augmentation` of these strengths; None where all are 0."""
+    if not (mirror_probability or gain_db or gain_slope_db):
+        return None
+    return Augmentation(grid, mirror_probability, gain_db, gain_slope_db)
+
+
 def mirror(sample: Sample) -> Sample:
     """Left and right exchanged: y to -y in the radar frame, u to W - u in the image.
 

@@ -1,60 +1,129 @@
-"""The camera of every frame of a data set, as the model wants it."""
+"""Images and cameras of the frames of a data set, as the model wants them."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import logging
-from collections.abc import Container, Sequence
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from radejax.core.errors import UserError
+from radejax.data.images import read_left_image
 from radejax.data.kradar.frame import Frame
+from radejax.data.records.arrays import ArrayRecords
 from radejax.geometry.calibration import CameraCalibration, ImageKind
 from radejax.geometry.camera import Camera
 
 _log = logging.getLogger(__name__)
 
 
-def frame_cameras(
+@dataclasses.dataclass(frozen=True)
+class CameraOptions:
+    """How images and calibrations are used; `config.data.camera` states the same.
+
+    Attributes:
+        projection: "raw", "rectified" or "pinhole", see `CameraCalibration.camera`.
+        ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own, the
+            one that its boxes were moved by; or None.
+        resize: Image files of another size than the model's are resized, and their
+            calibration with them; otherwise they are an error.
+        allow_missing: Frames without an image are predicted from the radar alone and
+            counted; otherwise they are an error.
+    """
+
+    projection: ImageKind = "raw"
+    ego_from_lidar_m: tuple[float, float, float] | None = None
+    resize: bool = False
+    allow_missing: bool = True
+
+    @classmethod
+    def of_config(cls, data: Mapping[str, Any]) -> CameraOptions:
+        """Options of `config.data`; the defaults where it has no camera."""
+        if "camera" not in data:
+            return cls()
+        fields = dict(data["camera"])
+        if fields.get("ego_from_lidar_m") is not None:
+            fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**{name: fields[name] for name in names if name in fields})
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraInputs:
+    """What a model sees beside the radar: an image and a camera for every frame.
+
+    Attributes:
+        cameras: One a frame, NumPy float64; `is_valid` is False where there is none.
+        image_size: Height and width of the images that the model sees.
+        options: That they were made with.
+        features: What an image backbone made of the images, in their place, or None.
+        image_paths: Front image of every frame, None where it is missing.
+        feature_record: `[F]` index of each frame's features, -1 where it has none; or
+            None.
+    """
+
+    cameras: tuple[Camera, ...]
+    image_size: tuple[int, int]
+    options: CameraOptions
+    features: ArrayRecords | None
+    image_paths: tuple[pathlib.Path | None, ...]
+    feature_record: np.ndarray | None
+
+    def empty_images(self, count: int) -> np.ndarray:
+        """Black images `[count, H, W, 3]` uint8, or zero features."""
+        if self.features is not None:
+            return np.zeros((count, *self.features.shape), self.features.dtype)
+        return np.zeros((count, *self.image_size, 3), np.uint8)
+
+    def image(self, index: int) -> np.ndarray:
+        """Image (or features) of a frame, black where it is missing."""
+        if self.features is not None and self.feature_record[index] >= 0:
+            return self.features.read(int(self.feature_record[index]))
+        if self.features is None and self.image_paths[index] is not None:
+            return read_left_image(
+                self.image_paths[index], self.image_size, resize=self.options.resize
+            )
+        return self.empty_images(1)[0]
+
+
+def camera_inputs(
     frames: Sequence[Frame],
     image_size: tuple[int, int],
-    *,
-    projection: ImageKind = "raw",
-    ego_from_lidar_m: Sequence[float] | None = None,
-    resize: bool = False,
-    allow_missing: bool = False,
-    embedded: Container[str] = (),
-) -> list[Camera]:
+    options: CameraOptions,
+    features: ArrayRecords | None = None,
+) -> CameraInputs:
     """Cameras of left front images, each calibration file read once.
 
     Args:
         frames: Of a data set.
         image_size: Height and width of the images that the model sees.
-        projection: Kind of image, see `CameraCalibration.camera`.
-        ego_from_lidar_m: Shift from LiDAR to radar; None takes each frame's own, the
-            one that its boxes were moved by.
-        resize: Images of another size are resized, and their calibration with them.
-        allow_missing: Frames without an image or a calibration get a camera whose
-            `is_valid` is False; how many is logged. Otherwise they are an error.
-        embedded: Keys of frames whose image is not needed, being embedded already.
-
-    Returns:
-        One camera a frame, NumPy float64.
+        options: With `allow_missing`, frames without an image or a calibration get a
+            black image and a camera whose `is_valid` is False, and how many is logged.
+        features: What `radejax embed` made of the images, see `open_embeddings`; the
+            image files may then be gone.
 
     Raises:
-        UserError: A frame has no image or calibration, and not `allow_missing`; or the
-            calibration is of images of another size, and not `resize`.
+        UserError: A frame has no image or calibration, and not `allow_missing`; the
+            calibration is of images of another size, and not `resize`; or an image is
+            not among the features.
         DataError: A calibration file is damaged.
     """
-    height, width = image_size
-
-    def has_none(frame: Frame) -> bool:
-        has_image = frame.camera_path is not None or frame.key in embedded
-        return not has_image or frame.camera_calibration_path is None
-
-    missing = [frame.key for frame in frames if has_none(frame)]
-    if missing and not allow_missing:
+    record = None
+    if features is not None:
+        index_of = features.index_of()
+        record = np.array([index_of.get(frame.key, -1) for frame in frames], np.int64)
+        _check_embedded(frames, record, features)
+    has_none = [
+        frame.camera_calibration_path is None
+        or (frame.camera_path is None if record is None else record[i] < 0)
+        for i, frame in enumerate(frames)
+    ]
+    missing = [f.key for f, gone in zip(frames, has_none, strict=True) if gone]
+    if missing and not options.allow_missing:
         raise UserError(
             f"{len(missing)} of {len(frames)} frames have no front image or no camera "
             f"calibration, the first is {missing[0]}; "
@@ -70,23 +139,94 @@ def frame_cameras(
     @functools.cache
     def read(path: str, shift: tuple[float, ...]) -> Camera:
         calibration = CameraCalibration.from_kradar(path, ego_from_lidar_m=shift)
-        if (calibration.height, calibration.width) != (height, width):
-            if not resize:
+        if (calibration.height, calibration.width) != tuple(image_size):
+            height, width = image_size
+            if not options.resize:
                 raise UserError(
                     f"{path}: calibration of {calibration.width} x "
                     f"{calibration.height} images, the model sees {width} x {height} "
                     "(config.model.image.size); config.data.camera.resize=True resizes"
                 )
             calibration = calibration.resized(width, height)
-        return calibration.camera(projection)
+        return calibration.camera(options.projection)
 
     def camera(frame: Frame) -> Camera:
-        if has_none(frame):
-            return no_camera(image_size)
-        shift = ego_from_lidar_m or frame.radar_from_lidar_m
+        shift = options.ego_from_lidar_m or frame.radar_from_lidar_m
         return read(str(frame.camera_calibration_path), tuple(map(float, shift)))
 
-    return [camera(frame) for frame in frames]
+    return CameraInputs(
+        tuple(
+            no_camera(image_size) if gone else camera(frame)
+            for frame, gone in zip(frames, has_none, strict=True)
+        ),
+        tuple(image_size),
+        options,
+        features,
+        tuple(frame.camera_path for frame in frames),
+        record,
+    )
+
+
+def _check_embedded(
+    frames: Sequence[Frame], record: np.ndarray, features: ArrayRecords
+) -> None:
+    """`UserError` for frames whose image is there but was not embedded."""
+    forgotten = [
+        frame.key
+        for frame, position in zip(frames, record, strict=True)
+        if position < 0 and frame.camera_path is not None
+    ]
+    if forgotten:
+        raise UserError(
+            f"{features.folder}: {len(forgotten)} of {len(frames)} frames have an image "
+            f"that is not embedded, the first is {forgotten[0]}; embed all of the data: "
+            "`radejax embed`"
+        )
+
+
+def check_embeddable(*, freeze: bool, mirror_probability: float) -> None:
+    """`UserError` where embeddings cannot stand for the images.
+
+    Args:
+        freeze: Whether the image backbone is not trained.
+        mirror_probability: Of training frames.
+    """
+    if not freeze:
+        raise UserError(
+            "embeddings are what a frozen backbone makes of images, but "
+            "config.model.image.freeze is False"
+        )
+    if mirror_probability:
+        raise UserError(
+            "embeddings cannot be mirrored: set config.data.mirror_probability to 0"
+        )
+
+
+def require_images(
+    frames: Sequence[Frame], inputs: CameraInputs | None, split: str = "train"
+) -> None:
+    """`UserError` if no frame has both an image and a calibration.
+
+    Args:
+        frames: Of the split.
+        inputs: Of these frames; None for models without a camera.
+        split: Its name, for the message.
+    """
+    if inputs is None or any(camera.is_valid for camera in inputs.cameras):
+        return
+    lacking = {
+        "front image (cam-front/cam-front_*.png)": sum(
+            frame.camera_path is None for frame in frames
+        ),
+        "camera calibration (calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of "
+        "K-Radar's repository: --camera_calibration FOLDER)": sum(
+            frame.camera_calibration_path is None for frame in frames
+        ),
+    }
+    reasons = "; ".join(f"{n} have no {what}" for what, n in lacking.items() if n)
+    raise UserError(
+        f"no frame of the {split} split ({len(frames)}) can use the camera: {reasons}"
+    )
 
 
 def no_camera(image_size: tuple[int, int]) -> Camera:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.errors import UserError
+from radejax.core.structures import Batch
 from radejax.data.projection import LOG_SCALE_DB
-
-if TYPE_CHECKING:
-    import jax
 
 ENCODINGS = ("float16", "uint8", "float32")
 MAX_ERROR_DB = {
@@ -68,8 +68,14 @@ def to_float(projection: jax.Array) -> jax.Array:
     Returns:
         `[...]` float32.
     """
-    import jax.numpy as jnp
-
     if projection.dtype == jnp.uint8:
         return projection.astype(jnp.float32) / 255.0
     return projection.astype(jnp.float32)
+
+
+def model_inputs(batch: Batch) -> tuple[Any, ...]:
+    """Positional inputs of the model: the projection, and the camera's if there is one."""
+    projection = to_float(batch.projection)
+    if batch.image is None:
+        return (projection,)
+    return projection, batch.image, batch.camera

@@ -6,99 +6,71 @@ never on threads or workers; the state of the iterator is one number.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
 from typing import Any
 
 import grain
+import jax
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES, Batch
-from radejax.data.frame_table import (
-    IMAGE_SIZE,
-    FrameTable,
-    frames_with_records,
-    make_table,
-    read_left_image,
-)
-from radejax.data.kradar.frame import Frame
-from radejax.data.records.arrays import ArrayRecords
-from radejax.data.records.projections import RecordSource
+from radejax.core.structures import Batch
+from radejax.data.augment import Augmentation
+from radejax.data.cameras import no_camera
+from radejax.data.frame_table import FrameTable
 from radejax.geometry.camera import stack_cameras
 
-__all__ = [
-    "FrameTable",
-    "frames_with_records",
-    "make_loader",
-    "make_table",
-    "read_left_image",
-    "steps_per_epoch",
-]
 
+@dataclasses.dataclass(frozen=True)
+class LoaderOptions:
+    """How frames are drawn, and how batches are prepared.
 
-def make_loader(
-    records: RecordSource,
-    frames: Sequence[Frame],
-    *,
-    batch_size: int,
-    max_objects: int,
-    seed: int = 0,
-    shuffle: bool = True,
-    num_epochs: int | None = None,
-    drop_remainder: bool = True,
-    pad_remainder: bool = False,
-    classes: Sequence[str] = CLASSES,
-    num_threads: int = 2,
-    prefetch: int = 2,
-    num_workers: int = 0,
-    process_index: int | None = None,
-    process_count: int | None = None,
-    augment: Any = None,
-    images: bool = False,
-    cameras: Sequence[Any] | None = None,
-    allow_missing_images: bool = False,
-    image_size: tuple[int, int] = IMAGE_SIZE,
-    resize_images: bool = False,
-    features: ArrayRecords | None = None,
-    device: Any = None,
-    label_permutation_seed: int | None = None,
-) -> grain.DatasetIterator[Batch]:
-    """A checkpointable iterator over batches of NumPy arrays.
-
-    `Batch.projection` has the type of the records; `encoding.to_float` turns it into
-    network input on the device. `Batch.frame` is the index into `frames`.
-
-    Epochs do not mix: with `drop_remainder` every epoch leaves out the last
-    `len(frames) % batch_size` frames of its own order.
-
-    Args:
-        records: Projections, of these frames at least.
-        frames: Labelled frames, normally a split of a `KRadar`.
+    Attributes:
         batch_size: Frames of a batch of this process.
-        max_objects: Rows of boxes in every frame; more objects are an error.
         seed: Of order and augmentation.
-        shuffle: A new order every epoch; otherwise the order of `frames`.
+        shuffle: A new order every epoch; otherwise the order of the table.
         num_epochs: None repeats without end.
         drop_remainder: Leave out the last, smaller batch of an epoch.
         pad_remainder: Instead fill it with empty frames of index -1, so that all
             batches have one shape and all processes have as many.
-        classes: Class names in the order of the class indices.
         num_threads: Threads that prepare batches; 0: the caller's.
         prefetch: Batches prepared ahead.
         num_workers: Worker processes, each with its threads; 0: threads alone, which
             are faster for large frames (see benchmarks/pipeline.py).
         process_index: This host of several; None asks jax.
         process_count: Number of hosts; None asks jax.
-        augment: `augment.Augmentation` applied to every frame, or None.
-        images: Fill `Batch.image` with left front images, uint8.
-        cameras: Fill `Batch.camera` from one `geometry.camera.Camera` a frame.
-        allow_missing_images: As in `make_table`.
-        image_size: Height and width of the images.
-        resize_images: Resize images of another size instead of raising.
-        features: What `radejax embed` made of the images, to fill `Batch.image` with
-            in their place.
         device: Device or sharding to put batches on ahead of use; None: host arrays.
-        label_permutation_seed: As in `make_table`.
+    """
+
+    batch_size: int
+    seed: int = 0
+    shuffle: bool = True
+    num_epochs: int | None = None
+    drop_remainder: bool = True
+    pad_remainder: bool = False
+    num_threads: int = 2
+    prefetch: int = 2
+    num_workers: int = 0
+    process_index: int | None = None
+    process_count: int | None = None
+    device: Any = None
+
+
+def make_loader(
+    table: FrameTable, options: LoaderOptions, *, augment: Augmentation | None = None
+) -> grain.DatasetIterator[Batch]:
+    """A checkpointable iterator over batches of NumPy arrays.
+
+    `Batch.projection` has the type of the records; `encoding.to_float` turns it into
+    network input on the device. `Batch.frame` is the index into the table's frames.
+
+    Epochs do not mix: with `drop_remainder` every epoch leaves out the last
+    `len(table) % batch_size` frames of its own order.
+
+    Args:
+        table: Records, labels and images, see `make_table`.
+        options: Batch size, order, threads.
+        augment: Applied to every frame, or None.
 
     Returns:
         Iterator with `get_state` and `set_state`; `grain.checkpoint.CheckpointSave`
@@ -106,48 +78,27 @@ def make_loader(
         any number of threads or workers.
 
     Raises:
-        UserError: As `make_table`; or there are fewer frames than one batch needs.
+        UserError: There are fewer frames than one batch needs.
     """
-    table = make_table(
-        records,
-        frames,
-        max_objects=max_objects,
-        classes=classes,
-        images=images,
-        cameras=cameras,
-        allow_missing_images=allow_missing_images,
-        label_permutation_seed=label_permutation_seed,
-        image_size=image_size,
-        resize=resize_images,
-        features=features,
-    )
-    if process_count is None or process_index is None:
-        import jax
-
-        process_index, process_count = jax.process_index(), jax.process_count()
-    order = _make_order(
-        len(table),
-        batch_size,
-        seed,
-        shuffle,
-        drop_remainder and not pad_remainder,
-        pad_remainder,
-        (process_index, process_count),
-    )
-    dataset = order.repeat(num_epochs).map(_LoadBatch(records, table, augment))
     threads = grain.ReadOptions(
-        num_threads=num_threads, prefetch_buffer_size=max(prefetch, num_threads)
+        num_threads=options.num_threads,
+        prefetch_buffer_size=max(options.prefetch, options.num_threads),
     )
-    dataset = dataset.to_iter_dataset(threads)
-    if num_workers:
+    order = _make_order(len(table), options).repeat(options.num_epochs)
+    dataset = order.map(_LoadBatch(table, augment)).to_iter_dataset(threads)
+    if options.num_workers:
         dataset = dataset.mp_prefetch(
             grain.MultiprocessingOptions(
-                num_workers=num_workers, per_worker_buffer_size=max(1, prefetch)
+                num_workers=options.num_workers,
+                per_worker_buffer_size=max(1, options.prefetch),
             )
         )
-    if device is not None:
+    if options.device is not None:
         dataset = grain.experimental.device_put(
-            dataset, device, cpu_buffer_size=prefetch, device_buffer_size=2
+            dataset,
+            options.device,
+            cpu_buffer_size=options.prefetch,
+            device_buffer_size=2,
         )
     return iter(dataset)
 
@@ -166,19 +117,17 @@ def steps_per_epoch(
 
 
 def _make_order(
-    num_frames: int,
-    batch_size: int,
-    seed: int,
-    shuffle: bool,
-    drop_remainder: bool,
-    pad_remainder: bool,
-    process: tuple[int, int],
+    num_frames: int, options: LoaderOptions
 ) -> grain.MapDataset[np.ndarray]:
     """Batches of `[B, 2]` frame index and augmentation seed of one process.
 
     Frame indices from `num_frames` on are padding.
     """
-    index, count = process
+    index, count = options.process_index, options.process_count
+    if index is None or count is None:
+        index, count = jax.process_index(), jax.process_count()
+    batch_size, seed = options.batch_size, options.seed
+    drop_remainder = options.drop_remainder and not options.pad_remainder
     if batch_size < 1:
         raise UserError(f"batch_size must be at least 1, got {batch_size}")
     if drop_remainder and num_frames < batch_size * count:
@@ -187,12 +136,12 @@ def _make_order(
             f"of {count} processes); lower batch_size or keep the remainder"
         )
     total = num_frames
-    if pad_remainder:
+    if options.pad_remainder:
         total = -(-num_frames // (batch_size * count)) * batch_size * count
     # grain's shuffle in epoch e of seed s is that of epoch e - 1 of seed s + 1.
     spread = np.random.SeedSequence(seed).generate_state(2)
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
-    if shuffle:
+    if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
     dataset = dataset.random_map(_AddSeed()).batch(
         batch_size * count, drop_remainder=drop_remainder, batch_fn=np.stack
@@ -225,18 +174,19 @@ class _Share(grain.transforms.Map):
 class _LoadBatch(grain.transforms.Map):
     """Reads the frames of a batch, each straight into its place."""
 
-    def __init__(self, records: RecordSource, table: FrameTable, augment: Any) -> None:
-        self._records, self._table, self._augment = records, table, augment
+    def __init__(self, table: FrameTable, augment: Augmentation | None) -> None:
+        self._table, self._augment = table, augment
+        images = table.images
+        self._no_camera = None if images is None else no_camera(images.image_size)
 
     def __repr__(self) -> str:
         return "_LoadBatch()"
 
     def map(self, element: np.ndarray) -> Batch:
-        batch = self._empty(len(element))
-        cameras = []
+        batch, cameras = self._empty(len(element)), []
         for row, (index, seed) in enumerate(element):
             if index >= len(self._table):
-                cameras.append(self._table.camera(0, is_valid=False))
+                cameras.append(self._no_camera)
                 continue
             sample = self._sample(index)
             if self._augment is not None:
@@ -244,34 +194,34 @@ class _LoadBatch(grain.transforms.Map):
             batch.projection[row] = sample["projection"]
             batch.boxes[row] = sample["boxes"]
             batch.classes[row] = self._table.classes[index]
-            batch.is_valid[row] = self._table.is_valid[index]
+            batch.is_valid[row] = batch.classes[row] >= 0
             batch.frame[row] = index
             cameras.append(sample["camera"])
             if batch.image is not None:
                 batch.image[row] = sample["image"]
-        if self._table.cameras is None:
+        if self._table.images is None:
             return batch
         return batch.replace(camera=stack_cameras(cameras))
 
     def _sample(self, index: int) -> dict[str, Any]:
-        """One frame; images and cameras None where they are not asked for."""
-        record = self._records[int(self._table.record[index])]
+        """One frame; image and camera None where they are not asked for."""
+        table, images = self._table, self._table.images
         return {
-            "projection": record["projection"],
-            "boxes": self._table.boxes[index],
-            "image": self._table.image(index),
-            "camera": self._table.camera(index),
+            "projection": table.records[int(table.record[index])]["projection"],
+            "boxes": table.boxes[index],
+            "image": None if images is None else images.image(index),
+            "camera": None if images is None else images.cameras[index],
         }
 
     def _empty(self, size: int) -> Batch:
         """Nothing but padding."""
-        shape, dtype = self._records.grid.projection_shape, self._records.dtype
+        records, images = self._table.records, self._table.images
         rows = (size, self._table.boxes.shape[1])
         return Batch(
-            projection=np.zeros((size, *shape), dtype),
+            projection=np.zeros((size, *records.shape), records.dtype),
             boxes=np.zeros((*rows, 8), np.float32),
             classes=np.full(rows, -1, np.int32),
             is_valid=np.zeros(rows, bool),
             frame=np.full(size, -1, np.int32),
-            image=self._table.empty_images(size),
+            image=None if images is None else images.empty_images(size),
         )

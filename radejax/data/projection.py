@@ -8,17 +8,15 @@ from memory once when it goes in the tensor's own memory order.
 
 from __future__ import annotations
 
-import concurrent.futures
-import functools
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.errors import UserError
-
-if TYPE_CHECKING:
-    import jax
 
 POWER_FLOOR = 1e-10
 LOG_OFFSET_DB = 1.2
@@ -26,9 +24,7 @@ LOG_SCALE_DB = 184.3
 """p = (10 log10(power + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB."""
 
 
-def project(
-    tesseract: np.ndarray, *, dtype: Any = np.float32, num_threads: int = 1
-) -> np.ndarray:
+def project(tesseract: np.ndarray, *, dtype: Any = np.float32) -> np.ndarray:
     """Tensor max projection of one tesseract, in one pass over its memory.
 
     Channels are the maximum over elevation of every Doppler bin, then the maximum over
@@ -40,7 +36,6 @@ def project(
             fastest as `scipy.io.loadmat` lays it out (column-major) or C-contiguous.
         dtype: Of the result. The logarithm is computed in float32, or in float64 for
             float64 input.
-        num_threads: Threads that share the pass.
 
     Returns:
         `[R, A, D+E]` projection.
@@ -66,49 +61,27 @@ def project(
         tesseract = tesseract.astype(np.float32)
     if not tesseract.dtype.isnative:
         tesseract = tesseract.astype(tesseract.dtype.newbyteorder("="))
-    doppler, range_, elevation, azimuth = tesseract.shape
-    result = np.empty((range_, azimuth, doppler + elevation), dtype)
-    by_column = tesseract.T  # [A, E, R, D]
-    if by_column.flags.c_contiguous:
-
-        def reduce(i: int) -> None:
-            result[:, i] = _project_slab(by_column[i], _column_maxima)
-    else:
-
-        def reduce(i: int) -> None:
-            result[i] = _project_slab(tesseract[:, i], _row_maxima)
-
-    size = azimuth if by_column.flags.c_contiguous else range_
-    if num_threads > 1:
-        with concurrent.futures.ThreadPoolExecutor(num_threads) as pool:
-            list(pool.map(reduce, range(size)))
-    else:
-        for i in range(size):
-            reduce(i)
-    return result
+    if tesseract.T.flags.c_contiguous:
+        return project_columns(tesseract.T, dtype=dtype)
+    rows = [_project_slab(row, _row_maxima) for row in tesseract.swapaxes(0, 1)]
+    return np.stack(rows).astype(dtype, copy=False)
 
 
 def project_columns(
-    columns: Iterable[np.ndarray], num_columns: int, *, dtype: Any = np.float32
+    columns: Iterable[np.ndarray], *, dtype: Any = np.float32
 ) -> np.ndarray:
     """`project` for a tesseract that arrives column by column, as files store it.
 
     Args:
         columns: For every azimuth a C-contiguous `[E, R, D]` slab of linear power.
             A slab is used up before the next is asked for: the buffer may be the same.
-        num_columns: Number of azimuths.
         dtype: Of the result.
 
     Returns:
         `[R, A, D+E]` projection.
     """
-    result = None
-    for i, column in enumerate(columns):
-        level = _project_slab(column, _column_maxima)  # [R, D+E]
-        if result is None:
-            result = np.empty((len(level), num_columns, level.shape[1]), dtype)
-        result[:, i] = level
-    return result
+    levels = [_project_slab(column, _column_maxima) for column in columns]
+    return np.stack(levels, axis=1).astype(dtype, copy=False)
 
 
 def _project_slab(slab: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.ndarray:
@@ -159,35 +132,15 @@ def project_plain(tesseract: np.ndarray) -> np.ndarray:
     return np.concatenate([level.max(axis=2), level.max(axis=3)], axis=-1)
 
 
+@jax.jit
 def project_jax(tesseract: jax.Array) -> jax.Array:
     """`project` for accelerators: `[..., D, R, E, A]` to `[..., R, A, D+E]`, float32.
 
     Leading axes are frames. Jit-compiled; maxima first, as on the host.
     """
-    return _project_jax()(tesseract)
-
-
-@functools.cache
-def _project_jax() -> Any:
-    """The compiled function, made on first use: readers of files need no jax."""
-    import jax
-    import jax.numpy as jnp
-
-    def one(tesseract: jax.Array) -> jax.Array:
-        power = jnp.concatenate(
-            [
-                tesseract.max(axis=2).transpose(1, 2, 0),  # [R, A, D]
-                tesseract.max(axis=0).transpose(0, 2, 1),  # [R, A, E]
-            ],
-            axis=-1,
-        )
-        level = jnp.log10(power.astype(jnp.float32) + POWER_FLOOR)
-        return level * (10.0 / LOG_SCALE_DB) + LOG_OFFSET_DB / LOG_SCALE_DB
-
-    def many(tesseract: jax.Array) -> jax.Array:
-        function = one
-        for _ in range(tesseract.ndim - 4):
-            function = jax.vmap(function)
-        return function(tesseract)
-
-    return jax.jit(many)
+    chex.assert_axis_dimension_gteq(tesseract, -4, 1)
+    over_elevation = jnp.moveaxis(tesseract.max(axis=-2), -3, -1)  # [..., R, A, D]
+    over_doppler = tesseract.max(axis=-4).swapaxes(-1, -2)  # [..., R, A, E]
+    power = jnp.concatenate([over_elevation, over_doppler], axis=-1)
+    level = jnp.log10(power.astype(jnp.float32) + POWER_FLOOR)
+    return level * (10.0 / LOG_SCALE_DB) + LOG_OFFSET_DB / LOG_SCALE_DB

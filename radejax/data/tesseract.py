@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
+from radejax.data.kradar.frame import Frame
 from radejax.data.projection import project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -79,7 +80,7 @@ def project_file(
             _check(path, np.broadcast_to(stored.type(0), layout[1]), shape_drea)
             slab = np.empty((elevation, range_, doppler), stored)
             columns = _read_slabs(file, slab, azimuth, timings)
-            projection = project_columns(columns, azimuth, dtype=dtype)
+            projection = project_columns(columns, dtype=dtype)
     if layout is None:
         began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)
@@ -227,6 +228,19 @@ def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
         projection = read_projection_npy(path, projection_shape=shape)
         return projection.astype(np.float32)
     return project_file(path, shape_drea=grid.shape_drea)
+
+
+def read_projection(frame: Frame, grid: RadarGrid) -> np.ndarray:
+    """`[R, A, D+E]` float32 projection of a frame: from its tesseract, or the released one.
+
+    Raises:
+        UserError: The frame has neither.
+        FileNotFoundError, DataError: As `read_frame`.
+    """
+    path = frame.tesseract_path or frame.projection_path
+    if path is None:
+        raise UserError(f"frame {frame.key} has no tesseract or projection")
+    return read_frame(path, grid)
 
 
 def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:

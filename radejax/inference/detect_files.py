@@ -6,6 +6,7 @@ which image belongs to a frame.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,7 @@ import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Detections
-from radejax.data.cameras import frame_cameras
+from radejax.data.cameras import camera_inputs
 from radejax.data.kradar import KRadar
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import Camera
@@ -94,15 +95,8 @@ def front_images(
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
     )
-    options = detector.camera_options
-    cameras = frame_cameras(
-        frames,
-        detector.model.image_size,
-        projection=options.projection,
-        ego_from_lidar_m=options.ego_from_lidar_m,
-        resize=options.resize,
-        allow_missing=True,
-    )
+    options = dataclasses.replace(detector.camera_options, allow_missing=True)
+    cameras = camera_inputs(frames, detector.model.image_size, options).cameras
     return {
         path: (frame.camera_path, camera)
         for frame, camera in zip(frames, cameras, strict=True)

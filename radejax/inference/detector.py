@@ -18,12 +18,12 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch, Detections
 from radejax.data import projection as projection_lib
+from radejax.data.cameras import CameraOptions
 from radejax.data.encoding import to_float
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference import packed
-from radejax.inference.inputs import CameraOptions
 from radejax.training.step import map_grid
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)

@@ -1,15 +1,10 @@
-"""Images through the frozen image backbone once, into records to train from.
-
-A folder of embeddings has a `manifest.json` like one of projections: which backbone
-made them (configuration and a checksum of its weights), their shape, and its files.
-"""
+"""Images through the frozen image backbone once, into records to train from."""
 
 from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
 import hashlib
-import json
 import os
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,20 +15,16 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from radejax.core.errors import DataError, UserError
-from radejax.core.files import read_json, write_json
-from radejax.data.frame_table import read_left_image
+from radejax.core import files
+from radejax.core.errors import UserError
+from radejax.data.images import read_left_image
 from radejax.data.kradar.frame import Frame
+from radejax.data.records import embeddings
 from radejax.data.records import files as record_files
-from radejax.data.records.arrays import MANIFEST, ArrayRecords
+from radejax.data.records.arrays import MANIFEST
 from radejax.models.dinorade import IMAGE_BACKBONE
 
-FORMAT = "radejax-embeddings"
-FORMAT_VERSION = 1
 DTYPES = ("float32", "float16")
-
-# Fields of `config.model.image` that do not change what comes out.
-_IRRELEVANT = ("freeze", "attention", "layer_scale")
 
 
 def embed_dataset(
@@ -81,9 +72,9 @@ def embed_dataset(
     out_dir = pathlib.Path(out_dir)
     params = variables["params"][IMAGE_BACKBONE]
     plan = {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "image": _relevant(image_config),
+        "format": embeddings.FORMAT,
+        "version": embeddings.FORMAT_VERSION,
+        "image": embeddings.relevant_fields(image_config),
         "weights_sha256": weights_sha256(params),
         "shape": list(model.feature_shape),
         "dtype": dtype,
@@ -91,7 +82,7 @@ def embed_dataset(
         "num_frames": len(frames),
         "frames_sha256": _sha256("\n".join(f.key for f in frames).encode()),
     }
-    _agree_on_plan(out_dir, plan)
+    files.claim(out_dir / "plan.json", plan, "other embeddings")
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
     params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
     chunks = [
@@ -116,59 +107,10 @@ def embed_dataset(
                 bar.update(len(chunk))
             counts["missing"] += len(entry.skipped)
             entries.append(entry)
-    files = [dataclasses.asdict(entry) for entry in entries]
-    write_json(out_dir / MANIFEST, {**plan, "counts": counts, "files": files})
+    described = [dataclasses.asdict(entry) for entry in entries]
+    content = {**plan, "counts": counts, "files": described}
+    files.write_json(out_dir / MANIFEST, content)
     return counts
-
-
-def open_embeddings(
-    folder: str | os.PathLike, model_config: Mapping[str, Any] | None = None
-) -> ArrayRecords:
-    """Features `[h, w, C]` of a folder, by record; `index_of()` maps frame keys to them.
-
-    Args:
-        folder: What `radejax embed` wrote.
-        model_config: `config.model` that they must fit, or None.
-
-    Raises:
-        FileNotFoundError: There is no such folder, or it is not finished.
-        DataError: The manifest is damaged or of another version.
-        UserError: They come from another backbone.
-    """
-    path = pathlib.Path(folder) / MANIFEST
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
-        )
-    try:
-        manifest = read_json(path)
-        version = manifest["format"], manifest["version"]
-        if version != (FORMAT, FORMAT_VERSION):
-            raise DataError(
-                f"{path}: {version[0]} {version[1]}, this radejax reads {FORMAT} "
-                f"{FORMAT_VERSION}"
-            )
-        files = [record_files.RecordFile.from_dict(f) for f in manifest["files"]]
-        shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
-    except DataError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged manifest ({error!r})") from None
-    if model_config is not None:
-        wanted = _relevant(model_config["image"])
-        for name, value in wanted.items():
-            if manifest["image"].get(name) != value:
-                raise UserError(
-                    f"{folder}: embeddings of a backbone with {name} = "
-                    f"{manifest['image'].get(name)}, config.model.image.{name} is "
-                    f"{value}"
-                )
-    return ArrayRecords(folder, files, shape, dtype)
-
-
-def embeddings_sha256(folder: str | os.PathLike) -> str:
-    """Checksum of the weights that embeddings were made with."""
-    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
 
 
 def weights_sha256(params: Mapping[str, Any]) -> str:
@@ -211,8 +153,7 @@ def _write_file(
     dtype: str,
     bar: tqdm,
 ) -> record_files.RecordFile:
-    writer = record_files.RecordFileWriter(folder, name)
-    try:
+    with record_files.RecordFileWriter(folder, name) as writer:
         for frame in frames:
             if frame.camera_path is None:
                 writer.skipped[frame.key] = "no front image"
@@ -223,30 +164,6 @@ def _write_file(
                 writer.write(key, row)
             bar.update(len(keys))
         return writer.commit()
-    except BaseException:
-        writer.discard()
-        raise
-
-
-def _agree_on_plan(out_dir: pathlib.Path, plan: Mapping[str, Any]) -> None:
-    """Writes the plan of a new folder; `UserError` if the folder has another one."""
-    path = out_dir / "plan.json"
-    if not path.exists():
-        out_dir.mkdir(parents=True, exist_ok=True)
-        write_json(path, dict(plan))
-        return
-    found = read_json(path)
-    for key, value in plan.items():
-        if found.get(key) != value:
-            raise UserError(
-                f"{out_dir} holds other embeddings ({key} is {found.get(key)} there, "
-                f"{value} now); choose another folder, or delete that one"
-            )
-
-
-def _relevant(image_config: Mapping[str, Any]) -> dict[str, Any]:
-    plain = {k: v for k, v in dict(image_config).items() if k not in _IRRELEVANT}
-    return json.loads(json.dumps(plain))
 
 
 def _sha256(content: bytes) -> str:

@@ -14,46 +14,16 @@ import jax
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.data.cameras import no_camera
-from radejax.data.frame_table import read_left_image
+from radejax.data.cameras import CameraOptions, no_camera
+from radejax.data.images import read_left_image
 from radejax.data.tesseract import read_frame
-from radejax.geometry.calibration import CameraCalibration, ImageKind
+from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import Camera, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
 
 PathLike = str | pathlib.Path
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraOptions:
-    """How calibrations are used; `config.data.camera` states the same.
-
-    Attributes:
-        projection: "raw", "rectified" or "pinhole", see `CameraCalibration.camera`.
-        ego_from_lidar_m: Shift from LiDAR to radar in place of the calibrations' own,
-            or None.
-        resize: Image files of another size than the model's are resized.
-        allow_missing: Frames without an image are predicted from the radar alone and
-            counted; otherwise they are an error.
-    """
-
-    projection: ImageKind = "raw"
-    ego_from_lidar_m: tuple[float, float, float] | None = None
-    resize: bool = False
-    allow_missing: bool = True
-
-    @classmethod
-    def of_config(cls, data: Mapping[str, Any]) -> CameraOptions:
-        """Options of `config.data`; the defaults where it has no camera."""
-        if "camera" not in data:
-            return cls()
-        fields = dict(data["camera"])
-        if fields.get("ego_from_lidar_m") is not None:
-            fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: fields[name] for name in names if name in fields})
 
 
 def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:

@@ -26,8 +26,8 @@ import radejax
 from radejax import models
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.data.cameras import CameraOptions
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.inputs import CameraOptions
 from radejax.interop import image_backbone as camera_inputs
 from radejax.models import radenet
 from radejax.models.dinorade import IMAGE_BACKBONE as BACKBONE

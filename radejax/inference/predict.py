@@ -14,15 +14,18 @@ import tqdm
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, Detections
+from radejax.data.cameras import CameraInputs
+from radejax.data.encoding import model_inputs
+from radejax.data.frame_table import make_table
 from radejax.data.kradar import KRadar
-from radejax.data.pipeline import make_loader
+from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
 from radejax.training import processes, sharding
-from radejax.training.step import map_grid, model_inputs
+from radejax.training.step import map_grid
 
 
 class Predictor:
@@ -118,7 +121,7 @@ def predict_dataset(
     frames: KRadar,
     batch_size: int = 8,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    images: CameraInputs | None = None,
     progress: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> dict[str, np.ndarray]:
@@ -129,7 +132,7 @@ def predict_dataset(
         records: Projections of the frames.
         frames: Which frames, in which order.
         batch_size: Frames at once; rounded up to a multiple of the devices.
-        inputs: Further arguments of `make_loader`, see `camera_inputs`.
+        images: Of the frames, for models with a camera; see `camera_inputs`.
         progress: Show a bar.
         should_stop: Asked before every batch.
 
@@ -144,20 +147,23 @@ def predict_dataset(
     if not len(frames):
         raise UserError("no frames to detect objects in")
     on_mesh = isinstance(detector, Predictor)
-    loader = make_loader(
+    table = make_table(
         records,
         frames,
-        batch_size=detector.rows(batch_size) if on_mesh else batch_size,
         max_objects=max(len(frame.boxes) for frame in frames) or 1,
         classes=detector.classes,
+        images=images,
+    )
+    options = LoaderOptions(
+        detector.rows(batch_size) if on_mesh else batch_size,
         shuffle=False,
         num_epochs=1,
         drop_remainder=False,
         pad_remainder=on_mesh,  # a `Detector` does it itself
         process_index=None if on_mesh else 0,
         process_count=None if on_mesh else 1,
-        **(inputs or {}),
     )
+    loader = make_loader(table, options)
 
     def detect(batch: Batch) -> tuple[Detections, Any]:
         if on_mesh:

@@ -1,10 +1,10 @@
-"""What a radar-camera run needs beside a radar run: images, cameras, backbone weights."""
+"""Weights of the image backbone of a radar-camera run: found, loaded, checked."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import flax.traverse_util
@@ -14,9 +14,8 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.data.cameras import frame_cameras
-from radejax.data.kradar.frame import Frame
-from radejax.inference.embed import embeddings_sha256, open_embeddings, weights_sha256
+from radejax.data.records.embeddings import embeddings_sha256
+from radejax.inference.embed import weights_sha256
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.models.lifting import ReferencePoints
 
@@ -38,93 +37,6 @@ def require_camera(config: ConfigDict) -> None:
             f"config.model.name is {config.model.name!r}, which has no camera; expected "
             "'dinorade', for example configs/dinorade.py"
         )
-
-
-def loader_arguments(
-    config: ConfigDict, frames: Sequence[Frame], embeddings: PathLike | None = None
-) -> dict[str, Any]:
-    """Arguments of `radejax.data.pipeline.make_loader` for images and cameras.
-
-    Args:
-        config: Of the run; `model.image` and `data.camera` are read.
-        frames: Of a data set.
-        embeddings: Folder of `radejax embed`, in place of the images.
-
-    Returns:
-        Nothing for a model without a camera.
-
-    Raises:
-        UserError: Images, calibrations or embeddings are missing or of another size or
-            backbone.
-    """
-    if not has_camera(config):
-        if embeddings is not None:
-            raise UserError(
-                f"embeddings are given, but config.model.name is {config.model.name!r}, "
-                "which has no camera"
-            )
-        return {}
-    options, image = config.data.camera, config.model.image
-    features = None
-    if embeddings is not None:
-        _check_embeddable(config)
-        features = open_embeddings(embeddings, config.model)
-    arguments = {
-        "cameras": frame_cameras(
-            frames,
-            tuple(image.size),
-            projection=options.projection,
-            ego_from_lidar_m=options.ego_from_lidar_m,
-            resize=options.resize,
-            allow_missing=options.allow_missing,
-            embedded=() if features is None else features.index_of(),
-        ),
-        "allow_missing_images": options.allow_missing,
-        "image_size": tuple(image.size),
-        "resize_images": options.resize,
-    }
-    given = {"images": True} if features is None else {"features": features}
-    return {**arguments, **given}
-
-
-def _check_embeddable(config: ConfigDict) -> None:
-    if not config.model.image.freeze:
-        raise UserError(
-            "embeddings are what a frozen backbone makes of images, but "
-            "config.model.image.freeze is False"
-        )
-    if config.data.mirror_probability:
-        raise UserError(
-            "embeddings cannot be mirrored: set config.data.mirror_probability to 0"
-        )
-
-
-def require_images(
-    frames: Sequence[Frame], arguments: Mapping[str, Any], split: str = "train"
-) -> None:
-    """`UserError` if no frame has both an image and a calibration.
-
-    Args:
-        frames: Of the split.
-        arguments: Of `loader_arguments`; empty for models without a camera.
-        split: Its name, for the message.
-    """
-    cameras = arguments.get("cameras")
-    if cameras is None or any(camera.is_valid for camera in cameras):
-        return
-    lacking = {
-        "front image (cam-front/cam-front_*.png)": sum(
-            frame.camera_path is None for frame in frames
-        ),
-        "camera calibration (calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of "
-        "K-Radar's repository: --camera_calibration FOLDER)": sum(
-            frame.camera_calibration_path is None for frame in frames
-        ),
-    }
-    reasons = "; ".join(f"{n} have no {what}" for what, n in lacking.items() if n)
-    raise UserError(
-        f"no frame of the {split} split ({len(frames)}) can use the camera: {reasons}"
-    )
 
 
 def load_image_backbone(

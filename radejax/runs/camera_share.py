@@ -13,12 +13,13 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
+from radejax.data.encoding import model_inputs
+from radejax.data.frame_table import make_table
 from radejax.data.kradar.frame import Frame
-from radejax.data.pipeline import make_loader
+from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.interop import image_backbone
-from radejax.training.step import model_inputs
+from radejax.runs.data import camera_inputs
 
 
 def camera_share(
@@ -50,19 +51,22 @@ def camera_share(
     """
     spread = np.linspace(0, len(frames) - 1, min(max_frames, len(frames)))
     frames = [frames[int(i)] for i in np.round(spread)]
-    loader = make_loader(
+    table = make_table(
         records,
         frames,
-        batch_size=batch_size,
         max_objects=max(len(frame.boxes) for frame in frames) or 1,
         classes=config.classes,
+        images=camera_inputs(config, frames, embeddings),
+    )
+    options = LoaderOptions(
+        batch_size,
         shuffle=False,
         num_epochs=1,
         pad_remainder=True,
         process_index=0,  # only the main process draws
         process_count=1,
-        **image_backbone.loader_arguments(config, frames, embeddings),
     )
+    loader = make_loader(table, options)
     model = models.build(config.model)
 
     @jax.jit

@@ -12,8 +12,12 @@ from collections.abc import Sequence
 from ml_collections import ConfigDict
 
 from radejax.core.errors import UserError
+from radejax.data import cameras
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.frame import Frame
 from radejax.data.records import job
+from radejax.data.records.embeddings import open_embeddings
+from radejax.interop.image_backbone import has_camera
 
 _log = logging.getLogger(__name__)
 
@@ -169,6 +173,40 @@ def project(config: ConfigDict, paths: DataPaths) -> None:
     frames = paths.open(config, split=None)
     _log.info("%s", frames.summary().to_text())
     job.project_dataset(frames, paths.records)
+
+
+def camera_inputs(
+    config: ConfigDict,
+    frames: Sequence[Frame],
+    embeddings: str | os.PathLike | None = None,
+) -> cameras.CameraInputs | None:
+    """Images and cameras of frames as the config says; None without a camera.
+
+    Args:
+        config: Of the run; `model.image` and `data.camera` are read.
+        frames: Of a data set.
+        embeddings: Folder of `radejax embed`, in place of the images.
+
+    Raises:
+        UserError: Images, calibrations or embeddings are missing or of another size or
+            backbone.
+    """
+    if not has_camera(config):
+        if embeddings is not None:
+            raise UserError(
+                f"embeddings are given, but config.model.name is {config.model.name!r}, "
+                "which has no camera"
+            )
+        return None
+    features = None
+    if embeddings is not None:
+        cameras.check_embeddable(
+            freeze=config.model.image.freeze,
+            mirror_probability=config.data.mirror_probability,
+        )
+        features = open_embeddings(embeddings, config.model.image)
+    options = cameras.CameraOptions.of_config(config.data)
+    return cameras.camera_inputs(frames, config.model.image.size, options, features)
 
 
 def _check_folders(paths: Sequence[str]) -> None:

@@ -13,20 +13,28 @@ import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.data.cameras import require_images
 from radejax.data.encoding import decode as decode_array
-from radejax.data.frame_table import IMAGE_SIZE, read_left_image
+from radejax.data.images import front_view
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import read_grid
 from radejax.data.kradar.frame import Frame
-from radejax.data.records.projections import RecordSource, describe_grid
+from radejax.data.records.projections import (
+    RecordSource,
+    describe_grid,
+    record_positions,
+)
 from radejax.evaluation.files.predictions import tables_from_frames
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.report import Report, write_report
-from radejax.geometry.calibration import CameraCalibration
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.interop import image_backbone as camera_inputs
+from radejax.interop.image_backbone import (
+    has_camera,
+    missing_backbone,
+    require_camera,
+)
 from radejax.runs.camera_share import camera_share, write_camera_share
-from radejax.runs.data import OtherData, project
+from radejax.runs.data import OtherData, camera_inputs, project
 from radejax.runs.workdir import Run, load_run
 from radejax.training import processes
 
@@ -82,9 +90,9 @@ def evaluate_run(
         raise UserError(f"no frames of split {split} in {', '.join(run.paths.roots)}")
     seen = frames
     if exchange_images is not None:
-        camera_inputs.require_camera(config)
+        require_camera(config)
         seen = with_images_exchanged(frames, exchange_images)
-    inputs = camera_inputs.loader_arguments(config, seen, run.paths.embeddings)
+    images = camera_inputs(config, seen, run.paths.embeddings)
     source = {
         "step": run.step,
         "split": split,
@@ -96,7 +104,7 @@ def evaluate_run(
     name = "evaluation" if other is None else f"evaluation_{other.name}"
     name += "" if exchange_images is None else "_exchanged"
     if other is not None:
-        camera_inputs.require_images(frames, inputs, split)
+        require_images(frames, images, split)
         if out is None:
             _check_source(run.workdir / name, source)
         processes.main_first(lambda: project(config, run.paths))
@@ -107,7 +115,7 @@ def evaluate_run(
         config, run.variables, run.grid, score_threshold=options.score_threshold
     )
     predictions = predict_dataset(
-        predictor, records, seen, options.batch_size, inputs=inputs
+        predictor, records, seen, options.batch_size, images=images
     )
     count = options.num_pictures if num_pictures is None else num_pictures
     return processes.main_only(
@@ -133,7 +141,7 @@ def with_other_data(run: Run, other: OtherData) -> Run:
             f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
             f"{run.workdir} was trained on {describe_grid(run.grid)}"
         )
-    is_blind = camera_inputs.missing_backbone(run.variables["params"], config)
+    is_blind = missing_backbone(run.variables["params"], config)
     if is_blind and paths.embeddings is None:
         raise UserError(
             f"{run.workdir} is without the weights of its image backbone: give "
@@ -146,12 +154,12 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     """`UserError` if a folder has results on other data than these."""
     if not (out / "source.json").exists():
         return
-    found = files.read_json(out / "source.json")
-    for name in ("roots", "labels", "label_version", "split"):
-        if (there := found.get(name)) != (here := source[name]):
-            raise UserError(
-                f"{out} has results of {name} {there}, these are of {here}: give --out"
-            )
+    names = ("roots", "labels", "label_version", "split")
+    found, wanted = (
+        {name: values.get(name) for name in names}
+        for values in (files.read_json(out / "source.json"), source)
+    )
+    files.require_same(found, wanted, f"{out} has other results", mend="give --out")
 
 
 def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
@@ -200,7 +208,7 @@ def _report(
         draw_frame=drawer,
     )
     _log.info("step %d, split %s\n%s", run.step, source["split"], report.text)
-    if camera_inputs.has_camera(config):
+    if has_camera(config):
         shares = camera_share(
             config, run.variables, records, frames, embeddings=run.paths.embeddings
         )
@@ -232,22 +240,6 @@ def report_options(config: Any, name: str) -> Options:
         invalid_sizes="false_positive",
         bootstrap=0,
     )
-
-
-def record_positions(records: RecordSource, frames: KRadar) -> list[int]:
-    """Index of the record of every frame.
-
-    Raises:
-        UserError: Frames have no record; says how many and names the first.
-    """
-    index_of = records.index_of()
-    missing = [frame.key for frame in frames if frame.key not in index_of]
-    if missing:
-        raise UserError(
-            f"{len(missing)} of {len(frames)} frames have no record in "
-            f"{records.folder}, the first is {missing[0]}: project the data set again"
-        )
-    return [index_of[frame.key] for frame in frames]
 
 
 class FrameDrawer:
@@ -350,30 +342,3 @@ def draw_curves(workdir: pathlib.Path, path: pathlib.Path) -> None:
 
     figure = curves.draw_training(workdir / "metrics.jsonl", title=workdir.name)
     bev.save_figure(figure, path)
-
-
-def read_camera(frame: Frame) -> CameraCalibration | None:
-    """Calibration of a frame's left front camera; None where there is no image."""
-    if frame.camera_path is None or frame.camera_calibration_path is None:
-        return None
-    return CameraCalibration.from_kradar(
-        frame.camera_calibration_path, ego_from_lidar_m=frame.radar_from_lidar_m
-    )
-
-
-def front_view(
-    frame: Frame,
-) -> tuple[np.ndarray | None, CameraCalibration | None]:
-    """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
-
-    Images of another size than the calibration's are resized to it. None where there is
-    none.
-
-    Raises:
-        DataError: A file is damaged.
-    """
-    camera = read_camera(frame)
-    if frame.camera_path is None:
-        return None, None
-    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
-    return read_left_image(frame.camera_path, size, resize=True), camera

@@ -18,14 +18,16 @@ from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data import pipeline
-from radejax.data.augment import Augmentation
+from radejax.data.augment import make_augmentation
+from radejax.data.cameras import require_images
+from radejax.data.frame_table import make_table
 from radejax.data.kradar.frame import Frame
+from radejax.data.records.embeddings import embeddings_sha256
 from radejax.data.records.projections import RecordSource
-from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.embed import embeddings_sha256, weights_sha256
-from radejax.interop import image_backbone as camera_inputs
+from radejax.inference.embed import weights_sha256
+from radejax.interop.image_backbone import load_image_backbone
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.runs.data import DataPaths, prepare_data, saved_path
+from radejax.runs.data import DataPaths, camera_inputs, prepare_data, saved_path
 from radejax.runs.workdir import (
     PathLike,
     checkpoint_info,
@@ -33,7 +35,6 @@ from radejax.runs.workdir import (
     initial_variables,
     load_run,
     lock_workdir,
-    relative,
     run_info,
 )
 from radejax.training import loop, processes, sharding
@@ -42,7 +43,6 @@ from radejax.training.step import map_grid
 __all__ = [
     "config_name",
     "load_run",
-    "make_augmentation",
     "run",
     "train",
 ]
@@ -127,7 +127,7 @@ def run(
         )
         if _train_and_evaluate(config, workdir, paths, init_from):
             minutes = (time.perf_counter() - started) / 60
-            _log.info(_CLOSING.format(minutes=minutes, workdir=relative(workdir)))
+            _log.info(_CLOSING.format(minutes=minutes, workdir=files.relative(workdir)))
     return workdir
 
 
@@ -186,21 +186,29 @@ def train(
         "train.batch_size",
         config.train.num_accumulate,
     )
-    inputs = camera_inputs.loader_arguments(config, frames, paths.embeddings)
-    camera_inputs.require_images(frames, inputs)
-    loader = pipeline.make_loader(
+    images = camera_inputs(config, frames, paths.embeddings)
+    require_images(frames, images)
+    table = make_table(
         records,
         frames,
-        batch_size=config.train.batch_size // jax.process_count(),
         max_objects=config.data.max_objects,
         classes=config.classes,
+        images=images,
+        label_permutation_seed=config.data.label_permutation_seed,
+    )
+    options = pipeline.LoaderOptions(
+        config.train.batch_size // jax.process_count(),
         seed=config.seed,
-        augment=make_augmentation(config.data, records.grid),
         num_threads=config.data.num_threads,
         num_workers=config.data.num_workers,
-        label_permutation_seed=config.data.label_permutation_seed,
-        **inputs,
     )
+    augment = make_augmentation(
+        records.grid,
+        mirror_probability=config.data.mirror_probability,
+        gain_db=config.data.gain_db,
+        gain_slope_db=config.data.gain_slope_db,
+    )
+    loader = pipeline.make_loader(table, options, augment=augment)
     evaluate = None
     if config.train.evaluate_every_epochs:
         from radejax.runs.validation import Validation  # above: it reads whole runs
@@ -211,9 +219,7 @@ def train(
         variables = initial_variables(init_from, config)
     pretrained = None
     if not _has_backbone(variables):
-        pretrained = camera_inputs.load_image_backbone(
-            paths.image_backbone, config, paths.embeddings
-        )
+        pretrained = load_image_backbone(paths.image_backbone, config, paths.embeddings)
     return loop.train(
         model,
         variables,
@@ -271,15 +277,3 @@ def _what_stays(
             digest = weights_sha256(source["params"][IMAGE_BACKBONE])
         stays["sha256 of the frozen image backbone"] = digest[:16]
     return stays
-
-
-def make_augmentation(data: ConfigDict, grid: RadarGrid) -> Augmentation | None:
-    """Random changes of training frames as `config.data` says; None for none."""
-    augmentation = Augmentation(
-        grid=grid,
-        mirror_probability=data.mirror_probability,
-        gain_db=data.gain_db,
-        gain_slope_db=data.gain_slope_db,
-    )
-    is_on = data.mirror_probability or data.gain_db or data.gain_slope_db
-    return augmentation if is_on else None

@@ -17,8 +17,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.predictions import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.interop import image_backbone
-from radejax.runs.data import DataPaths
+from radejax.runs.data import DataPaths, camera_inputs
 from radejax.runs.evaluate import FrameDrawer, report_options
 from radejax.training import processes
 from radejax.training.state import TrainState
@@ -53,9 +52,7 @@ class Validation:
                 "no frames of the test split to evaluate on during training; set "
                 "train.evaluate_every_epochs=0"
             )
-        self._inputs = image_backbone.loader_arguments(
-            config, self._frames, paths.embeddings
-        )
+        self._images = camera_inputs(config, self._frames, paths.embeddings)
         self._ground_truth, self._table = tables_from_frames(self._frames)
         self._options = report_options(config, "training")
         self._predictor: Predictor | None = None
@@ -114,7 +111,7 @@ class Validation:
                 self._records,
                 self._frames,
                 self._config.evaluation.batch_size,
-                inputs=self._inputs,
+                images=self._images,
                 progress=False,
                 should_stop=should_stop,
             )

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import logging
 import os
 import pathlib
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -29,7 +28,6 @@ from ml_collections import ConfigDict
 import radejax
 from radejax import models
 from radejax.core import files
-from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop import image_backbone as camera_inputs
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -62,8 +60,7 @@ class Run:
     step: int
 
 
-@contextlib.contextmanager
-def lock_workdir(workdir: pathlib.Path) -> Iterator[None]:
+def lock_workdir(workdir: pathlib.Path) -> contextlib.AbstractContextManager[None]:
     """Keeps a second training out of a work folder, which is made if missing.
 
     The system releases the lock however the process ends.
@@ -71,18 +68,11 @@ def lock_workdir(workdir: pathlib.Path) -> Iterator[None]:
     Raises:
         UserError: Another process holds it.
     """
-    workdir.mkdir(parents=True, exist_ok=True)
-    with (workdir / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"another training is at work in {relative(workdir)}: wait for its "
-                "end, or give another --workdir"
-            ) from None
-        except OSError as error:
-            _log.warning("no locks on the disk of %s (%s)", workdir, error.strerror)
-        yield
+    return files.lock(
+        workdir / "lock",
+        f"another training is at work in {files.relative(workdir)}: wait for its end, "
+        "or give another --workdir",
+    )
 
 
 def claim_workdir(workdir: pathlib.Path, config: ConfigDict) -> None:
@@ -92,19 +82,14 @@ def claim_workdir(workdir: pathlib.Path, config: ConfigDict) -> None:
         UserError: The folder belongs to a run with another configuration; names the
             fields that differ.
     """
-    path = workdir / "config.json"
-    wanted = json.loads(config.to_json()) | {"profile": "", "seeds": []}
-    if path.exists():
-        found = files.read_json(path)
-        if found | {"watch": None} != wanted | {"watch": None}:
-            raise UserError(
-                f"{relative(workdir)} holds a run with another config: "
-                + "; ".join(differences(found, wanted))
-                + ". Give another --workdir, or remove that one"
-            )
-        return
-    workdir.mkdir(parents=True, exist_ok=True)
-    files.write_json(path, wanted)
+    files.claim(
+        workdir / "config.json",
+        json.loads(config.to_json()) | {"profile": "", "seeds": []},
+        "a run with another config",
+        mend="give another --workdir, or remove that one",
+        name="config",
+        ignore=("watch",),
+    )
 
 
 def load_config(workdir: PathLike) -> ConfigDict:
@@ -117,25 +102,6 @@ def load_config(workdir: PathLike) -> ConfigDict:
     if not (workdir / "config.json").exists():
         raise FileNotFoundError(f"no run in {workdir}: config.json is missing")
     return ConfigDict(files.read_json(workdir / "config.json"), convert_dict=True)
-
-
-def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
-    """What differs between two configurations, read from JSON: a line each."""
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        keys = sorted(set(found) | set(wanted))
-        return [
-            line
-            for key in keys
-            if found.get(key) != wanted.get(key)
-            for line in differences(found.get(key), wanted.get(key), f"{name}.{key}")
-        ]
-    return [f"{name} is {found!r} there and {wanted!r} here"]
-
-
-def relative(path: pathlib.Path) -> str:
-    """A path as messages name it: from the current folder where it is below that."""
-    here = pathlib.Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 def run_info(
@@ -267,8 +233,8 @@ def initial_variables(path: PathLike, config: ConfigDict) -> Mapping[str, Any]:
     if pathlib.Path(path).is_dir():
         other = load_run(path)
         found, wanted = (json.loads(c.model.to_json()) for c in (other.config, config))
-        if lines := differences(found, wanted, "config.model"):
-            raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
+        what, mend = f"weights of {path} do not fit", "give others"
+        files.require_same(found, wanted, what, mend=mend, name="config.model")
         return other.variables
     if camera_inputs.has_camera(config):
         from radejax.interop import dinorade_torch

@@ -67,17 +67,13 @@ def simulate_dataset(
     source = make_source(checked)
     num_frames, size = expected_size(checked, source)
     _log.info("%s: %d frames, about %.2g GB", root, num_frames, size / 1e9)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        _write_marker(root, checked, finished=False)
-        _remove_leftovers(root)
+    content = _marker(checked)
+    with files.disk_full(root / MARKER):
+        files.write_json(root / MARKER, content)
+        files.remove_stale(root)
         _write_common(root, checked, source)
         _write_frames(root, checked, source, num_threads, progress)
-        _write_marker(root, checked, finished=True)
-    except OSError as error:
-        if error.errno in (28, 122):  # no space left, quota exceeded
-            raise files.no_space_error(root / MARKER) from error
-        raise
+        files.write_json(root / MARKER, content | {"finished": True})
     return root
 
 
@@ -103,49 +99,22 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
                 " choose another folder"
             )
         return False
-    found = json.loads(marker.read_text())
-    if found["fingerprint"] != config.fingerprint():
-        changed = _changed_fields(found["config"], json.loads(config.to_json()))
-        raise UserError(
-            f"{root} holds a data set of another simulation config (differs in:"
-            f" {', '.join(changed) or 'version of the simulator'});"
-            " choose another folder or delete it"
-        )
-    return bool(found["finished"])
+    files.claim(
+        marker,
+        _marker(config),
+        "a data set of another simulation config",
+        ignore=("finished",),
+    )
+    return bool(files.read_json(marker)["finished"])
 
 
-def _changed_fields(old: dict, new: dict) -> list[str]:
-    return sorted(k for k in {*old, *new} if old.get(k) != new.get(k))
-
-
-def _write_marker(
-    root: pathlib.Path, config: SimulationConfig, *, finished: bool
-) -> None:
-    content = {
-        "fingerprint": config.fingerprint(),
-        "finished": finished,
+def _marker(config: SimulationConfig) -> dict[str, Any]:
+    """What an unfinished data set says of itself; the fingerprint has the version."""
+    return {
         "config": json.loads(config.to_json()),
+        "finished": False,
+        "fingerprint": config.fingerprint(),
     }
-    with files.atomic_write(root / MARKER) as file:
-        file.write(json.dumps(content, indent=1, sort_keys=True).encode())
-
-
-def _remove_leftovers(root: pathlib.Path) -> None:
-    """Removes temporary files of writers that were killed."""
-    for path in root.rglob(".*.tmp"):
-        process = path.name.split(".")[-2]
-        if process.isdigit() and not _is_alive(int(process)):
-            path.unlink(missing_ok=True)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # somebody else's
-        pass
-    return True
 
 
 def _write_common(

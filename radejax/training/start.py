@@ -14,6 +14,7 @@ import optax
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
+from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.training import sharding
 from radejax.training.checkpoints import Checkpoints, abstract_state
@@ -24,7 +25,7 @@ from radejax.training.state import (
     make_schedule,
     with_pretrained,
 )
-from radejax.training.step import Metrics, make_train_step, model_inputs
+from radejax.training.step import Metrics, make_train_step
 
 _STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
 

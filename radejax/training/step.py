@@ -12,20 +12,12 @@ import jax.numpy as jnp
 import optax
 
 from radejax.core.structures import Batch
-from radejax.data.encoding import to_float
+from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
 from radejax.training.state import TrainState, merge_parameters
 
 Metrics = dict[str, jax.Array]
-
-
-def model_inputs(batch: Batch) -> tuple[Any, ...]:
-    """Positional inputs of the model: the projection, and the camera's if there is one."""
-    projection = to_float(batch.projection)
-    if batch.image is None:
-        return (projection,)
-    return projection, batch.image, batch.camera
 
 
 def make_train_step(

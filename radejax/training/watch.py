@@ -11,7 +11,7 @@ import pathlib
 import re
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -22,7 +22,7 @@ from tensorboardX import summary
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from radejax.core import files
-from radejax.core.errors import DiskFullError, UserError
+from radejax.core.errors import UserError
 from radejax.training import processes
 from radejax.training.checkpoints import BEST
 from radejax.training.clock import StepClock, seconds_since_start
@@ -255,14 +255,9 @@ class _Wandb:
         self._run.finish()
 
 
-@contextlib.contextmanager
-def _told_if_full(path: pathlib.Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if not files.is_no_space(error):
-            raise
-        raise DiskFullError(
-            f"no space left to write {path}; checkpoints are intact, free some and run "
-            "the same command again"
-        ) from error
+def _told_if_full(path: pathlib.Path) -> contextlib.AbstractContextManager[None]:
+    message = (
+        f"no space left to write {path}; checkpoints are intact, free some and run the "
+        "same command again"
+    )
+    return files.disk_full(path, message)

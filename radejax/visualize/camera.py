@@ -73,7 +73,7 @@ def draw_camera(
         raise UserError(
             f"image has shape {image.shape}, the calibration is for {expected}; "
             "K-Radar's front images are stereo pairs of which the left half is meant "
-            "(radejax.data.frame_table.read_left_image), and CameraCalibration.resized "
+            "(radejax.data.images.read_left_image), and CameraCalibration.resized "
             "follows a resized image"
         )
     aspect = _pixel_aspect(calibration)

@@ -1,6 +1,5 @@
 """Configs: words, presets, the rows of the papers' tables; every one can be built."""
 
-import importlib.util
 import pathlib
 from typing import Any
 
@@ -8,7 +7,7 @@ import jax
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, load_module, parse_words
 from radejax.core.errors import UserError
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -16,10 +15,7 @@ RADENET = ("base", "cbam", "cbam_heads", "model", "no_cbam", "stem", "expand")
 
 
 def _get(name: str, words: str | None = None) -> Any:
-    spec = importlib.util.spec_from_file_location(name, CONFIGS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.get_config(words)
+    return load_module(CONFIGS / f"{name}.py").get_config(words)
 
 
 def _fields(config: Any) -> set[str]:

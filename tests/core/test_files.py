@@ -1,4 +1,4 @@
-"""Files are whole or not there."""
+"""Files are whole or not there, and folders belong to one job."""
 
 import errno
 import pathlib
@@ -6,7 +6,9 @@ import pathlib
 import pytest
 
 from radejax.core import files
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, DiskFullError, UserError
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: pathlib.Path) -> None:
@@ -24,11 +26,51 @@ def test_full_disk_is_one_clear_error(tmp_path: pathlib.Path) -> None:
         pytest.raises(UserError, match="no space left on the disk of"),
         files.atomic_path(tmp_path / "a.json"),
     ):
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise FULL
     assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_may_have_words_of_its_own() -> None:
+    @files.disk_full("x/a.json", "no space for a checkpoint")
+    def save(error: Exception) -> None:
+        raise error
+
+    with pytest.raises(DiskFullError, match="no space for a checkpoint"):
+        save(FULL)
+    with pytest.raises(OSError, match="Input/output"):
+        save(OSError(errno.EIO, "Input/output error"))
 
 
 def test_damaged_json_is_named(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.json").write_text('{"x": ')
     with pytest.raises(DataError, match=r"a\.json is not valid JSON"):
         files.read_json(tmp_path / "a.json")
+
+
+def test_a_folder_is_one_jobs(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "new" / "plan.json"
+    plan = {"a": {"b": (1, 2), "long": list(range(90))}, "seed": 0, "watch": 1}
+    files.claim(path, plan, "another job")
+    assert files.read_json(path)["a"]["b"] == [1, 2]
+    files.claim(path, {**plan, "watch": 2}, "another job", ignore=("watch",))
+    other = {"a": {"b": (1, 3), "long": []}, "watch": 1}
+    with pytest.raises(
+        UserError,
+        match=r"new holds another job: a\.b is \[1, 2\] there and \[1, 3\] here; "
+        r"a\.long differs; seed is 0 there and None here; give --out",
+    ):
+        files.claim(path, other, "another job", mend="give --out")
+    with pytest.raises(UserError, match=r"plan\.json is a file, expected a folder"):
+        files.claim(path / "plan.json", plan, "another job")
+
+
+def test_a_lock_is_held_once(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "new" / "lock"
+    with (
+        files.lock(path, "somebody is here"),
+        pytest.raises(UserError, match="somebody is here"),
+        files.lock(path, "somebody is here"),
+    ):
+        pass
+    with files.lock(path, "let go, though the file is there"):
+        pass

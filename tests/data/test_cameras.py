@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.data.cameras import frame_cameras
+from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.geometry.calibration import CameraCalibration
 
 CALIBRATION = CameraCalibration.from_angles(
@@ -27,6 +27,11 @@ class _Frame:
     camera_path: str | None
     camera_calibration_path: str | None
     radar_from_lidar_m: tuple = (-2.54, 0.3, 0.0)
+
+
+def frame_cameras(frames, image_size, **options):
+    options = CameraOptions(**{"allow_missing": False, **options})
+    return camera_inputs(frames, image_size, options).cameras
 
 
 @pytest.fixture

@@ -2,15 +2,10 @@ import types
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from radejax.core.errors import DataError, UserError
-from radejax.data.frame_table import (
-    IMAGE_SIZE,
-    frames_with_records,
-    make_table,
-    read_left_image,
-)
+from radejax.core.errors import UserError
+from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.frame_table import make_table
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
 from radejax.data.records.projections import RecordSource
@@ -72,9 +67,6 @@ def test_frames_without_records():
     source = records(["1/a"], {"1/b": "t.mat: truncated"})
     with pytest.raises(UserError, match=r"1 of 2 frames .* 1/b \(t\.mat: truncated\)"):
         make_table(source, frames, max_objects=1)
-    kept, missing = frames_with_records(source, frames)
-    assert [f.key for f in kept] == ["1/a"]
-    assert missing == ["1/b"]
     with pytest.raises(UserError, match="no frames"):
         make_table(source, [], max_objects=1)
 
@@ -97,39 +89,10 @@ def test_labels_can_be_exchanged_between_frames(kradar_root, tmp_path):
     assert ((mixed.classes >= 0) == mixed.is_valid).all()
 
 
-def test_missing_images_and_cameras():
-    frames = [frame("1/a", camera_path="x.png"), frame("1/b")]
-    source = records(["1/a", "1/b"])
-    with pytest.raises(UserError, match=r"1 of 2 frames have no front image .* 1/b"):
-        make_table(source, frames, max_objects=1, images=True)
-    table = make_table(
-        source, frames, max_objects=1, images=True, allow_missing_images=True
-    )
-    assert table.image_paths == ("x.png", None)
+def test_cameras_are_of_the_same_frames():
+    frames = [frame("1/a"), frame("1/b")]
+    for one in frames:
+        one.camera_calibration_path = None
+    images = camera_inputs(frames[:1], (2, 4), CameraOptions())
     with pytest.raises(UserError, match="1 cameras for 2 frames"):
-        make_table(source, frames, max_objects=1, cameras=[None])
-
-
-def test_left_half_of_the_stereo_pair(tmp_path):
-    height, width = IMAGE_SIZE
-    pixels = np.random.default_rng(0).integers(
-        0, 255, (height, 2 * width, 3), dtype=np.uint8
-    )
-    Image.fromarray(pixels).save(tmp_path / "a.png", compress_level=1)
-    np.testing.assert_array_equal(
-        read_left_image(tmp_path / "a.png"), pixels[:, :width]
-    )
-    Image.fromarray(pixels[:, :width]).save(tmp_path / "b.png", compress_level=1)
-    np.testing.assert_array_equal(
-        read_left_image(tmp_path / "b.png"), pixels[:, :width]
-    )
-    Image.fromarray(pixels[:50, :70]).save(tmp_path / "c.png")
-    with pytest.raises(DataError, match=r"c\.png: 70 x 50 pixels, expected 2560 x 720"):
-        read_left_image(tmp_path / "c.png")
-    content = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=r"a\.png: damaged image"):
-        read_left_image(tmp_path / "a.png")
-    (tmp_path / "a.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"a\.png: damaged image"):
-        read_left_image(tmp_path / "a.png")
+        make_table(records(["1/a", "1/b"]), frames, max_objects=1, images=images)

@@ -12,21 +12,17 @@ from PIL import Image
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
-from radejax.data import frame_table
 from radejax.data.augment import Augmentation
+from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.frame_table import make_table
+from radejax.data.images import IMAGE_SIZE
 from radejax.data.kradar import KRadar
-from radejax.data.pipeline import make_loader, steps_per_epoch
+from radejax.data.pipeline import LoaderOptions, make_loader, steps_per_epoch
 from radejax.data.records.job import project_dataset
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.calibration import CameraCalibration
 
-OPTIONS = {
-    "batch_size": 3,
-    "max_objects": 5,
-    "seed": 1,
-    "process_index": 0,
-    "process_count": 1,
-}
+OPTIONS = LoaderOptions(3, seed=1, process_index=0, process_count=1)
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +39,12 @@ def records(data, tmp_path_factory):
 
 @pytest.fixture
 def loader(records, data):
-    def make(**options):
-        return make_loader(records, data, **{**OPTIONS, **options})
+    table = make_table(records, data, max_objects=5)
+
+    def make(augment=None, **options):
+        return make_loader(
+            table, dataclasses.replace(OPTIONS, **options), augment=augment
+        )
 
     return make
 
@@ -87,7 +87,8 @@ def test_batches_are_the_records_and_labels(loader, records, data):
 
 def test_splits_point_to_the_right_records(records, kradar_root):
     test = KRadar(kradar_root, split="test")
-    batch = next(make_loader(records, test, shuffle=False, **OPTIONS))
+    table = make_table(records, test, max_objects=5)
+    batch = next(make_loader(table, dataclasses.replace(OPTIONS, shuffle=False)))
     for row, index in enumerate(batch.frame):
         record = records[records.frames.index(test[index].key)]
         np.testing.assert_array_equal(batch.projection[row], record["projection"])
@@ -278,7 +279,7 @@ def test_images_and_cameras(records, data, tmp_path):
     paths = [tmp_path / f"{10 + i}.png" for i in range(len(data))]
     for i, path in enumerate(paths):
         Image.fromarray(np.full((2, 4, 3), 10 + i, np.uint8)).save(path)
-    camera = CameraCalibration.from_angles(
+    calibration = CameraCalibration.from_angles(
         intrinsics=(2.0, 2.0, 2.0, 1.0),
         yaw_deg=90,
         pitch_deg=0,
@@ -286,40 +287,42 @@ def test_images_and_cameras(records, data, tmp_path):
         translation_m=(0, 0, 0),
         width=4,
         height=2,
-    ).camera()
+    )
+    (tmp_path / "cam_1.yml").write_text(calibration.to_kradar_text())
     frames = [
-        _with(frame, camera_path=None if i == 2 else paths[i])
+        dataclasses.replace(
+            frame,
+            camera_path=None if i == 2 else paths[i],
+            camera_calibration_path=tmp_path / "cam_1.yml",
+        )
         for i, frame in enumerate(data)
     ]
-    options = {**OPTIONS, "batch_size": 4, "shuffle": False, "images": True}
-    options["image_size"] = (2, 4)
     with pytest.raises(UserError, match="1 of 12 frames have no front image"):
-        make_loader(records, frames, **options)
+        camera_inputs(frames, (2, 4), CameraOptions(allow_missing=False))
+    images = camera_inputs(frames, (2, 4), CameraOptions())
+    table = make_table(records, frames, max_objects=5, images=images)
+    options = dataclasses.replace(OPTIONS, batch_size=5, pad_remainder=True)
+    *_, batch = make_loader(
+        table, dataclasses.replace(options, shuffle=False, num_epochs=1)
+    )
+    assert batch.frame.tolist() == [10, 11, -1, -1, -1]
+    assert batch.image[:, 0, 0, 0].tolist() == [20, 21, 0, 0, 0]
+    assert batch.camera.is_valid.tolist() == [True, True, False, False, False]
     batch = next(
-        make_loader(
-            records,
-            frames,
-            cameras=[camera] * 12,
-            allow_missing_images=True,
-            **options,
-        )
+        make_loader(table, dataclasses.replace(OPTIONS, batch_size=4, shuffle=False))
     )
     assert batch.image.dtype == np.uint8
     assert batch.image[:, 0, 0, 0].tolist() == [10, 11, 0, 13]
     assert batch.camera.is_valid.tolist() == [True, True, False, True]
     chex.assert_shape(batch.camera.cam_from_ego, (4, 3, 4))
     assert batch.camera.intrinsics.dtype == np.float32
-    assert frame_table.IMAGE_SIZE == (720, 1280)
-
-
-def _with(frame, **changes):
-    return dataclasses.replace(frame, **changes)
+    assert IMAGE_SIZE == (720, 1280)
 
 
 # Errors -------------------------------------------------------------------------------
 
 
-def test_wrong_sizes(loader):
+def test_wrong_sizes(loader, records, data):
     with pytest.raises(UserError, match="12 frames are fewer than one batch"):
         loader(batch_size=13)
     with pytest.raises(UserError, match="on each of 5 processes"):
@@ -327,7 +330,7 @@ def test_wrong_sizes(loader):
     with pytest.raises(UserError, match="must be at least 1, got 0"):
         loader(batch_size=0)
     with pytest.raises(UserError, match="would do"):
-        loader(max_objects=0)
+        make_table(records, data, max_objects=0)
 
 
 @pytest.mark.parametrize("num_threads", [0, 2])
@@ -340,9 +343,8 @@ def test_a_damaged_record_is_named_when_it_is_read(
     content[content.index(records[4]["projection"].tobytes()) + 10] ^= 1
     path.write_bytes(content)
     damaged = make_loader(
-        RecordSource(folder),
-        data,
-        **{**OPTIONS, "shuffle": False, "num_threads": num_threads},
+        make_table(RecordSource(folder), data, max_objects=5),
+        dataclasses.replace(OPTIONS, shuffle=False, num_threads=num_threads),
     )
     next(damaged)
     with pytest.raises(DataError, match=r"00000-of-00003\.arrayrecord: record 4"):

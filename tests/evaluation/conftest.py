@@ -1,19 +1,17 @@
 """Loads the slow reference and makes random scenes."""
 
-import importlib.util
 import pathlib
 
 import numpy as np
 import pytest
 
+from radejax.core.config import load_module
+
 HERE = pathlib.Path(__file__).parent
 
 
 def _load(name):
-    spec = importlib.util.spec_from_file_location(f"eval_{name}", HERE / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(HERE / f"{name}.py")
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
+from radejax.data.cameras import CameraOptions
 from radejax.inference import packed
 from radejax.inference.detect_files import (
     detect_files,
@@ -15,7 +16,6 @@ from radejax.inference.detect_files import (
     front_images,
     output_name,
 )
-from radejax.inference.inputs import CameraOptions
 from radejax.inference.open import open_detector
 from radejax.simulation.dataset import default_config, simulate_dataset
 

@@ -9,8 +9,9 @@ import pytest
 
 from radejax import Detector, UserError
 from radejax.core.structures import Batch
+from radejax.data.cameras import CameraOptions
 from radejax.geometry.camera import stack_cameras
-from radejax.inference.inputs import CameraOptions, prepare
+from radejax.inference.inputs import prepare
 from radejax.models.lifting import reference_points
 
 from .. import small_models as small

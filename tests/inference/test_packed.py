@@ -1,6 +1,5 @@
 """Packed models are read back as they were, without what may not be passed on."""
 
-import importlib.util
 import json
 import pathlib
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 import safetensors.numpy
 
 from radejax import Detector, UserError, models
+from radejax.core.config import load_module
 from radejax.core.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
@@ -70,9 +70,7 @@ CONFIGS = [
 @pytest.mark.parametrize(("name", "words"), CONFIGS)
 def test_the_config_of_a_model_makes_the_same_model(name: str, words: str) -> None:
     path = small.CONFIGS / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = load_module(path)
     model = models.build(module.get_config(words).model)
     again = models.build(packed.model_config(model))
     assert again == model

@@ -1,7 +1,6 @@
 """Tests of radejax.interop.dinorade_torch, against the released code's outputs."""
 
 import functools
-import importlib.util
 import json
 import pathlib
 
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax.core.config import load_module
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.calibration import CameraCalibration
 from radejax.interop import dinorade_torch
@@ -26,11 +26,9 @@ from radejax.models.lifting import (
 
 
 def golden_recipes():
-    path = pathlib.Path(__file__).parents[1] / "golden" / "dinorade_make.py"
-    spec = importlib.util.spec_from_file_location("dinorade_make", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(
+        pathlib.Path(__file__).parents[1] / "golden" / "dinorade_make.py"
+    )
 
 
 RECIPES = golden_recipes()

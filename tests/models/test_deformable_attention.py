@@ -1,7 +1,6 @@
 """Tests of radejax.models.deformable_attention and deformable_sampling."""
 
 import functools
-import importlib.util
 import itertools
 import json
 import math
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax.core.config import load_module
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.deformable_sampling import deformable_attention
 
@@ -21,12 +21,7 @@ MODULES = ("module_single_level", "module_two_levels", "module_box_reference")
 
 def load_make(golden):
     """The recipes beside the golden files."""
-    spec = importlib.util.spec_from_file_location(
-        "dinorade_make", golden / "dinorade_make.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(golden / "dinorade_make.py")
 
 
 @pytest.fixture(scope="module", params=["golden", "shared"])

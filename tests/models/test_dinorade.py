@@ -1,7 +1,6 @@
 """Tests of radejax.models.dinorade."""
 
 import functools
-import importlib.util
 import pathlib
 
 import chex
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax.core.config import load_module
 from radejax.core.errors import UserError
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
@@ -292,11 +292,7 @@ def test_parameters_at_full_size(variant, trained, frozen):
 
 
 def config_module():
-    path = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
-    spec = importlib.util.spec_from_file_location("dinorade_config", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_module(pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py")
 
 
 def test_configs_differ_where_paper_and_code_do():

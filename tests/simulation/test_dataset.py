@@ -4,6 +4,7 @@ import hashlib
 import json
 import logging
 import os
+import socket
 import subprocess
 import sys
 
@@ -145,7 +146,7 @@ class TestRepeating:
         dead = subprocess.Popen([sys.executable, "-c", ""])
         dead.wait()
         left, busy = (
-            root / "1" / f".tesseract_00001.mat.{process}.tmp"
+            root / "1" / f".tesseract_00001.mat.{socket.gethostname()}.{process}.tmp"
             for process in (dead.pid, os.getpid())
         )
         left.write_bytes(b"half")

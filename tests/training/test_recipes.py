@@ -1,6 +1,5 @@
 """The configs of both papers: what they say, and two steps of each at tiny size."""
 
-import importlib.util
 import pathlib
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from radejax import models
+from radejax.core.config import load_module
 from radejax.core.structures import Batch
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
@@ -33,10 +33,7 @@ ALL = [
 
 
 def _get(name: str, words: str = "") -> Any:
-    spec = importlib.util.spec_from_file_location(name, CONFIGS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.get_config(words)
+    return load_module(CONFIGS / f"{name}.py").get_config(words)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,12 @@ The folders are described in `docs/data.md`. Reading starts from the label files
 from __future__ import annotations
 
 import collections
+import copy
+import dataclasses
+import itertools
 import os
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,16 +25,17 @@ from radejax.data.kradar.frame import Frame
 from radejax.data.kradar.labels import (
     AVAILABILITY_FLAGS,
     LABEL_CLASSES,
-    Label,
     LabelFile,
     Problem,
     normalise_version,
     parse_label_file,
 )
-from radejax.data.kradar.sequence_info import camera_folders, read_sequence_info
-from radejax.data.kradar.splits import select_frames
+from radejax.data.kradar.sequences import camera_folders, read_sequence_info
+from radejax.data.kradar.splits import Key, select_frames
 
 PathLike = str | os.PathLike
+
+_Parsed = tuple[LabelFile | None, list[Problem]]  # None: nothing in it can be trusted
 
 
 class KRadar(Sequence[Frame]):
@@ -90,37 +94,36 @@ class KRadar(Sequence[Frame]):
         self.version = normalise_version(version)
         self.strict = strict
         self.classes = tuple(classes)
-        self.roots = _as_paths(root)
-        self._findings = Findings(strict=strict)
-        self._check_arguments(labels, visibility)
+        self.roots = as_paths(root)
+        _check_arguments(self.roots, labels, visibility, self.classes)
         self.folders = folders.find_sequences(self.roots)
         self.grid = folders.read_grid(self.roots)
-        source = self._open_labels(labels)
-        near = list(self.roots)
+        self._source = self._open_labels(labels)
+        self._near = list(self.roots)
         if labels is not None:
-            near += [pathlib.Path(labels), pathlib.Path(labels).parent]
-        keys = select_frames(
-            source,
-            self._findings,
-            split=split,
-            near=near,
-            sequence_numbers=sequence_numbers,
-        )
-        files = self._read_label_files(source, keys)
-        self._info = {
-            number: read_sequence_info(
-                number,
-                self.folders.get(number),
-                self._findings,
-                radar_from_lidar=radar_from_lidar,
-                z_offset_m=float(z_offset_m),
-                camera_folders=camera_folders(
-                    self.roots, _as_paths(camera_calibration)
-                ),
-            )
-            for number in sorted({number for number, _ in files})
-        }
-        self._frames = self._make_frames(files, visibility, field_of_view)
+            self._near += [pathlib.Path(labels), pathlib.Path(labels).parent]
+        self._sequence_numbers = sequence_numbers
+        self._offset = (radar_from_lidar, float(z_offset_m))
+        self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
+        self._visibility, self._field_of_view = visibility, field_of_view
+        self._parsed: dict[Key, _Parsed] = {}
+        self._read(split)
+
+    def of_split(self, split: PathLike | None) -> KRadar:
+        """The frames of a split, as opening the data set with it gives them.
+
+        Label files that either of the two has read are not read again.
+
+        Args:
+            split: As of the class.
+
+        Raises:
+            UserError: There is no such split.
+            DataError: Something is missing or malformed, and `strict`.
+        """
+        other = copy.copy(self)
+        other._read(split)
+        return other
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -142,24 +145,6 @@ class KRadar(Sequence[Frame]):
         counts = collections.Counter(cls for f in self._frames for cls in f.classes)
         return {cls: counts[cls] for cls in self.classes}
 
-    # Opening -------------------------------------------------------------------------
-
-    def _check_arguments(
-        self, labels: PathLike | None, visibility: Sequence[str] | None
-    ) -> None:
-        if not self.roots and labels is None:
-            raise UserError("give a K-Radar root, or labels, or both")
-        if isinstance(visibility, str):
-            raise UserError(
-                f"visibility is a sequence of flags, such as ({visibility!r},)"
-            )
-        unknown = [cls for cls in self.classes if cls not in LABEL_CLASSES]
-        if unknown or not self.classes:
-            raise UserError(
-                f"classes {unknown or 'are empty'}, expected some of "
-                + ", ".join(LABEL_CLASSES)
-            )
-
     def _open_labels(self, labels: PathLike | None) -> folders.LabelSource:
         """The label source; `UserError` when there is nothing in it."""
         if labels is not None:
@@ -177,41 +162,68 @@ class KRadar(Sequence[Frame]):
             )
         return source
 
-    # Reading -------------------------------------------------------------------------
+    def _read(self, split: PathLike | None) -> None:
+        """Finds what belongs to a split and reads it."""
+        self._findings = Findings(strict=self.strict)
+        keys = select_frames(
+            self._source,
+            self._findings,
+            split=split,
+            near=self._near,
+            sequence_numbers=self._sequence_numbers,
+        )
+        files = self._read_label_files(keys)
+        self._info = {
+            number: read_sequence_info(
+                number,
+                self.folders.get(number),
+                self._findings,
+                radar_from_lidar=self._offset[0],
+                z_offset_m=self._offset[1],
+                camera_folders=self._camera_folders,
+            )
+            for number in sorted({number for number, _ in files})
+        }
+        self._frames = self._make_frames(files)
 
-    def _read_label_files(
-        self, source: folders.LabelSource, keys: list[tuple[int, str]]
-    ) -> dict[tuple[int, str], LabelFile]:
+    def _read_label_files(self, keys: list[Key]) -> dict[Key, LabelFile]:
         """Parsed label files; damaged ones are reported."""
-        files = {}
-        for key, content in source.read(keys):
-            where = source.where(key)
-            problems: list[Problem] = []
-            try:
-                file = parse_label_file(
-                    content, self.version, where=where, problems=problems
-                )
-            except DataError as error:
-                self._findings.report("label file", where, str(error))
-                continue
+        files: dict[Key, LabelFile] = {}
+        for key, (file, problems) in self._parse(keys):
             if problems and not any(file.labels for file in files.values()):
-                self._raise_on_other_version(problems[0], source)
+                self._raise_on_other_version(problems[0])
             for problem in problems:
                 self._findings.report(problem.kind, problem.where, problem.message)
-            self._count_labels(key, file)
-            files[key] = file
+            if file is not None:
+                self._count_labels(key, file)
+                files[key] = file
         return files
 
-    def _raise_on_other_version(
-        self, problem: Problem, source: folders.LabelSource
-    ) -> None:
+    def _parse(self, keys: list[Key]) -> Iterator[tuple[Key, _Parsed]]:
+        """Every file with its problems, parsed unless that was done before."""
+        contents = self._source.read([key for key in keys if key not in self._parsed])
+        for key in keys:
+            if key not in self._parsed:
+                _, content = next(contents)
+                where, problems = self._source.where(key), []
+                try:
+                    file = parse_label_file(
+                        content, self.version, where=where, problems=problems
+                    )
+                except DataError as error:
+                    file, problems = None, [Problem("label file", where, str(error))]
+                self._parsed[key] = file, problems
+            yield key, self._parsed[key]
+
+    def _raise_on_other_version(self, problem: Problem) -> None:
         """A wrong version is the user's to mend, not thousands of malformed lines."""
         if "has the layout of" in problem.message:
             raise UserError(
-                f"{problem}; say the version of the labels in {source.description}"
+                f"{problem}; say the version of the labels in "
+                f"{self._source.description}"
             )
 
-    def _count_labels(self, key: tuple[int, str], file: LabelFile) -> None:
+    def _count_labels(self, key: Key, file: LabelFile) -> None:
         self.counts["objects in the label files"] += len(file.labels)
         self.counts["disabled objects (no leading *)"] += file.num_disabled
         odd = [x for x in file.labels if x.visibility not in AVAILABILITY_FLAGS]
@@ -219,55 +231,39 @@ class KRadar(Sequence[Frame]):
         expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
         self.counts["files named unlike their header"] += key[1] != expected
 
-    def _make_frames(
-        self,
-        files: dict[tuple[int, str], LabelFile],
-        visibility: Sequence[str] | None,
-        field_of_view: bool,
-    ) -> list[Frame]:
+    def _make_frames(self, files: dict[Key, LabelFile]) -> list[Frame]:
         """Frames with filtered boxes; all boxes of the data set are filtered at once."""
-        owners, labels, offsets = [], [], []
-        for index, ((number, _), file) in enumerate(files.items()):
-            owners += [index] * len(file.labels)
-            labels += file.labels
-            offsets += [self._info[number].radar_from_lidar_m] * len(file.labels)
+        labels = [label for file in files.values() for label in file.labels]
+        sizes = np.array([len(file.labels) for file in files.values()], int)
+        offsets = [self._info[number].radar_from_lidar_m for number, _ in files]
         boxes = np.array([label.box for label in labels], np.float64).reshape(-1, 7)
-        boxes[:, :3] += np.array(offsets, np.float64).reshape(-1, 3)
-        is_kept = self._filter(boxes, labels, visibility, field_of_view)
-        kept = np.flatnonzero(is_kept)
-        ends = np.searchsorted(
-            np.array(owners, np.int64)[kept], np.arange(len(files) + 1)
-        )
-        self.counts["frames"] = len(files)
-        self.counts["frames without objects"] = int((np.diff(ends) == 0).sum())
+        boxes[:, :3] += np.repeat(np.reshape(offsets, (-1, 3)), sizes, axis=0)
         names = np.array([label.cls for label in labels], dtype=np.str_)
         flags = np.array([label.visibility for label in labels], dtype=np.str_)
+        kept = np.flatnonzero(self._filter(boxes, names, flags))
+        ends = np.searchsorted(kept, np.append(0, np.cumsum(sizes)))
+        self.counts["frames"] = len(files)
+        self.counts["frames without objects"] = int((np.diff(ends) == 0).sum())
+        rows_of_files = [kept[a:b] for a, b in itertools.pairwise(ends)]
         return [
-            self._frame(key, file, *_take(boxes, names, flags, kept[a:b]))
-            for (key, file), a, b in zip(
-                files.items(), ends[:-1], ends[1:], strict=True
-            )
+            self._frame(key, file, *(column[rows] for column in (boxes, names, flags)))
+            for (key, file), rows in zip(files.items(), rows_of_files, strict=True)
         ]
 
     def _filter(
-        self,
-        boxes: np.ndarray,
-        labels: list[Label],
-        visibility: Sequence[str] | None,
-        field_of_view: bool,
+        self, boxes: np.ndarray, names: np.ndarray, flags: np.ndarray
     ) -> np.ndarray:
         """`[M]` True for the objects to keep; the others are counted by reason."""
-        is_kept = np.ones(len(labels), bool)
-        rules = {"class": np.array([x.cls in self.classes for x in labels], bool)}
-        if visibility is not None:
-            flags = set(visibility)
-            rules["visibility"] = np.array(
-                [x.visibility in flags for x in labels], bool
+        rules = {"class": np.isin(names, np.array(self.classes, np.str_))}
+        if self._visibility is not None:
+            rules["visibility"] = np.isin(
+                flags, np.array(list(self._visibility), np.str_)
             )
-        if field_of_view:
+        if self._field_of_view:
             rules["field of view"] = self.grid.in_field_of_view(
                 boxes[:, 0], boxes[:, 1]
             )
+        is_kept = np.ones(len(names), bool)
         for rule, passes in rules.items():
             self.counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
             is_kept &= passes
@@ -276,7 +272,7 @@ class KRadar(Sequence[Frame]):
 
     def _frame(
         self,
-        key: tuple[int, str],
+        key: Key,
         file: LabelFile,
         boxes: np.ndarray,
         classes: np.ndarray,
@@ -304,9 +300,7 @@ class KRadar(Sequence[Frame]):
         return Frame(
             *key,
             header,
-            info.conditions.environment,
-            info.conditions.time,
-            info.conditions.weather,
+            *dataclasses.astuple(info.conditions),
             tuple(file.labels),
             boxes,
             classes,
@@ -319,17 +313,28 @@ class KRadar(Sequence[Frame]):
         )
 
 
-def _as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
+def _check_arguments(
+    roots: list[pathlib.Path],
+    labels: PathLike | None,
+    visibility: Sequence[str] | None,
+    classes: tuple[str, ...],
+) -> None:
+    if not roots and labels is None:
+        raise UserError("give a K-Radar root, or labels, or both")
+    if isinstance(visibility, str):
+        raise UserError(f"visibility is a sequence of flags, such as ({visibility!r},)")
+    unknown = [cls for cls in classes if cls not in LABEL_CLASSES]
+    if unknown or not classes:
+        raise UserError(
+            f"classes {unknown or 'are empty'}, expected some of "
+            + ", ".join(LABEL_CLASSES)
+        )
+
+
+def as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
     """A list of paths from one, several or none."""
     if paths is None:
         return []
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
     return [pathlib.Path(path) for path in paths]
-
-
-def _take(
-    boxes: np.ndarray, names: np.ndarray, flags: np.ndarray, rows: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows of one frame as arrays of their own."""
-    return boxes[rows], names[rows], flags[rows]

@@ -11,16 +11,13 @@ import math
 import os
 import pathlib
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.files import atomic_write
+from radejax.core.files import atomic_write, write_text
 from radejax.data.kradar.labels import Label, normalise_version
-
-if TYPE_CHECKING:
-    from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid
 
 _SENSORS = "tesseract_os2-64_cam-front_os1-128_cam-lrr"
 _MAT_TEXT = b"MATLAB 5.0 MAT-file, written by radejax"
@@ -54,8 +51,7 @@ def write_labels(
     numbers = "_".join(f"{int(index):05d}" for index in indices)
     lines = [f"* idx({_SENSORS})={numbers}, timestamp={timestamp_s}"]
     lines += [_object_line(label, version) for label in labels]
-    with atomic_write(path) as file:
-        file.write(("\n".join(lines) + "\n").encode("ascii"))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def write_calibration(
@@ -63,16 +59,14 @@ def write_calibration(
 ) -> None:
     """Writes `info_calib/calib_radar_lidar.txt`: metres to add to LiDAR positions."""
     text = f"frame difference,x,y\n{int(frame_difference)},{float(dx_m)!r},{float(dy_m)!r}\n"
-    with atomic_write(path) as file:
-        file.write(text.encode("ascii"))
+    write_text(path, text)
 
 
 def write_description(
     path: str | os.PathLike, environment: str, time: str, weather: str
 ) -> None:
     """Writes `description.txt`: the conditions of one sequence on one line."""
-    with atomic_write(path) as file:
-        file.write(f"{environment},{time},{weather}\n".encode("ascii"))
+    write_text(path, f"{environment},{time},{weather}\n")
 
 
 def write_splits(
@@ -91,8 +85,7 @@ def write_splits(
         lines = [
             f"{seq},{str(frame).removesuffix('.txt')}.txt" for seq, frame in frames
         ]
-        with atomic_write(pathlib.Path(folder) / f"{name}.txt") as file:
-            file.write("\n".join(lines).encode("ascii"))
+        write_text(pathlib.Path(folder) / f"{name}.txt", "\n".join(lines))
 
 
 def write_tesseract(
@@ -120,8 +113,7 @@ def write_tesseract(
 
 def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
     """Writes `radar_grid.json` at the root of a data set of another sensor grid."""
-    with atomic_write(pathlib.Path(root) / "radar_grid.json") as file:
-        file.write(json.dumps(grid.to_dict()).encode("ascii"))
+    write_text(pathlib.Path(root) / "radar_grid.json", json.dumps(grid.to_dict()))
 
 
 def _object_line(label: Label, version: str) -> str:

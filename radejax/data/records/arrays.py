@@ -13,9 +13,33 @@ from typing import Any
 import numpy as np
 
 from radejax.core.errors import DataError
-from radejax.data.records.files import READER_OPTIONS, RecordFile, sha256
+from radejax.core.files import read_json
+from radejax.data.records.files import (
+    READER_OPTIONS,
+    RecordFile,
+    damage_named,
+    sha256,
+)
 
 MANIFEST = "manifest.json"
+
+
+def read_manifest_json(folder: pathlib.Path, kind: tuple[str, int]) -> dict[str, Any]:
+    """What `manifest.json` of a folder says, of a format and version.
+
+    Raises:
+        DataError: It is damaged or of another format or version.
+    """
+    path = folder / MANIFEST
+    with damage_named(path):
+        content = read_json(path)
+        found = content["format"], content["version"]
+        if found != kind:
+            raise DataError(
+                f"{path}: {found[0]} version {found[1]}, this radejax reads {kind[0]} "
+                f"version {kind[1]}"
+            )
+        return content
 
 
 class ArrayRecords(Sequence[Any]):

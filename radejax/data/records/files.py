@@ -13,15 +13,13 @@ import hashlib
 import json
 import os
 import pathlib
-import re
-import socket
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from radejax.core import files as core_files
 from radejax.core.errors import DataError
-from radejax.core.files import atomic_write, is_no_space, no_space_error
 
 # One record a group: random access then reads one frame, not its neighbours.
 WRITER_OPTIONS = "group_size:1,uncompressed"
@@ -65,29 +63,32 @@ def manifest_path(folder: pathlib.Path, name: str) -> pathlib.Path:
 
 
 class RecordFileWriter:
-    """Writes one file of records under a temporary name; `commit` makes it real."""
+    """Writes one file of records under a temporary name; `commit` makes it real.
+
+    A `with` block that ends in an error leaves nothing behind.
+    """
 
     def __init__(self, folder: pathlib.Path, name: str) -> None:
         from array_record.python.array_record_module import ArrayRecordWriter
 
         self._folder, self._name = folder, name
-        self._temporary = folder / f".{name}.{socket.gethostname()}.{os.getpid()}.tmp"
+        self._temporary = core_files.temporary_path(folder / name)
         self._frames: list[str] = []
         self.skipped: dict[str, str] = {}
         self.num_clipped = 0
-        remove_stale(folder, name)
-        with self._no_space_named():
+        core_files.remove_stale(folder, name)
+        with core_files.disk_full(folder / name):
             self._writer = ArrayRecordWriter(str(self._temporary), WRITER_OPTIONS)
 
     def write(self, key: str, stored: np.ndarray) -> None:
         """Appends the projection of one frame."""
-        with self._no_space_named():
+        with core_files.disk_full(self._folder / self._name):
             self._writer.write(np.ascontiguousarray(stored).tobytes())
         self._frames.append(key)
 
     def commit(self) -> RecordFile:
         """Closes, checks, renames, and writes the manifest of the file."""
-        with self._no_space_named():
+        with core_files.disk_full(self._folder / self._name):
             self._writer.close()
             with open(self._temporary, "rb+") as file:
                 os.fsync(file.fileno())
@@ -100,25 +101,22 @@ class RecordFileWriter:
                 self.num_clipped,
             )
             os.replace(self._temporary, self._folder / self._name)
-        with atomic_write(manifest_path(self._folder, self._name)) as file:
-            file.write(json.dumps(dataclasses.asdict(entry), indent=1).encode())
+        path = manifest_path(self._folder, self._name)
+        core_files.write_text(path, json.dumps(dataclasses.asdict(entry), indent=1))
         return entry
+
+    def __enter__(self) -> RecordFileWriter:
+        return self
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        if kind is not None:
+            self.discard()
 
     def discard(self) -> None:
         """Removes what was written so far."""
         with contextlib.suppress(Exception):  # a full disk also fails to close
             self._writer.close()
         self._temporary.unlink(missing_ok=True)
-
-    @contextlib.contextmanager
-    def _no_space_named(self) -> Iterator[None]:
-        """Turns the writer's errors on a full disk into a `UserError`."""
-        try:
-            yield
-        except Exception as error:
-            if is_no_space(error):
-                raise no_space_error(self._folder / self._name) from error
-            raise
 
 
 def read_manifest_of(folder: pathlib.Path, name: str) -> RecordFile | None:
@@ -129,39 +127,26 @@ def read_manifest_of(folder: pathlib.Path, name: str) -> RecordFile | None:
     """
     path = manifest_path(folder, name)
     try:
-        entry = RecordFile.from_dict(json.loads(path.read_bytes()))
+        with damage_named(path):
+            entry = RecordFile.from_dict(core_files.read_json(path))
         size = (folder / name).stat().st_size
     except FileNotFoundError:
         return None
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged manifest ({error!r}); delete it") from None
     return entry if size == entry.num_bytes else None
 
 
-def remove_stale(folder: pathlib.Path, name: str) -> None:
-    """Removes what killed processes of this machine left of a file."""
-    host = re.escape(socket.gethostname())
-    pattern = re.compile(rf"\.{re.escape(name)}\.{host}\.(\d+)\.tmp")
-    for path in folder.glob(f".{name}.*.tmp"):
-        match = pattern.fullmatch(path.name)
-        if match and not _is_running(int(match[1])):
-            path.unlink(missing_ok=True)
+@contextlib.contextmanager
+def damage_named(path: pathlib.Path) -> Iterator[None]:
+    """Turns what reading the fields of a damaged manifest raises into a `DataError`."""
+    try:
+        yield
+    except DataError:
+        raise
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: damaged manifest ({error!r}); delete it") from None
 
 
 def sha256(path: pathlib.Path) -> str:
     """Checksum of a file."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _is_running(pid: int) -> bool:
-    """True if a process of this machine could still be writing."""
-    try:
-        os.kill(pid, 0)
-        stat = pathlib.Path(f"/proc/{pid}/stat").read_text()
-    except ProcessLookupError:
-        return False
-    except OSError:  # not ours, or no /proc here
-        return True
-    # In containers nobody may collect the dead: "pid (name) Z ..." is one of them.
-    return stat.rpartition(")")[2].split()[0] != "Z"

@@ -11,7 +11,6 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import hashlib
-import json
 import math
 import multiprocessing
 import os
@@ -19,19 +18,18 @@ import pathlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
+from radejax.core import files as core_files
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import atomic_write
 from radejax.data.encoding import check_encoding, encode, num_clipped
+from radejax.data.kradar import Frame, KRadar
 from radejax.data.records import files
+from radejax.data.records.projections import Manifest, write_manifest
 from radejax.data.tesseract import project_file, read_projection_npy
-
-if TYPE_CHECKING:
-    from radejax.data.kradar import Frame, KRadar
-    from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid
 
 PLAN = "plan.json"
 
@@ -142,7 +140,7 @@ def project_dataset(
     ]
     names = [files.file_name(i, len(chunks)) for i in range(len(chunks))]
     plan = _plan([key for key, *_ in sources], frames_per_file, grid, dtype)
-    _agree_on_plan(out_dir, plan)
+    core_files.claim(out_dir / PLAN, plan, "another projection")
     shapes = (tuple(grid.shape_drea), tuple(grid.projection_shape))
     tasks = [
         _Task(out_dir, name, chunk, *shapes, plan["dtype"], skip_bad)
@@ -185,31 +183,6 @@ def _plan(keys: list[str], frames_per_file: int, grid: RadarGrid, dtype: str) ->
         "frames_sha256": hashlib.sha256("\n".join(keys).encode()).hexdigest(),
         "grid": grid.to_dict(),
     }
-
-
-def _agree_on_plan(out_dir: pathlib.Path, plan: dict) -> None:
-    """Writes the plan of a new folder; `UserError` if the folder has another one."""
-    path = out_dir / PLAN
-    try:
-        found = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        with atomic_write(path) as file:
-            file.write(json.dumps(plan).encode("ascii"))
-        return
-    except ValueError:
-        raise DataError(f"{path}: damaged plan; delete it") from None
-    except NotADirectoryError:
-        raise UserError(
-            f"{out_dir}: is a file, expected a folder for records"
-        ) from None
-    differing = [key for key in plan if found.get(key) != plan[key]]
-    if differing:
-        key = differing[0]
-        values = "" if key == "grid" else f": {found.get(key)} there, {plan[key]} now"
-        raise UserError(
-            f"{out_dir} holds another projection ({key} differs{values}); choose another "
-            "folder, or delete that one"
-        )
 
 
 def _count_finished(task: _Task, report: ProjectionReport) -> bool:
@@ -323,8 +296,7 @@ def _project_task(
     """Projects one file of records; returns its manifest, reading and working time."""
     began = time.perf_counter()
     timings = {"reading": 0.0}
-    writer = files.RecordFileWriter(task.folder, task.name)
-    try:
+    with files.RecordFileWriter(task.folder, task.name) as writer:
         for key, tesseract_path, projection_path in task.frames:
             try:
                 projection = _projection(
@@ -341,9 +313,6 @@ def _project_task(
                 writer.write(key, encode(projection, task.encoding))
             count_frame(1)
         entry = writer.commit()
-    except BaseException:
-        writer.discard()
-        raise
     return entry, timings["reading"], time.perf_counter() - began
 
 
@@ -372,8 +341,6 @@ def _finish(
     sources: list[tuple[str, pathlib.Path | None, pathlib.Path | None]],
 ) -> bool:
     """Writes the manifest of the folder if every file is there."""
-    from radejax.data.records.projections import Manifest, write_manifest
-
     entries = [files.read_manifest_of(out_dir, name) for name in names]
     if any(entry is None for entry in entries):
         return False

@@ -12,15 +12,17 @@ import itertools
 import json
 import os
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from radejax.core.errors import DataError, UserError
-from radejax.core.files import atomic_write
+from radejax.core.errors import UserError
+from radejax.core.files import write_text
 from radejax.data.encoding import MAX_ERROR_DB, check_encoding
-from radejax.data.records.arrays import MANIFEST, ArrayRecords
-from radejax.data.records.files import RecordFile
+from radejax.data.kradar.frame import Frame
+from radejax.data.records.arrays import MANIFEST, ArrayRecords, read_manifest_json
+from radejax.data.records.files import RecordFile, damage_named
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"
@@ -73,8 +75,8 @@ class Manifest:
 
 def write_manifest(folder: str | os.PathLike, manifest: Manifest) -> None:
     """Writes `manifest.json`."""
-    with atomic_write(pathlib.Path(folder) / MANIFEST) as file:
-        file.write(json.dumps(manifest.to_dict(), indent=1).encode("ascii"))
+    text = json.dumps(manifest.to_dict(), indent=1)
+    write_text(pathlib.Path(folder) / MANIFEST, text)
 
 
 def read_manifest(folder: str | os.PathLike) -> Manifest:
@@ -97,25 +99,14 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         raise FileNotFoundError(
             f"{folder}: no {MANIFEST}{hint if folder.is_dir() else ''}"
         )
-    try:
-        fields = json.loads(path.read_bytes())
-        if fields["format"] != FORMAT:
-            raise DataError(f"{path}: format {fields['format']!r}, expected {FORMAT!r}")
-        if fields["version"] != FORMAT_VERSION:
-            raise DataError(
-                f"{path}: version {fields['version']} of the record format, this radejax "
-                f"reads version {FORMAT_VERSION}"
-            )
+    fields = read_manifest_json(folder, (FORMAT, FORMAT_VERSION))
+    with damage_named(path):
         return Manifest(
             RadarGrid.from_dict(fields["grid"]),
             check_encoding(fields["encoding"]["dtype"]),
             fields["sources"],
             [RecordFile.from_dict(entry) for entry in fields["files"]],
         )
-    except DataError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged manifest ({error!r})") from None
 
 
 class RecordSource(ArrayRecords):
@@ -160,6 +151,24 @@ class RecordSource(ArrayRecords):
 
     def __getitem__(self, index: Any) -> dict[str, Any]:
         return {"projection": self.read(int(index)), "frame": int(index)}
+
+
+def record_positions(records: RecordSource, frames: Sequence[Frame]) -> list[int]:
+    """Index of the record of every frame.
+
+    Raises:
+        UserError: Frames have no record; says how many and names the first.
+    """
+    index_of = records.index_of()
+    missing = [frame.key for frame in frames if frame.key not in index_of]
+    if missing:
+        skipped = records.manifest.skipped
+        reason = f" ({skipped[missing[0]]})" if missing[0] in skipped else ""
+        raise UserError(
+            f"{records.folder}: {len(missing)} of {len(frames)} frames have no record, "
+            f"the first is {missing[0]}{reason}: project the data set again"
+        )
+    return [index_of[frame.key] for frame in frames]
 
 
 def describe_grid(grid: RadarGrid) -> str:

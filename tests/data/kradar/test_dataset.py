@@ -1,3 +1,4 @@
+import collections
 import json
 import math
 import shutil
@@ -8,8 +9,13 @@ import pytest
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES
-from radejax.data.kradar import KRadar, write
-from radejax.data.kradar.labels import LABEL_CLASSES, Label, normalise_version
+from radejax.data.kradar import KRadar, dataset, write
+from radejax.data.kradar.labels import (
+    LABEL_CLASSES,
+    Label,
+    normalise_version,
+    parse_label_file,
+)
 
 NAME = "00004_00001"
 INDICES = (4, 1, 2, 1, 3)
@@ -129,6 +135,42 @@ def test_split_by_rule_is_noted(tmp_path, kradar_writer):
     data = KRadar(tmp_path, split="test")
     assert [frame.header.lidar for frame in data] == [3, 4, 7, 8]
     assert "K-Radar's rule" in data.summary().to_text()
+
+
+def test_splits_of_an_opened_data_set_parse_no_label_again(
+    tmp_path, kradar_writer, monkeypatch
+):
+    kradar_writer(tmp_path)
+    (tmp_path / "1/info_label/00005_00002.txt").write_text("")  # damaged
+    path = tmp_path / "1/info_label/00004_00001.txt"
+    path.write_text(path.read_text() + "*, R, 1, Tree, 1, 2, 3, 4, 5, 6, 7\n")
+    (tmp_path / "mine.txt").write_text("1,00004_00001.txt\n2,00009_00006.txt\n")
+    (tmp_path / "none.txt").write_text("7,00004_00001.txt\n")
+    parsed = collections.Counter()
+
+    def parse(content, *arguments, where, **options):
+        parsed[where] += 1
+        return parse_label_file(content, *arguments, where=where, **options)
+
+    splits = (None, "train", "test", tmp_path / "mine.txt", tmp_path / "none.txt")
+    wanted = [KRadar(tmp_path, split=split) for split in splits]
+    monkeypatch.setattr(dataset, "parse_label_file", parse)
+    for first in (None, "test"):
+        parsed.clear()
+        data = KRadar(tmp_path, split=first)
+        before = data.summary()
+        for split, other in zip(splits, wanted, strict=True):
+            found = data.of_split(split)
+            assert found.summary() == other.summary()
+            assert found.class_counts() == other.class_counts()
+            assert [frame.key for frame in found] == [frame.key for frame in other]
+            for a, b in zip(found, other, strict=True):
+                np.testing.assert_array_equal(a.boxes, b.boxes)
+        assert data.summary() == before
+        assert set(parsed.values()) == {1}
+        assert len(parsed) == 12
+    with pytest.raises(UserError, match="neither 'train'"):
+        data.of_split("validation")
 
 
 def test_split_entries_without_labels(tmp_path, kradar_writer):

@@ -5,7 +5,7 @@ import pytest
 from radejax.data.kradar import write
 from radejax.data.kradar.findings import Findings
 from radejax.data.kradar.folders import SequenceFolder
-from radejax.data.kradar.sequence_info import camera_folders, read_sequence_info
+from radejax.data.kradar.sequences import camera_folders, read_sequence_info
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import socket
 import numpy as np
 import pytest
 
+from radejax.core import files as core_files
 from radejax.core.errors import DataError, UserError
 from radejax.data.records import files
 from radejax.data.records.files import RecordFileWriter
@@ -65,7 +66,7 @@ def test_leftovers_of_killed_processes_are_removed(tmp_path):
     elsewhere = tmp_path / f".{NAME}.another.1.tmp"
     for path in (dead, mine, elsewhere):
         path.write_bytes(b"x")
-    files.remove_stale(tmp_path, NAME)
+    core_files.remove_stale(tmp_path, NAME)
     assert sorted(tmp_path.iterdir()) == sorted([mine, elsewhere])
 
 

@@ -11,7 +11,8 @@ import time
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, DiskFullError, UserError
+from radejax.core.files import is_running
 from radejax.data.kradar import KRadar
 from radejax.data.records import job as projection_job
 from radejax.data.records.job import parse_shard, project_dataset
@@ -70,7 +71,7 @@ KILLED = """
 import sys
 import threading
 from radejax.data.kradar import KRadar
-from radejax.data.projection_job import project_dataset
+from radejax.data.records.job import project_dataset
 if __name__ == "__main__":
     project_dataset(
         KRadar(sys.argv[1]), sys.argv[2], num_workers=1, frames_per_file=5, progress=False
@@ -117,17 +118,6 @@ def wait_until(condition, seconds=120.0):
     while not condition():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.05)
-
-
-def is_running(pid: int) -> bool:
-    """False also for a zombie that nobody has waited for."""
-    try:
-        state = (
-            pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        )
-    except FileNotFoundError:
-        return False
-    return state != "Z"
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
@@ -191,15 +181,18 @@ def test_eight_bits_state_what_they_lose(kradar_root, tmp_path):
 def test_a_folder_keeps_to_its_plan(kradar_root, tmp_path):
     data = KRadar(kradar_root)
     run(data, tmp_path)
-    with pytest.raises(UserError, match=r"\(dtype differs: float16 there, uint8 now\)"):
+    with pytest.raises(
+        UserError,
+        match=r"another projection: dtype is 'float16' there",
+    ):
         run(data, tmp_path, dtype="uint8")
-    with pytest.raises(UserError, match=r"\(num_frames differs: 12 there, 8 now\)"):
+    with pytest.raises(UserError, match="num_frames is 12 there and 8 here"):
         run(data[:8], tmp_path, grid=data.grid)
     other = RadarGrid.kradar()
-    with pytest.raises(UserError, match=r"\(grid differs\)"):
+    with pytest.raises(UserError, match=r"grid\.azimuth_rad differs"):
         run(data, tmp_path, grid=other)
     (tmp_path / "plan.json").write_text("{")
-    with pytest.raises(DataError, match=r"plan\.json: damaged plan"):
+    with pytest.raises(DataError, match=r"plan\.json is not valid JSON"):
         run(data, tmp_path)
 
 
@@ -225,11 +218,11 @@ def test_wrong_arguments(kradar_root, tmp_path):
 
 
 def test_a_full_disk_keeps_nothing_half_written(kradar_root, tmp_path, monkeypatch):
-    class Full(projection_job.record_files.RecordFileWriter):
+    class Full(projection_job.files.RecordFileWriter):
         def write(self, key, stored):
-            raise projection_job.record_files.no_space_error(tmp_path / "x")
+            raise DiskFullError("no space left on the disk of x")
 
-    monkeypatch.setattr(projection_job.record_files, "RecordFileWriter", Full)
+    monkeypatch.setattr(projection_job.files, "RecordFileWriter", Full)
     with pytest.raises(UserError, match="no space left on the disk of"):
         run(KRadar(kradar_root), tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["plan.json"]

@@ -137,11 +137,8 @@ def test_a_flipped_byte_is_found(copy):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"version": 2},
-            r"version 2 of the record format, this radejax reads version 1",
-        ),
-        ({"format": "x"}, r"format 'x', expected 'radejax-projections'"),
+        ({"version": 2}, r"radejax-projections version 2, this .* reads .* version 1"),
+        ({"format": "x"}, r"x version 1, this radejax reads radejax-projections"),
         ({"grid": {}}, r"damaged manifest"),
         ({"files": [{}]}, r"damaged manifest"),
         ({"encoding": {"dtype": "int4"}}, r"damaged manifest"),
@@ -153,7 +150,7 @@ def test_other_versions_and_damaged_manifests(copy, change, message):
     with pytest.raises(DataError, match=r"manifest\.json: " + message):
         RecordSource(copy)
     path.write_text("{")
-    with pytest.raises(DataError, match="damaged manifest"):
+    with pytest.raises(DataError, match="is not valid JSON"):
         read_manifest(copy)
 
 

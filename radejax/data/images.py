@@ -1,0 +1,70 @@
+"""Front images of frames, read as the models and the drawings want them."""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+
+from radejax.core.errors import DataError
+from radejax.data.kradar.frame import Frame
+from radejax.geometry.calibration import CameraCalibration
+
+IMAGE_SIZE = (720, 1280)
+"""Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
+
+
+def read_left_image(
+    path: pathlib.Path, size: tuple[int, int] = IMAGE_SIZE, *, resize: bool = False
+) -> np.ndarray:
+    """`[H, W, 3]` uint8 left half of a front image (a stereo pair, or left only).
+
+    Args:
+        path: Of the picture file. More than twice as wide as high: a stereo pair.
+        size: Height and width of the result.
+        resize: Bring other sizes to `size`, averaging where they are larger.
+
+    Raises:
+        DataError: The file is damaged, or of another size and not `resize`.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    height, width = size
+    try:
+        with Image.open(path) as file:
+            found = file.size
+            if not resize and found not in ((2 * width, height), (width, height)):
+                raise DataError(
+                    f"{path}: {found[0]} x {found[1]} pixels, expected "
+                    f"{2 * width} x {height} (stereo) or {width} x {height}"
+                )
+            is_pair = found[0] > 2 * found[1] if resize else found[0] == 2 * width
+            left = (0, 0, found[0] // 2 if is_pair else found[0], found[1])
+            image = file.convert("RGB").crop(left)
+            if image.size != (width, height):
+                image = image.resize((width, height), Image.Resampling.BOX)
+            return np.asarray(image)
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise DataError(f"{path}: damaged image ({error})") from None
+
+
+def front_view(
+    frame: Frame,
+) -> tuple[np.ndarray | None, CameraCalibration | None]:
+    """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
+
+    Images of another size than the calibration's are resized to it. None where there is
+    none.
+
+    Raises:
+        DataError: A file is damaged.
+    """
+    if frame.camera_path is None:
+        return None, None
+    camera = None
+    if frame.camera_calibration_path is not None:
+        camera = CameraCalibration.from_kradar(
+            frame.camera_calibration_path, ego_from_lidar_m=frame.radar_from_lidar_m
+        )
+    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
+    return read_left_image(frame.camera_path, size, resize=True), camera
