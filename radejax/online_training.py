@@ -22,6 +22,7 @@ from radejax.runs.workdir import checkpoint_info, claim_workdir, lock_workdir
 from radejax.simulation.config import plain
 from radejax.simulation.online import OnlineBatches
 from radejax.training import loop, sharding
+from radejax.training.start import Plan
 from radejax.training.step import map_grid
 
 SEED_OFFSET = 1_000_003
@@ -106,16 +107,18 @@ def _train(
         batches.loader(),
         map_grid(batches.grid, model, config.data.azimuth_mapping),
         workdir,
-        options=config.train,
-        loss=config.loss,
-        watch=config.watch,
-        seed=config.seed,
-        info=checkpoint_info(
-            config,
-            batches.grid,
-            {"online_sequences": num_sequences},
-            {"number of sequences": num_sequences},
+        Plan(
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info=checkpoint_info(
+                config,
+                batches.grid,
+                {"online_sequences": num_sequences},
+                {"number of sequences": num_sequences},
+            ),
+            steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
+            frame_names=batches.frame_names,
         ),
-        steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
-        frame_names=batches.frame_names,
     )

@@ -38,6 +38,7 @@ from radejax.runs.workdir import (
     run_info,
 )
 from radejax.training import loop, processes, sharding
+from radejax.training.start import Plan
 from radejax.training.step import map_grid
 
 __all__ = [
@@ -226,25 +227,27 @@ def train(
         loader,
         map_grid(records.grid, model, config.data.azimuth_mapping),
         workdir,
-        options=config.train,
-        loss=config.loss,
-        watch=config.watch,
-        seed=config.seed,
-        info=checkpoint_info(
-            config,
-            records.grid,
-            info,
-            _what_stays(frames, variables, pretrained, paths.embeddings, model),
+        Plan(
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info=checkpoint_info(
+                config,
+                records.grid,
+                info,
+                _what_stays(frames, variables, pretrained, paths.embeddings, model),
+            ),
+            steps_per_epoch=pipeline.steps_per_epoch(
+                len(frames),
+                config.train.batch_size // jax.process_count(),
+                process_count=jax.process_count(),
+            ),
+            pretrained=pretrained,
+            trace_folder=config.profile,
+            frame_names=[frame.key for frame in frames],
         ),
-        steps_per_epoch=pipeline.steps_per_epoch(
-            len(frames),
-            config.train.batch_size // jax.process_count(),
-            process_count=jax.process_count(),
-        ),
-        pretrained=pretrained,
         evaluate=evaluate,
-        trace_folder=config.profile,
-        frame_names=[frame.key for frame in frames],
     )
 
 
