@@ -32,6 +32,7 @@ from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.radenet import REMAT
 from radejax.training import loop, sharding
+from radejax.training.start import Plan
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step
 
@@ -114,12 +115,14 @@ def train(config, grid, steps, num_devices, folder):
         loader,
         models.map_grid(grid, model, config.data.azimuth_mapping),
         folder,
-        options=config.train,
-        loss=config.loss,
-        watch=config.watch,
-        seed=config.seed,
-        info={},
-        steps_per_epoch=1,
+        Plan(
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info={},
+            steps_per_epoch=1,
+        ),
         mesh=sharding.make_mesh(num_devices),
     )
     lines = (folder / "metrics.jsonl").read_text().splitlines()

@@ -29,6 +29,7 @@ from radejax.core.structures import CLASSES
 from radejax.runs.workdir import checkpoint_info, claimed
 from radejax.simulation.config import plain
 from radejax.training import loop, sharding
+from radejax.training.start import Plan
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -94,18 +95,20 @@ def train_online(
             batches.loader(),
             models.map_grid(batches.grid, model, config.data.azimuth_mapping),
             workdir,
-            options=config.train,
-            loss=config.loss,
-            watch=config.watch,
-            seed=config.seed,
-            info=checkpoint_info(
-                config,
-                batches.grid,
-                {"online_sequences": num_sequences},
-                {"number of sequences": num_sequences},
+            Plan(
+                options=config.train,
+                loss=config.loss,
+                watch=config.watch,
+                seed=config.seed,
+                info=checkpoint_info(
+                    config,
+                    batches.grid,
+                    {"online_sequences": num_sequences},
+                    {"number of sequences": num_sequences},
+                ),
+                steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
+                frame_names=batches.frame_names,
             ),
-            steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
-            frame_names=batches.frame_names,
         )
 
 

@@ -22,6 +22,7 @@ from radejax.runs.evaluate import evaluate
 from radejax.runs.validation import Validation
 from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
 from radejax.training import loop, processes
+from radejax.training.start import Plan
 
 _log = logging.getLogger(__name__)
 
@@ -123,18 +124,20 @@ def train(
         loader,
         models.map_grid(data.records.grid, model, config.data.azimuth_mapping),
         folder,
-        options=config.train,
-        loss=config.loss,
-        watch=config.watch,
-        seed=config.seed,
-        info=checkpoint_info(
-            config, data.records.grid, info, _what_stays(frames, weights)
+        Plan(
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info=checkpoint_info(
+                config, data.records.grid, info, _what_stays(frames, weights)
+            ),
+            steps_per_epoch=len(frames) // config.train.batch_size,
+            pretrained=weights.pretrained,
+            trace_folder=config.profile,
+            frame_names=[frame.key for frame in frames],
         ),
-        steps_per_epoch=len(frames) // config.train.batch_size,
-        pretrained=weights.pretrained,
         evaluate=validation,
-        trace_folder=config.profile,
-        frame_names=[frame.key for frame in frames],
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import pathlib
 import tempfile
@@ -15,6 +16,7 @@ from ml_collections import ConfigDict
 from PIL import Image
 
 from radejax.core.errors import UserError
+from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
@@ -62,7 +64,11 @@ class Validation:
             )
         self._images = data.images(self._frames)
         self._predictor = make_predictor(config, model, data, mesh)
-        self._ground_truth, self._table = tables_from_frames(self._frames)
+
+    @functools.cached_property
+    def _tables(self) -> tuple[Columns, Columns]:
+        """Ground truth and frames as columns."""
+        return tables_from_frames(self._frames)
 
     def __call__(
         self,
@@ -77,16 +83,17 @@ class Validation:
         """
         predictions = self._predict(state.eval_variables, should_stop)
         predictions, _ = repair_sizes(predictions, self._options.invalid_sizes)
+        ground_truth, table = self._tables
         data = EvaluationSet(
-            self._ground_truth,
+            ground_truth,
             predictions,
             classes=self._options.classes,
-            frames=self._table,
+            frames=table,
             roi=self._options.roi,
             label_version=self._options.label_version,
         )
         values, best = {}, None
-        for row in measure(data, self._table, self._options, kinds=()):
+        for row in measure(data, table, self._options, kinds=()):
             result = row.result
             if not result.is_defined:
                 continue

@@ -21,7 +21,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import files
-from radejax.core.errors import DataError, DiskFullError
+from radejax.core.errors import DataError
 from radejax.training import processes, sharding
 
 _log = logging.getLogger(__name__)
@@ -124,7 +124,7 @@ class Checkpoints:
         """
         if step in self._manager.all_steps():
             return
-        with _told_if_full(self.folder):
+        with self._told_if_full():
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
@@ -141,8 +141,22 @@ class Checkpoints:
         Raises:
             DiskFullError: Earlier checkpoints stay intact.
         """
-        with _told_if_full(self.folder):
+        with self._told_if_full():
             self._manager.wait_until_finished()
+
+    @contextlib.contextmanager
+    def _told_if_full(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception:
+            free = shutil.disk_usage(self.folder).free / 2**20
+            message = (
+                f"no space left for a checkpoint in {self.folder} ({free:.0f} MiB "
+                "free); earlier checkpoints are intact, free some and run the same "
+                "command again"
+            )
+            with files.disk_full(self.folder, message):
+                raise
 
     def restore(
         self, state: Any, data_iterator: Any
@@ -271,17 +285,3 @@ def abstract_state(state: Any, sharding: Any) -> Any:
     return jax.tree.map(
         lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), state, sharding
     )
-
-
-@contextlib.contextmanager
-def _told_if_full(folder: pathlib.Path) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:  # tensorstore's errors have no class of their own
-        if not files.is_no_space(error):
-            raise
-        free = shutil.disk_usage(folder).free / 2**20
-        raise DiskFullError(
-            f"no space left for a checkpoint in {folder} ({free:.0f} MiB free); earlier "
-            "checkpoints are intact, free some and run the same command again"
-        ) from error

@@ -1,10 +1,12 @@
-"""What a start of a training begins with: the state, and the step that is compiled."""
+"""What a start of a training begins with: plan, state, and the step that is compiled."""
 
 from __future__ import annotations
 
 import collections
+import dataclasses
+import logging
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -27,43 +29,83 @@ from radejax.training.state import (
 )
 from radejax.training.step import Metrics, make_train_step
 
+_log = logging.getLogger(__name__)
+
 _STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
 
 
-def optimizer_of(options: Any, num_steps: int) -> optax.GradientTransformation:
-    """The optimizer with its learning rate, from the fields of `config.train`."""
-    schedule = make_schedule(
-        learning_rate=options.learning_rate,
-        final_learning_rate=options.final_learning_rate,
-        num_steps=num_steps,
-        warmup_steps=options.warmup_steps,
-    )
-    return make_optimizer(
-        schedule,
-        weight_decay=options.weight_decay,
-        gradient_clip_norm=options.gradient_clip_norm,
-    )
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What is trained, and how.
+
+    Attributes:
+        options: The fields of `train` in `core.config`, as attributes.
+        loss: Keyword arguments of `detection_loss`.
+        watch: The fields of `watch` in `core.config`, as attributes.
+        seed: Of drawn variables and of everything random in a step.
+        info: Plain values that each checkpoint carries. Those under "same" are the
+            same on every start of a run; "config" is shown by Weights & Biases.
+        steps_per_epoch: Batches of one pass over the data.
+        pretrained: Part of the variables that takes the place of drawn ones, an image
+            backbone's weights for example.
+        trace_folder: Writes a trace of the steps `watch.profile_steps` there.
+        frame_names: What `Batch.frame` counts, for messages; its numbers if None.
+    """
+
+    options: Any
+    loss: Mapping[str, Any]
+    watch: Any
+    seed: int
+    info: Mapping[str, Any]
+    steps_per_epoch: int
+    pretrained: Mapping[str, Any] | None = None
+    trace_folder: str = ""
+    frame_names: Sequence[str] | None = None
+
+    @property
+    def num_steps(self) -> int:
+        """Of the whole training."""
+        return self.steps_per_epoch * self.options.num_epochs
+
+    @property
+    def wandb(self) -> dict[str, Any] | None:
+        """What a run at Weights & Biases is named after; None without one."""
+        if not self.watch.wandb:
+            return None
+        config = self.info.get("config", {})
+        return {"project": self.watch.wandb_project, "config": dict(config)}
+
+    def optimizer(self) -> optax.GradientTransformation:
+        """AdamW with its learning rate by step."""
+        schedule = make_schedule(
+            learning_rate=self.options.learning_rate,
+            final_learning_rate=self.options.final_learning_rate,
+            num_steps=self.num_steps,
+            warmup_steps=self.options.warmup_steps,
+        )
+        return make_optimizer(
+            schedule,
+            weight_decay=self.options.weight_decay,
+            gradient_clip_norm=self.options.gradient_clip_norm,
+        )
 
 
 def initial(
     model: nn.Module,
-    optimizer: optax.GradientTransformation,
-    options: Any,
-    seed: int,
-    loader: Any,
     variables: Mapping[str, Any] | None,
-    pretrained: Mapping[str, Any] | None,
+    loader: Any,
+    optimizer: optax.GradientTransformation,
+    plan: Plan,
 ) -> Callable[[], TrainState]:
     """A function that makes the state before the first step, to be compiled.
 
     What is given need not be drawn. The function is a tree of its arrays: handed to a
-    compiled function, they are arguments and no constants of the program. The arguments
-    are those of `loop.train`.
+    compiled function, they are arguments and no constants of the program.
     """
 
     def init(batch: Batch, variables: Any, pretrained: Any) -> TrainState:
         if variables is None:
-            keys = jax.random.split(jax.random.key(seed))
+            keys = jax.random.split(jax.random.key(plan.seed))
             rngs = {"params": keys[0], "dropout": keys[1]}
             variables = model.init(rngs, *model_inputs(batch), train=False)
         if pretrained is not None:
@@ -71,13 +113,13 @@ def initial(
         return create_state(
             variables,
             optimizer,
-            batch_size=options.batch_size,
-            use_ema=options.ema_decay is not None,
+            batch_size=plan.options.batch_size,
+            use_ema=plan.options.ema_decay is not None,
             is_frozen=getattr(model, "is_frozen", None),
         )
 
     # NumPy arrays: the same on every process, and so on every device.
-    given = jax.tree.map(np.asarray, (variables, pretrained))
+    given = jax.tree.map(np.asarray, (variables, plan.pretrained))
     return jax.tree_util.Partial(init, _first_batch(loader), *given)
 
 
@@ -94,33 +136,32 @@ def restore(
     loader: Any,
     init: Callable[[], TrainState],
     mesh: jax.sharding.Mesh,
-    parameter_sharding: sharding.ParameterSharding,
-    info: Mapping[str, Any],
+    plan: Plan,
 ) -> tuple[TrainState, int]:
     """State and step of the newest checkpoint, or those before the first step.
 
-    The loader is set to where it was.
-
     Args:
         checkpoints: Of the run.
-        loader: Checkpointable iterator.
+        loader: Checkpointable iterator, which is set to where it was.
         init: From `initial`.
         mesh: Devices that the state is placed on.
-        parameter_sharding: See `sharding.state_sharding`.
-        info: What is to be saved; "same" must be what was saved.
+        plan: Its `info["same"]` must be what was saved.
 
     Raises:
         UserError: The run would continue with other data or frozen weights.
         DataError: No checkpoint restores.
     """
     abstract = jax.eval_shape(init)
-    placement = sharding.state_sharding(abstract, mesh, parameter_sharding)
+    how = plan.options.parameter_sharding
+    placement = sharding.state_sharding(abstract, mesh, how)
     # Frozen parameters are not in a checkpoint: they come from where they came from.
     saved = abstract_state(abstract, placement).replace(frozen={})
-    state, found, step = checkpoints.restore(saved, loader) or (None, {}, 0)
-    _check_same(found.get("same", {}), info.get("same", {}), checkpoints.folder.parent)
-    if state is not None and not abstract.frozen:
-        return state, step
+    state, info, step = checkpoints.restore(saved, loader) or (None, {}, 0)
+    _check_same(info.get("same", {}), plan.info.get("same", {}), checkpoints.folder)
+    if state is not None:
+        _log.info("continuing from step %d of %d", step, plan.num_steps)
+        if not abstract.frozen:
+            return state, step
     # Compiled in half the time where LLVM does it: drawing runs once, and hundreds of
     # random generators take long to optimise; the numbers are the same.
     is_cpu = mesh.devices.flat[0].platform == "cpu"
@@ -133,7 +174,7 @@ def restore(
 
 
 def _check_same(
-    found: Mapping[str, Any], given: Mapping[str, Any], workdir: pathlib.Path
+    found: Mapping[str, Any], given: Mapping[str, Any], checkpoints: pathlib.Path
 ) -> None:
     """`UserError` where a run would continue with other data or frozen weights."""
     differing = [
@@ -143,37 +184,41 @@ def _check_same(
     ]
     if differing:
         raise UserError(
-            f"the run in {workdir} was trained with something else: "
+            f"the run in {checkpoints.parent} was trained with something else: "
             f"{'; '.join(differing)}. Give the same, or another --workdir"
         )
 
 
 def compile_step(
     model: nn.Module,
-    optimizer: optax.GradientTransformation,
     grid: RadarGrid,
+    optimizer: optax.GradientTransformation,
     state: TrainState,
     mesh: jax.sharding.Mesh,
-    options: Any,
-    loss: Mapping[str, Any],
-    seed: int,
+    plan: Plan,
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
-    """The step of a run, for states placed as this one, which it takes apart.
+    """The step of a run, for states placed as this one; it consumes its state.
 
-    It returns before it is computed, as long as not too many are under way.
+    It returns before it is computed, unless too many are under way.
+
+    Raises:
+        UserError: The batch does not divide over the devices.
     """
-    whole = sharding.replicated(mesh)
-    placement = jax.tree.map(lambda x: x.sharding, state)
+    options, whole = plan.options, sharding.replicated(mesh)
+    sharding.check_batch_size(
+        options.batch_size, mesh, "train.batch_size", options.num_accumulate
+    )
     step = make_train_step(
         model,
         optimizer,
         grid,
-        loss=dict(loss),
+        loss=dict(plan.loss),
         num_accumulate=options.num_accumulate,
         ema_decay=options.ema_decay,
     )
+    placement = jax.tree.map(lambda x: x.sharding, state)
     step = jax.jit(step, donate_argnums=0, out_shardings=(placement, whole))
-    rng = jax.jit(jax.random.key, out_shardings=whole)(np.uint32(seed + 1))
+    rng = jax.jit(jax.random.key, out_shardings=whole)(np.uint32(plan.seed + 1))
     in_flight: collections.deque[Metrics] = collections.deque()
 
     def limited(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -62,37 +63,14 @@ def make_train_step(
 
     gradient = jax.value_and_grad(loss_of_part, has_aux=True)
 
-    def accumulate(state: TrainState, batch: Batch, rng: jax.Array) -> Any:
-        if num_accumulate == 1:
-            (_, aux), grads = gradient(
-                state.params, state.frozen, state.model_state, batch, rng
-            )
-            return grads, *aux
-
-        def body(carry: Any, part_and_rng: Any) -> Any:
-            model_state, total = carry
-            part, part_rng = part_and_rng
-            (_, (model_state, parts)), grads = gradient(
-                state.params, state.frozen, model_state, part, part_rng
-            )
-            return (model_state, jax.tree.map(jnp.add, total, grads)), parts
-
-        split = split_batch(batch, num_accumulate)
-        start = state.model_state, jax.tree.map(jnp.zeros_like, state.params)
-        rngs = jax.random.split(rng, num_accumulate)
-        (model_state, grads), parts = jax.lax.scan(body, start, (split, rngs))
-        grads = jax.tree.map(lambda g: g / num_accumulate, grads)
-        metrics = {
-            name: p.mean(0) if jnp.issubdtype(p.dtype, jnp.floating) else p.sum(0)
-            for name, p in parts.items()  # numbers of objects and boxes are sums
-        }
-        return grads, model_state, metrics
-
     def step(
         state: TrainState, batch: Batch, rng: jax.Array
     ) -> tuple[TrainState, Metrics]:
+        chex.assert_tree_shape_prefix(batch, batch.frame.shape)
         rng = jax.random.fold_in(rng, state.step)
-        grads, model_state, metrics = accumulate(state, batch, rng)
+        grads, model_state, metrics = _accumulate(
+            gradient, num_accumulate, state, batch, rng
+        )
         grad_norm = optax.global_norm(grads)
         is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(metrics["loss"])
 
@@ -101,27 +79,67 @@ def make_train_step(
         ema_params = state.ema_params
         if ema_decay is not None:
             ema_params = optax.incremental_update(params, ema_params, 1.0 - ema_decay)
-        taken = params, model_state, opt_state, ema_params
-        kept = state.params, state.model_state, state.opt_state, state.ema_params
-        params, model_state, opt_state, ema_params = jax.tree.map(
-            lambda new, old: jnp.where(is_finite, new, old), taken, kept
-        )
-        is_skipped = (~is_finite).astype(jnp.int32)
-        in_row = (state.num_skipped_in_row + 1) * is_skipped
-        state = state.replace(
-            step=state.step + 1,
+        after = _taken_if(
+            is_finite,
+            state,
+            batch.frame,
             params=params,
             model_state=model_state,
             opt_state=opt_state,
             ema_params=ema_params,
-            num_skipped=state.num_skipped + is_skipped,
-            num_skipped_in_row=in_row,
-            most_skipped_in_row=jnp.maximum(state.most_skipped_in_row, in_row),
-            skipped_frames=jnp.where(is_finite, state.skipped_frames, batch.frame),
         )
-        return state, {**metrics, "grad_norm": grad_norm, "skipped": state.num_skipped}
+        # Otherwise the next step would be compiled anew.
+        chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
+        return after, {**metrics, "grad_norm": grad_norm, "skipped": after.num_skipped}
 
     return step
+
+
+def _accumulate(
+    gradient: Callable, num_parts: int, state: TrainState, batch: Batch, rng: jax.Array
+) -> tuple[Any, Any, Metrics]:
+    """Gradients of a batch, cut into parts, and what its forward pass gives beside."""
+    if num_parts == 1:
+        (_, aux), grads = gradient(
+            state.params, state.frozen, state.model_state, batch, rng
+        )
+        return grads, *aux
+
+    def body(carry: Any, part_and_rng: Any) -> Any:
+        model_state, total = carry
+        part, part_rng = part_and_rng
+        (_, (model_state, parts)), grads = gradient(
+            state.params, state.frozen, model_state, part, part_rng
+        )
+        return (model_state, jax.tree.map(jnp.add, total, grads)), parts
+
+    split = split_batch(batch, num_parts)
+    start = state.model_state, jax.tree.map(jnp.zeros_like, state.params)
+    rngs = jax.random.split(rng, num_parts)
+    (model_state, grads), parts = jax.lax.scan(body, start, (split, rngs))
+    grads = jax.tree.map(lambda g: g / num_parts, grads)
+    metrics = {
+        name: p.mean(0) if jnp.issubdtype(p.dtype, jnp.floating) else p.sum(0)
+        for name, p in parts.items()  # numbers of objects and boxes are sums
+    }
+    return grads, model_state, metrics
+
+
+def _taken_if(
+    is_finite: jax.Array, state: TrainState, frames: jax.Array, **changed: Any
+) -> TrainState:
+    """The state with what a step changed, or the step counted as skipped."""
+    kept = {name: getattr(state, name) for name in changed}
+    is_skipped = (~is_finite).astype(jnp.int32)
+    in_row = (state.num_skipped_in_row + 1) * is_skipped
+    return state.replace(
+        **jax.tree.map(lambda new, old: jnp.where(is_finite, new, old), changed, kept),
+        step=state.step + 1,
+        num_skipped=state.num_skipped + is_skipped,
+        num_skipped_in_row=in_row,
+        most_skipped_in_row=jnp.maximum(state.most_skipped_in_row, in_row),
+        skipped_frames=jnp.where(is_finite, state.skipped_frames, frames),
+    )
 
 
 def split_batch(batch: Batch, num_parts: int) -> Batch:

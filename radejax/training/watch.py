@@ -11,7 +11,7 @@ import pathlib
 import re
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -22,7 +22,7 @@ from tensorboardX import summary
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from radejax.core import files
-from radejax.core.errors import DiskFullError, UserError
+from radejax.core.errors import UserError
 from radejax.training import processes
 from radejax.training.checkpoints import BEST
 from radejax.training.clock import StepClock, seconds_since_start
@@ -66,8 +66,8 @@ class Watch:
         start_step: Step of the restored state.
         num_steps: Of the whole training.
         frames_per_step: For the rate.
-        wandb_project: Also log to this project of Weights & Biases; None: do not.
-        config: What Weights & Biases shows as the run's configuration.
+        wandb: Also log to Weights & Biases, with this "project" and the "config" that
+            is shown there; None: do not.
 
     Raises:
         UserError: Weights & Biases is asked for and not installed.
@@ -77,12 +77,10 @@ class Watch:
     def __init__(
         self,
         folder: pathlib.Path,
-        *,
         start_step: int,
         num_steps: int,
         frames_per_step: int,
-        wandb_project: str | None = None,
-        config: Mapping[str, Any] | None = None,
+        wandb: Mapping[str, Any] | None = None,
     ) -> None:
         self._clock = StepClock()
         self.timing = self._clock.timing
@@ -91,8 +89,8 @@ class Watch:
         self._logs: list[_Jsonl | _Board | _Wandb] = []
         if processes.is_main():
             self._logs.append(_Jsonl(folder / "metrics.jsonl", start_step))
-            if wandb_project is not None:
-                self._logs.append(_Wandb(wandb_project, folder, config))
+            if wandb is not None:
+                self._logs.append(_Wandb(folder, wandb))
             self._logs.append(_Board(folder / "tensorboard", start_step))
         self._bar = tqdm.tqdm(
             total=num_steps,
@@ -225,9 +223,7 @@ class _Board:
 class _Wandb:
     """The run of a work folder at Weights & Biases, continued if it is there."""
 
-    def __init__(
-        self, project: str, folder: pathlib.Path, config: Mapping[str, Any] | None
-    ) -> None:
+    def __init__(self, folder: pathlib.Path, arguments: Mapping[str, Any]) -> None:
         try:
             import wandb
         except ImportError as error:
@@ -237,12 +233,11 @@ class _Wandb:
             ) from error
         self._image = wandb.Image
         self._run = wandb.init(
-            project=project,
             name=folder.name,
             id=hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:16],
             resume="allow",
             dir=str(folder),
-            config=dict(config or {}),
+            **arguments,
         )
 
     def write(self, step: int, values: Values, pictures: Pictures) -> None:
@@ -255,14 +250,9 @@ class _Wandb:
         self._run.finish()
 
 
-@contextlib.contextmanager
-def _told_if_full(path: pathlib.Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if not files.is_no_space(error):
-            raise
-        raise DiskFullError(
-            f"no space left to write {path}; checkpoints are intact, free some and run "
-            "the same command again"
-        ) from error
+def _told_if_full(path: pathlib.Path) -> contextlib.AbstractContextManager[None]:
+    message = (
+        f"no space left to write {path}; checkpoints are intact, free some and run the "
+        "same command again"
+    )
+    return files.disk_full(path, message)

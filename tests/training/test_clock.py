@@ -1,11 +1,29 @@
-"""Traces of steps: written, or said not to be."""
+"""Times by part, and traces of steps: written, or said not to be."""
 
 import pathlib
+import time
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import pytest
 
-from radejax.training.clock import Trace
+from radejax.training.clock import StepClock, Trace
+
+
+def test_waiting_behind_busy_devices_is_no_waiting_for_data() -> None:
+    clock = StepClock()
+    for is_ready in (True, False):
+        with clock.timing(
+            "data", behind=[SimpleNamespace(is_ready=lambda r=is_ready: r)]
+        ):
+            time.sleep(0.01 if is_ready else 0.03)
+    with clock.timing("other"):
+        time.sleep(0.1)
+    time.sleep(0.02)
+    seconds = clock.take()
+    assert seconds["compute"] > seconds["data"] >= 0.01
+    assert 0.02 <= seconds["host"] < 0.1
+    assert sum(clock.take().values()) < 0.01
 
 
 def _trace(folder: pathlib.Path, first: int, last: int, steps: int) -> None:

@@ -1,5 +1,6 @@
 """Training from start to end, interrupted, damaged, stopped."""
 
+import dataclasses
 import functools
 import json
 import os
@@ -16,6 +17,7 @@ import pytest
 from radejax.core.errors import DataError, UserError
 from radejax.training import loop, processes, sharding
 from radejax.training.checkpoints import Checkpoints, abstract_state
+from radejax.training.start import Plan
 from radejax.training.watch import Scores
 
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -30,22 +32,24 @@ def run(tiny: Tiny) -> Any:
         workdir: pathlib.Path, loader: Any = None, config: Any = None, **others: Any
     ) -> Any:
         config = tiny.config if config is None else config
-        arguments = {
-            "options": config.train,
-            "loss": config.loss,
-            "watch": config.watch,
-            "seed": config.seed,
-            "info": {"config": {"seed": 0}},
-            "steps_per_epoch": STEPS_PER_EPOCH,
-            "mesh": sharding.make_mesh(1),
-        }
+        plan = Plan(
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info={"config": {"seed": 0}},
+            steps_per_epoch=STEPS_PER_EPOCH,
+        )
+        names = {field.name for field in dataclasses.fields(plan)} & set(others)
+        plan = dataclasses.replace(plan, **{name: others.pop(name) for name in names})
         return loop.train(
             tiny.model,
             None,
             tiny.loader() if loader is None else loader,
             tiny.map_grid,
             workdir,
-            **(arguments | others),
+            plan,
+            **({"mesh": sharding.make_mesh(1)} | others),
         )
 
     return train

@@ -17,6 +17,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.open import starting_weights
 from radejax.interop import radenet_torch
 from radejax.training import loop, sharding
+from radejax.training.start import Plan
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step
 
@@ -158,12 +159,14 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
         tiny.loader(),
         tiny.map_grid,
         workdir,
-        options=config.train,
-        loss=config.loss,
-        watch=config.watch,
-        seed=config.seed,
-        info={},
-        steps_per_epoch=2,
+        Plan(
+            options=config.train,
+            loss=config.loss,
+            watch=config.watch,
+            seed=config.seed,
+            info={},
+            steps_per_epoch=2,
+        ),
         mesh=sharding.make_mesh(1),
     )
     assert result.step == 2

@@ -107,8 +107,9 @@ def test_weights_and_biases_gets_metrics_pictures_and_the_config(
 ) -> None:
     fake = FakeWandb()
     monkeypatch.setitem(sys.modules, "wandb", fake)
-    options = {"num_steps": 4, "frames_per_step": 2, "wandb_project": "p"}
-    with Watch(tmp_path, start_step=0, config={"seed": 3}, **options) as watch:
+    options = {"num_steps": 4, "frames_per_step": 2}
+    options["wandb"] = {"project": "p", "config": {"seed": 3}}
+    with Watch(tmp_path, start_step=0, **options) as watch:
         watch.log(1, {"focal": 2.5}, epoch=0.5)
         picture = np.zeros((4, 6, 3), np.uint8)
         watch.log_scores(2, Scores({"ap/exact": 7.0}, 7.0, {"frame": picture}))
@@ -131,4 +132,4 @@ def test_weights_and_biases_that_is_not_installed_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match=r"wandb is not installed: pip install"):
-        Watch(tmp_path, start_step=0, num_steps=1, frames_per_step=1, wandb_project="p")
+        Watch(tmp_path, 0, 1, 1, wandb={"project": "p"})
