@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from functools import partial
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,27 @@ from radejax.detection.decode import boxes_at, find_peaks, suppress
 from radejax.detection.matching import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import Sigma, focal_loss, gaussian_heatmap
-from radejax.losses.gwd import Root, Transform, gwd_loss
+from radejax.losses.gwd import Transform, gwd_loss
 
 Matching = Literal["center", "nms"]
+Pairs = tuple[jax.Array, jax.Array, jax.Array]
+"""Predictions and their objects, `[B, N, 8]` each, and where they count, `[B, N]`."""
+
+
+class AfterNms(NamedTuple):
+    """Which predicted boxes are compared with an object where NMS chooses them.
+
+    Attributes:
+        max_peaks: Peaks that enter NMS.
+        score_threshold: Peaks must score above it.
+        nms_iou: Overlap that suppresses.
+        match_iou: A box has an object where they overlap more than this.
+    """
+
+    max_peaks: int = 128
+    score_threshold: float | jax.Array = 0.3
+    nms_iou: float | jax.Array = 0.3
+    match_iou: float | jax.Array = 0.0
 
 
 def detection_loss(
@@ -26,24 +45,19 @@ def detection_loss(
     sigma_cells: float = 3.0,
     gwd_transform: Transform = "sqrt",
     gwd_tau: float = 1.65,
-    gwd_root: Root = "eigh",
     normalize_yaw: bool = False,
     matching: Matching = "center",
     weights: tuple[float, float, float] = (2.0, 1.0, 1.0),
     normalize: bool = True,
     z0_m: float | jax.Array = 0.0,
     is_frame_valid: jax.Array | None = None,
-    max_peaks: int = 128,
-    score_threshold: float | jax.Array = 0.3,
-    nms_iou: float | jax.Array = 0.3,
-    match_iou: float | jax.Array = 0.0,
+    nms: AfterNms = AfterNms(),  # noqa: B008, immutable
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Weighted sum of the three losses over a batch, and its parts.
+    """Weighted sum of the three losses over a batch, and its parts; in float32.
 
     The regression losses are means over the matched boxes of a frame, then over all
-    frames; frames without any count as 0. Sums and means run over the whole batch, so
-    a batch sharded over devices gives the same result under `jax.jit`. Everything is
-    computed in float32 whatever the dtype of the maps.
+    frames; frames without any count as 0. All run over the whole batch, so that one
+    sharded over devices gives the same result.
 
     Args:
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
@@ -53,28 +67,20 @@ def detection_loss(
         sigma_cells: Standard deviation of targets in bins, for "fixed".
         gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
         gwd_tau: See `gwd_loss`.
-        gwd_root: See `gwd`.
-        normalize_yaw: Scale the predicted yaw vector to length 1 before the Gaussian
-            Wasserstein distance (released: raw). Smooth L1 always sees it raw, which
-            is what teaches the network its length.
-        matching: "center": the box parameters at each object's own bin are compared
-            with that object (as released). "nms": every predicted box that survives
-            NMS is compared with the object it overlaps most (the paper's text).
+        normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released:
+            raw). Smooth L1 always sees it raw, which teaches the network its length.
+        matching: "center": box parameters at each object's own bin (as released); "nms":
+            each box that survives NMS with the object it overlaps most (the paper).
         weights: Of focal, GWD and smooth L1.
-        normalize: Divide each part by its own value, held constant: the reported total
-            is then constant and the gradients of the parts have the ratio `weights`.
-            Parts that are 0, as in a batch without objects, add nothing.
-        z0_m: Sensor height added to the regressed z.
+        normalize: Divide each part by its own value, held constant: gradients of the
+            parts have the ratio `weights`, the total is constant, parts of 0 add nothing.
+        z0_m: Sensor height, added to the regressed z.
         is_frame_valid: `[B]` bool, False for frames that only fill up a batch.
-        max_peaks: Peaks that enter NMS, for "nms".
-        score_threshold: Peaks must score above it, for "nms".
-        nms_iou: Overlap that suppresses, for "nms".
-        match_iou: A box has an object where they overlap more than this, for "nms".
+        nms: Which predicted boxes have an object, for "nms".
 
     Returns:
-        Scalar total, and a dict of scalars: raw `focal`, `gwd`, `smooth_l1` and their
-        weighted sum `weighted_sum` for logging, `num_objects`, `num_positive` (bins
-        that count as positive), `num_matched` (boxes in the regression losses).
+        Scalar total, and scalars by name: raw `focal`, `gwd`, `smooth_l1`, their
+        `weighted_sum`, `num_objects`, `num_positive` (bins), `num_matched` (boxes).
 
     Raises:
         ValueError: Unknown option, or shapes of maps, batch and grid disagree.
@@ -83,11 +89,7 @@ def detection_loss(
         RADE-Net, equation (17).
     """
     _check(maps, batch, grid, matching)
-    is_valid, boxes = batch.is_valid, batch.boxes.astype(jnp.float32)
-    if is_frame_valid is not None:
-        is_valid &= is_frame_valid[:, None]
-    # Padding rows may hold anything; NaN times 0 would reach the gradients.
-    boxes = jnp.where(is_valid[..., None], boxes, 0.0)
+    boxes, is_valid = _objects(batch, is_frame_valid)
     target = gaussian_heatmap(
         boxes,
         batch.classes,
@@ -98,34 +100,34 @@ def detection_loss(
         sigma_cells=sigma_cells,
     )
     focal = focal_loss(maps.heatmap_logits, target, is_frame_valid=is_frame_valid)
-    if matching == "center":
-        predicted, wanted, is_matched = _pairs_at_centers(
-            maps, boxes, is_valid, grid, z0_m
-        )
-    else:
-        predicted, wanted, is_matched = _pairs_after_nms(
-            maps,
-            boxes,
-            is_valid,
-            grid,
-            z0_m,
-            max_peaks=max_peaks,
-            score_threshold=score_threshold,
-            nms_iou=nms_iou,
-            match_iou=match_iou,
-        )
+    pair = _pairs_at_centers if matching == "center" else partial(_after_nms, nms)
+    predicted, wanted, is_matched = pair(maps, boxes, is_valid, grid, z0_m)
     for_gwd = _with_unit_yaw(predicted) if normalize_yaw else predicted
-    per_box_gwd = gwd_loss(for_gwd, wanted, gwd_tau, gwd_transform, root=gwd_root)
-    gwd = _mean_of_frames(per_box_gwd, is_matched, is_frame_valid)
-    per_box_l1 = jnp.mean(smooth_l1(predicted - wanted), axis=-1)
-    l1 = _mean_of_frames(per_box_l1, is_matched, is_frame_valid)
-    parts = {"focal": focal, "gwd": gwd, "smooth_l1": l1}
+    gwd = gwd_loss(for_gwd, wanted, gwd_tau, gwd_transform)
+    l1 = jnp.mean(smooth_l1(predicted - wanted), axis=-1)
+    parts = {
+        "focal": focal,
+        "gwd": _mean_of_frames(gwd, is_matched, is_frame_valid),
+        "smooth_l1": _mean_of_frames(l1, is_matched, is_frame_valid),
+    }
     total = _weighted_sum(parts, weights, normalize)
     parts["weighted_sum"] = _weighted_sum(parts, weights, False)
-    parts["num_objects"] = jnp.sum(is_valid, dtype=jnp.int32)
-    parts["num_positive"] = jnp.sum(target >= 1, dtype=jnp.int32)
-    parts["num_matched"] = jnp.sum(is_matched, dtype=jnp.int32)
+    counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
+    for name, where in counted.items():
+        parts[f"num_{name}"] = jnp.sum(where, dtype=jnp.int32)
     return total, parts
+
+
+def _objects(
+    batch: Batch, is_frame_valid: jax.Array | None
+) -> tuple[jax.Array, jax.Array]:
+    """Boxes `[B, N, 8]` float32, and `[B, N]` where they are objects."""
+    is_valid = batch.is_valid
+    if is_frame_valid is not None:
+        is_valid &= is_frame_valid[:, None]
+    # Padding rows may hold anything; NaN times 0 would reach the gradients.
+    boxes = jnp.where(is_valid[..., None], batch.boxes.astype(jnp.float32), 0.0)
+    return boxes, is_valid
 
 
 def smooth_l1(difference: jax.Array) -> jax.Array:
@@ -144,36 +146,36 @@ def _pairs_at_centers(
     is_valid: jax.Array,
     grid: RadarGrid,
     z0_m: float | jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Predictions at the objects' bins and the objects: `[B, N, 8]` each, `[B, N]`."""
+) -> Pairs:
+    """Predictions at the objects' own bins."""
     cell = grid.nearest_cell(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
     predicted = boxes_at(_params_at(maps.box_params, cell), cell, grid, z0_m)
     return _neutral(predicted, boxes, is_valid)
 
 
-def _pairs_after_nms(
+def _after_nms(
+    nms: AfterNms,
     maps: DetectionMaps,
     boxes: jax.Array,
     is_valid: jax.Array,
     grid: RadarGrid,
     z0_m: float | jax.Array,
-    *,
-    max_peaks: int,
-    score_threshold: float | jax.Array,
-    nms_iou: float | jax.Array,
-    match_iou: float | jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Predictions that survive NMS and their objects: `[B, P, 8]` each, `[B, P]`."""
+) -> Pairs:
+    """Predictions that survive NMS, and the objects that they overlap."""
     # Which boxes are compared is a choice, not a function to differentiate.
     fixed = jax.lax.stop_gradient(maps)
     peaks = find_peaks(
-        fixed, grid, max_peaks=max_peaks, score_threshold=score_threshold, z0_m=z0_m
+        fixed,
+        grid,
+        max_peaks=nms.max_peaks,
+        score_threshold=nms.score_threshold,
+        z0_m=z0_m,
     )
-    keep = suppress(peaks, nms_iou)
+    keep = suppress(peaks, nms.nms_iou)
 
     def match(predicted, is_predicted, objects, is_object):
         return match_boxes(
-            predicted, is_predicted, objects, is_object, iou_threshold=match_iou
+            predicted, is_predicted, objects, is_object, iou_threshold=nms.match_iou
         )
 
     matches = jax.vmap(match)(peaks.boxes, keep, boxes, is_valid)
@@ -189,9 +191,7 @@ def _params_at(params: jax.Array, cell: jax.Array) -> jax.Array:
     return jax.vmap(lambda params, cell: params[cell[:, 0], cell[:, 1]])(params, cell)
 
 
-def _neutral(
-    predicted: jax.Array, wanted: jax.Array, is_matched: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _neutral(predicted: jax.Array, wanted: jax.Array, is_matched: jax.Array) -> Pairs:
     """Both boxes of unmatched rows replaced by one harmless box, without gradient."""
     row = is_matched[..., None]
     return jnp.where(row, predicted, 1.0), jnp.where(row, wanted, 1.0), is_matched
