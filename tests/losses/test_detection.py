@@ -8,7 +8,7 @@ import pytest
 
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import detection_loss, smooth_l1
+from radejax.losses.detection import AfterNms, detection_loss, smooth_l1
 from radejax.losses.focal import gaussian_heatmap
 from radejax.losses.gwd import gwd_loss
 
@@ -187,8 +187,15 @@ def small_scene(rng, counts=(0, 1, 3), rows=4):
 @partial(jax.jit, static_argnames="options")
 def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
     def loss(maps):
+        z0_m, score_threshold, nms_iou = numbers
         return detection_loss(
-            maps, batch, GRID, is_frame_valid=is_frame_valid, **numbers, **dict(options)
+            maps,
+            batch,
+            GRID,
+            is_frame_valid=is_frame_valid,
+            z0_m=z0_m,
+            nms=AfterNms(score_threshold=score_threshold, nms_iou=nms_iou),
+            **dict(options),
         )
 
     return jax.value_and_grad(loss, has_aux=True)(maps)
@@ -196,8 +203,8 @@ def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
 
 def loss_and_grad(maps, batch, is_frame_valid=None, **options):
     """Compiled once per shape and set of options, not once per test."""
-    numbers = {"z0_m": 0.0, "score_threshold": 0.3, "nms_iou": 0.3}
-    numbers = {name: options.pop(name, value) for name, value in numbers.items()}
+    defaults = {"z0_m": 0.0, "score_threshold": 0.3, "nms_iou": 0.3}
+    numbers = tuple(options.pop(name, value) for name, value in defaults.items())
     if is_frame_valid is None:
         is_frame_valid = jnp.ones(len(batch.boxes), bool)
     return _loss_and_grad(
