@@ -263,7 +263,7 @@ def report_options(config: ConfigDict, name: str) -> Options:
         roi=tuple(options.roi),
         score_threshold=options.score_threshold,
         skip_empty=None if options.skip_empty == "none" else options.skip_empty,
-        label_version=config.data.options.label_version,
+        label_version=config.data.label_version,
         invalid_sizes="false_positive",
         bootstrap=0,
     )
