@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import pathlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +24,7 @@ from radejax.models.vit import ViT
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 
+_LAYER = re.compile(r"layer\.\d+\.")
 _PREFIX = "model."  # transformers 5 saves some models with it
 _FIELDS = {
     "hidden_size": "hidden_size",
@@ -39,6 +41,18 @@ _FIELDS = {
     "mlp_bias": "mlp_bias",
     "layerscale_value": "layer_scale",
 }
+
+_SIZES = (
+    "hidden_size",
+    "num_hidden_layers",
+    "num_attention_heads",
+    "intermediate_size",
+    "patch_size",
+    "num_register_tokens",
+)
+_FLAGS = ("use_gated_mlp", "proj_bias", "mlp_bias")
+_NUMBERS = ("rope_theta", "layer_norm_eps", "layerscale_value")
+_MOST = 65536  # of any size: the largest DINOv3 has an mlp of 8192
 
 
 def load(
@@ -81,8 +95,8 @@ def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
     """The model a Hugging Face `config.json` describes.
 
     Raises:
-        UserError: It is not a DINOv3 ViT, a field is missing or not supported, or an
-            override is unknown.
+        UserError: It is not a DINOv3 ViT, a field is missing, of a wrong type, out of
+            range or not supported, or an override is unknown.
     """
     if config.get("model_type") != "dinov3_vit":
         raise UserError(
@@ -90,6 +104,7 @@ def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
         )
     if missing := sorted(set(_FIELDS) - set(config)):
         raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
+    _check_values(config)
     if config["hidden_act"] not in ("gelu", "silu"):
         raise UserError(
             f"hidden_act is {config['hidden_act']!r}, expected 'gelu' or 'silu'"
@@ -105,15 +120,46 @@ def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
     return ViT(**(fields | model_overrides))
 
 
+def _check_values(config: Mapping[str, Any]) -> None:
+    """`UserError` for a value of a wrong type or out of range."""
+    for name in _FIELDS:
+        value, least = config[name], 0 if name == "num_register_tokens" else 1
+        if name in _SIZES:
+            fits = type(value) is int and least <= value <= _MOST
+            expected = f"an integer from {least} to {_MOST}"
+        elif name in _FLAGS:
+            fits, expected = isinstance(value, bool), "true or false"
+        elif name in _NUMBERS:
+            fits = type(value) in (int, float) and 0 < value < float("inf")
+            expected = "a finite number above 0"
+        else:
+            continue
+        if not fits:
+            raise UserError(f"DINOv3 config: {name} is {value!r}, expected {expected}")
+    channels, heads = config["hidden_size"], config["num_attention_heads"]
+    if channels % heads or (channels // heads) % 4:
+        raise UserError(
+            f"DINOv3 config: hidden_size is {channels} and num_attention_heads {heads}, "
+            "expected heads of a multiple of 4 channels"
+        )
+
+
 def to_params(
     model: ViT, tensors: Mapping[str, Any], source: str = "state dict"
 ) -> dict[str, Any]:
     """Parameters of `model` from DINOv3 tensors by name.
 
     Raises:
-        DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
+        DataError: There are more or fewer layers than the model has; tensors are
+            missing, unexpected or mis-shaped; all are listed.
     """
     tensors = {name.removeprefix(_PREFIX): t for name, t in tensors.items()}
+    num_layers = len({n.split(".")[1] for n in tensors if _LAYER.match(n)})
+    if num_layers != model.num_layers:
+        raise DataError(
+            f"{source}: has {num_layers} layers, expected {model.num_layers}, as "
+            f"num_hidden_layers of {CONFIG_FILE} says"
+        )
     reader = StateDictReader(tensors, source)
     channels = model.hidden_size
     patches = reader.conv(
@@ -164,6 +210,9 @@ def _layer(reader: StateDictReader, model: ViT, prefix: str) -> dict[str, Any]:
 
 def _read_config(path: pathlib.Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text())
-    except ValueError as error:
+        config = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: not a JSON file ({error})") from error
+    if not isinstance(config, dict):
+        raise DataError(f"{path}: expected a JSON object, got {type(config).__name__}")
+    return config

@@ -17,11 +17,12 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar import Frame
 from radejax.inference.open import PathLike, StartingWeights, starting_weights
+from radejax.runs import check_config
 from radejax.runs.data import Data, Sources, open_data
 from radejax.runs.evaluate import evaluate
 from radejax.runs.validation import Validation
 from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
-from radejax.training import loop, processes
+from radejax.training import loop, processes, sharding
 from radejax.training.start import Plan
 
 _log = logging.getLogger(__name__)
@@ -57,10 +58,17 @@ def run(
         The work folder.
 
     Raises:
-        UserError: The work folder belongs to another configuration or is in use, no
-            data, or no space.
+        UserError: A field of the config has an impossible value, the work folder
+            belongs to another configuration or is in use, no data, or no space.
     """
     started = time.perf_counter()
+    check_config.check(config)
+    sharding.check_batch_size(
+        config.train.batch_size,
+        sharding.make_mesh(),
+        "train.batch_size",
+        config.train.num_accumulate,
+    )
     folder = default_workdir(workdir, name)
     model = models.build(config.model)  # what cannot be built fails first
     with claimed(folder, config):

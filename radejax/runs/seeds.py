@@ -13,7 +13,7 @@ from ml_collections import ConfigDict
 from tabulate import tabulate
 
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.runs import check_config
 from radejax.runs.experiment import run
 from radejax.runs.workdir import PathLike, default_workdir
 from radejax.training import processes
@@ -45,9 +45,8 @@ def run_seeds(
     Raises:
         UserError: Two seeds are equal; and as `experiment.run`.
     """
+    check_config.check(config)
     seeds = tuple(int(seed) for seed in config.seeds)
-    if len(set(seeds)) < len(seeds):
-        raise UserError(f"config.seeds has a seed twice: {list(seeds)}")
     workdir = default_workdir(workdir, name)
     tables = {}
     for seed in seeds:

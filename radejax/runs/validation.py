@@ -6,7 +6,7 @@ import functools
 import math
 import pathlib
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -55,7 +55,7 @@ class Validation:
     ) -> None:
         self._config, self._records = config, data.records
         self._options = report_options(config, "training")
-        _check_best(config.train.best_metric, self._options)
+        check_best_metric(config.train.best_metric, self._options.iou_thresholds)
         self._frames = data.split("test")
         if not len(self._frames):
             raise UserError(
@@ -152,11 +152,20 @@ class Validation:
         return pictures
 
 
-def _check_best(name: str, options: Any) -> None:
+def check_best_metric(name: str, iou_thresholds: Sequence[float]) -> None:
+    """Refuses a `train.best_metric` that validations do not compute.
+
+    Args:
+        name: Such as "map_3d_iou30".
+        iou_thresholds: Of `config.evaluation`.
+
+    Raises:
+        UserError: Names those that there are.
+    """
     known = [
         f"map_{space}_iou{100 * iou:.4g}"
         for space in ("bev", "3d")
-        for iou in options.iou_thresholds
+        for iou in iou_thresholds
     ]
     if name not in known:
         raise UserError(

@@ -1,8 +1,9 @@
 """Checkpoints of a run: state, position in the data, configuration and metrics.
 
 Written by orbax: in the background, to a temporary folder that gets its final name
-only when whole. Where the newest does not restore, the one before is used and those
-after it are set aside with a warning.
+only when whole, with checksums that are verified when it is restored. Where the newest
+does not restore, training uses the one before and sets those after it aside with a
+warning; whoever reads for inference is told which one is whole.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import files
 from radejax.core.errors import DataError
-from radejax.training import processes, sharding
+from radejax.training import checksums, processes, sharding
 
 _log = logging.getLogger(__name__)
 
 BEST = "best"
 """Name of the metric that decides which checkpoint is best; higher is better."""
+
+_CHECKSUMS = "checksums"
+"""Item of a checkpoint; those of earlier versions are without."""
 
 _VARIABLES = ("params", "ema_params", "model_state")
 
@@ -131,6 +135,13 @@ class Checkpoints:
                     state=ocp.args.StandardSave(state),
                     data=grain.checkpoint.CheckpointSave(data_iterator),
                     info=ocp.args.JsonSave(dict(info)),
+                    checksums=ocp.args.JsonSave(
+                        {
+                            "state": checksums.of_arrays(state),
+                            "info": checksums.of_values(dict(info)),
+                            "data": checksums.of_values(data_iterator.get_state()),
+                        }
+                    ),
                 ),
                 metrics=dict(metrics) if metrics else None,
             )
@@ -187,6 +198,7 @@ class Checkpoints:
                         info=ocp.args.JsonRestore(),
                     ),
                 )
+                self._verify(step, restored["state"], restored["info"])
                 self._restore_position(step, data_iterator)
             # Whatever a damaged file makes orbax, tensorstore or json raise.
             except Exception as error:
@@ -216,6 +228,7 @@ class Checkpoints:
 
         Raises:
             FileNotFoundError: No checkpoint, or not that step.
+            DataError: It is damaged; names the newest that is whole.
         """
         steps = self.steps()
         if not steps:
@@ -225,6 +238,29 @@ class Checkpoints:
             raise FileNotFoundError(
                 f"no checkpoint of step {step} in {self.folder}; there are {steps}"
             )
+        try:
+            return *self._read_variables(step), step
+        # Whatever a damaged file makes orbax, tensorstore or json raise.
+        except Exception as error:
+            reason = str(error).strip().split("\n")[0]
+            whole = self._newest_whole([older for older in steps if older != step])
+            mend = (
+                "no other one is whole" if whole is None else f"step {whole} is whole"
+            )
+            raise DataError(
+                f"checkpoint {step} in {self.folder} is damaged ({reason}); {mend}"
+            ) from error
+
+    def _newest_whole(self, steps: list[int]) -> int | None:
+        """The last of some steps whose variables can be read."""
+        for step in reversed(steps):
+            with contextlib.suppress(Exception):  # as damaged as the one asked for
+                self._read_variables(step)
+                return step
+        return None
+
+    def _read_variables(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Variables as NumPy arrays and `info` of a checkpoint that is there."""
         with ocp.PyTreeCheckpointer() as reader:
             folder = self.folder / str(step) / "state"
             saved = reader.metadata(folder).item_metadata.tree
@@ -245,8 +281,21 @@ class Checkpoints:
                 info=ocp.args.JsonRestore(),
             ),
         )
+        self._verify(step, found["state"], found["info"])
         state = {name: found["state"].get(name) for name in _VARIABLES}
-        return jax.tree.map(np.asarray, state), found["info"], step
+        return jax.tree.map(np.asarray, state), found["info"]
+
+    def _verify(self, step: int, state: Any, info: Mapping[str, Any]) -> None:
+        """`DataError` if what was restored is not what was saved."""
+        saved = self._saved_checksums(step)
+        if saved is not None:
+            checksums.check(checksums.of_arrays(state), saved["state"], "array")
+            checksums.check({"info": checksums.of_values(info)}, saved, "part")
+
+    def _saved_checksums(self, step: int) -> dict[str, Any] | None:
+        """None of a checkpoint of an earlier version."""
+        folder = self.folder / str(step) / _CHECKSUMS
+        return files.read_json(folder / "metadata") if folder.is_dir() else None
 
     def _restore_position(self, step: int, data_iterator: Any) -> None:
         """Sets the iterator to where it was, with any number of processes then and now.
@@ -258,7 +307,11 @@ class Checkpoints:
         saved = sorted(folder.glob("process_0-of-*.json"))
         if not saved:
             raise FileNotFoundError(f"no position in the data in {folder}")
-        data_iterator.set_state(files.read_json(saved[0]))
+        position = files.read_json(saved[0])
+        known = self._saved_checksums(step)
+        if known is not None:
+            checksums.check({"data": checksums.of_values(position)}, known, "part")
+        data_iterator.set_state(position)
 
     def _set_aside(self, step: int) -> None:
         """Renames a damaged checkpoint so that it can be looked at and saved anew."""

@@ -167,3 +167,47 @@ def test_other_models_are_refused(change, message, make):
     config = {k: v for k, v in config.items() if v is not None}
     with pytest.raises(UserError, match=message):
         dinov3_hf.model_from_config(config)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("num_hidden_layers", 10**9, "an integer from 1 to 65536"),
+        ("num_hidden_layers", -8, "an integer"),
+        ("num_hidden_layers", "8", "an integer"),
+        ("num_hidden_layers", None, "an integer"),
+        ("num_hidden_layers", 0, "an integer"),
+        ("num_hidden_layers", True, "an integer"),
+        ("num_attention_heads", 0, "an integer"),
+        ("patch_size", 16.0, "an integer"),
+        ("num_register_tokens", -1, "an integer from 0"),
+        ("rope_theta", None, "a finite number above 0"),
+        ("rope_theta", float("inf"), "a finite number"),
+        ("layer_norm_eps", float("nan"), "a finite number"),
+        ("use_gated_mlp", "no", "true or false"),
+    ],
+)
+def test_impossible_values_are_named(make, field, value, expected):
+    words = rf"{field} is {value!r}, expected {expected}"
+    with pytest.raises(UserError, match=words):
+        dinov3_hf.model_from_config(make.TINY_CONFIG | {field: value})
+
+
+def test_heads_must_divide_the_channels(make):
+    with pytest.raises(UserError, match="hidden_size is 96 and num_attention_heads 7"):
+        dinov3_hf.model_from_config(make.TINY_CONFIG | {"num_attention_heads": 7})
+
+
+@pytest.mark.parametrize("count", [2, 4, 65536])
+def test_layers_are_counted_in_the_names(make, tensors, count):
+    model = dinov3_hf.model_from_config(make.TINY_CONFIG | {"num_hidden_layers": count})
+    with pytest.raises(DataError, match=f"x: has 3 layers, expected {count}"):
+        dinov3_hf.to_params(model, tensors, "x")
+
+
+def test_a_config_that_is_no_object(folder):
+    (folder / "config.json").write_text("[1]")
+    with pytest.raises(
+        DataError, match=r"config.json: expected a JSON object, got list"
+    ):
+        dinov3_hf.load(folder)

@@ -23,6 +23,7 @@ CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 
 def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:
     folder, config = tmp_path / "run", base_config()
+    config.train.batch_size = 8  # as many as the tests have devices
     with (
         claimed(folder, config),
         pytest.raises(UserError, match="another training"),

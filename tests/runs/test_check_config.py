@@ -1,0 +1,199 @@
+"""Impossible values are refused before a run does anything."""
+
+import itertools
+import math
+import pathlib
+import re
+from typing import Any
+
+import pytest
+from ml_collections import ConfigDict
+
+from radejax.core.config import base_config, load_config, load_module
+from radejax.core.errors import UserError
+from radejax.runs import experiment, seeds
+from radejax.runs.check_config import RULES, check
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
+NAN, INF = math.nan, math.inf
+
+WRONG = [
+    ("seed", -1),
+    ("seed", 2**32 - 1),
+    ("seed", 0.5),
+    ("seed", True),
+    ("seeds", (0, 0)),
+    ("seeds", (0, -1)),
+    ("classes", ()),
+    ("classes", ("Sedan", "Sedan")),
+    ("classes", ("Tank",)),
+    ("classes", "Sedan"),
+    ("profile", None),
+    ("model.name", "yolo"),
+    ("model.num_classes", 4),
+    ("model.widths", ()),
+    ("model.widths", (32, 0)),
+    ("model.widths", 128),
+    ("model.decoder_width", 0),
+    ("model.num_groups", 0),
+    ("model.pad_multiple", 0),
+    ("model.input_stem", "no"),
+    ("model.cbam", False),
+    ("model.remat", 1),
+    ("model.doppler_bins", "64"),
+    ("model.heatmap_prior", 1.0),
+    ("loss", 3),
+    ("loss.sigma", "adaptiv"),
+    ("loss.sigma_cells", 0.0),
+    ("loss.gwd_tau", 0.0),
+    ("loss.gwd_tau", NAN),
+    ("loss.gwd_transform", "log"),
+    ("loss.weights", 1.0),
+    ("loss.weights", (1.0, 1.0)),
+    ("loss.weights", (1.0, 1.0, "1")),
+    ("loss.weights", (0.0, 0.0, 0.0)),
+    ("loss.z0_m", INF),
+    ("decode.max_detections", 0),
+    ("decode.nms_iou", NAN),
+    ("decode.score_threshold", -0.1),
+    ("train.batch_size", 0),
+    ("train.batch_size", 2.0),
+    ("train.num_epochs", 0),
+    ("train.learning_rate", 0.0),
+    ("train.final_learning_rate", 1.0),
+    ("train.weight_decay", -1.0),
+    ("train.warmup_steps", -1),
+    ("train.gradient_clip_norm", 0.0),
+    ("train.ema_decay", 2.0),
+    ("train.ema_decay", "0.9"),
+    ("train.num_accumulate", 0),
+    ("train.log_every_steps", 0),
+    ("train.checkpoint_every_steps", 0),
+    ("train.checkpoints_to_keep", 0),
+    ("train.parameter_sharding", "zero"),
+    ("data.label_version", "v3"),
+    ("data.visibility", "R"),
+    ("data.visibility", ("X",)),
+    ("data.max_objects", 0),
+    ("data.num_threads", -1),
+    ("data.mirror_probability", 1.5),
+    ("data.gain_db", -1.0),
+    ("evaluation.roi", (0, 1, 2)),
+    ("evaluation.roi", (72.0, 0.0, -6.4, 6.4, -2.0, 6.0)),
+    ("evaluation.protocols", ("nope",)),
+    ("evaluation.protocols", ()),
+    ("evaluation.protocols", "kradar_r40"),
+    ("evaluation.skip_empty", None),
+    ("evaluation.iou_thresholds", (2.0,)),
+    ("evaluation.iou_thresholds", (0.3, NAN)),
+    ("evaluation.bootstrap", -1),
+    ("evaluation.batch_size", 0),
+    ("watch.wandb", 1),
+    ("watch.profile_steps", (5, 2)),
+    ("simulation.seed", -1),
+    ("simulation.output", "video"),
+    ("simulation.train_sequences", 2.5),
+    ("simulation.label_distance_m", NAN),
+    ("simulation.lidar_to_radar_m", [0.0, 0.0]),
+    ("simulation.grid", "ars540"),
+    ("model.image.num_heads", 0),
+    ("model.image.size", (720,)),
+    ("model.fusion.dropout", 1.0),
+    ("model.axes.range_m", (0.0, NAN)),
+    ("data.camera.projection", "fisheye"),
+    ("data.camera.ego_from_lidar_m", (1.0, 2.0)),
+]
+
+
+def _with(field: str, value: Any) -> ConfigDict:
+    """A good config, of types that a hand-written file may mix up, with one value."""
+    config = load_config(str(CONFIGS / "quickstart_fusion.py"))
+    with config.ignore_type():
+        section, _, name = field.rpartition(".")
+        place = config
+        for part in filter(None, section.split(".")):
+            place = place[part]
+        with place.unlocked():
+            place[name] = value
+    return config
+
+
+@pytest.mark.parametrize(("field", "value"), WRONG)
+def test_an_impossible_value_is_named_with_what_is_expected(
+    field: str, value: Any
+) -> None:
+    words = rf"^config\.{re.escape(field)} is {re.escape(repr(value))}, expected .+"
+    with pytest.raises(UserError, match=words) as raised:
+        check(_with(field, value))
+    assert "\n" not in str(raised.value)
+
+
+def test_nothing_is_written_or_built_for_a_wrong_config(tmp_path: pathlib.Path) -> None:
+    config = _with("evaluation.protocols", ("nope",))
+    with pytest.raises(UserError, match=r"evaluation.protocols"):
+        experiment.run(config, name="x", workdir=tmp_path / "run")
+    config.seeds = (0, 1)
+    with pytest.raises(UserError, match=r"evaluation.protocols"):
+        seeds.run_seeds(config, name="x", workdir=tmp_path / "run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_batch_that_does_not_divide_is_refused_first(tmp_path: pathlib.Path) -> None:
+    config = _with("train.num_accumulate", 3)
+    with pytest.raises(UserError, match=r"train.batch_size=4 does not divide"):
+        experiment.run(config, name="x", workdir=tmp_path / "run")
+    assert not list(tmp_path.iterdir())
+
+
+def test_fields_that_are_missing_or_unknown() -> None:
+    config = _with("train.num_epoch", 3)
+    with pytest.raises(UserError, match=r"num_epoch is not .* config.train.num_epochs"):
+        check(config)
+    config = base_config()
+    del config.train["num_epochs"]
+    with pytest.raises(UserError, match=r"config.train.num_epochs is missing"):
+        check(config)
+    config = base_config()
+    del config["loss"]
+    with pytest.raises(UserError, match=r"config.loss.sigma is missing"):
+        check(config)
+
+
+def test_what_one_field_asks_of_another() -> None:
+    config = _with("train.best_metric", "map_3d_iou70")
+    check(config)  # no validation, no best one
+    config.train.evaluate_every_epochs = 1
+    with pytest.raises(UserError, match="can be one of map_bev_iou30"):
+        check(config)
+    with pytest.raises(UserError, match="doppler_bins is 64, expected 16"):
+        check(_with("model.doppler_bins", 64))
+
+
+def _words(name: str) -> list[str]:
+    module = load_module(CONFIGS / f"{name}.py")
+    if name.startswith("quickstart"):
+        return ["", "short"] + ["radar", "radar,short"] * name.endswith("fusion")
+    groups = [
+        ["", *getattr(module, names, ())]
+        for names in ("VARIANTS", "PRESETS", "CLASS_SETS")
+    ]
+    return [",".join(filter(None, words)) for words in itertools.product(*groups)]
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.py")))
+def test_every_preset_passes_and_every_field_has_its_rule(name: str) -> None:
+    choices = _words(name)
+    for words in choices:
+        check(load_config(f"{CONFIGS / name}.py:{words}"))
+    check(base_config())
+    if name in ("radenet", "dinorade"):
+        assert len(choices) > 40  # every row in both worlds
+
+
+def test_rules_are_of_fields_that_exist() -> None:
+    full = load_config(str(CONFIGS / "quickstart_fusion.py")).to_dict()
+    for name in RULES:
+        place: Any = full
+        for part in name.split("."):
+            assert part in place, name
+            place = place[part]
