@@ -22,6 +22,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from radejax.core.archives import DEFLATE_RATIO
 from radejax.core.errors import DataError
 
 _MATRIX, _DEFLATED = 14, 15
@@ -33,7 +34,6 @@ _CLASSES |= {14: "i8", 15: "u8"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
 _STORED |= {12: "i8", 13: "u8"}
 _HEAD = 512  # bytes of a variable before its numbers, more than any real array has
-_DEFLATE_RATIO = 1032  # what deflate makes of one byte at most
 _CHUNK = 1 << 20
 
 
@@ -210,7 +210,7 @@ def _check_size(file: BinaryIO, layout: Layout, size: int, end: int) -> None:
         )
     if layout.deflated is None and end < needed:
         raise _damage(file, "an array is longer than its variable")
-    if layout.deflated and layout.inflated > _DEFLATE_RATIO * layout.deflated[1]:
+    if layout.deflated and layout.inflated > DEFLATE_RATIO * layout.deflated[1]:
         raise _damage(
             file, f"{layout.deflated[1]} bytes cannot inflate to {layout.inflated}"
         )

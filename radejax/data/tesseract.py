@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from radejax.core.archives import DEFLATE_RATIO, read_npy
 from radejax.core.errors import DataError, UserError
 from radejax.data import mat5
 from radejax.data.kradar.frame import Frame
@@ -19,8 +20,6 @@ from radejax.data.projection import project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
-
-_DEFLATE_RATIO = 1032  # what deflate makes of one byte at most
 
 
 def read_tesseract(
@@ -183,24 +182,22 @@ def read_projection_npy(
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is truncated, damaged, or of another shape or type.
+        DataError: The file is truncated, damaged, of another shape or type, or has cells
+            that are not finite.
     """
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such projection")
-    try:
-        stored = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise DataError(f"{path}: damaged, not a NumPy array file ({error})") from None
-    if (
-        not isinstance(stored, np.ndarray)
-        or stored.ndim != 3
-        or stored.dtype.kind != "f"
-    ):
+    stored = read_npy(path)
+    if stored.ndim != 3 or stored.dtype.kind != "f":
         raise DataError(
             f"{path}: expected floats [Doppler + elevation, range, azimuth], got "
-            f"{getattr(stored, 'shape', type(stored).__name__)} of "
-            f"{getattr(stored, 'dtype', 'no type')}"
+            f"{stored.shape} of {stored.dtype}"
+        )
+    if not np.isfinite(stored).all():
+        raise DataError(
+            f"{path}: damaged, {int((~np.isfinite(stored)).sum())} of {stored.size} "
+            "cells are not finite"
         )
     projection = np.ascontiguousarray(stored.transpose(1, 2, 0))
     if projection_shape is not None and projection.shape != tuple(projection_shape):
@@ -285,7 +282,7 @@ def _open_hdf5(path: str | os.PathLike) -> Iterator[Any]:
         if (
             len(set(filters)) < len(filters)
             or stored > os.path.getsize(path)
-            or claimed > stored * (_DEFLATE_RATIO if filters else 1)
+            or claimed > stored * (DEFLATE_RATIO if filters else 1)
             or chunk > claimed
         ):
             raise DataError(

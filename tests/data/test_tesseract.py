@@ -255,6 +255,10 @@ def test_released_projections(tmp_path, tesseract, dtype):
 
 def test_bad_released_projections(tmp_path):
     path = tmp_path / "p.npy"
+    np.save(path, np.full((7, 6, 5), np.nan))
+    with pytest.raises(DataError, match="210 of 210 cells are not finite"):
+        read_projection_npy(path)
+    path.unlink()
     with pytest.raises(FileNotFoundError, match="no such projection"):
         read_projection_npy(path)
     np.save(path, np.ones((7, 6, 5), np.int32))
