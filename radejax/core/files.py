@@ -17,6 +17,7 @@ from radejax.core.errors import DataError, DiskFullError, UserError
 
 _log = logging.getLogger(__name__)
 
+_LONGEST_INT = 30  # digits; 64 bits have 20
 _LONG = 80  # characters of a value that a message shows
 
 # Whole files -------------------------------------------------------------------------
@@ -72,9 +73,19 @@ def read_json(path: str | os.PathLike) -> Any:
         DataError: The file is not valid JSON; names it and the place.
     """
     try:
-        return json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        text = pathlib.Path(path).read_text(encoding="utf-8")
+        return json.loads(text, parse_int=_parse_int)
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid JSON: {error}") from error
+    except (IsADirectoryError, NotADirectoryError):
+        raise DataError(f"{path} is not valid JSON: it is no file") from None
+
+
+def _parse_int(digits: str) -> int:
+    """An integer as JSON has it; Python's own take quadratic time for long ones."""
+    if len(digits) > _LONGEST_INT:
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits)
 
 
 def temporary_path(path: pathlib.Path) -> pathlib.Path:

@@ -10,6 +10,8 @@ from radejax.core.errors import DataError
 from radejax.data.kradar.frame import Frame
 from radejax.geometry.calibration import CameraCalibration
 
+_MAX_PIXELS = 8192
+
 IMAGE_SIZE = (720, 1280)
 """Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
 
@@ -27,12 +29,17 @@ def read_left_image(
     Raises:
         DataError: The file is damaged, or of another size and not `resize`.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     height, width = size
     try:
         with Image.open(path) as file:
             found = file.size
+            if max(found) > _MAX_PIXELS:
+                raise DataError(
+                    f"{path}: {found[0]} x {found[1]} pixels, expected at most "
+                    f"{_MAX_PIXELS} in each direction"
+                )
             if not resize and found not in ((2 * width, height), (width, height)):
                 raise DataError(
                     f"{path}: {found[0]} x {found[1]} pixels, expected "
@@ -44,7 +51,9 @@ def read_left_image(
             if image.size != (width, height):
                 image = image.resize((width, height), Image.Resampling.BOX)
             return np.asarray(image)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # Pillow's decoders raise nearly anything on damage
         raise DataError(f"{path}: damaged image ({error})") from None
 
 

@@ -12,16 +12,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from radejax.core.archives import DEFLATE_RATIO, read_npy
 from radejax.core.errors import DataError, UserError
+from radejax.data import mat5
 from radejax.data.kradar.frame import Frame
 from radejax.data.projection import project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
-
-_MI_INT8, _MI_INT32, _MI_UINT32, _MI_MATRIX = 1, 5, 6, 14
-_COMPLEX = 0x0800
-_MI_FLOATS = {7: np.dtype("<f4"), 9: np.dtype("<f8")}
 
 
 def read_tesseract(
@@ -41,16 +39,12 @@ def read_tesseract(
         DataError: The file is truncated, damaged, or of another shape.
     """
     with _open(path) as file, _damage_named(path):
-        layout = _parse_mat5(file)
+        layout = _layout(path, file, shape_drea)
         if layout is not None:
-            dtype, shape = layout
-            tesseract = np.fromfile(file, dtype, count=math.prod(shape)).reshape(
-                shape, order="F"
-            )
-        else:
-            tesseract = _read_hdf5(path) if _is_hdf5(path) else _read_mat(path)
-    _check(path, tesseract.dtype, tesseract.shape, shape_drea)
-    return tesseract
+            return mat5.read_array(file, layout)
+        with _open_hdf5(path) as data:
+            _check(path, data.dtype, data.shape[::-1], shape_drea)
+            return data[()].T
 
 
 def project_file(
@@ -73,14 +67,15 @@ def project_file(
     """
     timings = {"reading": 0.0} if timings is None else timings
     with _open(path) as file, _damage_named(path):
-        layout = _parse_mat5(file)
-        if layout is not None:
-            stored, (doppler, range_, elevation, azimuth) = layout
-            _check(path, *layout, shape_drea)
-            slab = np.empty((elevation, range_, doppler), stored)
+        layout = _layout(path, file, shape_drea)
+        is_streamed = layout is not None and _is_streamed(layout)
+        if is_streamed:
+            file.seek(layout.offset)
+            slab = np.empty(layout.shape[2::-1], layout.dtype)
+            azimuth = layout.shape[3]
             columns = _read_slabs(file, slab, azimuth, timings)
             projection = project_columns(columns, dtype=dtype)
-    if layout is None:
+    if not is_streamed:
         began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)
         timings["reading"] += time.perf_counter() - began
@@ -162,16 +157,15 @@ def check_tesseract(
 ) -> None:
     """Raises what `project_file` would, from the head and the size of the file alone.
 
-    Compressed and v7.3 files say little in their head: of them only `deep`, which reads
-    and projects every file, finds damage.
+    Damage within the numbers only `deep` finds, which reads and projects every file.
     """
     if deep:
         project_file(path, shape_drea=shape_drea)
         return
-    with _open(path) as file:
-        layout = _parse_mat5(file)
-    if layout is not None:
-        _check(path, *layout, shape_drea)
+    with _open(path) as file, _damage_named(path):
+        if _layout(path, file, shape_drea) is None:
+            with _open_hdf5(path) as data:
+                _check(path, data.dtype, data.shape[::-1], shape_drea)
 
 
 def read_projection_npy(
@@ -188,24 +182,22 @@ def read_projection_npy(
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is truncated, damaged, or of another shape or type.
+        DataError: The file is truncated, damaged, of another shape or type, or has cells
+            that are not finite.
     """
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such projection")
-    try:
-        stored = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise DataError(f"{path}: damaged, not a NumPy array file ({error})") from None
-    if (
-        not isinstance(stored, np.ndarray)
-        or stored.ndim != 3
-        or stored.dtype.kind != "f"
-    ):
+    stored = read_npy(path)
+    if stored.ndim != 3 or stored.dtype.kind != "f":
         raise DataError(
             f"{path}: expected floats [Doppler + elevation, range, azimuth], got "
-            f"{getattr(stored, 'shape', type(stored).__name__)} of "
-            f"{getattr(stored, 'dtype', 'no type')}"
+            f"{stored.shape} of {stored.dtype}"
+        )
+    if not np.isfinite(stored).all():
+        raise DataError(
+            f"{path}: damaged, {int((~np.isfinite(stored)).sum())} of {stored.size} "
+            "cells are not finite"
         )
     projection = np.ascontiguousarray(stored.transpose(1, 2, 0))
     if projection_shape is not None and projection.shape != tuple(projection_shape):
@@ -244,60 +236,57 @@ def read_projection(frame: Frame, grid: RadarGrid) -> np.ndarray:
     return read_frame(path, grid)
 
 
-def _parse_mat5(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...]] | None:
-    """Type and shape of an uncompressed little-endian v5 file that holds `arrDREA`.
-
-    Leaves the file at its first number. None for anything unexpected: scipy then reads
-    the file or says what is wrong. `DataError` when the file is too short.
-    """
-    head = file.read(200)
-    if len(head) < 200 or head[124:128] != b"\x00\x01IM":
-        return None
-    # Tag, size and content of the matrix, its flags, dimensions, name and numbers.
-    words = np.frombuffer(head, "<u4", count=18, offset=128).tolist()
-    shape, dtype = tuple(words[8:12]), _MI_FLOATS.get(words[16])
-    if (
-        (words[0], *words[2:4]) != (_MI_MATRIX, _MI_UINT32, 8)
-        or words[4] & _COMPLEX
-        or words[6:8] != [_MI_INT32, 16]
-        or words[12:14] != [_MI_INT8, len(VARIABLE)]
-        or head[184:192] != VARIABLE.encode().ljust(8, b"\0")
-        or dtype is None
-        or min(shape) < 1
-        or words[17] != dtype.itemsize * math.prod(shape)
-    ):
-        return None
-    size, needed = os.fstat(file.fileno()).st_size, file.tell() + words[17]
-    if size < needed:
-        raise DataError(
-            f"{file.name}: truncated: {size} bytes, {VARIABLE} of shape {shape} needs "
-            f"{needed}"
-        )
-    return dtype, shape
-
-
-def _is_hdf5(path: pathlib.Path) -> bool:
+def _layout(
+    path: str | os.PathLike, file: BinaryIO, shape_drea: tuple[int, ...] | None
+) -> mat5.Layout | None:
+    """Checked layout of the tesseract in a v5 file; None for a v7.3 file."""
+    layout = mat5.find_array(file, VARIABLE)
+    if layout is not None:
+        _check(path, layout.dtype, layout.shape, shape_drea)
+        return layout
     import h5py  # needed for v7.3 files only
 
-    return bool(h5py.is_hdf5(path))
+    if not h5py.is_hdf5(path):
+        raise DataError(f"{path}: damaged, neither a MATLAB v5 nor a v7.3 file")
+    return None
 
 
-def _read_hdf5(path: pathlib.Path) -> np.ndarray:
-    """v7.3: an HDF5 data set with the axes reversed."""
+def _is_streamed(layout: mat5.Layout) -> bool:
+    """True where the numbers can be projected as they come."""
+    is_native_float = layout.dtype.kind == "f" and layout.dtype.isnative
+    return layout.deflated is None and is_native_float
+
+
+@contextlib.contextmanager
+def _open_hdf5(path: str | os.PathLike) -> Iterator[Any]:
+    """v7.3: the data set of an HDF5 file, whose axes are reversed; nothing is read yet.
+
+    Numbers that are elsewhere (links, external storage, virtual data sets) would make
+    one file read another: `DataError`. Likewise claims that its bytes cannot fill.
+    """
     import h5py
 
     with h5py.File(path, "r") as file:
         if VARIABLE not in file:
             raise DataError(f"{path}: no {VARIABLE} in it, only {sorted(file)}")
-        return file[VARIABLE][()].T
-
-
-def _read_mat(path: pathlib.Path) -> np.ndarray:
-    """v5, compressed or unusual, through scipy."""
-    import scipy.io
-
-    variables = scipy.io.loadmat(path, variable_names=[VARIABLE])
-    if VARIABLE not in variables:
-        names = [name for name, *_ in scipy.io.whosmat(path)]
-        raise DataError(f"{path}: no {VARIABLE} in it, only {names}")
-    return variables[VARIABLE]
+        data = file[VARIABLE]
+        is_here = isinstance(file.get(VARIABLE, getlink=True), h5py.HardLink)
+        if not isinstance(data, h5py.Dataset) or not is_here:
+            raise DataError(f"{path}: {VARIABLE} is no array, or a link to one")
+        if data.external or data.is_virtual:
+            raise DataError(f"{path}: the numbers of {VARIABLE} are in other files")
+        how = data.id.get_create_plist()
+        filters = [how.get_filter(i)[0] for i in range(how.get_nfilters())]
+        stored, claimed = data.id.get_storage_size(), data.nbytes
+        chunk = math.prod(data.chunks or (1,)) * data.dtype.itemsize
+        if (
+            len(set(filters)) < len(filters)
+            or stored > os.path.getsize(path)
+            or claimed > stored * (DEFLATE_RATIO if filters else 1)
+            or chunk > claimed
+        ):
+            raise DataError(
+                f"{path}: damaged, {VARIABLE} of shape {data.shape[::-1]} claims "
+                f"{claimed} bytes and stores {stored}"
+            )
+        yield data

@@ -35,6 +35,17 @@ _SHIFTS = ("x_ldr2cam", "y_ldr2cam", "z_ldr2cam")
 _LENS = ("k1", "k2", "k3", "k4", "k5")
 _PINHOLE = ("fx", "fy", "px", "py")
 
+_MAX_PIXELS = 1 << 16
+_MAX_NUMBER = 1e9  # in a file
+_LIMITS = {  # far beyond what cameras have: pixels, coefficients, metres
+    "intrinsics": 1e6,
+    "distortion": 1e3,
+    "rotation": 1.0 + 1e-6,
+    "translation_m": 1e3,
+    "ego_from_lidar_m": 1e3,
+    "rectified": 1e6,
+}
+
 # Between the corners of `boxes.corners`.
 _BOX_EDGES = np.array(
     [(i, (i + 1) % 4) for i in range(4)]
@@ -90,12 +101,24 @@ class CameraCalibration:
         }
         for name, shape in shapes.items():
             value = np.array(getattr(self, name), np.float64)
-            if value.shape != shape or not np.isfinite(value).all():
+            limit = _LIMITS[name]
+            if value.shape != shape or not (np.abs(value) <= limit).all():
                 raise CalibrationError(
-                    f"{name} must be {shape} finite numbers, got {value.tolist()}"
+                    f"{name} must be {shape} finite numbers up to {limit:g}, got "
+                    f"{value.tolist()}"
                 )
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        if not (0 < self.width <= _MAX_PIXELS and 0 < self.height <= _MAX_PIXELS):
+            raise CalibrationError(
+                f"width and height must be 1 to {_MAX_PIXELS} pixels, got {self.width} x "
+                f"{self.height}"
+            )
+        if min(*self.intrinsics[:2], *self.rectified[:2]) <= 0:
+            raise CalibrationError(
+                f"focal lengths must be positive, got {self.intrinsics[:2].tolist()} and "
+                f"{self.rectified[:2].tolist()}"
+            )
 
     # Construction --------------------------------------------------------------------
 
@@ -156,15 +179,18 @@ class CameraCalibration:
             "width": int(values.get("img_size_w", 1280)),
             "height": int(values.get("img_size_h", 720)),
         }
-        return cls.from_angles(
-            intrinsics=[values[key] for key in _PINHOLE],
-            distortion=[values[key] for key in _LENS],
-            yaw_deg=yaw,
-            pitch_deg=pitch,
-            roll_deg=roll,
-            translation_m=[values[key] for key in _SHIFTS],
-            **(size | fields),
-        )
+        try:
+            return cls.from_angles(
+                intrinsics=[values[key] for key in _PINHOLE],
+                distortion=[values[key] for key in _LENS],
+                yaw_deg=yaw,
+                pitch_deg=pitch,
+                roll_deg=roll,
+                translation_m=[values[key] for key in _SHIFTS],
+                **(size | fields),
+            )
+        except CalibrationError as error:
+            raise CalibrationFileError(f"{path}: {error}") from None
 
     def to_kradar_text(self) -> str:
         """The content of a K-Radar calibration file; `from_kradar` reads it back."""
@@ -304,7 +330,11 @@ def _rotation(axis: int, angle: float) -> np.ndarray:
 
 def _read_numbers(path: pathlib.Path) -> dict[str, float]:
     values = {}
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise CalibrationFileError(f"{path}: not a UTF-8 text file") from None
+    for number, line in enumerate(lines, 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         key, separator, value = line.partition(":")
@@ -312,9 +342,12 @@ def _read_numbers(path: pathlib.Path) -> dict[str, float]:
             if not separator:
                 raise ValueError
             values[key.strip()] = float(value)
+            if not abs(values[key.strip()]) <= _MAX_NUMBER:
+                raise ValueError
         except ValueError:
             raise CalibrationFileError(
-                f"{path}:{number}: expected 'key: number', found {line!r}"
+                f"{path}:{number}: expected 'key: number' up to {_MAX_NUMBER:g}, found "
+                f"{line[:80]!r}"
             ) from None
     return values
 

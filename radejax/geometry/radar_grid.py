@@ -14,6 +14,14 @@ import numpy as np
 
 from radejax.geometry.boxes import array_module
 
+_MAX_RANGE_M = 10_000.0
+_LIMITS = {  # what a radar can have, in the unit of the axis
+    "range_m": (-1.0, _MAX_RANGE_M),
+    "azimuth_rad": (-np.pi, np.pi),
+    "elevation_rad": (-np.pi / 2, np.pi / 2),
+    "doppler_mps": (-1000.0, 1000.0),
+}
+
 AzimuthMapping = Literal["true", "stretched"]
 
 
@@ -34,7 +42,8 @@ class RadarGrid:
         fov_azimuth_rad: Objects beyond plus or minus this azimuth are outside.
 
     Raises:
-        ValueError: An axis has fewer than 2 bins, or is not uniform and increasing.
+        ValueError: An axis has fewer than 2 bins, is not uniform and increasing, or is
+            beyond what a radar can have; says the limits.
 
     References:
         Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
@@ -54,12 +63,23 @@ class RadarGrid:
                 raise ValueError(
                     f"{name} must be a vector of at least 2 bins, got shape {axis.shape}"
                 )
+            low, high = _LIMITS[name]
+            if not (axis >= low).all() or not (axis <= high).all():
+                raise ValueError(
+                    f"{name} must lie within {low:g} and {high:g}, got {axis.min()} to "
+                    f"{axis.max()}"
+                )
             step = (axis[-1] - axis[0]) / (axis.size - 1)
             deviation = np.abs(axis - (axis[0] + step * np.arange(axis.size))).max()
             if not step > 0 or deviation > 1e-3 * step:
                 raise ValueError(f"{name} must be uniform and increasing, got {axis}")
             axis.setflags(write=False)
             object.__setattr__(self, name, axis)
+        for name, limit in (("fov_range_m", _MAX_RANGE_M), ("fov_azimuth_rad", np.pi)):
+            if not 0 < getattr(self, name) <= limit:
+                raise ValueError(
+                    f"{name} must be positive up to {limit:g}, got {getattr(self, name)}"
+                )
 
     # Construction --------------------------------------------------------------------
 

@@ -162,10 +162,15 @@ def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
             are Doppler; override `doppler_bins` and `elevation_bins`.
     """
     shapes = {name: tuple(value.shape) for name, value in tensors.items()}
-    levels = [int(m[1]) for n in shapes if (m := _ENCODER.match(n))]
+    levels = {int(m[1]) for n in shapes if (m := _ENCODER.match(n))}
+    if levels != set(range(1, len(levels) + 1)):
+        raise DataError(
+            "not a state dict of RADE-Net: its encoder blocks are numbered "
+            f"{sorted(levels)[-3:]}, expected 1 to {len(levels)}"
+        )
     widths = tuple(
         _common_size(shapes, f"backbone.encoder_block_{i}.", 0)
-        for i in range(1, max(levels, default=0) + 1)
+        for i in range(1, len(levels) + 1)
     )
     heads = "expanded" if "head.heatmap_head.head.6.weight" in shapes else "default"
     last_head = f"head.heatmap_head.head.{9 if heads == 'expanded' else 3}."
@@ -193,7 +198,7 @@ def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
     return {"name": "radenet"} | defaults | shown | overrides
 
 
-_ENCODER = re.compile(r"backbone\.encoder_block_(\d+)\.")
+_ENCODER = re.compile(r"backbone\.encoder_block_([0-9]{1,9})\.")
 
 
 def _infer_input(

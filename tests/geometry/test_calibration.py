@@ -235,3 +235,27 @@ def test_bad_calibrations(tmp_path):
         forward_camera(intrinsics=(1.0, 2.0))
     with pytest.raises(CalibrationError, match="raw, rectified, pinhole"):
         forward_camera().camera("fisheye")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("img_size_w", "0", r"width and height must be 1 to 65536 pixels, got 0 x 80"),
+        ("img_size_h", "-3", r"width and height must be"),
+        ("fx", "-1", r"focal lengths must be positive"),
+        ("fx", "inf", r"expected 'key: number' up to 1e\+09, found 'fx: inf'"),
+        ("k1", "1e308", r"expected 'key: number' up to"),
+        ("k1", "1e8", r"distortion must be .* up to 1000"),
+        ("x_ldr2cam", "1e8", r"translation_m must be"),
+    ],
+)
+def test_impossible_cameras_name_the_file(tmp_path, key, value, message):
+    path = tmp_path / "cam_1.yml"
+    text = forward_camera().to_kradar_text()
+    lines = [x for x in text.splitlines() if not x.startswith(f"{key}:")]
+    path.write_text("\n".join([*lines, f"{key}: {value}"]))
+    with pytest.raises(CalibrationFileError, match=r"cam_1\.yml:.*" + message):
+        CameraCalibration.from_kradar(path)
+    path.write_bytes(b"\xff")
+    with pytest.raises(CalibrationFileError, match=r"cam_1\.yml: not a UTF-8"):
+        CameraCalibration.from_kradar(path)

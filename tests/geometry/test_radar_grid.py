@@ -160,7 +160,7 @@ def test_reduced_grid_looks_like_the_sensor():
         ({"range_m": np.array([1.0])}, "range_m must be a vector of at least 2 bins"),
         ({"azimuth_rad": np.array([0.0, 1.0, 3.0])}, "azimuth_rad must be uniform"),
         ({"range_m": np.array([2.0, 1.0])}, "range_m must be uniform and increasing"),
-        ({"doppler_mps": np.array([0.0, np.nan])}, "doppler_mps must be uniform"),
+        ({"doppler_mps": np.array([0.0, np.nan])}, "doppler_mps must lie within"),
     ],
 )
 def test_bad_axes_are_refused(changes, message):
@@ -171,3 +171,14 @@ def test_bad_axes_are_refused(changes, message):
 def test_unknown_mapping_is_refused():
     with pytest.raises(ValueError, match="'true' or 'stretched', got 'bent'"):
         KRADAR.padded(8, "bent")
+
+
+@pytest.mark.parametrize("axis", ["range_m", "azimuth_rad", "elevation_rad"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_impossible_axes_are_errors(axis, value):
+    fields = RadarGrid.kradar().to_dict()
+    fields[axis][-1] = value
+    with pytest.raises(ValueError, match=f"{axis} must lie within .* and .*, got"):
+        RadarGrid.from_dict(fields)
+    with pytest.raises(ValueError, match="fov_range_m must be positive up to 10000"):
+        RadarGrid.from_dict(RadarGrid.kradar().to_dict() | {"fov_range_m": value})

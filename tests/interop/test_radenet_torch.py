@@ -270,3 +270,11 @@ def test_official_default_with_intermediates(shared, recipe):
             np.testing.assert_allclose(
                 actual.transpose(2, 0, 1), expected[name], atol=1e-4, err_msg=name
             )
+
+
+def test_a_huge_block_number_is_an_error(small_state):
+    state = dict(small_state)
+    name = "backbone.encoder_block_100000000.adjust_input.weight"
+    state[name] = np.zeros((1, 1, 1, 1), np.float32)
+    with pytest.raises(DataError, match=r"encoder blocks are numbered .*100000000"):
+        radenet_torch.load(state, **OVERRIDES)

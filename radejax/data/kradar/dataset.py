@@ -208,6 +208,8 @@ class KRadar(Sequence[Frame]):
                 _, content = next(contents)
                 where, problems = self._source.where(key), []
                 try:
+                    if isinstance(content, DataError):
+                        raise content
                     file = parse_label_file(
                         content, self.version, where=where, problems=problems
                     )

@@ -7,14 +7,18 @@ root that has it.
 
 from __future__ import annotations
 
-import json
+import contextlib
+import functools
 import os
 import pathlib
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
+from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import read_json
+from radejax.data.kradar.labels import MAX_LABEL_BYTES, read_label_bytes
 from radejax.geometry.radar_grid import RadarGrid
 
 _OWN_LABEL_FOLDERS = {
@@ -23,8 +27,8 @@ _OWN_LABEL_FOLDERS = {
     "v2.0": ("info_label_v2_0", "info_label_v2", "info_label"),
     "v2.1": ("info_label_v2_1", "info_label"),
 }
-_SEQUENCE_NAME = re.compile(r"(\d{1,6})(?:_info_label_revised)?")
-_LABEL_NAME = re.compile(r"\d+_\d+\.txt")
+_SEQUENCE_NAME = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
+_LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
 
 
 class SequenceFolder:
@@ -61,14 +65,22 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
 
     Raises:
         FileNotFoundError: A root does not exist.
+        DataError: A root has a sequence twice, as `1` and `01`.
     """
     found: dict[int, list[pathlib.Path]] = {}
     for root in roots:
         if not root.is_dir():
             raise FileNotFoundError(f"{root}: no such folder, expected a K-Radar root")
         for folder in sorted(root.iterdir()):
-            if folder.name.isdecimal() and folder.is_dir():
-                found.setdefault(int(folder.name), []).append(folder)
+            # As labels have it; isdecimal is also true of the digits of other scripts.
+            if re.fullmatch(r"[0-9]{1,6}", folder.name) and folder.is_dir():
+                same = found.setdefault(int(folder.name), [])
+                if same and same[-1].parent == root:
+                    raise DataError(
+                        f"sequence {int(folder.name)} is there twice, as {same[-1]} and "
+                        f"{folder}: delete or move one"
+                    )
+                same.append(folder)
     return {number: SequenceFolder(found[number]) for number in sorted(found)}
 
 
@@ -98,18 +110,29 @@ class LabelSource:
 
     def read(
         self, keys: Sequence[tuple[int, str]]
-    ) -> Iterator[tuple[tuple[int, str], bytes]]:
-        """Contents of label files; the archive is opened once."""
+    ) -> Iterator[tuple[tuple[int, str], bytes | DataError]]:
+        """Contents of label files, or why one has none; the archive is opened once."""
         if self.archive is None:
-            for key in keys:
-                yield key, pathlib.Path(self.files[key]).read_bytes()
-            return
-        with zipfile.ZipFile(self.archive) as archive:
+            read: Callable[[tuple[int, str]], bytes] = self._read_file
+            manager: contextlib.AbstractContextManager = contextlib.nullcontext()
+        else:
+            manager = open_zip(self.archive)
+        with manager as archive:
+            if archive is not None:
+                read = functools.partial(self._read_member, archive)
             for key in keys:
                 try:
-                    yield key, archive.read(str(self.files[key]))
-                except (zipfile.BadZipFile, OSError) as error:
-                    raise DataError(f"{self.where(key)}: damaged: {error}") from None
+                    content: bytes | DataError = read(key)
+                except DataError as error:
+                    content = error
+                yield key, content
+
+    def _read_file(self, key: tuple[int, str]) -> bytes:
+        return read_label_bytes(pathlib.Path(self.files[key]))
+
+    def _read_member(self, archive: zipfile.ZipFile, key: tuple[int, str]) -> bytes:
+        name = str(self.files[key])
+        return read_member(archive, name, max_bytes=MAX_LABEL_BYTES)
 
 
 def own_labels(sequences: dict[int, SequenceFolder], version: str) -> LabelSource:
@@ -133,21 +156,31 @@ def labels_from(path: pathlib.Path) -> LabelSource:
     Raises:
         FileNotFoundError: There is no such folder or file.
         UserError: It is neither a folder nor a zip, or holds no label files.
+        DataError: A frame is in it twice, or the zip is damaged.
     """
     if path.is_dir():
         relative = [file.relative_to(path) for file in path.rglob("*.txt")]
-        members = {_label_key(name): path / name for name in relative}
+        members = [(_label_key(name), path / name) for name in sorted(relative)]
         archive = None
     elif not path.exists():
         raise FileNotFoundError(f"{path}: no such labels, expected a folder or a zip")
-    elif zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as file:
+    elif path.suffix == ".zip" or zipfile.is_zipfile(path):
+        with open_zip(path) as file:
             names = file.namelist()
-        members = {_label_key(pathlib.PurePosixPath(name)): name for name in names}
+        members = [(_label_key(pathlib.PurePosixPath(name)), name) for name in names]
         archive = path
     else:
         raise UserError(f"{path}: labels must be a folder or a zip file")
-    files = {key: member for key, member in members.items() if key is not None}
+    files: dict[tuple[int, str], pathlib.Path | str] = {}
+    for key, member in members:
+        if key is None:
+            continue
+        if key in files:
+            raise DataError(
+                f"{path}: frame {key[0]}/{key[1]} is there twice, as {files[key]} and "
+                f"{member}: one revision of every label, delete or move the other"
+            )
+        files[key] = member
     if not files:
         raise UserError(
             f"{path}: no label files in it, expected <sequence>/<radar>_<lidar>.txt "
@@ -209,8 +242,9 @@ def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
     for root in roots:
         path = root / "radar_grid.json"
         if path.is_file():
+            content = read_json(path)
             try:
-                found[path] = RadarGrid.from_dict(json.loads(path.read_bytes()))
+                found[path] = RadarGrid.from_dict(content)
             except (ValueError, KeyError, TypeError) as error:
                 raise DataError(f"{path}: no radar grid: {error!r}") from None
     if len(set(found.values())) > 1:

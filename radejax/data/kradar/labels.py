@@ -35,6 +35,13 @@ LABEL_CLASSES = (
 VERSIONS = ("v1.0", "v1.1", "v2.0", "v2.1")
 AVAILABILITY_FLAGS = ("R", "L", "L1")
 
+MAX_LABEL_BYTES = 1 << 18
+"""Of a label file; K-Radar's largest have 3 kB."""
+
+_MAX_LINE = 1000  # characters; K-Radar's longest lines have 150
+_MAX_DISTANCE_M, _MAX_HALF_EXTENT_M, _MAX_YAW_DEG = 1000.0, 50.0, 3600.0
+_MAX_INDEX, _MAX_TIME_S = 2**31, 1e11
+
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _SEPARATOR = r"\s*,\s*"
 _BOX = _SEPARATOR.join(rf"({_NUMBER})" for _ in range(7))
@@ -51,11 +58,11 @@ _LINES = {
     )
     for version, fields in _LEADING_FIELDS.items()
 }
-_HEADER = re.compile(r"\*\s*idx\(([^)]*)\)=([\d_]+),\s*timestamp=([\d.]+)\s*")
+_HEADER = re.compile(r"\*\s*idx\(([^)]*)\)=([\d_]+),\s*timestamp=([\d.]+)\s*", re.ASCII)
 _TOOL_HEADER = re.compile(
     r"\*\s*radar idx: (\d+), lidar idx: (\d+), camera idx: (\d+), time: ([\d.]+)"
     r"(?:,.*)?",
-    flags=re.DOTALL,
+    flags=re.DOTALL | re.ASCII,
 )
 _LINE_END = re.compile(r"\r\n|\n|\r")
 
@@ -173,13 +180,22 @@ def read_label_file(
 ) -> LabelFile:
     """Header and objects of one label file; arguments as in `read_labels`."""
     version, path = normalise_version(version), pathlib.Path(path)
+    content = read_label_bytes(path)
+    return parse_label_file(content, version, where=str(path), problems=problems)
+
+
+def read_label_bytes(path: pathlib.Path) -> bytes:
+    """Content of a label file; errors as `read_labels`, also for a far too large one."""
     try:
-        content = path.read_bytes()
+        with open(path, "rb") as file:
+            content = file.read(MAX_LABEL_BYTES + 1)
     except FileNotFoundError:
         raise FileNotFoundError(f"{path}: no such label file") from None
     except IsADirectoryError:
         raise DataError(f"{path}: is a folder, expected a label file") from None
-    return parse_label_file(content, version, where=str(path), problems=problems)
+    if len(content) > MAX_LABEL_BYTES:
+        raise DataError(f"{path}: more than {MAX_LABEL_BYTES} bytes, no label file")
+    return content
 
 
 def parse_label_file(
@@ -196,6 +212,8 @@ def parse_label_file(
     """
     version = normalise_version(version)
     lines = _LINE_END.split(_decode(content, where))
+    if len(lines[0]) > 2 * _MAX_LINE:  # of v2.0 also with an object
+        raise DataError(f"{where}:1: {_short(lines[0])} is too long for a header")
     header_line, joined = _split_header(lines[0])
     header = _parse_header(header_line, where)
     labels: list[Label] = []
@@ -255,14 +273,25 @@ def _parse_header(line: str, where: str) -> LabelHeader:
             f"{where}:1: {_short(line)} is no header, expected "
             "'* idx(...)=00033_00001_00002_00001_00004, timestamp=...'"
         )
+    if max(number or 0 for number in numbers) >= _MAX_INDEX:
+        raise DataError(f"{where}:1: {_short(line)} has frame numbers of {_MAX_INDEX}")
     try:
-        return LabelHeader(*numbers, float(time_text))
+        timestamp_s = float(time_text)
     except ValueError:
         raise DataError(f"{where}:1: timestamp {time_text!r} is not a number") from None
+    if timestamp_s > _MAX_TIME_S:
+        raise DataError(
+            f"{where}:1: timestamp {_short(time_text)} is no Unix time in s"
+        )
+    return LabelHeader(*numbers, timestamp_s)
 
 
 def _parse_object(line: str, version: str, where: str) -> Label:
     """One object line; a `DataError` says what is wrong with it."""
+    if len(line) > _MAX_LINE:
+        raise DataError(
+            f"{where}: {len(line)} characters, expected at most {_MAX_LINE}: {_short(line)}"
+        )
     match = _LINES[version].fullmatch(line)
     if match is None:
         raise DataError(f"{where}: {_explain(line, version)}")
@@ -275,16 +304,25 @@ def _parse_object(line: str, version: str, where: str) -> Label:
         )
     extents = [2.0 * half for half in half_extents]
     box = (x, y, z, *extents, math.radians(yaw_deg))
-    if not all(map(math.isfinite, box)) or min(extents) <= 0:
+    if not (
+        all(abs(value) <= _MAX_DISTANCE_M for value in (x, y, z))
+        and all(0 < half <= _MAX_HALF_EXTENT_M for half in half_extents)
+        and abs(yaw_deg) <= _MAX_YAW_DEG
+    ):
         raise DataError(
-            f"{where}: half extents {', '.join(map(repr, half_extents))} and positions "
-            "must be finite, extents positive"
+            f"{where}: position {x!r}, {y!r}, {z!r} m, yaw {yaw_deg!r} deg, half extents "
+            f"{', '.join(map(repr, half_extents))} m: all must be finite, positions up to "
+            f"{_MAX_DISTANCE_M:g} m, half extents positive up to {_MAX_HALF_EXTENT_M:g} "
+            f"m, yaw up to {_MAX_YAW_DEG:g} deg"
         )
     visibility = leading.pop(0) if version in ("v1.1", "v2.1") else "R"
     previous = None
     if version.startswith("v1") and leading[1] is not None:
         previous = int(leading[1])
-    return Label(cls, box, visibility, int(leading[0]), previous)
+    track = int(leading[0])
+    if max(abs(track), abs(previous or 0)) >= _MAX_INDEX:
+        raise DataError(f"{where}: track id in {_short(line)}, expected below 2**31")
+    return Label(cls, box, visibility, track, previous)
 
 
 def _explain(line: str, version: str) -> str:

@@ -22,6 +22,8 @@ DEFAULT_RADAR_FROM_LIDAR_M = (-2.54, 0.3)
 """Metres to add to LiDAR x and y: the same on every K-Radar sequence."""
 
 _DEFAULT_OFFSET_TEXT = "taking K-Radar's (-2.54, 0.3)"
+_MAX_OFFSET_M = 100.0
+_SPLIT_LINE = r"\s*([0-9]{1,6})\s*,\s*([0-9]{1,9}_[0-9]{1,9})(?:\.txt)?\s*"
 _CAMERA_FOLDERS = ("calib", "cam_calib", "resources/cam_calib")
 
 WEATHERS = ("normal", "overcast", "fog", "rain", "sleet", "lightsnow", "heavysnow")
@@ -107,10 +109,11 @@ def read_calibration(path: str | os.PathLike) -> RadarCalibration:
         difference, dx_m, dy_m = map(float, lines[1].split(","))
     except ValueError:
         difference = dx_m = dy_m = math.nan
-    if not all(map(math.isfinite, (difference, dx_m, dy_m))) or difference % 1:
+    is_near = abs(dx_m) <= _MAX_OFFSET_M and abs(dy_m) <= _MAX_OFFSET_M
+    if not is_near or not abs(difference) < 1e6 or difference % 1:
         raise DataError(
             f"{path}:2: {lines[1][:80]!r}, expected three numbers: frame difference "
-            "(whole), x, y, such as 32,-2.54,0.3"
+            f"(whole), x, y up to {_MAX_OFFSET_M:g} m, such as 32,-2.54,0.3"
         )
     return RadarCalibration(int(difference), dx_m, dy_m)
 
@@ -237,7 +240,7 @@ def read_split(path: str | os.PathLike) -> list[tuple[int, str]]:
     for number, line in enumerate(_read_lines(path), start=1):
         if not line.strip():
             continue
-        match = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+_\d+)(?:\.txt)?\s*", line)
+        match = re.fullmatch(_SPLIT_LINE, line)
         if match is None:
             raise DataError(
                 f"{path}:{number}: {line[:80]!r}, expected 'sequence,label file', such "
@@ -274,3 +277,5 @@ def _read_lines(path: str | os.PathLike) -> list[str]:
         return pathlib.Path(path).read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise DataError(f"{path}:1: not a UTF-8 text file") from None
+    except IsADirectoryError:
+        raise DataError(f"{path}: is a folder, expected a text file") from None

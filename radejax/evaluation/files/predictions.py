@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from radejax.core import files
+from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS
 from radejax.evaluation.columns import Columns, wanted_columns
@@ -110,11 +111,7 @@ def find_frames(
 
 
 def _read_npz(path: pathlib.Path) -> Columns:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            columns = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError) as error:
-        raise DataError(f"{path} is not a readable .npz file: {error}") from error
+    columns = read_npz(path)
     if "class_names" in columns and columns.get("cls", np.zeros(0)).dtype.kind in "iu":
         columns["cls"] = columns["class_names"][columns["cls"]]
     return columns

@@ -5,10 +5,14 @@ import zipfile
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar import folders, write
+from radejax.data.kradar import KRadar, folders, write
 from radejax.geometry.radar_grid import RadarGrid
 
 LABEL = "00004_00001"
+HEADER = (
+    "* idx(tesseract_os2-64_cam-front_os1-128_cam-lrr)=00004_00001_00002_00003_00004, "
+    "timestamp=1643292946.710046076"
+)
 
 
 def touch(path: pathlib.Path, text: str = "x") -> pathlib.Path:
@@ -90,8 +94,63 @@ def test_damaged_zip_names_the_member(tmp_path):
         archive.writestr(f"1/{LABEL}.txt", "x" * 1000)
     path.write_bytes(path.read_bytes().replace(b"x" * 1000, b"y" * 1000))
     source = folders.labels_from(path)
-    with pytest.raises(DataError, match=rf"labels\.zip/1/{LABEL}\.txt: damaged"):
-        list(source.read([(1, LABEL)]))
+    ((_, error),) = source.read([(1, LABEL)])
+    assert isinstance(error, DataError)
+    assert f"labels.zip/1/{LABEL}.txt: damaged" in str(error)
+
+
+def test_a_frame_twice_names_both(tmp_path):
+    for folder in ("1", "01", "a/1"):
+        touch(tmp_path / f"labels/{folder}/{LABEL}.txt")
+    both = rf"frame 1/{LABEL} is there twice, as .*01/{LABEL}\.txt and .*1/{LABEL}\.txt"
+    with pytest.raises(DataError, match=both):
+        folders.labels_from(tmp_path / "labels")
+    path = tmp_path / "labels.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"1/{LABEL}.txt", "x")
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            archive.writestr(f"1/{LABEL}.txt", "y")
+    with pytest.raises(DataError, match=f"as 1/{LABEL}.txt and 1/{LABEL}.txt"):
+        folders.labels_from(path)
+    for name in ("1", "01"):
+        touch(tmp_path / f"root/{name}/description.txt")
+    with pytest.raises(DataError, match=r"sequence 1 is there twice, as .*01 and .*1:"):
+        folders.find_sequences([tmp_path / "root"])
+
+
+def test_one_bad_member_leaves_the_others(tmp_path):
+    path = tmp_path / "labels.zip"
+    content = HEADER.encode()
+    bomb = bytes(2 << 20)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(f"1/{LABEL}.txt", content)
+        archive.writestr("1/00005_00002.txt", bomb)
+        archive.writestr("1/00006_00003.txt", content, zipfile.ZIP_LZMA)
+    data = KRadar(labels=path)
+    assert [frame.name for frame in data] == [LABEL]
+    bombed, lzma = (problem.message for problem in data.summary().problems)
+    assert "claims 2097152 bytes, expected at most" in bombed
+    assert "compressed by method 14, expected stored (0) or deflated (8)" in lzma
+    with pytest.raises(DataError, match="00005_00002"):
+        KRadar(labels=path, strict=True)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(DataError, match=r"labels\.zip: damaged, not a zip file"):
+        KRadar(labels=path)
+
+
+def test_a_label_that_is_a_folder_is_reported(tmp_path):
+    touch(tmp_path / f"1/{LABEL}.txt", HEADER)
+    (tmp_path / "1/00005_00002.txt").mkdir()
+    data = KRadar(labels=tmp_path)
+    assert len(data) == 1
+    assert "is a folder, expected a label file" in str(data.summary().problems[0])
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, '{"range_m": 1e400}', "1"])
+def test_damaged_grids_are_named(tmp_path, text):
+    touch(tmp_path / "radar_grid.json", text)
+    with pytest.raises(DataError, match=r"radar_grid\.json"):
+        folders.read_grid([tmp_path])
 
 
 def test_split_files_and_camera_calibration_are_found(tmp_path):

@@ -1,4 +1,5 @@
 import math
+import time
 
 import pytest
 from hypothesis import given, settings
@@ -117,13 +118,37 @@ def test_oddities_are_read(text):
         (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}nan", r"'nan' is not a number"),
         (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1_0", r"'1_0' is not a number"),
         (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1e999", r"must be finite"),
-        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}-1.0", r"must be finite, extents pos"),
+        (
+            f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}-1.0",
+            r"half extents positive up to 50 m",
+        ),
+        (
+            f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1e39",
+            r"half extents positive up to 50",
+        ),
+        (f"{HEADER}\n*, L, 4, Sedan, 1e308{BOX[4:]}", r"positions up to 1000 m"),
+        (f"{HEADER}\n*, L, 4, Sedan, {'9' * 5000}{BOX[4:]}", r"50\d\d characters"),
+        (f"{HEADER}\n*, L, {'9' * 500}, Sedan, {BOX}", r"track id .* below 2\*\*31"),
+        (HEADER.replace("00033", "9" * 500), r"f\.txt:1: .* has frame numbers"),
+        (HEADER.replace("00033", "9" * 5000), r"f\.txt:1: .* too long for a header"),
+        (HEADER.replace("1643292946.", "9" * 400), r"is no Unix time"),
+        (HEADER.replace("00033", "٠٠٠٣٣"), r"f\.txt:1: .* is no header"),
         (f"{HEADER}\n*, L, x, Sedan, {BOX}", r"is not an object line of v2\.1"),
     ],
 )
 def test_malformed_files_name_file_and_line(text, message):
     with pytest.raises(DataError, match=message):
         parse(text)
+
+
+def test_numbers_of_64_kb_take_no_time():
+    text = f"{HEADER}\n*, L, 4, Sedan, {'1' * 65536}x, 2"
+    text += f"\n*, L, 4, Sedan{' ' * 65536}x"
+    problems: list[Problem] = []
+    began = time.process_time()
+    parse(text, problems=problems)
+    assert time.process_time() - began < 1
+    assert len(problems) == 2
 
 
 def test_undecodable_file_names_the_line():

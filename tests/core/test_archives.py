@@ -1,0 +1,100 @@
+import io
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from radejax.core.archives import open_zip, read_member, read_npy, read_npz
+from radejax.core.errors import DataError
+
+
+def npy(array: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(24.0).reshape(2, 3, 4),
+        np.asfortranarray(np.arange(6, dtype=np.int16).reshape(2, 3)),
+        np.array(["Sedan", "Bus or Truck"]),
+        np.zeros((0, 7)),
+        np.float32(3),
+    ],
+)
+def test_arrays_are_what_was_written(tmp_path, array):
+    (tmp_path / "a.npy").write_bytes(npy(array))
+    np.savez(tmp_path / "a.npz", first=array, second=np.arange(3))
+    found = read_npz(tmp_path / "a.npz")
+    assert list(found) == ["first", "second"]
+    for one in (read_npy(tmp_path / "a.npy"), found["first"]):
+        np.testing.assert_array_equal(one, array)
+        assert one.dtype == array.dtype
+
+
+def claim(content: bytes) -> bytes:
+    """An array file of the same length that claims terabytes."""
+    wanted = content.replace(b"(4,), }            ", b"(400000000000,), }  ")
+    return wanted[: len(content)]
+
+
+def test_claims_beyond_the_file_take_no_memory(tmp_path):
+    content = claim(npy(np.zeros(4)))
+    assert b"400000000000" in content
+    (tmp_path / "a.npy").write_bytes(content)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("first.npy", content)
+    tracemalloc.start()
+    with pytest.raises(
+        DataError, match=r"a\.npy: damaged, \d+ bytes of numbers, shape"
+    ):
+        read_npy(tmp_path / "a.npy")
+    with pytest.raises(DataError, match=r"a\.npz/first\.npy: damaged"):
+        read_npz(tmp_path / "a.npz")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("reader", [read_npy, read_npz])
+def test_every_truncation_and_flip_is_read_or_named(tmp_path, reader):
+    path = tmp_path / f"a.{reader.__name__[-3:]}"
+    array = np.arange(6.0)
+    if reader is read_npy:
+        path.write_bytes(npy(array))
+    else:
+        np.savez_compressed(path, a=array)
+    content = path.read_bytes()
+    num_named = 0
+    for place in range(len(content)):
+        flipped = content[:place] + bytes([content[place] ^ 64]) + content[place + 1 :]
+        for damaged in (flipped, content[:place]):
+            path.write_bytes(damaged)
+            try:
+                reader(path)
+            except DataError as error:
+                assert str(path) in str(error)  # noqa: PT017
+                num_named += 1
+    assert num_named >= len(content)
+
+
+def test_members_that_are_not_read(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("bomb", bytes(1 << 20))
+        archive.writestr("lzma", b"x", zipfile.ZIP_LZMA)
+    with open_zip(path) as archive:
+        assert read_member(archive, "bomb", max_bytes=1 << 20) == bytes(1 << 20)
+        with pytest.raises(
+            DataError, match="claims 1048576 bytes, expected at most 1000"
+        ):
+            read_member(archive, "bomb", max_bytes=1000)
+        with pytest.raises(DataError, match="compressed by method 14"):
+            read_member(archive, "lzma", max_bytes=1000)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(content)
+    with open_zip(path) as archive, pytest.raises(DataError, match="is encrypted"):
+        read_member(archive, "bomb", max_bytes=1 << 20)
