@@ -105,3 +105,21 @@ def test_processes_without_a_coordinator_are_wrong_use(tmp_path: pathlib.Path) -
     assert ended.returncode == entry.WRONG_USE
     assert "--num_processes and --process_id together" in ended.stderr
     assert not (tmp_path / "run").exists()
+
+
+def test_words_are_repeated_or_with_commas() -> None:
+    assert entry.words(["a, b", "c", ""]) == ("a", "b", "c")
+
+
+def test_a_second_folder_without_its_flag_is_wrong_use(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "train.py", "--config=configs/quickstart.py:short"]
+    command += [f"--workdir={tmp_path / 'run'}", "--data", "disk1", "disk2"]
+    ended = subprocess.run(
+        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120
+    )
+    assert ended.returncode == entry.WRONG_USE
+    assert ended.stderr == (
+        "error: unexpected arguments: disk2; several folders are --data A,B or "
+        "--data A --data B\n"
+    )
+    assert not (tmp_path / "run").exists()

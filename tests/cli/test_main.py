@@ -197,3 +197,36 @@ def test_simulate_works_anywhere(
     (((config, out), _),) = seen
     assert config == dataset.default_config() | {"frames_per_sequence": 3}
     assert out == pathlib.Path("data")
+
+
+def test_roots_are_separate_repeated_or_with_commas(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from radejax.data.kradar import check
+
+    names = ("a", "b", "c", "d,e")
+    for name in names:
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    seen = []
+
+    def look(roots: object, **_: object) -> SimpleNamespace:
+        seen.append(roots)
+        return SimpleNamespace(to_dict=dict, to_text=str, num_problems=0)
+
+    monkeypatch.setattr(check, "check_dataset", look)
+    wanted = [pathlib.Path(name) for name in names]
+    assert _run("data", "check", "a,b", "c", "d,e").exit_code == 0
+    assert list(seen[0]) == wanted
+    missing = _run("data", "check", "a,x")
+    assert missing.exit_code == 2
+    assert "'x' does not exist" in missing.output
+    opened = []
+
+    def open_data(roots: object, *_: object, **__: object) -> None:
+        opened.append(list(roots))
+        raise UserError("opened")
+
+    monkeypatch.setattr("radejax.data.kradar.KRadar", open_data)
+    assert "opened" in _run("overlay", "1", "--data", "a,b", "--data", "c").output
+    assert opened == [wanted[:3]]
