@@ -26,6 +26,12 @@ _DATA = flags.DEFINE_multi_string(
 _LABELS = flags.DEFINE_string(
     "labels", None, "Folder or zip of a label revision; the sequences' own by default."
 )
+_SEQUENCES = flags.DEFINE_multi_string(
+    "sequences", None, "Only these, 1,58: --config.data.sequences."
+)
+_WEATHER = flags.DEFINE_multi_string(
+    "weather", None, "Only sequences of these, fog,rain: --config.data.weather."
+)
 _RECORDS = flags.DEFINE_string(
     "records", None, "Folder of projected frames; made beside the data if missing."
 )
@@ -72,6 +78,10 @@ def main(arguments: list[str]) -> None:
         from radejax.runs.data import Sources
 
         config = _CONFIG.value
+        if _SEQUENCES.value is not None:
+            config.data.sequences = entry.numbers("--sequences", _SEQUENCES.value)
+        if _WEATHER.value is not None:
+            config.data.weather = entry.words(_WEATHER.value)
         sources = Sources(
             data=entry.words(_DATA.value or ()),
             labels=_LABELS.value,

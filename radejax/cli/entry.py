@@ -69,6 +69,18 @@ def words(values: Iterable[str]) -> tuple[str, ...]:
     return tuple(filter(None, found))
 
 
+def numbers(name: str, values: Iterable[str]) -> tuple[int, ...]:
+    """Of `--sequences 1,5 --sequences 58`: 1, 5 and 58.
+
+    Raises:
+        UserError: A word is no number; names the flag.
+    """
+    found = words(values)
+    if wrong := [word for word in found if not word.isdecimal()]:
+        raise UserError(f"{name}: {wrong[0]!r} is no number, expected 1,5,58")
+    return tuple(map(int, found))
+
+
 def check_leftovers(arguments: Sequence[str]) -> None:
     """`UserError` for arguments that belong to no flag, such as a second folder."""
     if arguments:

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from radejax.cli import entry
+from radejax.core.errors import UserError
 
 COUNT = click.IntRange(1)
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
@@ -58,6 +59,34 @@ labels = click.option(
     "--labels", type=EXISTING, help="Folder or zip of a label revision."
 )
 label_version = click.option("--label-version", default="v2.1", show_default=True)
+
+
+def _numbers(
+    context: click.Context, parameter: click.Parameter, values: Any
+) -> tuple[int, ...] | None:
+    """Of sequences: None for all."""
+    try:
+        return entry.numbers(parameter.opts[0], values) or None
+    except UserError as error:
+        raise click.BadParameter(str(error), context, parameter) from None
+
+
+sequences = click.option(
+    "--sequences",
+    "--sequence",
+    "sequence_numbers",
+    multiple=True,
+    callback=_numbers,
+    metavar="1,58",
+    help="Only these; all by default.",
+)
+weather = click.option(
+    "--weather",
+    multiple=True,
+    callback=lambda *given: split_words(*given) or None,
+    metavar="fog,rain",
+    help="Only sequences of these; all by default.",
+)
 
 
 class Step(click.ParamType):

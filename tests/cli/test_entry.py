@@ -1,6 +1,8 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
+import json
+import os
 import pathlib
 import socket
 import subprocess
@@ -123,3 +125,25 @@ def test_a_second_folder_without_its_flag_is_wrong_use(tmp_path: pathlib.Path) -
         "--data A --data B\n"
     )
     assert not (tmp_path / "run").exists()
+
+
+def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "train.py", "--config=configs/radenet.py"]
+    command += [f"--data={tmp_path}", f"--workdir={tmp_path / 'run'}"]
+    for words, message in (
+        (["--sequences=1,x"], "error: --sequences: 'x' is no number, expected 1,5,58"),
+        (["--sequences=1,58", "--weather=fog", "--weather=mist"], "unknown weather"),
+    ):
+        ended = subprocess.run(
+            [*command, *words],
+            cwd=REPOSITORY,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        )
+        assert ended.returncode == entry.WRONG_USE
+        assert message in ended.stderr
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["data"]["sequences"] == [1, 58]
+    assert config["data"]["weather"] == ["fog", "mist"]
