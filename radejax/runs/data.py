@@ -30,7 +30,7 @@ from radejax.data.cameras import (
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.folders import read_grid
-from radejax.data.pipeline import LoaderOptions, make_loader
+from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
 from radejax.data.records.arrays import ArrayRecords
 from radejax.data.records.embeddings import open_embeddings
@@ -326,15 +326,14 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
         sources = dataclasses.replace(sources, data=(root,))
     data = Data.open(config, model, sources.paths())
     _log.info("%s", data.frames.summary().to_text())
+    if count := len(data.split("train")):  # projecting takes long
+        check_enough(count, config.train.batch_size)
     data.project()
     lost = len(data.frames) - len(data.split(None))
     if lost:
         _log.warning(
-            "%d of %d frames were left out when they were projected; manifest.json in "
-            "%s says why",
-            lost,
-            len(data.frames),
-            data.paths.records,
+            f"{lost} of {len(data.frames)} frames were left out when they were projected; "
+            f"manifest.json in {data.paths.records} says why"
         )
     return data
 

@@ -21,7 +21,7 @@ from radejax.runs.data import Data, Sources, open_data
 from radejax.runs.evaluate import evaluate
 from radejax.runs.validation import Validation
 from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
-from radejax.training import loop, processes
+from radejax.training import loop, processes, sharding
 from radejax.training.start import Plan
 
 _log = logging.getLogger(__name__)
@@ -63,6 +63,12 @@ def run(
     started = time.perf_counter()
     folder = default_workdir(workdir, name)
     model = models.build(config.model)  # what cannot be built fails first
+    sharding.check_batch_size(
+        config.train.batch_size,
+        sharding.make_mesh(),
+        "config.train.batch_size",
+        config.train.num_accumulate,
+    )
     with claimed(folder, config):
         weights = starting_weights(
             model, init_from, sources.image_backbone, sources.embeddings

@@ -47,6 +47,10 @@ def test_frames_are_projected_beside_their_data_once(
         return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
     config = base_config()
+    with pytest.raises(UserError, match="2 frames are fewer than one batch"):
+        prepare()
+    assert not (tmp_path / "sim" / "records").exists()
+    config.train.batch_size = 2
     data = prepare()
     paths = data.paths
     assert paths.roots == (str(tmp_path / "sim"),)
@@ -104,6 +108,7 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     damaged = next(frame for frame in frames if frame.sequence == 1)
     damaged.projection_path.write_bytes(b"half")
     project_dataset(frames, root / "records", skip_bad=True, progress=False)
+    config.train.batch_size = 1
     model, sources = models.build(config.model), Sources(data=(str(root),))
     with caplog.at_level("WARNING", "radejax"):
         data = open_data(config, model, sources)
