@@ -128,8 +128,8 @@ def check_dataset(
     Args:
         roots: Folder or folders of the sequences.
         labels: Folder or zip of a label revision; None: the sequences' own.
-        version: Version of the labels. If they turn out to be of another, that is
-            reported and they are read as what they are.
+        version: Version of the labels. If they turn out to be of another, that is a
+            problem that is reported, and they are read as what they are.
         sequence_numbers: Only these sequences; None for all.
         weather: Only sequences of these weathers; None for all.
         deep: Read and project every tesseract, which finds all damage and takes hours.
@@ -201,8 +201,11 @@ def _open(
             data = KRadar(paths, labels, version=other, **part)
         except UserError:
             continue
-        findings.notes.append(
-            f"the labels are {other}, not {normalise_version(version)}"
+        findings.report(
+            "label version",
+            data.label_source,
+            f"the labels are {other}, not {normalise_version(version)}: give "
+            f"--label-version {other}, in training --config.data.label_version={other}",
         )
         return data
     raise UserError(f"the labels have the layout of none of {', '.join(VERSIONS)}")

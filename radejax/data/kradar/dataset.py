@@ -153,6 +153,11 @@ class KRadar(Sequence[Frame]):
         return self._findings.summary()
 
     @property
+    def label_source(self) -> str:
+        """Where the labels are from, as messages name it."""
+        return self._source.description
+
+    @property
     def counts(self) -> collections.Counter[str]:
         """What was read and left out, by reason: `summary().counts`."""
         return self._findings.counts
@@ -251,8 +256,9 @@ class KRadar(Sequence[Frame]):
         """A wrong version is the user's to mend, not thousands of malformed lines."""
         if "has the layout of" in problem.message:
             raise UserError(
-                f"{problem}; say the version of the labels in "
-                f"{self._source.description}"
+                f"{problem}; say the version of the labels in {self.label_source}: "
+                "--label-version VERSION, in training "
+                "--config.data.label_version=VERSION, such as v1.0"
             )
 
     def _count_labels(self, key: Key, file: LabelFile) -> None:

@@ -252,7 +252,9 @@ def test_strict_raises_on_the_first(damaged):
 
 def test_labels_of_another_version_are_one_error(tmp_path):
     write_frame(tmp_path, [sedan(10, 0), sedan(20, 0)], "v2.0")
-    with pytest.raises(UserError, match=r"layout of v1\.0 labels.*say the version"):
+    with pytest.raises(
+        UserError, match=r"layout of v1\.0 labels.*--config\.data\.label_version"
+    ):
         KRadar(tmp_path, version="v2.1")
     assert len(KRadar(tmp_path, version="v2.0")[0].boxes) == 2
 
