@@ -17,14 +17,20 @@ _CONFIG = config_flags.DEFINE_config_file("config", None, "Config file, with :wo
 _WORKDIR = flags.DEFINE_string(
     "workdir", None, "Folder of the run; runs/<name of the config> by default."
 )
-_DATA = flags.DEFINE_list(
+_DATA = flags.DEFINE_multi_string(
     "data",
     None,
-    "Root folders of K-Radar. Without it, configs with a `simulation` section simulate "
-    "one under data/.",
+    "Root folders of K-Radar: A,B or repeated. Without it, configs with a `simulation` "
+    "section simulate one under data/.",
 )
 _LABELS = flags.DEFINE_string(
     "labels", None, "Folder or zip of a label revision; the sequences' own by default."
+)
+_SEQUENCES = flags.DEFINE_multi_string(
+    "sequences", None, "Only these, 1,58: --config.data.sequences."
+)
+_WEATHER = flags.DEFINE_multi_string(
+    "weather", None, "Only sequences of these, fog,rain: --config.data.weather."
 )
 _RECORDS = flags.DEFINE_string(
     "records", None, "Folder of projected frames; made beside the data if missing."
@@ -59,10 +65,11 @@ _DEBUG = flags.DEFINE_bool("debug", False, "Show tracebacks of user errors.")
 flags.mark_flag_as_required("config")
 
 
-def main(_: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Runs the whole way from data to metrics."""
-    entry.set_up_jax()
     with entry.exit_codes(debug=_DEBUG.value):
+        entry.check_leftovers(arguments[1:])
+        entry.set_up_jax()
         place = _COORDINATOR.value, _NUM_PROCESSES.value, _PROCESS_ID.value
         if _DISTRIBUTED.value or place != (None,) * 3:
             entry.join_processes(*place)
@@ -71,8 +78,12 @@ def main(_: list[str]) -> None:
         from radejax.runs.data import Sources
 
         config = _CONFIG.value
+        if _SEQUENCES.value is not None:
+            config.data.sequences = entry.numbers("--sequences", _SEQUENCES.value)
+        if _WEATHER.value is not None:
+            config.data.weather = entry.words(_WEATHER.value)
         sources = Sources(
-            data=tuple(_DATA.value or ()),
+            data=entry.words(_DATA.value or ()),
             labels=_LABELS.value,
             records=_RECORDS.value,
             embeddings=_EMBEDDINGS.value,

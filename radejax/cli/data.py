@@ -19,6 +19,8 @@ def data() -> None:
 @options.roots
 @options.labels
 @options.label_version
+@options.sequences
+@options.weather
 @click.option("--deep", is_flag=True, help="Read every tesseract whole.")
 def check(
     roots: tuple[pathlib.Path, ...],
@@ -26,6 +28,7 @@ def check(
     label_version: str,
     deep: bool,
     as_json: bool,
+    **part: Any,
 ) -> None:
     """Report what is there, what is missing and what is damaged.
 
@@ -36,7 +39,12 @@ def check(
     from radejax.data.kradar.check import check_dataset
 
     report = check_dataset(
-        roots, labels=labels, version=label_version, deep=deep, progress=not as_json
+        roots,
+        labels=labels,
+        version=label_version,
+        deep=deep,
+        progress=not as_json,
+        **part,
     )
     options.echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
@@ -50,8 +58,12 @@ def check(
 )
 @options.labels
 @options.label_version
+@options.sequences
+@options.weather
 @click.option(
-    "--dtype", type=click.Choice(["float16", "uint8", "float32"]), default="float16"
+    "--dtype",
+    type=click.Choice(["float16", "uint8", "float32"]),
+    help="Of records that are there already, else float16.",
 )
 @click.option(
     "--workers",
@@ -68,6 +80,8 @@ def project(
     out: pathlib.Path,
     labels: pathlib.Path | None,
     label_version: str,
+    sequence_numbers: tuple[int, ...] | None,
+    weather: tuple[str, ...] | None,
     shard: str,
     as_json: bool,
     **settings: Any,
@@ -80,7 +94,13 @@ def project(
     from radejax.data.records.job import parse_shard, project_dataset
 
     parse_shard(shard)  # before the labels are read
-    frames = KRadar(roots, labels, version=label_version)
+    frames = KRadar(
+        roots,
+        labels,
+        version=label_version,
+        sequence_numbers=sequence_numbers,
+        weather=weather,
+    )
     click.echo(frames.summary().to_text(), err=True)
     summary = project_dataset(frames, out, shard=shard, **settings)
     options.echo_result(as_json, summary.to_dict(), summary.to_text())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+from typing import Any
 
 import click
 
@@ -22,6 +23,8 @@ from radejax.cli import entry, options
     "--out", required=True, type=options.FOLDER, help="Folder of the embeddings."
 )
 @options.labels
+@options.sequences
+@options.weather
 @click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32")
 @click.option("--batch-size", type=options.COUNT, default=8)
 def embed(
@@ -33,6 +36,7 @@ def embed(
     dtype: str,
     batch_size: int,
     as_json: bool,
+    **part: Any,
 ) -> None:
     """Run the front images through the frozen backbone once, to train from.
 
@@ -51,7 +55,7 @@ def embed(
     settings = load_config(config)
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
-    frames = KRadar(roots, labels, version=settings.data.label_version)
+    frames = KRadar(roots, labels, version=settings.data.label_version, **part)
     counts = embed_dataset(
         model,
         variables,

@@ -11,7 +11,7 @@ import os
 import pathlib
 import socket
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from radejax.core.errors import UserError
 from radejax.core.files import is_no_space
@@ -61,6 +61,33 @@ def _fail(error: Exception, code: int, debug: bool) -> None:
             message = f"no such file or folder: {error.filename}"
     sys.stderr.write(f"error: {message}\n")
     raise SystemExit(code)
+
+
+def words(values: Iterable[str]) -> tuple[str, ...]:
+    """Of `--data A,B --data C`, which comes as ["A,B", "C"]: A, B and C."""
+    found = (word.strip() for value in values for word in value.split(","))
+    return tuple(filter(None, found))
+
+
+def numbers(name: str, values: Iterable[str]) -> tuple[int, ...]:
+    """Of `--sequences 1,5 --sequences 58`: 1, 5 and 58.
+
+    Raises:
+        UserError: A word is no number; names the flag.
+    """
+    found = words(values)
+    if wrong := [word for word in found if not word.isdecimal()]:
+        raise UserError(f"{name}: {wrong[0]!r} is no number, expected 1,5,58")
+    return tuple(map(int, found))
+
+
+def check_leftovers(arguments: Sequence[str]) -> None:
+    """`UserError` for arguments that belong to no flag, such as a second folder."""
+    if arguments:
+        raise UserError(
+            f"unexpected arguments: {' '.join(arguments)}; several folders are "
+            "--data A,B or --data A --data B"
+        )
 
 
 def parse_flags(argv: Sequence[str]) -> list[str]:

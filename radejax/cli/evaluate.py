@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from radejax.cli import entry
-from radejax.cli.options import STEP, Command, echo_result
+from radejax.cli.options import STEP, Command, echo_result, split_words
 from radejax.core.errors import UserError
 
 
@@ -19,12 +19,7 @@ def _flag(name: str, text: str, **settings: Any) -> click.Option:
 
 def _list(name: str, text: str) -> click.Option:
     """Of `--data A,B --data C`: A, B and C."""
-
-    def split(*args: Any) -> tuple[str, ...]:
-        words = (word.strip() for value in args[-1] for word in value.split(","))
-        return tuple(filter(None, words))
-
-    return _flag(name, text, multiple=True, callback=split, metavar="A,B,...")
+    return _flag(name, text, multiple=True, callback=split_words, metavar="A,B,...")
 
 
 _COMMON = (
@@ -109,7 +104,7 @@ def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     if sum(flags[mode] is not None for mode in modes) != 1:
         raise UserError("give one of --workdir, --predictions and --compare A B")
     if flags["others"] and flags["compare"] is None:
-        raise UserError(f"unexpected arguments: {' '.join(flags['others'])}")
+        entry.check_leftovers(flags["others"])
     is_run = flags["workdir"] is not None
     typed = click.core.ParameterSource.COMMANDLINE
     given = {name for name in flags if ctx.get_parameter_source(name) is typed}

@@ -2,24 +2,91 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 import pathlib
 from typing import Any
 
 import click
 
 from radejax.cli import entry
+from radejax.core.errors import UserError
 
 COUNT = click.IntRange(1)
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
 FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(path_type=pathlib.Path, exists=True)
 
-roots = click.argument("roots", nargs=-1, required=True, type=EXISTING)
+
+class Paths(click.ParamType):
+    """Existing folders or files: A,B, or one path that has a comma in its name."""
+
+    name = "A,B,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[pathlib.Path, ...]:
+        """The paths; click's error for one that is not there."""
+        names = (value,) if os.path.exists(value) else entry.words([value]) or (value,)
+        return tuple(EXISTING.convert(name, param, ctx) for name in names)
+
+
+def split_words(_: click.Context, __: click.Parameter, values: Any) -> tuple[str, ...]:
+    """Callback of options that are repeated, or given once with commas."""
+    return entry.words(values)
+
+
+def _chained(
+    _: click.Context, __: click.Parameter, values: tuple[tuple[pathlib.Path, ...], ...]
+) -> tuple[pathlib.Path, ...]:
+    return tuple(itertools.chain(*values))
+
+
+roots = click.argument(
+    "roots", nargs=-1, required=True, type=Paths(), callback=_chained
+)
+data_roots = click.option(
+    "--data",
+    "roots",
+    multiple=True,
+    required=True,
+    type=Paths(),
+    callback=_chained,
+    help="Roots of K-Radar.",
+)
 labels = click.option(
     "--labels", type=EXISTING, help="Folder or zip of a label revision."
 )
 label_version = click.option("--label-version", default="v2.1", show_default=True)
+
+
+def _numbers(
+    context: click.Context, parameter: click.Parameter, values: Any
+) -> tuple[int, ...] | None:
+    """Of sequences: None for all."""
+    try:
+        return entry.numbers(parameter.opts[0], values) or None
+    except UserError as error:
+        raise click.BadParameter(str(error), context, parameter) from None
+
+
+sequences = click.option(
+    "--sequences",
+    "--sequence",
+    "sequence_numbers",
+    multiple=True,
+    callback=_numbers,
+    metavar="1,58",
+    help="Only these; all by default.",
+)
+weather = click.option(
+    "--weather",
+    multiple=True,
+    callback=lambda *given: split_words(*given) or None,
+    metavar="fog,rain",
+    help="Only sequences of these; all by default.",
+)
 
 
 class Step(click.ParamType):

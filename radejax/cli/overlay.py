@@ -15,7 +15,7 @@ ANIMATIONS = (".gif", ".mp4")
 
 @click.command(cls=options.Command)
 @click.argument("name", metavar="FRAME")
-@click.option("--data", "roots", multiple=True, required=True, type=options.EXISTING)
+@options.data_roots
 @options.labels
 @options.label_version
 @click.option("--out", type=options.FILE, default="overlay.png", show_default=True)

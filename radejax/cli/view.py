@@ -15,7 +15,8 @@ from radejax.core.errors import UserError
 @click.command(cls=options.Command)
 @options.roots
 @click.option("--out", type=options.FILE, default="recording.rrd", show_default=True)
-@click.option("--sequence", type=int, help="All by default.")
+@options.sequences
+@options.weather
 @options.labels
 @options.label_version
 @click.option(
@@ -26,13 +27,13 @@ from radejax.core.errors import UserError
 def view(
     roots: tuple[pathlib.Path, ...],
     out: pathlib.Path,
-    sequence: int | None,
     labels: pathlib.Path | None,
     label_version: str,
     workdir: pathlib.Path | None,
     max_frames: int | None,
     open_it: bool,
     as_json: bool,
+    **part: Any,
 ) -> None:
     """Record a sequence for the rerun viewer (extra "viewer").
 
@@ -50,8 +51,8 @@ def view(
         roots,
         labels,
         version=label_version,
-        sequence_numbers=None if sequence is None else [sequence],
         visibility=None,
+        **part,
     )
     complete = [f for f in frames if f.tesseract_path or f.projection_path]
     if not complete:

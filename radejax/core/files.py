@@ -10,6 +10,7 @@ import logging
 import os
 import pathlib
 import socket
+import stat
 from collections.abc import Collection, Iterator, Mapping
 from typing import IO, Any
 
@@ -28,7 +29,8 @@ def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     """A temporary path to write to, which becomes `path` at the end of the block.
 
     Missing parent folders are made. After an error or a kill `path` is what it was;
-    the error also removes the temporary file.
+    the error also removes the temporary file. Permissions are those of a new file in that
+    folder, also where a library writes for the owner alone.
 
     Raises:
         DiskFullError: No space is left on the disk.
@@ -38,8 +40,12 @@ def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     temporary = temporary_path(path)
     try:
         with disk_full(path):
+            temporary.touch()
+            mode = stat.S_IMODE(temporary.stat().st_mode)
             yield temporary
             with open(temporary, "rb+") as file:
+                if stat.S_IMODE(os.fstat(file.fileno()).st_mode) != mode:
+                    os.fchmod(file.fileno(), mode)
                 os.fsync(file.fileno())
             os.replace(temporary, path)
     except BaseException:
@@ -111,13 +117,13 @@ def is_running(process: int) -> bool:
     """True if a process of this machine, by its number, could still be writing."""
     try:
         os.kill(process, 0)
-        stat = pathlib.Path(f"/proc/{process}/stat").read_text()
+        status = pathlib.Path(f"/proc/{process}/stat").read_text()
     except ProcessLookupError:
         return False
     except OSError:  # not ours, or no /proc here
         return True
     # In containers nobody may collect the dead: "pid (name) Z ..." is one of them.
-    return stat.rpartition(")")[2].split()[0] != "Z"
+    return status.rpartition(")")[2].split()[0] != "Z"
 
 
 # Full disks --------------------------------------------------------------------------

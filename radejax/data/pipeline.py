@@ -116,6 +116,21 @@ def steps_per_epoch(
     return -(-num_frames // (process_count * batch_size))
 
 
+def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
+    """`UserError` for fewer frames than one batch.
+
+    Args:
+        num_frames: That there are.
+        batch_size: Of one process.
+        count: Of the processes.
+    """
+    if num_frames < batch_size * count:
+        raise UserError(
+            f"{num_frames} frames are fewer than one batch ({batch_size} frames on each "
+            f"of {count} processes); lower batch_size or keep the remainder"
+        )
+
+
 def _make_order(
     num_frames: int, options: LoaderOptions
 ) -> grain.MapDataset[np.ndarray]:
@@ -130,11 +145,8 @@ def _make_order(
     drop_remainder = options.drop_remainder and not options.pad_remainder
     if batch_size < 1:
         raise UserError(f"batch_size must be at least 1, got {batch_size}")
-    if drop_remainder and num_frames < batch_size * count:
-        raise UserError(
-            f"{num_frames} frames are fewer than one batch ({batch_size} frames on each "
-            f"of {count} processes); lower batch_size or keep the remainder"
-        )
+    if drop_remainder:
+        check_enough(num_frames, batch_size, count)
     total = num_frames
     if options.pad_remainder:
         total = -(-num_frames // (batch_size * count)) * batch_size * count

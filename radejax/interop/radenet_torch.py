@@ -238,7 +238,8 @@ _WRITERS: dict[str, Callable[[pathlib.Path, dict[str, np.ndarray]], None]] = {
     ".pth": torch_file.write,
     ".pt": torch_file.write,
     ".npz": lambda path, state: np.savez(path, **state),
-    ".safetensors": lambda path, state: safetensors.numpy.save_file(state, path),
+    # `save_file` would write for the owner alone.
+    ".safetensors": lambda path, state: path.write_bytes(safetensors.numpy.save(state)),
 }
 
 

@@ -30,11 +30,15 @@ from radejax.data.cameras import (
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.folders import read_grid
-from radejax.data.pipeline import LoaderOptions, make_loader
+from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
 from radejax.data.records.arrays import ArrayRecords
 from radejax.data.records.embeddings import open_embeddings
-from radejax.data.records.projections import RecordSource, describe_grid
+from radejax.data.records.projections import (
+    RecordSource,
+    describe_grid,
+    skipped_frames,
+)
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -194,6 +198,9 @@ class Data:
             visibility=config.data.visibility,
             classes=config.classes,
             camera_calibration=paths.camera_calibration,
+            # Runs of before are without these two fields.
+            sequence_numbers=config.data.get("sequences") or None,
+            weather=config.data.get("weather") or None,
         )
         return cls(
             paths=paths,
@@ -213,8 +220,11 @@ class Data:
             UserError: No frames, records of something else, or no space left.
         """
         processes.main_first(
-            lambda: job.project_dataset(self.frames, self.paths.records)
+            lambda: job.project_dataset(
+                self.frames, self.paths.records, retry_skipped=False
+            )
         )
+        self._splits.clear()  # frames may have been left out now
 
     @functools.cached_property
     def records(self) -> RecordSource:
@@ -223,12 +233,19 @@ class Data:
 
     @functools.cached_property
     def _splits(self) -> dict[str | None, KRadar]:
-        return {None: self.frames}
+        return {}
 
     def split(self, name: str | None) -> KRadar:
-        """Frames of "train", "test" or a split file; all for None."""
+        """Frames of "train", "test" or a split file; all for None.
+
+        Without those that were left out when they were projected, which are counted.
+        """
         if name not in self._splits:
-            self._splits[name] = self.frames.of_split(name)
+            frames = self.frames if name is None else self.frames.of_split(name)
+            skipped = skipped_frames(self.paths.records)
+            if any(frame.key in skipped for frame in frames):
+                frames = frames.without(skipped, "no record of them")
+            self._splits[name] = frames
         return self._splits[name]
 
     def images(self, frames: Sequence[Frame]) -> CameraInputs | None:
@@ -309,7 +326,15 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
         sources = dataclasses.replace(sources, data=(root,))
     data = Data.open(config, model, sources.paths())
     _log.info("%s", data.frames.summary().to_text())
+    if count := len(data.split("train")):  # projecting takes long
+        check_enough(count, config.train.batch_size)
     data.project()
+    lost = len(data.frames) - len(data.split(None))
+    if lost:
+        _log.warning(
+            f"{lost} of {len(data.frames)} frames were left out when they were projected; "
+            f"manifest.json in {data.paths.records} says why"
+        )
     return data
 
 

@@ -71,6 +71,12 @@ def run(
     )
     folder = default_workdir(workdir, name)
     model = models.build(config.model)  # what cannot be built fails first
+    sharding.check_batch_size(
+        config.train.batch_size,
+        sharding.make_mesh(),
+        "config.train.batch_size",
+        config.train.num_accumulate,
+    )
     with claimed(folder, config):
         weights = starting_weights(
             model, init_from, sources.image_backbone, sources.embeddings

@@ -1,6 +1,6 @@
 """The folder of a run, and what is where in it.
 
-config.json      the configuration; a run never changes it
+config.json      the configuration; from its first checkpoint a run never changes it
 run.json         where its data are, versions, command
 checkpoints/     newest, best and last, by step
 metrics.jsonl    losses by step; tensorboard/ the same
@@ -26,6 +26,7 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax.core import files
+from radejax.core.config import base_config
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.data import DataPaths, saved_path
 from radejax.training import processes
@@ -42,11 +43,12 @@ def default_workdir(workdir: PathLike | None, name: str) -> pathlib.Path:
 def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
     """Keeps a second training out of a work folder, which is made if missing.
 
+    A folder without a checkpoint takes the config that is given.
+
     Raises:
         UserError: Another process holds it, or it belongs to a run with another
             configuration; names the fields that differ.
     """
-    wanted = json.loads(config.to_json()) | {"profile": "", "seeds": []}
     with contextlib.ExitStack() as held:
         processes.main_only(
             lambda: held.enter_context(
@@ -57,17 +59,40 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
                 )
             )
         )
-        processes.main_first(
-            lambda: files.claim(
-                workdir / "config.json",
-                wanted,
-                "a run with another config",
-                mend="give another --workdir, or remove that one",
-                name="config",
-                ignore=("watch",),
-            )
-        )
+        processes.main_first(lambda: _claim(workdir, config))
         yield
+
+
+def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
+    """Keeps the config; compares it with that of the run, if there are checkpoints."""
+    wanted = json.loads(config.to_json()) | {"profile": "", "seeds": []}
+    path = workdir / "config.json"
+    if path.exists() and any(workdir.glob("checkpoints/*")):
+        found = files.read_json(path)
+        with_defaults = _with_defaults(found, json.loads(base_config().to_json()))
+        if with_defaults != found:  # of a version that lacked some fields
+            files.write_json(path, with_defaults)
+    elif processes.is_main():
+        path.unlink(missing_ok=True)
+    files.claim(
+        path,
+        wanted,
+        "a run with another config",
+        mend="give another --workdir, or remove that one",
+        name="config",
+        ignore=("watch",),
+    )
+
+
+def _with_defaults(found: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    """Fields that a config of an earlier version lacks, at what they are by default."""
+    added = {name: value for name, value in defaults.items() if name not in found}
+    deeper = {
+        name: _with_defaults(found[name], value)
+        for name, value in defaults.items()
+        if isinstance(value, dict) and isinstance(found.get(name), dict)
+    }
+    return {**found, **added, **deeper}
 
 
 def run_info(

@@ -1,6 +1,8 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
+import json
+import os
 import pathlib
 import socket
 import subprocess
@@ -105,3 +107,43 @@ def test_processes_without_a_coordinator_are_wrong_use(tmp_path: pathlib.Path) -
     assert ended.returncode == entry.WRONG_USE
     assert "--num_processes and --process_id together" in ended.stderr
     assert not (tmp_path / "run").exists()
+
+
+def test_words_are_repeated_or_with_commas() -> None:
+    assert entry.words(["a, b", "c", ""]) == ("a", "b", "c")
+
+
+def test_a_second_folder_without_its_flag_is_wrong_use(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "train.py", "--config=configs/quickstart.py:short"]
+    command += [f"--workdir={tmp_path / 'run'}", "--data", "disk1", "disk2"]
+    ended = subprocess.run(
+        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120
+    )
+    assert ended.returncode == entry.WRONG_USE
+    assert ended.stderr == (
+        "error: unexpected arguments: disk2; several folders are --data A,B or "
+        "--data A --data B\n"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "train.py", "--config=configs/radenet.py"]
+    command += [f"--data={tmp_path}", f"--workdir={tmp_path / 'run'}"]
+    for words, message in (
+        (["--sequences=1,x"], "error: --sequences: 'x' is no number, expected 1,5,58"),
+        (["--sequences=1,58", "--weather=fog", "--weather=mist"], "unknown weather"),
+    ):
+        ended = subprocess.run(
+            [*command, *words],
+            cwd=REPOSITORY,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        )
+        assert ended.returncode == entry.WRONG_USE
+        assert message in ended.stderr
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["data"]["sequences"] == [1, 58]
+    assert config["data"]["weather"] == ["fog", "mist"]

@@ -197,3 +197,63 @@ def test_simulate_works_anywhere(
     (((config, out), _),) = seen
     assert config == dataset.default_config() | {"frames_per_sequence": 3}
     assert out == pathlib.Path("data")
+
+
+def test_roots_are_separate_repeated_or_with_commas(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from radejax.data.kradar import check
+
+    names = ("a", "b", "c", "d,e")
+    for name in names:
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    seen = []
+
+    def look(roots: object, **_: object) -> SimpleNamespace:
+        seen.append(roots)
+        return SimpleNamespace(to_dict=dict, to_text=str, num_problems=0)
+
+    monkeypatch.setattr(check, "check_dataset", look)
+    wanted = [pathlib.Path(name) for name in names]
+    assert _run("data", "check", "a,b", "c", "d,e").exit_code == 0
+    assert list(seen[0]) == wanted
+    missing = _run("data", "check", "a,x")
+    assert missing.exit_code == 2
+    assert "'x' does not exist" in missing.output
+    opened = []
+
+    def open_data(roots: object, *_: object, **__: object) -> None:
+        opened.append(list(roots))
+        raise UserError("opened")
+
+    monkeypatch.setattr("radejax.data.kradar.KRadar", open_data)
+    assert "opened" in _run("overlay", "1", "--data", "a,b", "--data", "c").output
+    assert opened == [wanted[:3]]
+
+
+def test_a_part_of_the_data_is_chosen(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
+) -> None:
+    from radejax.data.kradar import check
+
+    seen = []
+
+    def look(_: object, *args: object, **options: object) -> SimpleNamespace:
+        seen.append((options["sequence_numbers"], options["weather"]))
+        if "strict" not in options and "deep" not in options:
+            raise UserError("opened")
+        return SimpleNamespace(to_dict=dict, to_text=str, num_problems=0)
+
+    monkeypatch.setattr(check, "check_dataset", look)
+    monkeypatch.setattr("radejax.data.kradar.KRadar", look)
+    part = ("--sequences", "1,58", "--weather", "fog", "--weather", "rain")
+    _run("data", "check", tmp_path, *part)
+    assert "opened" in _run("project", tmp_path, "--out", tmp_path, *part).output
+    assert "opened" in _run("view", tmp_path, *part).output
+    assert seen == 3 * [((1, 58), ("fog", "rain"))]
+    _run("data", "check", tmp_path)
+    assert seen[-1] == (None, None)
+    wrong = _run("data", "check", tmp_path, "--sequences", "1-5")
+    assert wrong.exit_code == 2
+    assert "'1-5' is no number, expected 1,5,58" in wrong.output

@@ -1,7 +1,9 @@
 """Files are whole or not there, and folders belong to one job."""
 
 import errno
+import os
 import pathlib
+import stat
 
 import pytest
 
@@ -19,6 +21,20 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: pathlib.Path) -
         raise RuntimeError
     assert files.read_json(path) == {"x": 1}
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_files_have_the_mode_that_the_umask_says(tmp_path: pathlib.Path) -> None:
+    for umask, mode in ((0o022, 0o644), (0o002, 0o664), (0o077, 0o600)):
+        before = os.umask(umask)
+        try:
+            with files.atomic_path(tmp_path / "weights") as temporary:
+                temporary.unlink()  # as libraries do that rename a file of their own
+                temporary.touch(mode=0o600)
+            files.write_json(tmp_path / "a.json", {})
+        finally:
+            os.umask(before)
+        for name in ("weights", "a.json"):
+            assert stat.S_IMODE((tmp_path / name).stat().st_mode) == mode
 
 
 def test_full_disk_is_one_clear_error(tmp_path: pathlib.Path) -> None:

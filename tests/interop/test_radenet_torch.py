@@ -88,6 +88,8 @@ def test_files_of_every_kind_come_back(small_state, tmp_path, ending):
     again, loaded = radenet_torch.load(path, **OVERRIDES)
     assert again == model
     chex.assert_trees_all_equal(loaded, variables)
+    (tmp_path / "plain").touch()
+    assert path.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
 def test_torch_loads_what_was_saved(small_state, tmp_path):

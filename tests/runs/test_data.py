@@ -7,6 +7,8 @@ import pytest
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
+from radejax.data.kradar import KRadar
+from radejax.data.records.job import project_dataset
 from radejax.runs.data import Data, DataPaths, Sources, open_data
 from radejax.simulation.dataset import default_config, simulate_dataset
 
@@ -45,6 +47,10 @@ def test_frames_are_projected_beside_their_data_once(
         return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
     config = base_config()
+    with pytest.raises(UserError, match="2 frames are fewer than one batch"):
+        prepare()
+    assert not (tmp_path / "sim" / "records").exists()
+    config.train.batch_size = 2
     data = prepare()
     paths = data.paths
     assert paths.roots == (str(tmp_path / "sim"),)
@@ -87,3 +93,31 @@ def test_results_on_other_data_are_named_by_folder_and_labels(
     assert Sources(data=("/a/b", "/c"), labels="/x/v1.zip").name == "b_v1"
     assert Sources(labels="/x/v1.zip").name == "v1"
     assert Sources(label_version="v1.1").name == "other"
+
+
+def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    simulation = default_config()
+    simulation.update(train_sequences=2, test_sequences=1, frames_per_sequence=2)
+    simulation["output"] = "projection"
+    root = tmp_path / "sim"
+    simulate_dataset(simulation, root, progress=False)
+    config = base_config()
+    frames = KRadar(root)
+    damaged = next(frame for frame in frames if frame.sequence == 1)
+    damaged.projection_path.write_bytes(b"half")
+    project_dataset(frames, root / "records", skip_bad=True, progress=False)
+    config.train.batch_size = 1
+    model, sources = models.build(config.model), Sources(data=(str(root),))
+    with caplog.at_level("WARNING", "radejax"):
+        data = open_data(config, model, sources)
+    assert "1 of 6 frames were left out when they were projected" in caplog.text
+    assert damaged.key not in [frame.key for frame in data.split("train")]
+    assert len(data.split(None)) == len(data.records) == 5
+    config.data.sequences = (1, 3)
+    part = open_data(config, model, sources)  # the same records
+    assert {frame.sequence for frame in part.frames} == {1, 3}
+    assert len(part.split(None)) == 3
+    del config.data["sequences"], config.data["weather"]  # as runs of before
+    assert len(open_data(config, model, sources).frames) == 6

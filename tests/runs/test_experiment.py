@@ -108,3 +108,16 @@ def test_labels_are_read_once_and_the_model_is_built_once(
     assert len(parsed) == 6
     assert set(parsed.values()) == {1}
     assert len(built) == 1
+
+
+def test_a_batch_that_does_not_divide_is_told_before_anything_is_written(
+    tmp_path: pathlib.Path,
+) -> None:
+    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
+    config.train.batch_size = 3  # of eight devices
+    sources = Sources(data=(str(tmp_path / "data"),))
+    with pytest.raises(
+        UserError, match=r"config\.train\.batch_size=3 does not divide over 8 devices"
+    ):
+        experiment.run(config, name="x", workdir=tmp_path / "run", sources=sources)
+    assert not list(tmp_path.iterdir())

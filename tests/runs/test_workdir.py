@@ -27,6 +27,11 @@ def test_another_config_is_refused_and_the_difference_named(
     config = base_config()
     with workdir.claimed(tmp_path, config):
         pass
+    config.train.num_epochs = 7  # nothing is trained: the folder takes it
+    with workdir.claimed(tmp_path, config):
+        kept = json.loads((tmp_path / "config.json").read_text())
+        assert kept["train"]["num_epochs"] == 7
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     config.train.batch_size = 3
     config.seed = 5
     with (
@@ -35,6 +40,23 @@ def test_another_config_is_refused_and_the_difference_named(
             match=r"config\.seed is 0 there and 5 here; "
             r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
         ),
+        workdir.claimed(tmp_path, config),
+    ):
+        pass
+
+
+def test_a_config_of_before_lacks_fields_that_are_new(tmp_path: pathlib.Path) -> None:
+    config = base_config()
+    old = json.loads(config.to_json())
+    del old["data"]["sequences"], old["seed"]
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
+    (tmp_path / "config.json").write_text(json.dumps(old))
+    with workdir.claimed(tmp_path, config):
+        pass
+    old["data"]["weather"] = ["fog"]
+    (tmp_path / "config.json").write_text(json.dumps(old))
+    with (
+        pytest.raises(UserError, match=r"config\.data\.weather is \['fog'\] there"),
         workdir.claimed(tmp_path, config),
     ):
         pass

@@ -115,6 +115,8 @@ def check_dataset(
     *,
     labels: str | os.PathLike | None = None,
     version: str = "v2.1",
+    sequence_numbers: Sequence[int] | None = None,
+    weather: Sequence[str] | None = None,
     deep: bool = False,
     progress: bool = False,
 ) -> HealthReport:
@@ -126,8 +128,10 @@ def check_dataset(
     Args:
         roots: Folder or folders of the sequences.
         labels: Folder or zip of a label revision; None: the sequences' own.
-        version: Version of the labels. If they turn out to be of another, that is
-            reported and they are read as what they are.
+        version: Version of the labels. If they turn out to be of another, that is a
+            problem that is reported, and they are read as what they are.
+        sequence_numbers: Only these sequences; None for all.
+        weather: Only sequences of these weathers; None for all.
         deep: Read and project every tesseract, which finds all damage and takes hours.
         progress: Show a progress bar.
 
@@ -137,7 +141,8 @@ def check_dataset(
     """
     paths = as_paths(roots)
     findings = Findings(strict=False)
-    data = _open(paths, labels, version, findings)
+    part = {"sequence_numbers": sequence_numbers, "weather": weather}
+    data = _open(paths, labels, version, part, findings)
     folders = data.folders if data is not None else find_sequences(paths)
     frames = [] if data is None else list(data)
     if data is not None:
@@ -149,6 +154,8 @@ def check_dataset(
     by_sequence = collections.defaultdict(list)
     for frame in frames:
         by_sequence[frame.sequence].append(frame)
+    if (sequence_numbers, weather) != (None, None):
+        folders = {n: f for n, f in folders.items() if n in by_sequence}
     numbers = sorted({*folders, *by_sequence})
     total = sum(len(f.listing("radar_tesseract")) for f in folders.values())
     shape = read_grid(paths).shape_drea
@@ -177,11 +184,12 @@ def _open(
     paths: list[pathlib.Path],
     labels: str | os.PathLike | None,
     version: str,
+    part: dict[str, Any],
     findings: Findings,
 ) -> KRadar | None:
     """The data set, as the version that its labels have; None without labels."""
     try:
-        return KRadar(paths, labels, version=version)
+        return KRadar(paths, labels, version=version, **part)
     except UserError as error:
         if "has the layout of" not in str(error):
             if labels is None and find_sequences(paths):
@@ -190,11 +198,14 @@ def _open(
             raise
     for other in VERSIONS:
         try:
-            data = KRadar(paths, labels, version=other)
+            data = KRadar(paths, labels, version=other, **part)
         except UserError:
             continue
-        findings.notes.append(
-            f"the labels are {other}, not {normalise_version(version)}"
+        findings.report(
+            "label version",
+            data.label_source,
+            f"the labels are {other}, not {normalise_version(version)}: give "
+            f"--label-version {other}, in training --config.data.label_version={other}",
         )
         return data
     raise UserError(f"the labels have the layout of none of {', '.join(VERSIONS)}")

@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 import os
 import pathlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,12 @@ from radejax.data.kradar.labels import (
     normalise_version,
     parse_label_file,
 )
-from radejax.data.kradar.sequences import camera_folders, read_sequence_info
-from radejax.data.kradar.splits import Key, select_frames
+from radejax.data.kradar.sequences import (
+    SequenceInfo,
+    camera_folders,
+    read_sequence_info,
+)
+from radejax.data.kradar.splits import Key, check_weather, select_frames
 
 PathLike = str | os.PathLike
 
@@ -58,7 +62,9 @@ class KRadar(Sequence[Frame]):
         visibility: Availability flags to keep, None for all.
         classes: Classes to keep.
         field_of_view: Keep only boxes whose center is in the field of view.
-        sequence_numbers: Only these sequences; None for all.
+        sequence_numbers: Only these sequences; None for all. Sequences that have labels
+            and no folder in the roots are left out and counted, if any has one.
+        weather: Only sequences of these weathers; None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
 
     Attributes:
@@ -90,6 +96,7 @@ class KRadar(Sequence[Frame]):
         classes: Sequence[str] = CLASSES,
         field_of_view: bool = True,
         sequence_numbers: Iterable[int] | None = None,
+        weather: Iterable[str] | None = None,
         camera_calibration: PathLike | None = None,
     ) -> None:
         self.version = normalise_version(version)
@@ -97,13 +104,14 @@ class KRadar(Sequence[Frame]):
         self.classes = tuple(classes)
         self.roots = as_paths(root)
         _check_arguments(self.roots, labels, visibility, self.classes)
+        self._weather = None if weather is None else check_weather(weather)
         self.folders = folders.find_sequences(self.roots)
         self.grid = folders.read_grid(self.roots)
         self._source = self._open_labels(labels)
         self.split_folders = list(self.roots)
         if labels is not None:
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
-        self._sequence_numbers = sequence_numbers
+        self._sequence_numbers = sequence_numbers and tuple(sequence_numbers)
         self._offset = (radar_from_lidar, float(z_offset_m))
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
         self._visibility, self._field_of_view = visibility, field_of_view
@@ -126,6 +134,14 @@ class KRadar(Sequence[Frame]):
         other._read(split)
         return other
 
+    def without(self, left_out: Collection[str], reason: str) -> KRadar:
+        """The frames but those of some keys, which are counted for a reason."""
+        other = copy.copy(self)
+        other._findings = copy.deepcopy(self._findings)
+        other._frames = [frame for frame in self if frame.key not in left_out]
+        other.counts[f"frames left out: {reason}"] += len(self) - len(other)
+        return other
+
     def __len__(self) -> int:
         return len(self._frames)
 
@@ -135,6 +151,11 @@ class KRadar(Sequence[Frame]):
     def summary(self) -> Summary:
         """What was read, left out, missing and malformed."""
         return self._findings.summary()
+
+    @property
+    def label_source(self) -> str:
+        """Where the labels are from, as messages name it."""
+        return self._source.description
 
     @property
     def counts(self) -> collections.Counter[str]:
@@ -172,9 +193,19 @@ class KRadar(Sequence[Frame]):
             split=split,
             near=self.split_folders,
             sequence_numbers=self._sequence_numbers,
+            folders_here=self.folders,
         )
-        files = self._read_label_files(keys)
-        self._info = {
+        if self._weather is None:
+            files = self._read_label_files(keys)
+            self._info = self._read_info(files)
+        else:  # not the labels of other weathers
+            self._info = self._read_info(keys)
+            files = self._read_label_files(self._of_weather(keys))
+        self._frames = self._make_frames(files)
+
+    def _read_info(self, keys: Iterable[Key]) -> dict[int, SequenceInfo]:
+        """What is known of every sequence of the keys."""
+        return {
             number: read_sequence_info(
                 number,
                 self.folders.get(number),
@@ -183,9 +214,14 @@ class KRadar(Sequence[Frame]):
                 z_offset_m=self._offset[1],
                 camera_folders=self._camera_folders,
             )
-            for number in sorted({number for number, _ in files})
+            for number in sorted({number for number, _ in keys})
         }
-        self._frames = self._make_frames(files)
+
+    def _of_weather(self, keys: list[Key]) -> list[Key]:
+        """The keys of the weathers that were asked for; the others are counted."""
+        kept = [k for k in keys if self._info[k[0]].conditions.weather in self._weather]
+        self.counts["frames left out by weather"] = len(keys) - len(kept)
+        return kept
 
     def _read_label_files(self, keys: list[Key]) -> dict[Key, LabelFile]:
         """Parsed label files; damaged ones are reported."""
@@ -222,8 +258,9 @@ class KRadar(Sequence[Frame]):
         """A wrong version is the user's to mend, not thousands of malformed lines."""
         if "has the layout of" in problem.message:
             raise UserError(
-                f"{problem}; say the version of the labels in "
-                f"{self._source.description}"
+                f"{problem}; say the version of the labels in {self.label_source}: "
+                "--label-version VERSION, in training "
+                "--config.data.label_version=VERSION, such as v1.0"
             )
 
     def _count_labels(self, key: Key, file: LabelFile) -> None:

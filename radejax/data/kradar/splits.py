@@ -23,6 +23,7 @@ def select_frames(
     split: str | os.PathLike | None,
     near: Sequence[pathlib.Path],
     sequence_numbers: Iterable[int] | None,
+    folders_here: Collection[int] = (),
 ) -> list[Key]:
     """Keys of the label files to read, sorted.
 
@@ -32,12 +33,27 @@ def select_frames(
         split: "train", "test", a split file, or None for every frame.
         near: Folders in which split files are looked for.
         sequence_numbers: Only these sequences; None for all.
+        folders_here: Sequences with folders. Labels of others are left out and counted,
+            unless there are none at all: then labels alone are at hand.
 
     Raises:
-        UserError: An unknown split, or a sequence without labels.
+        UserError: An unknown split, or a sequence without labels or folder.
     """
     present = {sequence for sequence, _ in source.files}
-    wanted = present if sequence_numbers is None else set(sequence_numbers)
+    absent = present.difference(folders_here) if folders_here else set()
+    if sequence_numbers is None:
+        wanted = present - absent
+        findings.counts["sequences with labels that are not in the roots"] = len(absent)
+        findings.counts["frames of sequences that are not in the roots"] = sum(
+            sequence in absent for sequence, _ in source.files
+        )
+    else:
+        wanted = set(sequence_numbers)
+    if wanted & absent:
+        raise UserError(
+            f"no folders of sequences {sorted(wanted & absent)} in the roots; there are "
+            f"{sorted(folders_here)}"
+        )
     if wanted - present:
         raise UserError(
             f"no labels of sequences {sorted(wanted - present)} in "
@@ -58,6 +74,17 @@ def select_frames(
         elif sequence_numbers is None:
             findings.counts["split entries of sequences that are not here"] += 1
     return [key for key in keys if key in entries]
+
+
+def check_weather(names: Iterable[str]) -> tuple[str, ...]:
+    """The names; `UserError` for one that no sequence has, or for none."""
+    names = tuple(names)
+    known = (*sequences.WEATHERS, "unknown")
+    if unknown := [name for name in names if name not in known]:
+        raise UserError(f"unknown weather {unknown}; available: {', '.join(known)}")
+    if not names:
+        raise UserError(f"no weather given; available: {', '.join(known)}")
+    return names
 
 
 def read_split_entries(

@@ -22,16 +22,17 @@ from typing import Any
 
 from tqdm import tqdm
 
-from radejax.core import files as core_files
 from radejax.core.errors import DataError, UserError
 from radejax.data.encoding import check_encoding, encode, num_clipped
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.records import files
-from radejax.data.records.projections import Manifest, write_manifest
+from radejax.data.records.plan import claim_folder, dtype_there
+from radejax.data.records.projections import (
+    Manifest,
+    write_manifest,
+)
 from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.geometry.radar_grid import RadarGrid
-
-PLAN = "plan.json"
 
 _SMALL_JOB_CELLS = 3e9  # some 50 of K-Radar's tesseracts, a few seconds
 
@@ -98,11 +99,12 @@ def project_dataset(
     out_dir: str | os.PathLike,
     *,
     grid: RadarGrid | None = None,
-    dtype: str = "float16",
+    dtype: str | None = None,
     shard: str | tuple[int, int] = (0, 1),
     num_workers: int | None = None,
     frames_per_file: int = 64,
     skip_bad: bool = False,
+    retry_skipped: bool = True,
     progress: bool = True,
 ) -> ProjectionReport:
     """Projects the tesseracts of a data set into a folder of records.
@@ -112,13 +114,16 @@ def project_dataset(
             every split and label revision. The records are in their order.
         out_dir: Folder of the records; made if needed.
         grid: Sensor axes; None takes those of `frames`.
-        dtype: Type of the records: "float16", "uint8" or "float32".
+        dtype: Type of the records: "float16", "uint8" or "float32"; None: of those that
+            are there, else "float16".
         shard: `(i, n)` or `"i/n"`, i from 0: this run does every n-th file.
         num_workers: Processes; 0: this one; None: one a core, or for a job that is done
             before they have started, this one.
         frames_per_file: Frames of one file of records (64 of K-Radar: 350 MB).
         skip_bad: Leave out frames whose tesseract is missing or damaged, and report
             them. Otherwise the first one raises.
+        retry_skipped: Without `skip_bad`, frames that an earlier run left out are tried
+            again, and raise if they are as they were. Otherwise they stay left out.
         progress: Show a progress bar with rate and time left.
 
     Returns:
@@ -133,8 +138,8 @@ def project_dataset(
     if grid is None:
         raise UserError("a plain list of frames has no grid: give grid=")
     index, count = parse_shard(shard)
-    dtype = check_encoding(dtype)
     out_dir = pathlib.Path(out_dir)
+    dtype = check_encoding(dtype or dtype_there(out_dir))
     sources = [(f.key, f.tesseract_path, f.projection_path) for f in frames]
     if not sources:
         raise UserError("no frames to project")
@@ -148,17 +153,23 @@ def project_dataset(
         "frames_sha256": hashlib.sha256(keys.encode()).hexdigest(),
         "grid": grid.to_dict(),
     }
-    core_files.claim(out_dir / PLAN, plan, "another projection")
+    report = ProjectionReport(num_frames=0)
+    earlier, what = claim_folder(out_dir, plan)
+    if earlier is not None:
+        sources = _count_earlier(sources, earlier, report)
     starts = range(0, len(sources), frames_per_file)
-    names = [files.file_name(i, len(starts)) for i in range(len(starts))]
+    names = [files.file_name(i, len(starts), what) for i in range(len(starts))]
     tasks = [
         _Task(out_dir, name, sources[i : i + frames_per_file], grid, dtype, skip_bad)
         for name, i in zip(names, starts, strict=True)
     ][index::count]
-    report = ProjectionReport(num_frames=sum(len(task.frames) for task in tasks))
-    todo = [task for task in tasks if not _count_finished(task, report)]
+    report.num_frames += sum(len(task.frames) for task in tasks)
+    keep = skip_bad or not retry_skipped
+    todo = [task for task in tasks if not _count_finished(task, report, keep)]
     _run(todo, report, num_workers, progress)
-    report.is_complete = _finish(out_dir, names, grid, dtype, sources)
+    report.is_complete = not names or _finish(
+        out_dir, names, grid, dtype, sources, earlier
+    )
     report.seconds = time.perf_counter() - began
     return report
 
@@ -175,10 +186,21 @@ def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
     return index, count
 
 
-def _count_finished(task: _Task, report: ProjectionReport) -> bool:
+def _count_earlier(
+    sources: list[_Source], earlier: Manifest, report: ProjectionReport
+) -> list[_Source]:
+    """The frames of which a finished job has nothing; the others are counted."""
+    recorded, skipped = set(earlier.frames), earlier.skipped
+    report.skipped = {key: skipped[key] for key, *_ in sources if key in skipped}
+    report.num_found = sum(key in recorded for key, *_ in sources)
+    report.num_frames = report.num_found + len(report.skipped)
+    return [s for s in sources if s[0] not in recorded and s[0] not in skipped]
+
+
+def _count_finished(task: _Task, report: ProjectionReport, keep_skipped: bool) -> bool:
     """True if an earlier run finished the file; its frames are then counted."""
     entry = files.read_manifest_of(task.folder, task.name)
-    if entry is None or (entry.skipped and not task.skip_bad):
+    if entry is None or (entry.skipped and not keep_skipped):
         return False
     report.num_found += len(entry.frames)
     report.skipped.update(entry.skipped)
@@ -296,7 +318,8 @@ def _project_task(
             except (DataError, FileNotFoundError, OSError) as error:
                 if not task.skip_bad:
                     raise DataError(
-                        f"frame {key}: {error} (skip_bad leaves such frames out)"
+                        f"frame {key}: {error} (`radejax project --skip-bad` into "
+                        f"{task.folder} leaves such frames out)"
                     ) from None
                 writer.skipped[key] = str(error)
             else:
@@ -323,8 +346,9 @@ def _finish(
     grid: RadarGrid,
     dtype: str,
     sources: list[_Source],
+    earlier: Manifest | None,
 ) -> bool:
-    """Writes the manifest of the folder if every file is there."""
+    """Writes the manifest of the folder, after an earlier one's, if every file is there."""
     entries = [files.read_manifest_of(out_dir, name) for name in names]
     if any(entry is None for entry in entries):
         return False
@@ -337,5 +361,10 @@ def _finish(
             {str(p.parents[2]) for _, *paths in sources for p in paths if p}
         ),
     }
+    if earlier is not None:
+        for name, value in earlier.sources.items():
+            described[name] += value
+        described["folders"] = sorted(set(described["folders"]))
+        entries = [*earlier.files, *entries]
     write_manifest(out_dir, Manifest(grid, dtype, described, entries))
     return True

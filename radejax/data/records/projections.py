@@ -109,6 +109,13 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         )
 
 
+def skipped_frames(folder: str | os.PathLike) -> dict[str, str]:
+    """Frames that were left out of a folder: key to reason; none of an unfinished one."""
+    if not (pathlib.Path(folder) / MANIFEST).is_file():
+        return {}
+    return read_manifest(folder).skipped
+
+
 class RecordSource(ArrayRecords):
     """Random access to the projections of a folder; a source for grain.
 

@@ -80,7 +80,9 @@ def test_deep_reads_what_the_head_does_not_say(root):
 def test_labels_of_another_version_are_read_as_what_they_are(root):
     report = check_dataset(root, version="v1.0")
     assert report.version == "v2.1"
-    assert "note: the labels are v2.1, not v1.0" in report.to_text()
+    assert "the labels are v2.1, not v1.0" in report.to_text()
+    assert "--config.data.label_version=v2.1" in report.to_text()
+    assert "label version" in report.summary.problem_counts()  # exit code 1
 
 
 def test_disk_without_labels(tmp_path):

@@ -252,7 +252,9 @@ def test_strict_raises_on_the_first(damaged):
 
 def test_labels_of_another_version_are_one_error(tmp_path):
     write_frame(tmp_path, [sedan(10, 0), sedan(20, 0)], "v2.0")
-    with pytest.raises(UserError, match=r"layout of v1\.0 labels.*say the version"):
+    with pytest.raises(
+        UserError, match=r"layout of v1\.0 labels.*--config\.data\.label_version"
+    ):
         KRadar(tmp_path, version="v2.1")
     assert len(KRadar(tmp_path, version="v2.0")[0].boxes) == 2
 
@@ -350,3 +352,43 @@ def test_all_real_label_files_are_read(shared):
     assert int((boxes[:, 0] < 0).sum()) == 8580
     assert int((boxes[:, 3] < boxes[:, 4]).sum()) == 2405
     assert int((np.abs(boxes[:, 6]) > math.pi).sum()) == 3218
+
+
+def test_labels_of_sequences_that_are_not_here_are_left_out_and_counted(
+    kradar_root, tmp_path
+):
+    part, labels = tmp_path / "part", tmp_path / "labels"
+    shutil.copytree(kradar_root / "1", part / "1")
+    shutil.copy(kradar_root / "radar_grid.json", part)
+    for sequence in "12":
+        shutil.copytree(kradar_root / sequence / "info_label", labels / sequence)
+    data = KRadar(part, labels)
+    assert {frame.sequence for frame in data} == {1}
+    assert data.counts["sequences with labels that are not in the roots"] == 1
+    assert data.counts["frames of sequences that are not in the roots"] == 6
+    assert len(KRadar(None, labels)) == 12  # labels alone
+    with pytest.raises(UserError, match=r"no folders of sequences \[2\] in the roots"):
+        KRadar(part, labels, sequence_numbers=[1, 2])
+
+
+def test_a_part_is_chosen_by_weather(kradar_root, tmp_path):
+    root = shutil.copytree(kradar_root, tmp_path / "kradar")
+    write.write_description(root / "2/description.txt", "urban", "day", "rain")
+    data = KRadar(root, weather=["rain"])
+    assert {frame.sequence for frame in data} == {2}
+    assert data.counts["frames left out by weather"] == 6
+    assert len(KRadar(root, weather=("fog", "rain"))) == 12
+    for wrong, message in (
+        (("mist",), r"unknown weather \['mist'\]"),
+        ((), "no weath"),
+    ):
+        with pytest.raises(UserError, match=message):
+            KRadar(root, weather=wrong)
+
+
+def test_frames_that_are_taken_away_are_counted(kradar_root):
+    data = KRadar(kradar_root)
+    rest = data.without({data[0].key, "9/x"}, "no record of them")
+    assert [frame.key for frame in rest] == [frame.key for frame in data][1:]
+    assert rest.counts["frames left out: no record of them"] == 1
+    assert "frames left out: no record of them" not in data.counts

@@ -16,7 +16,7 @@ from radejax.core.files import is_running
 from radejax.data.kradar import KRadar
 from radejax.data.records import job as projection_job
 from radejax.data.records.job import parse_shard, project_dataset
-from radejax.data.records.projections import RecordSource
+from radejax.data.records.projections import RecordSource, skipped_frames
 from radejax.data.tesseract import project_file
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -186,14 +186,59 @@ def test_a_folder_keeps_to_its_plan(kradar_root, tmp_path):
         match=r"another projection: dtype is 'float16' there",
     ):
         run(data, tmp_path, dtype="uint8")
-    with pytest.raises(UserError, match="num_frames is 12 there and 8 here"):
-        run(data[:8], tmp_path, grid=data.grid)
     other = RadarGrid.kradar()
     with pytest.raises(UserError, match=r"grid\.azimuth_rad differs"):
         run(data, tmp_path, grid=other)
     (tmp_path / "plan.json").write_text("{")
     with pytest.raises(DataError, match=r"plan\.json is not valid JSON"):
         run(data, tmp_path)
+
+
+def test_records_serve_other_frames_of_the_same_data(kradar_root, tmp_path):
+    data = KRadar(kradar_root)
+    out, part = tmp_path / "out", {"grid": data.grid}
+    run(data[:7], out, dtype="uint8", **part)
+    fewer = run(data[2:5], out, **part)
+    assert (fewer.num_frames, fewer.num_found, fewer.num_projected) == (3, 3, 0)
+    assert fewer.is_complete
+    more = run(data, out, frames_per_file=2)
+    assert (more.num_frames, more.num_found, more.num_projected) == (12, 7, 5)
+    records = RecordSource(out, verify=True)
+    assert records.frames == [frame.key for frame in data]
+    run(data, tmp_path / "whole", dtype="uint8")
+    whole = RecordSource(tmp_path / "whole")
+    for i in range(12):
+        stored, wanted = records[i]["projection"], whole[i]["projection"]
+        np.testing.assert_array_equal(stored, wanted)
+    assert records.manifest.sources == whole.manifest.sources
+    again = run(data, out)
+    assert (again.num_found, again.num_projected) == (12, 0)
+
+
+def test_what_was_only_planned_gives_way_and_what_was_begun_does_not(root, tmp_path):
+    data = KRadar(root)
+    bad = root / "1/radar_tesseract/tesseract_00004.mat"
+    content = bad.read_bytes()
+    bad.write_bytes(content[:-7])
+    with pytest.raises(DataError, match=r"`radejax project --skip-bad` into .*out"):
+        run(data, tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["plan.json"]
+    bad.write_bytes(content)
+    run(data, tmp_path / "out", dtype="uint8", shard="0/2")
+    with pytest.raises(
+        UserError, match=r"num_frames is 12 there and 8 here.*finish it"
+    ):
+        run(data[:8], tmp_path / "out", grid=data.grid)
+
+
+def test_frames_that_were_left_out_may_stay_so(root, tmp_path):
+    (root / "2/radar_tesseract/tesseract_00009.mat").unlink()
+    data = KRadar(root)
+    run(data, tmp_path / "out", skip_bad=True)
+    report = run(data, tmp_path / "out", retry_skipped=False)
+    assert (report.num_found, list(report.skipped)) == (11, ["2/00009_00006"])
+    assert skipped_frames(tmp_path / "out") == report.skipped
+    assert skipped_frames(tmp_path / "nowhere") == {}
 
 
 def test_wrong_arguments(kradar_root, tmp_path):
