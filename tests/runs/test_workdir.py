@@ -40,6 +40,23 @@ def test_another_config_is_refused_and_the_difference_named(
         pass
 
 
+def test_a_run_older_than_a_field_of_the_config_goes_on(tmp_path: pathlib.Path) -> None:
+    config = base_config()
+    old = json.loads(config.to_json())
+    del old["train"]["schedule"]
+    (tmp_path / "config.json").write_text(json.dumps(old))
+    with workdir.claimed(tmp_path, config):
+        pass
+    config.train.schedule = "cyclic_cosine"
+    with (
+        pytest.raises(
+            UserError, match=r"schedule is 'cosine' there and 'cyclic_cosine'"
+        ),
+        workdir.claimed(tmp_path, config),
+    ):
+        pass
+
+
 def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
     folder = tmp_path / "run"
     with (
