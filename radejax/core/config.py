@@ -156,7 +156,10 @@ def _train() -> ConfigDict:
             "batch_size": 10,
             "num_epochs": 10,
             "learning_rate": 1e-3,
-            "final_learning_rate": 1e-4,  # cosine, per step
+            "final_learning_rate": 1e-4,
+            # Per step, from the first rate to the final one: "cosine" once in the
+            # training; "cyclic_cosine" down in one epoch, up in the next, as released.
+            "schedule": "cosine",
             "weight_decay": 0.01,
             "warmup_steps": 0,
             "gradient_clip_norm": placeholder(float),

@@ -11,6 +11,7 @@ import os
 import pathlib
 import socket
 import stat
+import types
 from collections.abc import Collection, Iterator, Mapping
 from typing import IO, Any
 
@@ -174,6 +175,7 @@ def claim(
     mend: str = "choose another folder, or delete that one",
     name: str = "",
     ignore: Collection[str] = (),
+    defaults: Mapping[str, Any] = types.MappingProxyType({}),
 ) -> None:
     """Makes a folder the place of one job, or checks that it is this job's already.
 
@@ -185,6 +187,7 @@ def claim(
         mend: What to do then.
         name: Of the whole, before the fields' names in the message.
         ignore: Fields that may differ.
+        defaults: What a field stands at where the file is older than the field.
 
     Raises:
         UserError: The folder is another job's; names the fields that differ. Or it is
@@ -199,6 +202,7 @@ def claim(
     except FileNotFoundError:
         write_json(path, wanted)
         return
+    found = _filled_up(found, defaults)
     require_same(
         {field: value for field, value in found.items() if field not in ignore},
         {field: value for field, value in wanted.items() if field not in ignore},
@@ -206,6 +210,13 @@ def claim(
         mend=mend,
         name=name,
     )
+
+
+def _filled_up(found: Any, defaults: Any) -> Any:
+    """A tree of values with those that it lacks."""
+    if not (isinstance(found, Mapping) and isinstance(defaults, Mapping)):
+        return found
+    return {**defaults, **{k: _filled_up(v, defaults.get(k)) for k, v in found.items()}}
 
 
 def require_same(

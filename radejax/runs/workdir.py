@@ -65,34 +65,18 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
 
 def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     """Keeps the config; compares it with that of the run, if there are checkpoints."""
-    wanted = json.loads(config.to_json()) | {"profile": "", "seeds": []}
     path = workdir / "config.json"
-    if path.exists() and any(workdir.glob("checkpoints/*")):
-        found = files.read_json(path)
-        with_defaults = _with_defaults(found, json.loads(base_config().to_json()))
-        if with_defaults != found:  # of a version that lacked some fields
-            files.write_json(path, with_defaults)
-    elif processes.is_main():
+    if processes.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
     files.claim(
         path,
-        wanted,
+        json.loads(config.to_json()) | {"profile": "", "seeds": []},
         "a run with another config",
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("watch",),
+        defaults=json.loads(base_config().to_json()),
     )
-
-
-def _with_defaults(found: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
-    """Fields that a config of an earlier version lacks, at what they are by default."""
-    added = {name: value for name, value in defaults.items() if name not in found}
-    deeper = {
-        name: _with_defaults(found[name], value)
-        for name, value in defaults.items()
-        if isinstance(value, dict) and isinstance(found.get(name), dict)
-    }
-    return {**found, **added, **deeper}
 
 
 def run_info(

@@ -75,16 +75,22 @@ class Plan:
         config = self.info.get("config", {})
         return {"project": self.watch.wandb_project, "config": dict(config)}
 
-    def optimizer(self) -> optax.GradientTransformation:
-        """AdamW with its learning rate by step."""
-        schedule = make_schedule(
+    @property
+    def schedule(self) -> optax.Schedule:
+        """Learning rate by step."""
+        return make_schedule(
             learning_rate=self.options.learning_rate,
             final_learning_rate=self.options.final_learning_rate,
             num_steps=self.num_steps,
             warmup_steps=self.options.warmup_steps,
+            kind=self.options.schedule,
+            steps_per_epoch=self.steps_per_epoch,
         )
+
+    def optimizer(self) -> optax.GradientTransformation:
+        """AdamW with its learning rate by step."""
         return make_optimizer(
-            schedule,
+            self.schedule,
             weight_decay=self.options.weight_decay,
             gradient_clip_norm=self.options.gradient_clip_norm,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import flax.traverse_util
 import jax
@@ -51,20 +51,38 @@ class TrainState:
         return {"params": merge_parameters(params, self.frozen), **self.model_state}
 
 
+Schedule = Literal["cosine", "cyclic_cosine"]
+
+
 def make_schedule(
     *,
     learning_rate: float,
     final_learning_rate: float,
     num_steps: int,
     warmup_steps: int,
+    kind: Schedule = "cosine",
+    steps_per_epoch: int = 0,
 ) -> optax.Schedule:
-    """Linear warm-up from zero, then a cosine from the peak down to the floor.
+    """Linear warm-up from zero, then a cosine between the peak and the floor.
 
     RADE-Net section IV-B: cosine per step from 1e-3 to 1e-4, no warm-up.
 
+    Args:
+        learning_rate: The peak.
+        final_learning_rate: The floor.
+        num_steps: Of the training, warm-up included.
+        warmup_steps: Of those, before the cosine begins.
+        kind: "cosine": falls once, over the training. "cyclic_cosine", as released:
+            falls in one epoch and climbs back in the next, and so on, which is torch's
+            `CosineAnnealingLR` with `T_max = steps_per_epoch`, stepped per batch.
+        steps_per_epoch: Batches of one pass over the data, for "cyclic_cosine".
+
+    Returns:
+        Learning rate by step, float32.
+
     Raises:
         UserError: The warm-up is longer than the training, the learning rate is not
-            positive, or the floor is above it.
+            positive, the floor is above it, or the kind is unknown.
     """
     if learning_rate <= 0:
         raise UserError(f"train.learning_rate={learning_rate} must be positive")
@@ -78,9 +96,32 @@ def make_schedule(
             f"train.warmup_steps={warmup_steps} must be less than the {num_steps} steps "
             "of the training"
         )
-    return optax.warmup_cosine_decay_schedule(
-        0.0, learning_rate, warmup_steps, num_steps, final_learning_rate
-    )
+    if kind == "cosine":
+        return optax.warmup_cosine_decay_schedule(
+            0.0, learning_rate, warmup_steps, num_steps, final_learning_rate
+        )
+    if kind != "cyclic_cosine":
+        raise UserError(
+            f"train.schedule must be 'cosine' or 'cyclic_cosine', got {kind!r}"
+        )
+    warmup = optax.linear_schedule(0.0, learning_rate, warmup_steps)
+    cyclic = _cyclic_cosine(learning_rate, final_learning_rate, steps_per_epoch)
+    return optax.join_schedules([warmup, cyclic], [warmup_steps])
+
+
+def _cyclic_cosine(peak: float, floor: float, half_period: int) -> optax.Schedule:
+    """What torch's recursion comes to: floor + (peak - floor) cos^2(pi t / 2T).
+
+    In whole steps from the nearest floor, so that float32 keeps all digits of the rate
+    where it is small and after any number of epochs.
+    """
+
+    def rate(step: jax.Array) -> jax.Array:
+        from_floor = jnp.abs(jnp.mod(step, 2 * half_period) - half_period)
+        angle = jnp.asarray(from_floor, jnp.float32) * (jnp.pi / (2 * half_period))
+        return floor + (peak - floor) * jnp.square(jnp.sin(angle))
+
+    return rate
 
 
 def make_optimizer(

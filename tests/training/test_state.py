@@ -25,6 +25,65 @@ def test_cosine_at_start_middle_and_end() -> None:
     np.testing.assert_allclose(values, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
 
 
+def _torch_recursion(peak: float, floor: float, period: int, steps: int) -> np.ndarray:
+    """`CosineAnnealingLR.get_lr` of torch, stepped `steps` times, in float64."""
+    rates = [peak]
+    for epoch in range(1, steps):
+        rate = rates[-1]
+        if (epoch - 1 - period) % (2 * period) == 0:
+            rate += (peak - floor) * (1 - np.cos(np.pi / period)) / 2
+        else:
+            now, before = (1 + np.cos(np.pi * e / period) for e in (epoch, epoch - 1))
+            rate = now / before * (rate - floor) + floor
+        rates.append(rate)
+    return np.array(rates)
+
+
+# One batch an epoch, odd and even numbers, those of K-Radar in both recipes.
+@pytest.mark.parametrize("steps_per_epoch", [1, 2, 3, 7, 10, 1745, 2909])
+def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch: int) -> None:
+    num_steps = 11 * steps_per_epoch
+    schedule = make_schedule(
+        learning_rate=1e-3,
+        final_learning_rate=1e-5,
+        num_steps=num_steps,
+        warmup_steps=0,
+        kind="cyclic_cosine",
+        steps_per_epoch=steps_per_epoch,
+    )
+    rates = np.asarray(jax.jit(schedule)(jnp.arange(num_steps)))
+    assert rates.dtype == np.float32
+    expected = _torch_recursion(1e-3, 1e-5, steps_per_epoch, num_steps)
+    np.testing.assert_allclose(rates, expected, rtol=5e-7)
+    floors = np.flatnonzero(rates == np.float32(1e-5))
+    np.testing.assert_array_equal(floors % (2 * steps_per_epoch), steps_per_epoch)
+    assert len(floors) == 5
+
+
+def test_cyclic_cosine_begins_after_the_warm_up() -> None:
+    schedule = make_schedule(
+        learning_rate=1e-3,
+        final_learning_rate=1e-5,
+        num_steps=60,
+        warmup_steps=4,
+        kind="cyclic_cosine",
+        steps_per_epoch=10,
+    )
+    rates = [float(schedule(step)) for step in (0, 2, 4, 14, 24)]
+    np.testing.assert_allclose(rates, [0, 5e-4, 1e-3, 1e-5, 1e-3], rtol=1e-6)
+
+
+def test_unknown_schedule_is_refused() -> None:
+    with pytest.raises(UserError, match=r"train.schedule must be .* got 'step'"):
+        make_schedule(
+            learning_rate=1e-3,
+            final_learning_rate=1e-5,
+            num_steps=6,
+            warmup_steps=0,
+            kind="step",
+        )
+
+
 def test_warm_up_is_linear_from_zero() -> None:
     schedule = make_schedule(
         learning_rate=1e-3, final_learning_rate=1e-4, num_steps=100, warmup_steps=10
