@@ -48,7 +48,7 @@ PRESETS = {
         "train.final_learning_rate": 1e-4,
         "train.num_epochs": 10,
         "data.azimuth_mapping": "true",
-        "evaluation.protocols": ("kradar_r40",),
+        "evaluation.protocols": ("coco101", "exact", "kradar_r40"),
         "evaluation.skip_empty": "protocol",
     },
     "official": {

@@ -198,7 +198,8 @@ def _evaluation() -> ConfigDict:
     return ConfigDict(
         {
             "roi": NARROW_ROI,
-            "protocols": ("kradar_r40",),
+            # The papers', ours, K-Radar's; the first chooses the best checkpoint.
+            "protocols": ("coco101", "exact", "kradar_r40"),
             "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
             "score_threshold": 0.3,
