@@ -23,6 +23,7 @@ of 17,458 frames.
 from ml_collections import ConfigDict
 
 from radejax.core.config import base_config, parse_words
+from radejax.core.structures import WIDE_ROI
 
 _OFF = {"cbam": "off", "neck": "plain", "heads": "default"}
 
@@ -45,6 +46,8 @@ PRESETS = {
         "loss.matching": "nms",
         "loss.z0_m": 0.0,
         "decode.threshold_inclusive": True,
+        "decode.roi": None,
+        "decode.raw_yaw": "never",
         "train.final_learning_rate": 1e-4,
         "train.num_epochs": 10,
         "data.azimuth_mapping": "true",
@@ -58,6 +61,8 @@ PRESETS = {
         "loss.matching": "center",
         "loss.z0_m": 0.0,
         "decode.threshold_inclusive": False,
+        "decode.roi": WIDE_ROI,
+        "decode.raw_yaw": "always",
         "train.final_learning_rate": 1e-5,
         "train.num_epochs": 11,
         "data.azimuth_mapping": "stretched",

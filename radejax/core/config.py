@@ -146,6 +146,11 @@ def _decode() -> ConfigDict:
             "threshold_inclusive": True,  # score >= threshold
             "nms_iou": 0.3,
             "per_class_nms": False,
+            # Boxes with a center outside are left out before NMS: x, y, z from and to.
+            "roi": placeholder(tuple),
+            # Where the length of the regressed (sin, cos) scales a box: "nms" alone,
+            # "always" (results too, as the released evaluator has it), "never".
+            "raw_yaw": "nms",
         }
     )
 
