@@ -9,7 +9,9 @@ The argument is a list of words, at most one of each group:
 - variant: `r` radar alone (a RADE-Net with the dual stem), `rc` with camera and without
   elevation weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50,
   last stage fine-tuned, in place of DINOv3.
-- preset: `paper` or `official` (what the released code runs, its geometry included).
+- preset: `paper` or `official`: the released code with these values, its geometry
+  included. Never what the paper ran: the release's own settings for radar and camera
+  (`params_radcam.py`) are a copy of the radar's and lack keys that its code reads.
   Without one: the paper's, but with the released attention block in the radar branch
   and the losses read at the objects' own bins.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).

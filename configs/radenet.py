@@ -23,6 +23,7 @@ of 17,458 frames.
 from ml_collections import ConfigDict
 
 from radejax.core.config import base_config, parse_words
+from radejax.core.structures import WIDE_ROI
 
 _OFF = {"cbam": "off", "neck": "plain", "heads": "default"}
 
@@ -45,11 +46,13 @@ PRESETS = {
         "loss.matching": "nms",
         "loss.z0_m": 0.0,
         "decode.threshold_inclusive": True,
+        "decode.roi": None,
+        "decode.raw_yaw": "never",
         "train.final_learning_rate": 1e-4,
         "train.schedule": "cosine",
         "train.num_epochs": 10,
         "data.azimuth_mapping": "true",
-        "evaluation.protocols": ("kradar_r40",),
+        "evaluation.protocols": ("coco101", "exact", "kradar_r40"),
         "evaluation.skip_empty": "protocol",
     },
     "official": {
@@ -59,6 +62,8 @@ PRESETS = {
         "loss.matching": "center",
         "loss.z0_m": 0.0,
         "decode.threshold_inclusive": False,
+        "decode.roi": WIDE_ROI,
+        "decode.raw_yaw": "always",
         "train.final_learning_rate": 1e-5,
         "train.schedule": "cyclic_cosine",
         "train.num_epochs": 11,

@@ -62,7 +62,7 @@ def run_baseline(
         print(f"{name} from {least:.1f} dBsm")
     frames = KRadar(data, split="test")
     predictions = predict(records, frames, settings)
-    ground_truth, table = tables_from_frames(frames)
+    ground_truth, table = tables_from_frames(frames, "test")
     return write_report(
         ground_truth,
         predictions,
@@ -71,7 +71,6 @@ def run_baseline(
         run="CFAR",
         classes=CLASSES,
         protocols=protocols,
-        paper_protocol="coco101" if "coco101" in protocols else protocols[0],
         iou_thresholds=(0.3, 0.5),
         roi=NARROW_ROI,
         score_threshold=score_threshold,

@@ -77,6 +77,15 @@ def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
     assert {row["space"] for row in rows} == {"bev", "3d"}
     assert {float(row["iou"]) for row in rows} == {0.3, 0.5}
     assert list((run / "evaluation" / "pictures").glob("*.png"))
+    assert all(row["name"].endswith("/simulated") for row in rows)
+    tables = (run / "evaluation" / "tables.md").read_text()
+    titles = [line for line in tables.splitlines() if line.startswith("**")]
+    assert titles
+    assert all(title.startswith("**Simulated data: ") for title in titles)
+    assert not [word for word in ("RADE-Net", "DinoRADE", "RTNH") if word in tables]
+    assert "simulated frames" in (run / "evaluation" / "report.txt").read_text()
+    metrics = (run / "metrics.jsonl").read_text()
+    assert ("ap_3d" in metrics) == ("/simulated" in metrics)
     assert list((run / "tensorboard").iterdir())
     assert len((run / "metrics.jsonl").read_text().splitlines()) > 0
     for name in ("radar_tesseract", "info_label_v2_1", "cam-front", "info_calib"):

@@ -146,6 +146,11 @@ def _decode() -> ConfigDict:
             "threshold_inclusive": True,  # score >= threshold
             "nms_iou": 0.3,
             "per_class_nms": False,
+            # Boxes with a center outside are left out before NMS: x, y, z from and to.
+            "roi": placeholder(tuple),
+            # Where the length of the regressed (sin, cos) scales a box: "nms" alone,
+            # "always" (results too, as the released evaluator has it), "never".
+            "raw_yaw": "nms",
         }
     )
 
@@ -203,7 +208,8 @@ def _evaluation() -> ConfigDict:
     return ConfigDict(
         {
             "roi": NARROW_ROI,
-            "protocols": ("kradar_r40",),
+            # The papers', ours, K-Radar's; the first chooses the best checkpoint.
+            "protocols": ("coco101", "exact", "kradar_r40"),
             "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
             "score_threshold": 0.3,

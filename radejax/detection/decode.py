@@ -6,12 +6,15 @@ use, and a count of the peaks that found no row.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -51,15 +54,14 @@ def decode(
     per_class_nms: bool = False,
     threshold_inclusive: bool = False,
     z0_m: float | jax.Array = 0.0,
-    normalize_yaw: bool = False,
+    raw_yaw: Literal["nms", "always", "never"] = "nms",
 ) -> Detections:
     """Boxes of a batch of detection maps.
 
     As released: a peak is a bin that is not exceeded in its 3 x 3 neighbourhood of its
     own class map and scores above the threshold; a bin gives at most one box, of its
     best class (the first of equals); boxes outside the region are dropped; greedy
-    bird's-eye-view NMS. The length of the regressed yaw vector scales a box in NMS, as
-    released, but not in the result.
+    bird's-eye-view NMS.
 
     Args:
         maps: Heatmap logits and box parameters, any float dtype; scores are computed
@@ -74,8 +76,10 @@ def decode(
         threshold_inclusive: Peaks that score exactly the threshold count (the paper's
             reading; the released code's is exclusive).
         z0_m: Height added to the regressed z: the paper's sensor height.
-        normalize_yaw: NMS compares boxes of their regressed size, whatever the length
-            of the yaw vector.
+        raw_yaw: Where the length of the regressed (sin, cos) scales the footprint of a
+            box: "nms" alone; "always", so that results have that length and width, and
+            a short vector shrinks a box in every overlap, as in the released NMS and
+            evaluator; "never".
 
     Returns:
         Detections by descending score; equal scores in order of range, then azimuth.
@@ -83,6 +87,7 @@ def decode(
 
     Raises:
         ValueError: Shapes of maps and grid differ, or a size is not positive.
+        UserError: `raw_yaw` is something else.
 
     Examples:
         >>> grid = RadarGrid.reduced(
@@ -95,6 +100,10 @@ def decode(
     """
     if max_detections < 1:
         raise ValueError(f"max_detections must be at least 1, got {max_detections}")
+    if raw_yaw not in ("nms", "always", "never"):
+        raise UserError(
+            f'decode.raw_yaw is {raw_yaw!r}, expected "nms", "always" or "never"'
+        )
     peaks = find_peaks(
         maps,
         grid,
@@ -105,8 +114,10 @@ def decode(
         z0_m=z0_m,
     )
     keep = suppress(
-        peaks, nms_iou, per_class=per_class_nms, normalize_yaw=normalize_yaw
+        peaks, nms_iou, per_class=per_class_nms, normalize_yaw=raw_yaw == "never"
     )
+    if raw_yaw == "always":
+        peaks = peaks.replace(boxes=_with_raw_footprint(peaks.boxes))
     return _compact(peaks, keep, max_detections)
 
 
@@ -117,7 +128,11 @@ def suppress(
     per_class: bool = False,
     normalize_yaw: bool = False,
 ) -> jax.Array:
-    """`[B, P]` bool: which peaks survive rotated NMS; arguments as for `decode`."""
+    """`[B, P]` bool: which peaks survive rotated NMS; arguments as for `decode`.
+
+    `normalize_yaw` compares boxes of their regressed size, whatever the length of the
+    yaw vector.
+    """
     boxes = boxes7_from_8(peaks.boxes) if normalize_yaw else peaks.boxes
 
     def one_frame(
@@ -202,6 +217,12 @@ def boxes_at(
     sin = jnp.asarray(np.sin(grid.azimuth_rad), jnp.float32)[cell[..., 1]]
     center = jnp.stack([range_m * cos, -range_m * sin, jnp.zeros_like(sin) + z0_m], -1)
     return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
+
+
+def _with_raw_footprint(boxes: jax.Array) -> jax.Array:
+    """`[..., 8]` boxes, length and width multiplied by the length of the yaw vector."""
+    norm = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
+    return boxes.at[..., 3:5].multiply(norm)
 
 
 def _max_3x3(values: jax.Array) -> jax.Array:

@@ -112,6 +112,11 @@ def frame_ids(frames: Columns) -> np.ndarray:
     return ids
 
 
+def are_simulated(frames: Columns | None) -> bool:
+    """Whether a frame table says that frames of it are simulated."""
+    return frames is not None and bool(np.any(frames.get("simulated", False)))
+
+
 def wanted_columns(scored: bool) -> tuple[str, ...]:
     """Names of the columns of ground truth or, `scored`, of predictions."""
     return ("frame", "box", "cls", "score")[: 4 if scored else 3]

@@ -40,6 +40,7 @@ class EvaluationSet:
         left_out: Counts of what does not take part and why.
         roi: Name of the region.
         label_version: Label revision or None.
+        is_simulated: The frame table says that frames are simulated.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class EvaluationSet:
         self.classes = _check_classes(classes)
         self.roi = columns.roi_name(roi)
         self.label_version = label_version
+        self.is_simulated = columns.are_simulated(frames)
         truth = columns.read_columns(ground_truth, name="ground truth", scored=False)
         found = columns.read_columns(predictions, name="predictions", scored=True)
         if frames is None:
@@ -210,6 +212,7 @@ class EvaluationSet:
                 skip_empty=skip,
                 roi=self.roi,
                 label_version=self.label_version,
+                is_simulated=self.is_simulated,
                 **(vars(curve) | dropped),
             )
             results.append(result)

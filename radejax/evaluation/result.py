@@ -31,6 +31,7 @@ class Result:
         precision: `[K]` precision along the curve (K-Radar: after making it monotone).
         recall: `[K]` recall along the curve.
         score: `[K]` score threshold along the curve, falling.
+        is_simulated: The frames are simulated.
     """
 
     cls: str
@@ -48,6 +49,7 @@ class Result:
     precision: np.ndarray = dataclasses.field(repr=False)
     recall: np.ndarray = dataclasses.field(repr=False)
     score: np.ndarray = dataclasses.field(repr=False)
+    is_simulated: bool = False
 
     @property
     def is_defined(self) -> bool:
@@ -58,12 +60,14 @@ class Result:
     def metric(self) -> str:
         """Name with everything the number depends on but the class and the frames.
 
-        Such as ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow.
+        Such as ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow, and
+        then /simulated where the frames are.
         """
         return (
             f"ap_{self.space}_iou{100 * self.iou:.4g}/{self.protocol}"
             f"/score>{self.score_threshold:g}/skip={self.skip_empty or 'none'}"
             f"/labels={self.label_version or 'unknown'}/roi={self.roi}"
+            + ("/simulated" if self.is_simulated else "")
         )
 
 

@@ -44,7 +44,8 @@ class Detector:
         grid: Of the sensor.
         classes: Names in the order of the heatmap's channels.
         decode_options: Static keyword arguments of `radejax.detection.decode.decode`:
-            max_detections, threshold_inclusive, per_class_nms, z0_m.
+            max_detections, threshold_inclusive, per_class_nms, z0_m, raw_yaw; and roi,
+            for calls and a detector that give none.
         azimuth_mapping: "true", or "stretched" for official checkpoints.
         score_threshold: Default of calls.
         nms_iou: Default of calls.
@@ -90,12 +91,12 @@ class Detector:
         self.classes = tuple(classes)
         self.score_threshold = score_threshold
         self.nms_iou = nms_iou
-        self.roi = roi
         self.device = device if device is not None else jax.devices()[0]
         self.variables = jax.device_put(variables, self.device)
         self._batch_sizes = tuple(sorted(batch_sizes))
         self.azimuth_mapping = azimuth_mapping
         self.decode_options = {"max_detections": 100, **(decode_options or {})}
+        self.roi = self.decode_options.get("roi") if roi is None else roi
         self._run = jax.jit(self.detect_function(), static_argnames="is_tesseract")
 
     # Construction --------------------------------------------------------------------

@@ -34,6 +34,7 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
             config["score_threshold"] if score_threshold is None else score_threshold
         )
         iou = config["nms_iou"] if nms_iou is None else nms_iou
+        roi = config.get("roi") if roi is None else roi
         roi = [-np.inf, np.inf] * 3 if roi is None else roi
         settings = np.float32(score), np.float32(iou), np.asarray(roi, np.float32)
         # Copies: on CPU device_put shares memory, which the caller may refill.

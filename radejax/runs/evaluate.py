@@ -84,7 +84,7 @@ def evaluate(
             roi=config.evaluation.roi,
             score_threshold=config.decode.score_threshold,
         )
-        ground_truth, table = tables_from_frames(frames)
+        ground_truth, table = tables_from_frames(frames, split)
         report = write_report(
             ground_truth,
             predictions,
@@ -103,7 +103,9 @@ def evaluate(
         if drawn:
             drawer.draw_scenes(out / "scenes.png")
         if (workdir / "metrics.jsonl").exists():
-            pictures.draw_curves(workdir, out / "training.png")
+            pictures.draw_curves(
+                workdir, out / "training.png", is_simulated=frames.is_simulated
+            )
         _log.info("drew %d frames in %s", len(drawn), out / "pictures")
         return report
 
@@ -177,6 +179,7 @@ def source_of(
         "split": split,
         "exchange_images": exchange_images,
         "label_version": data.options.label_version,
+        "simulated": data.frames.is_simulated,
         **dataclasses.asdict(data.paths),
         "roots": list(data.paths.roots),  # as JSON has them
     }
@@ -252,13 +255,10 @@ def make_predictor(
 def report_options(config: ConfigDict, name: str) -> Options:
     """How the config of a run says that it is evaluated, without intervals."""
     options = config.evaluation
-    protocols = tuple(options.protocols)
     return Options(
         run=name,
         classes=tuple(config.classes),
-        protocols=protocols,
-        # The papers' printed numbers fit this one best, see docs/evaluation.md.
-        paper_protocol="coco101" if "coco101" in protocols else protocols[0],
+        protocols=tuple(options.protocols),
         iou_thresholds=tuple(options.iou_thresholds),
         roi=tuple(options.roi),
         score_threshold=options.score_threshold,

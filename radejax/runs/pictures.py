@@ -56,7 +56,10 @@ class FrameDrawer:
     def __call__(self, index: int, path: str | os.PathLike) -> None:
         """Draws the frame at a position of the data set into a picture file."""
         frame = self._frames[int(index)]
-        title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
+        title = (
+            f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
+            f"{_simulated(frame.is_simulated)}"
+        )
         scene = dataclasses.replace(self._scene(int(index)), title=title)
         figure = bev.draw_frame(scene)
         bev.save_figure(figure, path)
@@ -77,7 +80,7 @@ class FrameDrawer:
             roi=self._roi,
             image=image,
             camera=camera,
-            title=f"{frame.weather} ({frame.key})",
+            title=f"{frame.weather} ({frame.key}){_simulated(frame.is_simulated)}",
         )
 
     def draw_scenes(self, path: str | os.PathLike) -> None:
@@ -109,9 +112,17 @@ class FrameDrawer:
         return paths
 
 
-def draw_curves(workdir: pathlib.Path, path: pathlib.Path) -> None:
+def _simulated(is_simulated: bool) -> str:
+    """The end of a title."""
+    return ", simulated" if is_simulated else ""
+
+
+def draw_curves(
+    workdir: pathlib.Path, path: pathlib.Path, *, is_simulated: bool = False
+) -> None:
     """Draws the losses of a run over its steps into a picture file."""
-    figure = curves.draw_training(workdir / "metrics.jsonl", title=workdir.name)
+    title = f"{workdir.name}{_simulated(is_simulated)}"
+    figure = curves.draw_training(workdir / "metrics.jsonl", title=title)
     bev.save_figure(figure, path)
 
 
@@ -124,7 +135,8 @@ def draw_camera_share(
 ) -> None:
     """Writes `camera_share.json` and `camera_share.png`, see `camera_share`."""
     shares = camera_share(model, variables, data, frames)
-    write_camera_share(out, *shares, data.records.grid)
+    title = "Simulated data" if data.frames.is_simulated else ""
+    write_camera_share(out, *shares, data.records.grid, title=title)
 
 
 def camera_share(

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar import write as kradar_write
+from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.geometry.calibration import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
@@ -28,8 +29,6 @@ from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source
 from radejax.simulation.simulator import SequenceSimulator
 
 __all__ = ["default_config", "simulate_dataset"]
-
-MARKER = "simulation.json"
 
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 
@@ -69,12 +68,12 @@ def simulate_dataset(
     num_frames, size = expected_size(checked, source)
     _log.info("%s: %d frames, about %.2g GB", root, num_frames, size / 1e9)
     content = _marker(checked)
-    with files.disk_full(root / MARKER):
-        files.write_json(root / MARKER, content)
+    with files.disk_full(root / SIMULATION_MARKER):
+        files.write_json(root / SIMULATION_MARKER, content)
         files.remove_stale(root)
         _write_common(root, checked, source)
         _write_frames(root, checked, source, num_threads, progress)
-        files.write_json(root / MARKER, content | {"finished": True})
+        files.write_json(root / SIMULATION_MARKER, content | {"finished": True})
     return root
 
 
@@ -92,7 +91,7 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
     """True for a complete data set of this config; an error for anything alien."""
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file, expected a folder for the data set")
-    marker = root / MARKER
+    marker = root / SIMULATION_MARKER
     if not marker.exists():
         if root.exists() and any(not p.name.endswith(".tmp") for p in root.iterdir()):
             raise UserError(

@@ -109,6 +109,7 @@ def write_camera_share(
     maps: Mapping[str, np.ndarray],
     counts: Mapping[str, int],
     grid: RadarGrid,
+    title: str = "",
 ) -> None:
     """Writes `camera_share.json` (means and counts) and `camera_share.png`.
 
@@ -120,4 +121,7 @@ def write_camera_share(
         for name, m in means.items()
     }
     write_json(out / "camera_share.json", summary)
-    save_figure(draw_camera_share(maps, grid, counts=counts), out / "camera_share.png")
+    figure = draw_camera_share(maps, grid, counts=counts)
+    if title:
+        figure.suptitle(title)
+    save_figure(figure, out / "camera_share.png")

@@ -7,8 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from radejax.core.config import load_config
+from radejax.core.errors import UserError
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
+from radejax.evaluation.overlap import pair_iou
+from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
 KRADAR = RadarGrid.kradar()
@@ -17,7 +21,7 @@ CASES = ("padded_wide_roi", "padded_no_roi", "unpadded_wide_roi", "unpadded_no_r
 GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimuth=12)
 C = 3
 SIZES = ("grid", "max_detections", "pre_nms", "per_class_nms")
-FLAGS = ("threshold_inclusive", "normalize_yaw")
+FLAGS = ("threshold_inclusive", "raw_yaw")
 
 decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
 find_peaks = jax.jit(
@@ -317,10 +321,46 @@ def test_length_of_the_yaw_vector_scales_boxes_in_nms_only_as_released():
     maps = overlapping_classes()
     maps = maps.replace(box_params=maps.box_params.at[..., 7].set(0.1))
     run = partial(decode, maps, GRID, max_detections=4, score_threshold=0.3)
-    released, plain = run(), run(normalize_yaw=True)
+    released, plain = run(), run(raw_yaw="never")
     assert int(released.is_valid.sum()) == 2
     assert int(plain.is_valid.sum()) == 1
     np.testing.assert_allclose(released.boxes[0, 0, 3:5], 60)
+    always = run(raw_yaw="always")
+    np.testing.assert_array_equal(always.is_valid, released.is_valid)
+    np.testing.assert_allclose(always.boxes[0, 0, 3:5], 6, rtol=1e-6)
+    with pytest.raises(UserError, match=r"decode\.raw_yaw is 'yes', expected"):
+        run(raw_yaw="yes")
+
+
+def test_official_preset_decodes_as_released(case):
+    """Region filter before NMS and boxes as the released evaluator takes them."""
+    _, want, maps, grid = case
+    config = load_config("configs/radenet.py:official").decode
+    options = dict(config) | {"max_detections": 48}
+    if not want["wide_roi"]:
+        options["roi"] = None
+    found = D.decode(maps, grid, **options)
+    for frame in range(3):
+        kept = want[f"boxes_before_nms_{frame}"][want[f"kept_{frame}"]]
+        norm = np.hypot(kept[:, 6], kept[:, 7])[:, None]
+        boxes = found.boxes[frame, : len(kept)]
+        assert int(found.is_valid[frame].sum()) == len(kept)
+        np.testing.assert_allclose(boxes[:, :3], kept[:, :3], atol=2e-5)
+        np.testing.assert_allclose(boxes[:, 3:5], kept[:, 3:5] * norm, atol=2e-5)
+        np.testing.assert_allclose(boxes[:, 5], kept[:, 5], atol=2e-5)
+
+
+def test_our_evaluator_takes_the_raw_footprint_as_the_released_one(shared):
+    pairs = np.load(shared / "fixtures" / "iou" / "rotated_iou.npz")
+    mine = pairs["kind"] == "unnormalised_yaw"
+    assert mine.sum() == 20
+    a, b = (
+        np.asarray(boxes7_from_8(D._with_raw_footprint(jnp.asarray(pairs[key][mine]))))
+        for key in ("box_a", "box_b")
+    )
+    bev, volume = pair_iou(a.astype(float), b.astype(float))
+    np.testing.assert_allclose(bev, pairs["iou_bev"][mine], atol=5e-4)
+    np.testing.assert_allclose(volume, pairs["iou_3d"][mine], atol=5e-4)
 
 
 def test_thresholds_and_region_are_traced_values():

@@ -207,6 +207,19 @@ def test_lists_of_arrays(
         detector([projections[0], projections[0, :8]])
 
 
+def test_region_of_decode_options_holds_where_none_is_given(
+    detector: Detector, projections: np.ndarray
+) -> None:
+    region, other = (0, 15, -5, 5, -10, 10), (0, 9, -5, 5, -10, 10)
+    parts = detector.model, detector.variables, detector.grid
+    made = Detector(*parts, score_threshold=0.3, decode_options={"roi": region})
+    found = made(projections[:1])
+    boxes = np.asarray(found.boxes)[np.asarray(found.is_valid)]
+    assert len(boxes)
+    assert (boxes[:, 0] <= 15).all()
+    assert Detector(*parts, roi=other, decode_options={"roi": region}).roi == other
+
+
 def test_detections_carry_the_names_of_their_detector(
     detector: Detector, projections: np.ndarray
 ) -> None:

@@ -140,7 +140,9 @@ class TestRepeating:
         monkeypatch.setattr(dataset._SequenceWriter, "write", stops)
         with pytest.raises(KeyboardInterrupt):
             simulate_dataset(small_config(), root, num_threads=1, progress=False)
-        assert not json.loads((root / dataset.MARKER).read_text())["finished"]
+        assert not json.loads((root / dataset.SIMULATION_MARKER).read_text())[
+            "finished"
+        ]
         monkeypatch.setattr(dataset._SequenceWriter, "write", write)
         # A killed writer leaves its temporary file; a living one's is not touched.
         dead = subprocess.Popen([sys.executable, "-c", ""])

@@ -70,6 +70,7 @@ class KRadar(Sequence[Frame]):
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
         split_folders: In and beside which split files are looked for.
+        is_simulated: One of these folders says that its data are simulated.
 
     Raises:
         FileNotFoundError: A folder or file that was named does not exist.
@@ -111,6 +112,7 @@ class KRadar(Sequence[Frame]):
         self.split_folders = list(self.roots)
         if labels is not None:
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
+        self.is_simulated = folders.are_simulated(self.split_folders)
         self._sequence_numbers = sequence_numbers and tuple(sequence_numbers)
         self._offset = (radar_from_lidar, float(z_offset_m))
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
@@ -350,6 +352,7 @@ class KRadar(Sequence[Frame]):
             projection,
             camera,
             info.camera_calibration_path,
+            self.is_simulated,
         )
 
 

@@ -21,6 +21,9 @@ from radejax.core.files import read_json
 from radejax.data.kradar.labels import MAX_LABEL_BYTES, read_label_bytes
 from radejax.geometry.radar_grid import RadarGrid
 
+SIMULATION_MARKER = "simulation.json"
+"""File by which a data set says that it is simulated, and by what settings."""
+
 _OWN_LABEL_FOLDERS = {
     "v1.0": ("info_label_v1_0", "info_label"),
     "v1.1": ("info_label_v1_1", "info_label"),
@@ -230,6 +233,11 @@ def find_camera_calibration(
                 if (folder / name).is_file():
                     return folder / name, is_own
     return None, False
+
+
+def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
+    """Whether the simulator has left its `simulation.json` in one of the folders."""
+    return any((folder / SIMULATION_MARKER).is_file() for folder in folders)
 
 
 def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:

@@ -29,6 +29,7 @@ class Frame:
         projection_path: An official `.npy` projection, None where there is none.
         camera_path: Front image (stereo pair), None where it is missing.
         camera_calibration_path: Calibration of the left front camera, or None.
+        is_simulated: Nothing of it was measured.
     """
 
     sequence: int
@@ -46,6 +47,7 @@ class Frame:
     projection_path: pathlib.Path | None
     camera_path: pathlib.Path | None
     camera_calibration_path: pathlib.Path | None
+    is_simulated: bool = False
 
     @property
     def key(self) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.folders import are_simulated
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.files import kitti, predictions
 
@@ -58,7 +59,7 @@ def load(
     """
     path = pathlib.Path(path)
     if (path / "predictions.npz").is_file():
-        frames = _read_frames(path / "frames.json")
+        frames = _frames_of_report(path)
         truth = predictions.read_table(path / "ground_truth.npz", frames, scored=False)
         found = predictions.read_table(path / "predictions.npz", frames)
         return truth, found, frames, {}
@@ -74,7 +75,7 @@ def load(
             split=source.split,
             classes=classes,
         )
-        truth, frames = tables_from_frames(data)
+        truth, frames = tables_from_frames(data, source.split or "all")
         left_out = {f"labels: {what}": int(n) for what, n in data.counts.items()}
     elif path.is_dir():
         return (*kitti.read_kitti(path), left_out)
@@ -100,12 +101,26 @@ def _read_frames(path: PathLike) -> Columns:
     return {name: np.asarray(column) for name, column in content.items()}
 
 
-def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:
+def _frames_of_report(path: pathlib.Path) -> Columns:
+    """A report's frame table; in older ones `source.json` names the data instead."""
+    frames = dict(_read_frames(path / "frames.json"))
+    source = path / "source.json"
+    if "simulated" not in frames and source.is_file():
+        roots = map(pathlib.Path, files.read_json(source)["roots"])
+        frames["simulated"] = np.full(frames["frame"].size, are_simulated([*roots]))
+    return frames
+
+
+def tables_from_frames(
+    frames: Iterable[Any], split: str | None = None
+) -> tuple[Columns, Columns]:
     """Ground truth and frame table of a data set such as `radejax.data.kradar.dataset.KRadar`.
 
     Args:
-        frames: Objects with sequence, name, weather, environment, time, boxes `[N, 7]`
-            (radar frame) and classes `[N]` (names).
+        frames: Objects with sequence, name, weather, environment, time, is_simulated,
+            boxes `[N, 7]` (radar frame) and classes `[N]` (names).
+        split: Of the data set, for the frame table: "train", "test", "all" or a split
+            file; None where it is not known.
 
     Returns:
         Ground-truth columns and frame columns; the frame id is the position.
@@ -122,4 +137,7 @@ def tables_from_frames(frames: Iterable[Any]) -> tuple[Columns, Columns]:
     table = {"frame": np.arange(len(frames))}
     for column in ("sequence", "name", "weather", "environment", "time"):
         table[column] = np.array([getattr(frame, column) for frame in frames])
+    table["simulated"] = np.array([frame.is_simulated for frame in frames], bool)
+    if split is not None:
+        table["split"] = np.full(len(frames), str(split))
     return ground_truth, table

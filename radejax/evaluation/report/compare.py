@@ -66,7 +66,9 @@ def compare_files(
             resamples=resamples,
             seed=options.seed,
         )
-        parts.append(tables.comparison(found, str(paths[0]), str(path)).render())
+        table = tables.comparison(found, str(paths[0]), str(path))
+        is_simulated = data.is_simulated or first[0].is_simulated
+        parts.append((table.of_simulated() if is_simulated else table).render())
         rows += found
     runs = dict(zip(map(str, paths), [first, *others], strict=True))
     if "Sedan" in options.classes:
@@ -114,4 +116,8 @@ def _ablations(
         name: tables.index(measure(data, frames, options, kinds=()))
         for name, (data, frames) in runs.items()
     }
-    return paper_tables.table_3(measured, options.paper_protocol)
+    is_simulated = any(data.is_simulated for data, _ in runs.values())
+    table = paper_tables.table_3(
+        measured, options.paper_protocol, is_simulated=is_simulated
+    )
+    return table.of_simulated() if is_simulated else table

@@ -14,9 +14,10 @@ from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation import protocols
-from radejax.evaluation.columns import Columns
+from radejax.evaluation.columns import Columns, are_simulated
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT
+from radejax.evaluation.report import published
 from radejax.evaluation.result import Result, mean_ap
 
 ENVIRONMENTS = (
@@ -42,7 +43,6 @@ class Options:
         classes: Classes evaluated.
         iou_thresholds: IoU thresholds.
         protocols: Names of protocols.
-        paper_protocol: Protocol of the rows that stand beside published ones.
         score_threshold: Score cut of all APs.
         skip_empty: Frame rule; "protocol" takes each protocol's own.
         roi: Region of interest for both sides.
@@ -64,7 +64,6 @@ class Options:
     classes: tuple[str, ...] = CLASSES
     iou_thresholds: tuple[float, ...] = (0.3, 0.5, 0.7)
     protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
-    paper_protocol: str = "coco101"
     score_threshold: float = 0.0
     skip_empty: str | None = PROTOCOL_DEFAULT
     roi: str | Sequence[float] | None = "narrow"
@@ -77,6 +76,12 @@ class Options:
     invalid_sizes: str = "error"
     left_out_before: Mapping[str, int] = dataclasses.field(default_factory=dict)
     draw_frame: Callable[[int, Any], None] | None = None
+
+    @property
+    def paper_protocol(self) -> str:
+        """Protocol of the rows that stand beside published ones: theirs, or the first."""
+        authors = published.AUTHORS_PROTOCOL
+        return authors if authors in self.protocols else self.protocols[0]
 
     @property
     def main_protocols(self) -> tuple[str, ...]:
@@ -138,6 +143,28 @@ class Measured:
             "ap_official": None if math.isnan(made.ap) else made.ap,
             **{name: getattr(made, name) for name in _OF_RESULT},
         }
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """What frames are, as far as their table says.
+
+    Attributes:
+        num_frames: How many.
+        split: "train", "test", "all" or a split file; None: not known, or several.
+        is_simulated: Some of them are simulated.
+    """
+
+    num_frames: int
+    split: str | None
+    is_simulated: bool
+
+    @classmethod
+    def of(cls, frames: Columns) -> Origin:
+        """Read from a frame table."""
+        splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
+        split = str(splits[0]) if splits.size == 1 else None
+        return cls(np.size(frames["frame"]), split, are_simulated(frames))
 
 
 def condition_masks(frames: Columns, kind: str) -> dict[str, np.ndarray]:

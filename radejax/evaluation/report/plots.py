@@ -35,6 +35,7 @@ def draw(
     from radejax.visualize.curves import draw_calibration
 
     iou = options.iou_thresholds[0]
+    kind = ", simulated data" if data.is_simulated else ""
     masks = {
         "all": np.ones(data.frame.size, bool),
         **condition_masks(frames, "weather"),
@@ -51,11 +52,11 @@ def draw(
             )
             for name, mask in masks.items()
         }
-        figure = _precision_recall(results, f"{space}, IoU {iou:g}")
+        figure = _precision_recall(results, f"{space}, IoU {iou:g}{kind}")
         path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
         written.append(save_figure(figure, path, dpi=110))
     match = breakdown.matched_objects(data, "3d", iou)
-    axis = draw_calibration(data.pred.score, match >= 0, title=f"3d, IoU {iou:g}")
+    axis = draw_calibration(data.pred.score, match >= 0, title=f"3d, IoU {iou:g}{kind}")
     return [*written, save_figure(axis.figure, out_dir / "calibration.png", dpi=110)]
 
 

@@ -17,7 +17,9 @@ import csv
 import dataclasses
 import importlib.resources
 import itertools
+from typing import NamedTuple
 
+from radejax.core.structures import CLASSES
 from radejax.data.kradar.sequences import WEATHERS
 
 CONDITIONS = ("all", *WEATHERS)
@@ -26,7 +28,49 @@ AUTHORS_PROTOCOL = "coco101"
 """RADE-Net's and DinoRADE's own rows: RADE-Net's evaluator, 101 recall levels, frames
 without the class left out (the printed 0.99 is its floor 1/101)."""
 
+TEST_FRAMES = 17_536
+"""Frames of K-Radar's official test split, on which both papers evaluate."""
+
 COPIED = "not stated (copied from earlier work)"
+
+
+class Terms(NamedTuple):
+    """What two average precisions must share to be compared.
+
+    Attributes:
+        protocol: Name of the protocol.
+        labels: Label revision.
+        classes: Those that the detector was made for, in order of their names.
+        score_cut: Predictions need a score above this.
+        skip: Frames left out: "class", "frame" or None.
+        roi: Name of the region of interest.
+        split: Of the data set.
+        frames: Number of frames of the split.
+    """
+
+    protocol: str
+    labels: str | None
+    classes: tuple[str, ...]
+    score_cut: float
+    skip: str | None
+    roi: str
+    split: str | None
+    frames: int
+
+    def differences(self, theirs: Terms) -> str:
+        """What is not the same: "labels: v1.1, ours v2.1; ..."; "" where nothing is."""
+        return "; ".join(
+            f"{name.replace('_', ' ')}: {_words(there)}, ours {_words(here)}"
+            for name, here, there in zip(self._fields, self, theirs, strict=True)
+            if here != there
+        )
+
+
+def _words(value: object) -> str:
+    """A value of `Terms` in a sentence."""
+    if isinstance(value, tuple):
+        return " + ".join(value)
+    return "not known" if value is None else str(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,9 +106,36 @@ class PublishedRow:
         """Paper and table."""
         return f"{self.paper}, Table {self.table}"
 
+    @property
+    def terms(self) -> Terms:
+        """What the number depends on; those of copied rows are not known."""
+        return Terms(
+            protocol=self.protocol,
+            labels=self.label_version.split()[0],
+            classes=tuple(sorted(_CLASSES_OF_TABLE[self.paper, self.table])),
+            score_cut=0.3,
+            skip="class",
+            roi="narrow",
+            split="test",
+            frames=TEST_FRAMES,
+        )
+
     def get(self, cls: str, condition: str = "all") -> float | None:
         """The printed value, None where there is none."""
         return self.values.get((cls, condition))
+
+
+_CLASSES_OF_TABLE = {
+    ("RADE-Net", "I"): ("Sedan",),
+    ("RADE-Net", "II"): CLASSES,
+    ("RADE-Net", "III"): ("Sedan",),
+    ("DinoRADE", "1"): ("Sedan",),
+    ("DinoRADE", "2"): CLASSES,
+    ("DinoRADE", "3"): CLASSES,
+    # Its Sedan of R+C+W is that of Table 3 to the last digit.
+    ("DinoRADE", "4"): CLASSES,
+}
+"""Classes of the detectors behind a table, which may print fewer."""
 
 
 def _read() -> list[PublishedRow]:

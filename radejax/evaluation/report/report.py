@@ -164,6 +164,7 @@ def collect(
     return {
         "run": options.run,
         "options": options.to_dict(),
+        "origin": dataclasses.asdict(measure.Origin.of(frames)),
         "num_frames": int(data.frame.size),
         "num_ground_truth": len(data.gt),
         "num_predictions": len(data.pred),
@@ -205,12 +206,22 @@ def all_tables(
 ) -> list[tables.Table]:
     """Beside the published ones, then every protocol and IoU threshold, then details."""
     table = tables.index(rows)
-    result = paper_tables.beside_published(table, options)
+    origin = measure.Origin(**metrics["origin"])
+    result = paper_tables.beside_published(table, options, origin)
     for space, iou in itertools.product(tables.SPACE_TITLES, options.iou_thresholds):
         result.append(tables.protocols_at_a_glance(table, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, options.iou_thresholds):
         result.append(tables.class_by_weather(table, options, protocol, iou))
-    return [*result, *tables.detail_tables(metrics)]
+    return _labelled([*result, *tables.detail_tables(metrics)], metrics)
+
+
+def _labelled(
+    built: list[tables.Table], metrics: Mapping[str, Any]
+) -> list[tables.Table]:
+    """The tables; those of simulated frames say so."""
+    if metrics["origin"]["is_simulated"]:
+        return [table.of_simulated() for table in built]
+    return built
 
 
 def console_text(
@@ -232,10 +243,12 @@ def console_text(
         tables.error_table(metrics["box_errors"]),
         tables.confusion_table(metrics["confusion"]),
     ]
+    kind = "simulated " if metrics["origin"]["is_simulated"] else ""
     parts = [
-        f"{options.run}: {metrics['num_frames']} frames, {metrics['num_ground_truth']}"
+        f"{options.run}: {metrics['num_frames']} {kind}frames, "
+        f"{metrics['num_ground_truth']}"
         f" objects, {metrics['num_predictions']} predictions\n",
-        *(built_table.render() for built_table in built),
+        *(built_table.render() for built_table in _labelled(built, metrics)),
         f"Intervals: {metrics['intervals']}\n",
         "Left out, or kept with a remark:",
         *(f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()),

@@ -44,11 +44,13 @@ class Table:
         title: One line that says what the numbers are.
         header: `[K]` column titles.
         rows: Rows of `K` strings or counts.
+        notes: Lines under the table.
     """
 
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str | int]]
+    notes: Sequence[str] = ()
 
     def render(self, style: str = "text") -> str:
         """As "text", "markdown" or "latex"."""
@@ -57,9 +59,15 @@ class Table:
             self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         if style == "latex":
-            return f"% {self.title}\n{body}\n"
+            below = "".join(f"% {note}\n" for note in self.notes)
+            return f"% {self.title}\n{body}\n{below}"
         title = f"**{self.title}**" if style == "markdown" else self.title
-        return f"{title}\n\n{body}\n"
+        below = "".join(f"\n{note}\n" for note in self.notes)
+        return f"{title}\n\n{body}\n{below}"
+
+    def of_simulated(self) -> Table:
+        """The same, saying that its numbers are of simulated data."""
+        return dataclasses.replace(self, title=f"Simulated data: {self.title}")
 
 
 def index(rows: Sequence[Measured]) -> dict[Key, Measured]:

@@ -52,6 +52,7 @@ def test_tables_from_frames():
         time="day",
         boxes=np.ones((2, 7)),
         classes=["Sedan", "Bicycle"],
+        is_simulated=False,
     )
     empty = types.SimpleNamespace(
         **{**vars(frame), "boxes": np.zeros((0, 7)), "classes": [], "weather": "rain"}

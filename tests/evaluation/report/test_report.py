@@ -13,6 +13,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.report import measure, paper_tables, report, tables
 from radejax.evaluation.report.measure import Options
+from radejax.evaluation.report.published import published_rows
 
 TERMS = {"roi": None, "plots": False}
 
@@ -138,7 +139,8 @@ def test_differences_are_ours_minus_theirs(written):
     made, _, _ = written
     table = tables.index(made.rows)
     options = Options(run="mine", **TERMS)
-    built = paper_tables.table_1(table, options)
+    theirs = published_rows("RADE-Net", "I", method="RADE-Net", space="3d")[0].terms
+    built = paper_tables.table_1(table, options, theirs)
     row = next(
         row
         for row in built.rows
