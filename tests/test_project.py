@@ -85,6 +85,23 @@ def test_the_citation_is_of_this_version() -> None:
     assert all(source[0]["value"] in readme for source in sources)
 
 
+def test_the_version_is_in_one_place_and_in_the_changelog() -> None:
+    assert PROJECT["project"]["dynamic"] == ["version"]
+    source = PROJECT["tool"]["setuptools"]["dynamic"]["version"]
+    assert source == {"attr": "radejax.__version__"}
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    first, second, *_ = re.findall(r"^## \[(.*)\]", changes, re.MULTILINE)
+    assert (first, second) == ("Unreleased", radejax.__version__)
+
+
+def test_the_changelog_is_in_keep_a_changelogs_order() -> None:
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    kinds = ["Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"]
+    for version in re.split(r"^## ", changes, flags=re.MULTILINE)[1:]:
+        found = re.findall(r"^### (.*)$", version, re.MULTILINE)
+        assert found == [kind for kind in kinds if kind in found], version[:20]
+
+
 def test_hooks_and_templates_are_yaml_with_what_github_wants() -> None:
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))
     names = [hook["id"] for repo in hooks["repos"] for hook in repo["hooks"]]
