@@ -23,7 +23,11 @@ from radejax.cli.evaluate import evaluate
 from radejax.core.config import load_config
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 PROGRAMS = ("python", "python3", "radejax", "pip", "pytest", "git", ".", "cd")
 
 HELP = "tests/test_documented_commands.py::test_a_script_explains_itself"
@@ -242,7 +246,7 @@ def test_every_kind_of_command_is_run_by_a_test() -> None:
 def test_the_place_that_runs_a_command_is_there(place: str) -> None:
     if place.startswith(".ci/run: "):
         lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-        assert any(line.startswith(place.removeprefix(".ci/run: ")) for line in lines)
+        assert any(line.strip().startswith(place[len(".ci/run: ") :]) for line in lines)
         return
     path, _, name = place.partition("::")
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))

@@ -53,9 +53,11 @@ def config_name(filename: str) -> str:
     return "-".join([pathlib.Path(path).stem, *filter(None, words.split(","))])
 
 
-def load_module(path: str | os.PathLike) -> types.ModuleType:
+def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
     """The module of a Python file that is in no package, such as a config file."""
     spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
+    assert spec is not None  # a file has both
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

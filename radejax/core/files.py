@@ -26,7 +26,7 @@ _LONG = 80  # characters of a value that a message shows
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """A temporary path to write to, which becomes `path` at the end of the block.
 
     Missing parent folders are made. After an error or a kill `path` is what it was;
@@ -55,24 +55,24 @@ def atomic_path(path: str | os.PathLike) -> Iterator[pathlib.Path]:
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike) -> Iterator[IO[bytes]]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     """As `atomic_path`: an open binary file that becomes `path`."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         yield file
 
 
-def write_text(path: str | os.PathLike, text: str) -> None:
+def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Writes a text file atomically."""
     with atomic_write(path) as file:
         file.write(text.encode("utf-8"))
 
 
-def write_json(path: str | os.PathLike, value: Any) -> None:
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Writes plain values as JSON, atomically."""
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def read_json(path: str | os.PathLike) -> Any:
+def read_json(path: str | os.PathLike[str]) -> Any:
     """Reads a JSON file.
 
     Raises:
@@ -131,7 +131,9 @@ def is_running(process: int) -> bool:
 
 
 @contextlib.contextmanager
-def disk_full(path: str | os.PathLike, message: str | None = None) -> Iterator[None]:
+def disk_full(
+    path: str | os.PathLike[str], message: str | None = None
+) -> Iterator[None]:
     """Turns errors on a full disk into one line; a `with` block or a decorator.
 
     Args:
@@ -168,7 +170,7 @@ def is_no_space(error: BaseException) -> bool:
 
 
 def claim(
-    path: str | os.PathLike,
+    path: str | os.PathLike[str],
     wanted: Mapping[str, Any],
     what: str,
     *,
@@ -250,7 +252,7 @@ def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
 
 
 @contextlib.contextmanager
-def lock(path: str | os.PathLike, message: str) -> Iterator[None]:
+def lock(path: str | os.PathLike[str], message: str) -> Iterator[None]:
     """Keeps other processes out of a block while one is in it.
 
     The system releases the lock however the process ends.

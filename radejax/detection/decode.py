@@ -6,6 +6,7 @@ use, and a count of the peaks that found no row.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 import chex
@@ -286,7 +287,8 @@ def _pad_rows(detections: Detections, count: int) -> Detections:
         widths = [(0, 0), (0, count)] + [(0, 0)] * (values.ndim - 2)
         return jnp.pad(values, widths, constant_values=fill)
 
-    return detections.replace(
+    return dataclasses.replace(
+        detections,
         boxes=pad(detections.boxes, 0),
         scores=pad(detections.scores, 0),
         classes=pad(detections.classes, -1),

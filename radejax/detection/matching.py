@@ -67,7 +67,7 @@ def match_boxes(
     chex.assert_shape(is_object, objects.shape[:1])
     iou = (bev_iou if space == "bev" else iou_3d)(predicted, objects)  # [K, N]
     allowed = is_predicted[:, None] & is_object[None, :] & (iou > iou_threshold)
-    if predicted_classes is not None:
+    if predicted_classes is not None and object_classes is not None:
         chex.assert_equal_shape([predicted_classes, is_predicted])
         chex.assert_equal_shape([object_classes, is_object])
         allowed &= predicted_classes[:, None] == object_classes[None, :]
@@ -82,7 +82,9 @@ def match_boxes(
 def _match_in_order(iou: jax.Array) -> Matches:
     """Greedy one-to-one matching, rows first come first served: `[K, N]`."""
 
-    def match_row(is_free: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple]:
+    def match_row(
+        is_free: jax.Array, row: jax.Array
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         row = jnp.where(is_free, row, 0.0)
         idx = jnp.argmax(row).astype(jnp.int32)
         best = row[idx]

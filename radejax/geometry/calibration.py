@@ -87,8 +87,9 @@ class CameraCalibration:
     translation_m: np.ndarray
     width: int = 1280
     height: int = 720
-    ego_from_lidar_m: np.ndarray = EGO_FROM_LIDAR_M
-    rectified: np.ndarray = KRADAR_RECTIFIED
+    # Arrays like the others once __post_init__ is through.
+    ego_from_lidar_m: np.ndarray = EGO_FROM_LIDAR_M  # type: ignore[assignment]
+    rectified: np.ndarray = KRADAR_RECTIFIED  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         shapes = {
@@ -298,7 +299,7 @@ class CameraCalibration:
 
     # Value semantics -----------------------------------------------------------------
 
-    def _key(self) -> tuple:
+    def _key(self) -> tuple[object, ...]:
         return tuple(
             v.tobytes() if isinstance(v, np.ndarray) else v
             for v in (getattr(self, f.name) for f in dataclasses.fields(self))

@@ -281,7 +281,7 @@ class RadarGrid:
 
     # Value semantics -----------------------------------------------------------------
 
-    def _key(self) -> tuple:
+    def _key(self) -> tuple[object, ...]:
         return tuple(
             v.tobytes() if isinstance(v, np.ndarray) else v
             for v in (getattr(self, f.name) for f in dataclasses.fields(self))
@@ -299,6 +299,6 @@ def _as_float(*values: Any) -> tuple[Any, ...]:
     xp = array_module(*values)
     if xp is np:
         return (np, *(np.asarray(v, np.float64) for v in values))
-    values = [xp.asarray(v) for v in values]
-    dtype = xp.promote_types(xp.result_type(*values), xp.float32)
-    return (xp, *(v.astype(dtype) for v in values))
+    arrays = [xp.asarray(v) for v in values]
+    dtype = xp.promote_types(xp.result_type(*arrays), xp.float32)
+    return (xp, *(v.astype(dtype) for v in arrays))

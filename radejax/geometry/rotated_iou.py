@@ -66,8 +66,7 @@ def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def bev_iou_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
     """Bird's-eye-view IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`."""
-    a, b = _footprint(jnp, _as_float32(a)), _footprint(jnp, _as_float32(b))
-    return _ratio(jnp, _intersection(jnp, a, b), a[2] * a[3], b[2] * b[3])
+    return _bev_iou(jnp, _as_float32(a), _as_float32(b))
 
 
 def iou_3d_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -104,12 +103,7 @@ def bev_iou_np(
     a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16
 ) -> np.ndarray:
     """Bird's-eye-view IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`."""
-
-    def iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        a, b = _footprint(np, a), _footprint(np, b)
-        return _ratio(np, _intersection(np, a, b), a[2] * a[3], b[2] * b[3])
-
-    return _by_chunks(iou, a, b, chunk_size)
+    return _by_chunks(lambda a, b: _bev_iou(np, a, b), a, b, chunk_size)
 
 
 def iou_3d_np(a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16) -> np.ndarray:
@@ -161,6 +155,11 @@ def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
     sin = boxes[..., 6] / divisor
     cos = xp.where(scale > 0, boxes[..., 7] / divisor, 1)
     return x, y, xp.maximum(length * scale, 0), xp.maximum(breadth * scale, 0), sin, cos
+
+
+def _bev_iou(xp: Any, a: Any, b: Any) -> Any:
+    a, b = _footprint(xp, a), _footprint(xp, b)
+    return _ratio(xp, _intersection(xp, a, b), a[2] * a[3], b[2] * b[3])
 
 
 def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:

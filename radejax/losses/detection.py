@@ -173,11 +173,7 @@ def _after_nms(
     )
     keep = suppress(peaks, nms.nms_iou)
 
-    def match(predicted, is_predicted, objects, is_object):
-        return match_boxes(
-            predicted, is_predicted, objects, is_object, iou_threshold=nms.match_iou
-        )
-
+    match = partial(match_boxes, iou_threshold=nms.match_iou)
     matches = jax.vmap(match)(peaks.boxes, keep, boxes, is_valid)
     wanted = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, matches.object_idx)
     params = _params_at(maps.box_params, peaks.cell)

@@ -34,6 +34,7 @@ import jax.numpy as jnp
 
 Root = Literal["eigh", "closed_form"]
 Transform = Literal["none", "sqrt", "log1p"]
+_Matrix = tuple[jax.Array, jax.Array, jax.Array]  # xx, xy, yy
 
 _SMALLEST_EIGENVALUE = 1e-12  # as released
 _SMOOTHING_M = 1e-6  # scale below which sqrt(d) is rounded off
@@ -225,13 +226,17 @@ def trace_of_root_2x2(xx: jax.Array, xy: jax.Array, yy: jax.Array) -> jax.Array:
 
 
 @trace_of_root_2x2.defjvp
-def _trace_of_root_2x2_jvp(primals: tuple, tangents: tuple) -> tuple:
+def _trace_of_root_2x2_jvp(
+    primals: _Matrix, tangents: _Matrix
+) -> tuple[jax.Array, jax.Array]:
     roots, cos, sin = _roots_and_axes(*primals)
     first, second = _diagonal_in_basis(*tangents, cos, sin)
     return roots[0] + roots[1], first / (2 * roots[0]) + second / (2 * roots[1])
 
 
-def _roots_and_axes(xx: jax.Array, xy: jax.Array, yy: jax.Array) -> tuple:
+def _roots_and_axes(
+    xx: jax.Array, xy: jax.Array, yy: jax.Array
+) -> tuple[list[jax.Array], jax.Array, jax.Array]:
     """Roots of the two eigenvalues, and the first eigenvector (cos, sin).
 
     One Jacobi rotation diagonalises a 2x2 matrix exactly, elementwise and without a

@@ -80,7 +80,9 @@ class Scatterers:
     amplitude: Any
 
 
-def window_response(x: jax.Array, pedestal: float, num_samples: float = 0.0):
+def window_response(
+    x: jax.Array, pedestal: float, num_samples: float = 0.0
+) -> jax.Array:
     """Zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
 
     With D the transform of the uniform window (the Dirichlet kernel of `num_samples`
@@ -97,7 +99,7 @@ def window_response(x: jax.Array, pedestal: float, num_samples: float = 0.0):
         Real amplitudes, shape of `x`.
     """
 
-    def dirichlet(t):
+    def dirichlet(t: jax.Array) -> jax.Array:
         if not num_samples:
             return jnp.sinc(t)
         small = jnp.sin(jnp.pi * t / num_samples)

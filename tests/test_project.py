@@ -1,0 +1,128 @@
+"""What a contributor meets first: pages, workflows and `.ci/run` say the same."""
+
+import pathlib
+import re
+import subprocess
+import tomllib
+
+import pytest
+import yaml
+
+import radejax
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+CI = ROOT / ".ci" / "run"
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def _parts() -> list[str]:
+    """The parts that `.ci/run` names."""
+    (line,) = re.findall(
+        r'^parts="(.*)"$', CI.read_text(encoding="utf-8"), re.MULTILINE
+    )
+    return line.split()
+
+
+def test_a_run_without_words_runs_every_part() -> None:
+    text = CI.read_text(encoding="utf-8")
+    functions = re.findall(r"^(\w+)\(\) \{$", text, re.MULTILINE)
+    assert functions == _parts()
+    everything = text[text.index("== fresh virtual environment") :].splitlines()
+    assert [line for line in everything if line in functions] == functions
+
+
+def test_an_unknown_part_is_refused_with_the_names_of_all() -> None:
+    done = subprocess.run(
+        ["bash", str(CI), "lnt"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr == f"no part 'lnt'; parts: {' '.join(_parts())}\n"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *WORKFLOWS,
+        ROOT / "CONTRIBUTING.md",
+        ROOT / ".github" / "pull_request_template.md",
+    ],
+    ids=lambda path: path.name,
+)
+def test_what_calls_the_ci_calls_parts_that_are_there(path: pathlib.Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    calls = re.findall(r"bash \.ci/run((?: \w+)+)(?:$|`)", text, re.MULTILINE)
+    assert calls
+    assert {word for call in calls for word in call.split()} <= set(_parts())
+
+
+def test_the_workflows_call_every_part_on_every_python() -> None:
+    jobs = [
+        job
+        for path in WORKFLOWS
+        for job in yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"].values()
+    ]
+    runs = " ".join(step.get("run", "") for job in jobs for step in job["steps"])
+    assert all(re.search(rf"\.ci/run[\w ]* {part}\b", runs) for part in _parts())
+    (matrix,) = [job["strategy"]["matrix"] for job in jobs if "strategy" in job]
+    versions = "Programming Language :: Python :: "
+    assert [versions + python for python in matrix["python"]] == [
+        line for line in PROJECT["project"]["classifiers"] if line.startswith(versions)
+    ]
+    assert matrix["dependencies"] == ["lowest", "newest"]
+    extras = set(re.findall(r"\.\[(\w+)\]|--extra (\w+)", runs))
+    names = {name for pair in extras for name in pair if name}
+    assert names <= set(PROJECT["project"]["optional-dependencies"])
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["version"] == radejax.__version__
+    assert citation["license"] == PROJECT["project"]["license"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    sources = [ref["identifiers"] for ref in citation["references"][1:]]
+    assert all(source[0]["value"] in readme for source in sources)
+
+
+def test_the_version_is_in_one_place_and_in_the_changelog() -> None:
+    assert PROJECT["project"]["dynamic"] == ["version"]
+    source = PROJECT["tool"]["setuptools"]["dynamic"]["version"]
+    assert source == {"attr": "radejax.__version__"}
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    first, second, *_ = re.findall(r"^## \[(.*)\]", changes, re.MULTILINE)
+    assert (first, second) == ("Unreleased", radejax.__version__)
+
+
+def test_the_changelog_is_in_keep_a_changelogs_order() -> None:
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    kinds = ["Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"]
+    for version in re.split(r"^## ", changes, flags=re.MULTILINE)[1:]:
+        found = re.findall(r"^### (.*)$", version, re.MULTILINE)
+        assert found == [kind for kind in kinds if kind in found], version[:20]
+
+
+def test_hooks_and_templates_are_yaml_with_what_github_wants() -> None:
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))
+    names = [hook["id"] for repo in hooks["repos"] for hook in repo["hooks"]]
+    assert {"ruff-check", "ruff-format", "nbstripout"} <= set(names)
+    templates = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"))
+    assert templates
+    for path in templates:
+        form = yaml.safe_load(path.read_text(encoding="utf-8"))
+        assert {"name", "description", "body"} <= set(form)
+        assert all(part["attributes"]["label"] for part in form["body"])
+
+
+def test_modules_excused_from_types_are_there_and_not_among_the_strict() -> None:
+    strict, excused = (
+        override["module"]
+        for override in PROJECT["tool"]["mypy"]["overrides"]
+        if "ignore_missing_imports" not in override
+    )
+    for module in excused:
+        path = ROOT / module.replace(".", "/")
+        assert path.with_suffix(".py").is_file() or path.is_dir(), module
+        assert not module.startswith(tuple(name.rstrip("*") for name in strict[1:]))
+    assert (ROOT / "radejax" / "py.typed").is_file()
+    assert "py.typed" in PROJECT["tool"]["setuptools"]["package-data"]["radejax"]
