@@ -23,6 +23,9 @@ LOG_OFFSET_DB = 1.2
 LOG_SCALE_DB = 184.3
 """p = (10 log10(power + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB."""
 
+MAX_LEVEL = 100.0
+"""Beyond any projection: float64's largest power is at 17, the floor at -0.54."""
+
 
 def project(tesseract: np.ndarray, *, dtype: Any = np.float32) -> np.ndarray:
     """Tensor max projection of one tesseract, in one pass over its memory.

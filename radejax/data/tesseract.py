@@ -16,7 +16,7 @@ from radejax.core.archives import DEFLATE_RATIO, read_npy
 from radejax.core.errors import DataError, UserError
 from radejax.data import mat5
 from radejax.data.kradar.frame import Frame
-from radejax.data.projection import project, project_columns
+from radejax.data.projection import MAX_LEVEL, project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -183,7 +183,7 @@ def read_projection_npy(
     Raises:
         FileNotFoundError: There is no such file.
         DataError: The file is truncated, damaged, of another shape or type, or has cells
-            that are not finite.
+            that are not finite or that no power gives.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -194,10 +194,11 @@ def read_projection_npy(
             f"{path}: expected floats [Doppler + elevation, range, azimuth], got "
             f"{stored.shape} of {stored.dtype}"
         )
-    if not np.isfinite(stored).all():
+    is_possible = np.abs(stored) <= MAX_LEVEL  # False for NaN
+    if not is_possible.all():
         raise DataError(
-            f"{path}: damaged, {int((~np.isfinite(stored)).sum())} of {stored.size} "
-            "cells are not finite"
+            f"{path}: damaged, {int((~is_possible).sum())} of {stored.size} cells are "
+            f"not finite or beyond {MAX_LEVEL:g}, which no power gives"
         )
     projection = np.ascontiguousarray(stored.transpose(1, 2, 0))
     if projection_shape is not None and projection.shape != tuple(projection_shape):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -27,6 +28,8 @@ from radejax.inference.open import (
     settings_of_config,
 )
 from radejax.inference.program import detect
+
+_log = logging.getLogger(__name__)
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
@@ -58,6 +61,8 @@ class Detector:
     Attributes:
         num_radar_alone: Frames that a radar-camera model has so far predicted without
             an image.
+        num_impossible: Frames in host memory that had a cell that no power gives (NaN,
+            infinite); their boxes mean nothing. The first is warned of.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
@@ -85,7 +90,7 @@ class Detector:
         self.model = model = model if dtype is None else models.with_dtype(model, dtype)
         self.takes_camera = models.has_camera(model)
         self.camera_options = camera_options
-        self.num_radar_alone = 0
+        self.num_radar_alone = self.num_impossible = 0
         self._lock = threading.Lock()
         self.grid = grid
         self.classes = tuple(classes)
@@ -238,6 +243,7 @@ class Detector:
         num_frames = frames.shape[0]
         if num_frames == 0:
             raise UserError("no frames: the batch is empty")
+        self._count_impossible(frames, is_tesseract)
         image, camera = self._camera_inputs(image, camera, num_frames)
         roi = roi if roi is not None else self.roi
         settings = (
@@ -339,6 +345,23 @@ class Detector:
             return found.replace(class_names=self.classes)
 
         return function
+
+    def _count_impossible(self, frames: Any, is_tesseract: bool) -> None:
+        """Counts frames with cells that no power gives; warns of the first."""
+        if count := detector_inputs.num_impossible(frames, is_tesseract):
+            with self._lock:
+                is_first, self.num_impossible = (
+                    not self.num_impossible,
+                    self.num_impossible + count,
+                )
+            if is_first:
+                _log.warning(
+                    "%d of %d frames have cells that are NaN, infinite or otherwise no "
+                    "radar power: their boxes mean nothing (further ones are counted in "
+                    "num_impossible)",
+                    count,
+                    len(frames),
+                )
 
     def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
         """Images and cameras as arrays; counts the frames without."""

@@ -16,6 +16,7 @@ import numpy as np
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions, no_camera
 from radejax.data.images import read_left_image
+from radejax.data.projection import MAX_LEVEL
 from radejax.data.tesseract import read_frame
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import Camera, stack_cameras
@@ -55,6 +56,24 @@ def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
         f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
         f"[B, {', '.join(map(str, tesseract))}]"
     )
+
+
+def num_impossible(frames: Any, is_tesseract: bool) -> int:
+    """Number of frames with a cell that no power gives, NaN for example.
+
+    Args:
+        frames: Of `radar_batch`. Arrays on a device are not looked at, 0: that would
+            wait for them.
+        is_tesseract: Linear power, finite and not negative; otherwise levels.
+    """
+    if not isinstance(frames, np.ndarray):
+        return 0
+    axes = tuple(range(1, frames.ndim))
+    low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
+    limits = (
+        (0.0, np.finfo(np.float32).max) if is_tesseract else (-MAX_LEVEL, MAX_LEVEL)
+    )
+    return int((~((low >= limits[0]) & (high <= limits[1]))).sum())
 
 
 def _stack_frames(frames: Sequence[Any], grid: RadarGrid) -> np.ndarray:

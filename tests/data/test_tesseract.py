@@ -255,9 +255,10 @@ def test_released_projections(tmp_path, tesseract, dtype):
 
 def test_bad_released_projections(tmp_path):
     path = tmp_path / "p.npy"
-    np.save(path, np.full((7, 6, 5), np.nan))
-    with pytest.raises(DataError, match="210 of 210 cells are not finite"):
-        read_projection_npy(path)
+    for value in (np.nan, -np.inf, 1e38):
+        np.save(path, np.where(np.arange(210).reshape(7, 6, 5) == 9, value, 0.5))
+        with pytest.raises(DataError, match="1 of 210 cells are not finite or beyond"):
+            read_projection_npy(path)
     path.unlink()
     with pytest.raises(FileNotFoundError, match="no such projection"):
         read_projection_npy(path)

@@ -238,3 +238,20 @@ def test_detections_carry_the_names_of_their_detector(
     assert as_objects(jax.tree.map(lambda x: x[0], found)).names[0] == names[index]
     assert found.to_list(CLASSES)[0][0]["cls"] == CLASSES[index]
     assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
+def test_impossible_cells_are_counted_and_told_once(
+    detector: Detector, projections: np.ndarray, caplog: Any, value: float
+) -> None:
+    detector = detector.with_batch_sizes((1, 4))
+    frames = projections[:3].copy()
+    detector(frames)
+    assert detector.num_impossible == 0
+    frames[1, 2, 3, 1] = value
+    for _ in range(2):
+        detector(frames)
+    assert detector.num_impossible == 2
+    warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert [w for w in warnings if "1 of 3 frames have cells" in w] == warnings[:1]
+    assert len(warnings) == 1
