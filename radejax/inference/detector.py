@@ -52,9 +52,11 @@ class Detector:
         azimuth_mapping: "true", or "stretched" for official checkpoints.
         score_threshold: Default of calls.
         nms_iou: Default of calls.
-        roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, or None.
+        roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, "narrow",
+            "wide" or None.
         batch_sizes: Sizes that are compiled.
-        device: Where to run; JAX's default device if None.
+        device: Where to run: a device or a platform, "cpu" or "gpu"; JAX's default
+            device if None.
         dtype: Of the computation, "float32" or "bfloat16"; the model's own if None.
         camera_options: How calibrations are used by a radar-camera model.
 
@@ -81,9 +83,9 @@ class Detector:
         azimuth_mapping: str = "true",
         score_threshold: float = 0.3,
         nms_iou: float = 0.3,
-        roi: Sequence[float] | None = None,
+        roi: Sequence[float] | str | None = None,
         batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
-        device: jax.Device | None = None,
+        device: jax.Device | str | None = None,
         dtype: str | None = None,
         camera_options: CameraOptions = CameraOptions(),  # noqa: B008, frozen
     ) -> None:
@@ -96,12 +98,14 @@ class Detector:
         self.classes = tuple(classes)
         self.score_threshold = score_threshold
         self.nms_iou = nms_iou
-        self.device = device if device is not None else jax.devices()[0]
+        self.step: int | None = None
+        self.device = detector_inputs.named_device(device)
         self.variables = jax.device_put(variables, self.device)
-        self._batch_sizes = tuple(sorted(batch_sizes))
+        self._batch_sizes = detector_inputs.checked_sizes(batch_sizes)
         self.azimuth_mapping = azimuth_mapping
         self.decode_options = {"max_detections": 100, **(decode_options or {})}
-        self.roi = self.decode_options.get("roi") if roi is None else roi
+        roi = self.decode_options.get("roi") if roi is None else roi
+        self.roi = detector_inputs.named_region(roi)
         self._run = jax.jit(self.detect_function(), static_argnames="is_tesseract")
 
     # Construction --------------------------------------------------------------------
@@ -110,7 +114,16 @@ class Detector:
     def from_loaded(cls, loaded: LoadedModel, **overrides: Any) -> Detector:
         """Detector of what `radejax.inference.open.load` returned."""
         settings = {**loaded.settings, **overrides}
-        return cls(loaded.model, loaded.variables, loaded.grid, **settings)
+        detector = cls(loaded.model, loaded.variables, loaded.grid, **settings)
+        detector.step = loaded.step
+        return detector
+
+    def __repr__(self) -> str:
+        grid = " x ".join(map(str, self.grid.shape_drea))
+        return (
+            f"Detector({type(self.model).__name__}, grid {grid}, classes "
+            f"{', '.join(self.classes)}, step {self.step}, on {self.device})"
+        )
 
     @classmethod
     def from_workdir(
@@ -209,7 +222,7 @@ class Detector:
         *,
         score_threshold: float | None = None,
         nms_iou: float | None = None,
-        roi: Sequence[float] | None = None,
+        roi: Sequence[float] | str | None = None,
     ) -> Detections:
         """Finds the objects in one frame or many.
 
@@ -245,7 +258,7 @@ class Detector:
             raise UserError("no frames: the batch is empty")
         self._count_impossible(frames, is_tesseract)
         image, camera = self._camera_inputs(image, camera, num_frames)
-        roi = roi if roi is not None else self.roi
+        roi = self.roi if roi is None else detector_inputs.named_region(roi)
         settings = (
             np.float32(
                 self.score_threshold if score_threshold is None else score_threshold
@@ -292,7 +305,7 @@ class Detector:
     def with_batch_sizes(self, batch_sizes: Sequence[int]) -> Detector:
         """The same detector compiling other batch sizes; weights are shared."""
         other = copy.copy(self)
-        other._batch_sizes = tuple(sorted(batch_sizes))
+        other._batch_sizes = detector_inputs.checked_sizes(batch_sizes)
         return other
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from radejax.core.errors import UserError
+from radejax.core.structures import NARROW_ROI, WIDE_ROI
 from radejax.data.cameras import CameraOptions, no_camera
 from radejax.data.images import read_left_image
 from radejax.data.projection import MAX_LEVEL
@@ -262,3 +263,29 @@ def _one_camera(camera: Any, options: CameraOptions) -> Camera:
 def _check_count(what: str, found: int, expected: int) -> None:
     if found != expected:
         raise UserError(f"{found} {what} for {expected} frames")
+
+
+def named_region(roi: Sequence[float] | str | None) -> Sequence[float] | None:
+    """Limits of a region that may be named."""
+    named = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
+    if isinstance(roi, str) and roi in named:
+        return named[roi]
+    if roi is not None and (isinstance(roi, str) or len(roi) != 6):
+        raise UserError(f"roi {roi!r}, expected narrow, wide or x0, x1, y0, y1, z0, z1")
+    return roi
+
+
+def named_device(device: jax.Device | str | None) -> jax.Device:
+    """A device that may be named by its platform."""
+    try:
+        return jax.devices(device)[0] if not isinstance(device, jax.Device) else device
+    except RuntimeError as error:
+        there = ", ".join(sorted({d.platform for d in jax.devices()}))
+        raise UserError(f"device {device!r} is not there, found {there}") from error
+
+
+def checked_sizes(sizes: Sequence[int]) -> tuple[int, ...]:
+    """Batch sizes in order; `UserError` for none, or one that is not positive."""
+    if not sizes or min(sizes) < 1:
+        raise UserError(f"batch_sizes {tuple(sizes)}, expected numbers of at least 1")
+    return tuple(sorted(sizes))

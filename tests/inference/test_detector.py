@@ -9,13 +9,16 @@ import pytest
 
 from radejax import Detector, UserError, models
 from radejax.core.config import base_config
-from radejax.core.structures import CLASSES
+from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import write
 from radejax.data.projection import project
 from radejax.evaluation.files.kitti import prediction_texts
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.packed import LoadedModel
 from radejax.interop import dinorade_torch
 from radejax.visualize.canvas import as_objects
+
+from .. import small_models as small
 
 
 @pytest.fixture(scope="module")
@@ -255,3 +258,28 @@ def test_impossible_cells_are_counted_and_told_once(
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert [w for w in warnings if "1 of 3 frames have cells" in w] == warnings[:1]
     assert len(warnings) == 1
+
+
+def test_arguments_by_name_and_wrong_ones() -> None:
+    detector = small.detector(roi="narrow", device="cpu")
+    assert tuple(detector.roi) == tuple(NARROW_ROI)
+    assert detector.device.platform == "cpu"
+    assert repr(detector).startswith("Detector(RadeNet, grid ")
+    assert "classes Sedan" in repr(detector)
+    loaded = LoadedModel(
+        detector.model,
+        detector.variables,
+        detector.grid,
+        {"classes": detector.classes},
+        step=7,
+    )
+    assert "step 7" in repr(Detector.from_loaded(loaded))
+    for wrong, message in (
+        ({"roi": "middle"}, "roi 'middle', expected narrow, wide or x0"),
+        ({"roi": (0, 1)}, r"roi \(0, 1\), expected narrow"),
+        ({"device": "abacus"}, "device 'abacus' is not there, found cpu"),
+        ({"batch_sizes": (0,)}, r"batch_sizes \(0,\), expected numbers of at least 1"),
+        ({"batch_sizes": ()}, r"batch_sizes \(\), expected"),
+    ):
+        with pytest.raises(UserError, match=message):
+            small.detector(**wrong)
