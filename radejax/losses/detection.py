@@ -30,12 +30,16 @@ class AfterNms(NamedTuple):
         score_threshold: Peaks must score above it.
         nms_iou: Overlap that suppresses.
         match_iou: A box has an object where they overlap more than this.
+        threshold_inclusive: Peaks that score exactly the threshold count too.
+        per_class: Only boxes of the same class suppress each other.
     """
 
     max_peaks: int = 128
     score_threshold: float | jax.Array = 0.3
     nms_iou: float | jax.Array = 0.3
     match_iou: float | jax.Array = 0.0
+    threshold_inclusive: bool = False
+    per_class: bool = False
 
 
 def detection_loss(
@@ -209,9 +213,10 @@ def _after_nms(
         grid,
         max_peaks=nms.max_peaks,
         score_threshold=nms.score_threshold,
+        threshold_inclusive=nms.threshold_inclusive,
         z0_m=z0_m,
     )
-    keep = suppress(peaks, nms.nms_iou)
+    keep = suppress(peaks, nms.nms_iou, per_class=nms.per_class)
 
     def match(predicted, is_predicted, objects, is_object):
         return match_boxes(
