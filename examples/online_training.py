@@ -26,6 +26,7 @@ from radejax.cli import entry
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.runs.experiment import loss_options
 from radejax.runs.workdir import checkpoint_info, claimed
 from radejax.simulation.config import plain
 from radejax.training import loop, sharding
@@ -97,7 +98,7 @@ def train_online(
             workdir,
             Plan(
                 options=config.train,
-                loss=config.loss,
+                loss=loss_options(config),
                 watch=config.watch,
                 seed=config.seed,
                 info=checkpoint_info(

@@ -131,7 +131,7 @@ def _loss() -> ConfigDict:
             "gwd_transform": "sqrt",  # "none", "log1p"
             "gwd_tau": 1.65,
             "normalize_yaw": False,
-            "matching": "center",  # "nms"
+            "matching": "center",  # "nms", with the thresholds of `decode`
             "weights": (2.0, 1.0, 1.0),  # focal, GWD, smooth L1
             "normalize": True,  # divide each part by its own value
             # Boxes are z0 + dz. The paper prints no value for its sensor height.

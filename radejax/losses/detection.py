@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -15,6 +16,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import Sigma, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
+_LOSSES = ("focal", "gwd", "smooth_l1")
 Matching = Literal["center", "nms"]
 Pairs = tuple[jax.Array, jax.Array, jax.Array]
 """Predictions and their objects, `[B, N, 8]` each, and where they count, `[B, N]`."""
@@ -28,12 +30,16 @@ class AfterNms(NamedTuple):
         score_threshold: Peaks must score above it.
         nms_iou: Overlap that suppresses.
         match_iou: A box has an object where they overlap more than this.
+        threshold_inclusive: Peaks that score exactly the threshold count too.
+        per_class: Only boxes of the same class suppress each other.
     """
 
     max_peaks: int = 128
     score_threshold: float | jax.Array = 0.3
     nms_iou: float | jax.Array = 0.3
     match_iou: float | jax.Array = 0.0
+    threshold_inclusive: bool = False
+    per_class: bool = False
 
 
 def detection_loss(
@@ -47,7 +53,7 @@ def detection_loss(
     gwd_tau: float = 1.65,
     normalize_yaw: bool = False,
     matching: Matching = "center",
-    weights: tuple[float, float, float] = (2.0, 1.0, 1.0),
+    weights: Sequence[float] | jax.Array = (2.0, 1.0, 1.0),
     normalize: bool = True,
     z0_m: float | jax.Array = 0.0,
     is_frame_valid: jax.Array | None = None,
@@ -118,6 +124,44 @@ def detection_loss(
     return total, parts
 
 
+def whole_batch_loss(
+    parts: dict[str, jax.Array],
+    num_bins: int | jax.Array,
+    weights: Sequence[float] = (2.0, 1.0, 1.0),
+    normalize: bool = True,
+) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+    """The loss of a batch from those of its equal parts, and how parts sum to it.
+
+    A part divides by its own positive bins and loss values, the batch by those of all.
+
+    Args:
+        parts: `[P]` each, what `detection_loss` gives beside the total for every part.
+        num_bins: Of the heatmaps of one part; counts where it has no positive bin.
+        weights: As for `detection_loss`.
+        normalize: Likewise.
+
+    Returns:
+        `[P, 3]` weights: the mean over the parts of their losses, so weighted and not
+        normalised, has the gradient of the batch. Then what `detection_loss` gives for
+        the batch: total and its parts.
+    """
+    positive = parts["num_positive"].astype(jnp.float32)
+    of_part = jnp.where(positive > 0, positive, num_bins)
+    mean = jnp.mean(positive)
+    share = of_part / jnp.where(mean > 0, mean, num_bins)
+    shares = jnp.stack([share, jnp.ones_like(share), jnp.ones_like(share)], axis=-1)
+    losses = jnp.stack([parts[name] for name in _LOSSES], axis=-1)
+    values = jnp.mean(losses * shares, axis=0)
+    whole = dict(zip(_LOSSES, values, strict=True))
+    scale = jnp.asarray(weights, jnp.float32)
+    if normalize:
+        scale = scale / jnp.where(values > 0, values, 1.0)
+    total = _weighted_sum(whole, weights, normalize)
+    whole["weighted_sum"] = _weighted_sum(whole, weights, False)
+    counts = {k: jnp.sum(v, axis=0) for k, v in parts.items() if k.startswith("num_")}
+    return shares * scale[None], total, whole | counts
+
+
 def _objects(
     batch: Batch, is_frame_valid: jax.Array | None
 ) -> tuple[jax.Array, jax.Array]:
@@ -169,9 +213,10 @@ def _after_nms(
         grid,
         max_peaks=nms.max_peaks,
         score_threshold=nms.score_threshold,
+        threshold_inclusive=nms.threshold_inclusive,
         z0_m=z0_m,
     )
-    keep = suppress(peaks, nms.nms_iou)
+    keep = suppress(peaks, nms.nms_iou, per_class=nms.per_class)
 
     match = partial(match_boxes, iou_threshold=nms.match_iou)
     matches = jax.vmap(match)(peaks.boxes, keep, boxes, is_valid)
@@ -215,10 +260,10 @@ def _mean_of_frames(
 
 
 def _weighted_sum(
-    parts: dict[str, jax.Array], weights: tuple[float, float, float], normalize: bool
+    parts: dict[str, jax.Array], weights: Sequence[float] | jax.Array, normalize: bool
 ) -> jax.Array:
     total = jnp.zeros((), jnp.float32)
-    for weight, name in zip(weights, ("focal", "gwd", "smooth_l1"), strict=True):
+    for weight, name in zip(weights, _LOSSES, strict=True):
         part = parts[name]
         if normalize:
             constant = jax.lax.stop_gradient(part)

@@ -17,6 +17,7 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar import Frame
 from radejax.inference.open import PathLike, StartingWeights, starting_weights
+from radejax.losses.detection import AfterNms
 from radejax.runs import check_config
 from radejax.runs.data import Data, Sources, open_data
 from radejax.runs.evaluate import evaluate
@@ -140,7 +141,7 @@ def train(
         folder,
         Plan(
             options=config.train,
-            loss=config.loss,
+            loss=loss_options(config),
             watch=config.watch,
             seed=config.seed,
             info=checkpoint_info(
@@ -153,6 +154,21 @@ def train(
         ),
         evaluate=validation,
     )
+
+
+def loss_options(config: ConfigDict) -> dict[str, Any]:
+    """Keyword arguments of `detection_loss`.
+
+    Boxes that "nms" compares with objects are those that decoding would find.
+    """
+    decode = config.decode
+    nms = AfterNms(
+        score_threshold=decode.score_threshold,
+        threshold_inclusive=decode.threshold_inclusive,
+        nms_iou=decode.nms_iou,
+        per_class=decode.per_class_nms,
+    )
+    return {**config.loss, "nms": nms}
 
 
 def _what_stays(frames: Sequence[Frame], weights: StartingWeights) -> dict[str, Any]:

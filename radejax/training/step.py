@@ -14,7 +14,7 @@ import optax
 from radejax.core.structures import Batch
 from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import detection_loss
+from radejax.losses.detection import detection_loss, whole_batch_loss
 from radejax.training.state import TrainState, merge_parameters
 
 Metrics = dict[str, jax.Array]
@@ -39,8 +39,9 @@ def make_train_step(
         optimizer: From `make_optimizer`.
         grid: Grid of the model's maps.
         loss: Keyword arguments of `detection_loss`.
-        num_accumulate: The batch is cut into this many parts whose gradients are
-            averaged, for batches that do not fit at once.
+        num_accumulate: The batch is cut into this many parts, one after the other, for
+            batches that do not fit at once. Their gradients sum to the batch's: what
+            it divides by comes from a forward pass over all parts first.
         ema_decay: Decay of the parameters' moving average, or None.
 
     Returns:
@@ -49,19 +50,22 @@ def make_train_step(
     """
 
     def loss_of_part(
-        params: Any, frozen: Any, model_state: Any, part: Batch, rng: jax.Array
-    ) -> tuple[jax.Array, tuple[Any, Metrics]]:
+        params: Any,
+        state: TrainState,
+        model_state: Any,
+        part: Batch,
+        rng: jax.Array,
+        **changed: Any,
+    ) -> tuple[jax.Array, tuple[Any, Metrics, int]]:
         maps, updates = model.apply(
-            {"params": merge_parameters(params, frozen), **model_state},
+            {"params": merge_parameters(params, state.frozen), **model_state},
             *model_inputs(part),
             train=True,
             rngs={"dropout": rng},
             mutable=list(model_state),
         )
-        total, parts = detection_loss(maps, part, grid, **loss)
-        return total, (updates, {"loss": total, **parts})
-
-    gradient = jax.value_and_grad(loss_of_part, has_aux=True)
+        total, parts = detection_loss(maps, part, grid, **{**loss, **changed})
+        return total, (updates, parts, maps.heatmap_logits.size)
 
     def step(
         state: TrainState, batch: Batch, rng: jax.Array
@@ -69,7 +73,7 @@ def make_train_step(
         chex.assert_tree_shape_prefix(batch, batch.frame.shape)
         rng = jax.random.fold_in(rng, state.step)
         grads, model_state, metrics = _accumulate(
-            gradient, num_accumulate, state, batch, rng
+            loss_of_part, loss, num_accumulate, state, batch, rng
         )
         grad_norm = optax.global_norm(grads)
         is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(metrics["loss"])
@@ -96,33 +100,48 @@ def make_train_step(
 
 
 def _accumulate(
-    gradient: Callable, num_parts: int, state: TrainState, batch: Batch, rng: jax.Array
+    loss_of_part: Callable,
+    loss: Mapping[str, Any],
+    num_parts: int,
+    state: TrainState,
+    batch: Batch,
+    rng: jax.Array,
 ) -> tuple[Any, Any, Metrics]:
     """Gradients of a batch, cut into parts, and what its forward pass gives beside."""
+    gradient = jax.value_and_grad(loss_of_part, has_aux=True)
     if num_parts == 1:
-        (_, aux), grads = gradient(
-            state.params, state.frozen, state.model_state, batch, rng
+        (total, (model_state, metrics, _)), grads = gradient(
+            state.params, state, state.model_state, batch, rng
         )
-        return grads, *aux
+        return grads, model_state, {"loss": total, **metrics}
 
-    def body(carry: Any, part_and_rng: Any) -> Any:
-        model_state, total = carry
-        part, part_rng = part_and_rng
-        (_, (model_state, parts)), grads = gradient(
-            state.params, state.frozen, model_state, part, part_rng
+    def measure(_: None, part_and_rng: Any) -> Any:
+        _, (_, parts, num_bins) = loss_of_part(
+            state.params, state, state.model_state, *part_and_rng
         )
-        return (model_state, jax.tree.map(jnp.add, total, grads)), parts
+        return None, (parts, num_bins)
 
-    split = split_batch(batch, num_parts)
+    def add(carry: Any, part_rng_and_weights: Any) -> Any:
+        (model_state, total), (part, part_rng, weights) = carry, part_rng_and_weights
+        (_, (model_state, _, _)), grads = gradient(
+            state.params,
+            state,
+            model_state,
+            part,
+            part_rng,
+            weights=weights,
+            normalize=False,
+        )
+        return (model_state, jax.tree.map(jnp.add, total, grads)), None
+
+    split = split_batch(batch, num_parts), jax.random.split(rng, num_parts)
+    _, (parts, num_bins) = jax.lax.scan(measure, None, split)
+    options = {name: loss[name] for name in ("weights", "normalize") if name in loss}
+    weights, total, metrics = whole_batch_loss(parts, num_bins, **options)
     start = state.model_state, jax.tree.map(jnp.zeros_like, state.params)
-    rngs = jax.random.split(rng, num_parts)
-    (model_state, grads), parts = jax.lax.scan(body, start, (split, rngs))
+    (model_state, grads), _ = jax.lax.scan(add, start, (*split, weights))
     grads = jax.tree.map(lambda g: g / num_parts, grads)
-    metrics = {
-        name: p.mean(0) if jnp.issubdtype(p.dtype, jnp.floating) else p.sum(0)
-        for name, p in parts.items()  # numbers of objects and boxes are sums
-    }
-    return grads, model_state, metrics
+    return grads, model_state, {"loss": total, **metrics}
 
 
 def _taken_if(

@@ -395,6 +395,35 @@ def test_suppressed_peaks_are_not_matched():
     assert int(parts["num_matched"]) < int(every["num_matched"])
 
 
+@pytest.mark.parametrize(
+    ("changes", "num_matched"),
+    [
+        ({}, 0),
+        ({"threshold_inclusive": True}, 2),
+        ({"score_threshold": 0.4}, 2),
+        ({"score_threshold": 0.4, "nms_iou": 0.05}, 1),
+        ({"score_threshold": 0.4, "nms_iou": 0.05, "per_class": True}, 2),
+    ],
+)
+def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
+    # Two boxes 8 m long and 5.1 m apart, of other classes and with a score of 0.5.
+    logits = np.full((1, 24, 16, 2), -9.0, np.float32)
+    params = np.zeros((1, 24, 16, 8), np.float32)
+    boxes = np.zeros((1, 2, 8), np.float32)
+    for row, cell in enumerate(((10, 8), (11, 8))):
+        logits[0, *cell, row] = 0.0
+        boxes[0, row, :2] = GRID.cell_to_ego(*cell)
+    for array in (params, boxes):
+        array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
+    batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))
+    nms = AfterNms(**{"score_threshold": 0.5, **changes})
+    maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
+    _, parts = jax.jit(
+        lambda maps: detection_loss(maps, batch, GRID, matching="nms", nms=nms)
+    )(maps)
+    assert int(parts["num_matched"]) == num_matched
+
+
 def test_gradient_descent_finds_the_objects():
     maps, batch = small_scene(np.random.default_rng(7))
     optimizer = optax.adam(0.1)

@@ -12,6 +12,7 @@ from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.inference.open import StartingWeights
+from radejax.losses.detection import AfterNms
 from radejax.runs import experiment
 from radejax.runs.data import Sources
 from radejax.runs.workdir import claimed
@@ -39,10 +40,11 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    said_before = []
+    said_before, plans = [], []
 
-    def train(*_: Any, **__: Any) -> SimpleNamespace:
+    def train(*args: Any, **__: Any) -> SimpleNamespace:
         said_before.append(caplog.text)
+        plans.append(args[-1])
         return SimpleNamespace(finished=True, step=1)
 
     simulation = default_config()
@@ -51,6 +53,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     root = simulate_dataset(simulation, tmp_path / "data", progress=False)
     config = base_config()
     config.train.batch_size = 2
+    config.decode.update(score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False)
     monkeypatch.setattr(loop, "train", train)
     mesh = sharding.make_mesh(1)
     monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
@@ -59,6 +62,11 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     )
     assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
+    # What NMS chooses for the loss is what decoding finds.
+    expected = AfterNms(
+        score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False, per_class=False
+    )
+    assert plans[0].loss["nms"] == expected
 
 
 def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:

@@ -152,20 +152,6 @@ def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> Non
     chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
 
 
-@pytest.fixture(scope="module")
-def parts(tiny: Tiny, plain: Any) -> tuple[Any, Any]:
-    """Mean of the parameters after a plain step with each part, and their metrics."""
-    optimizer, state, _ = plain
-    small = state.replace(skipped_frames=state.skipped_frames[:4])
-    one = jax.jit(_make(tiny, optimizer))
-    batch = _batch(tiny, 8)
-    taken = [
-        one(small, jax.tree.map(lambda x, i=i: x[i::2], batch), RNG) for i in (0, 1)
-    ]
-    params = [after.params for after, _ in taken]
-    return jax.tree.map(lambda a, b: (a + b) / 2, *params), [m for _, m in taken]
-
-
 def test_parts_of_a_batch_stay_on_their_devices(tiny: Tiny) -> None:
     batch = sharding.put_batch(_batch(tiny, 8), sharding.make_mesh(4))
     split = jax.jit(lambda x: split_batch(x, 2)).lower(batch).compile()
@@ -176,29 +162,47 @@ def test_parts_of_a_batch_stay_on_their_devices(tiny: Tiny) -> None:
     np.testing.assert_array_equal(placed, [[0, 2, 4, 6], [1, 3, 5, 7]])
 
 
-@pytest.mark.parametrize("num_devices", [1, pytest.param(4, marks=pytest.mark.slow)])
-def test_accumulation_averages_the_gradients_of_the_parts(
-    num_devices: int, tiny: Tiny, plain: Any, parts: Any
+@pytest.mark.parametrize(
+    ("num_devices", "num_parts", "normalize"),
+    [
+        (1, 4, True),
+        (1, 2, False),
+        pytest.param(4, 2, True, marks=pytest.mark.slow),
+    ],
+)
+def test_accumulated_gradients_are_those_of_the_undivided_batch(
+    num_devices: int, num_parts: int, normalize: bool, tiny: Tiny, plain: Any
 ) -> None:
     optimizer, state, _ = plain
+    batch = _batch(tiny, 8)
+    # Parts of other numbers of objects, one without any.
+    is_valid = np.array(batch.is_valid)
+    is_valid[1::num_parts] = False
+    is_valid[0, 1] = False
+    batch = batch.replace(is_valid=is_valid)
+    options = dict(tiny.config.loss) | {"normalize": normalize}
+    whole, parts = (
+        make_train_step(
+            tiny.model, optimizer, tiny.map_grid, loss=options, num_accumulate=count
+        )
+        for count in (1, num_parts)
+    )
+    expected, expected_metrics = jax.jit(whole)(state, batch, RNG)
     mesh = sharding.make_mesh(num_devices)
     everywhere = sharding.replicated(mesh)
-    step = jax.jit(
-        _make(tiny, optimizer, num_accumulate=2), out_shardings=(everywhere, everywhere)
-    )
-    arguments = (
+    after, metrics = jax.jit(parts, out_shardings=(everywhere, everywhere))(
         jax.device_put(state, everywhere),
-        sharding.put_batch(_batch(tiny, 8), mesh),
+        sharding.put_batch(batch, mesh),
         jax.device_put(RNG, everywhere),
     )
-    after, metrics = step(*arguments)
-    chex.assert_trees_all_close(after.params, parts[0], rtol=1e-4, atol=1e-6)
-    for name in ("focal", "gwd", "smooth_l1"):
-        mean = np.mean([float(m[name]) for m in parts[1]])
-        np.testing.assert_allclose(float(metrics[name]), mean, rtol=1e-4)
-    for name in ("num_objects", "num_positive", "num_matched"):
-        assert int(metrics[name]) == sum(int(m[name]) for m in parts[1])
-    assert int(metrics["num_objects"]) == 16
+    gradients = [
+        jax.tree.map(lambda new, old: (old - new) / 0.1, new.params, state.params)
+        for new in (after, expected)
+    ]
+    largest = max(float(abs(g).max()) for g in jax.tree.leaves(gradients[1]))
+    chex.assert_trees_all_close(*gradients, rtol=1e-5, atol=2e-6 * largest)
+    chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-5)
+    assert int(metrics["num_objects"]) == is_valid.sum()
 
 
 def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(
