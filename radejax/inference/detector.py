@@ -274,7 +274,9 @@ class Detector:
             )
             count = chunk[0].shape[0]
             size = next(s for s in self._batch_sizes if s >= count)
-            chunk = jax.tree.map(lambda x, s=size: _pad_batch(x, s), chunk)
+            chunk = jax.tree.map(
+                lambda x, s=size: detector_inputs.pad_batch(x, s), chunk
+            )
             chunk = jax.tree.map(self._to_device, chunk)
             found = self._run(
                 self.variables, *chunk, *settings, is_tesseract=is_tesseract
@@ -401,12 +403,3 @@ class Detector:
         if self.device.platform == "cpu":
             return jax.device_put(x.copy(), self.device)
         return jax.block_until_ready(jax.device_put(x, self.device))
-
-
-def _pad_batch(x: Any, size: int) -> Any:
-    """Repeats the last frame up to a batch size."""
-    missing = size - x.shape[0]
-    if missing == 0:
-        return x
-    xp = np if isinstance(x, np.ndarray) else jnp
-    return xp.concatenate([x, xp.repeat(x[-1:], missing, 0)])

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.errors import UserError
@@ -289,3 +290,12 @@ def checked_sizes(sizes: Sequence[int]) -> tuple[int, ...]:
     if not sizes or min(sizes) < 1:
         raise UserError(f"batch_sizes {tuple(sizes)}, expected numbers of at least 1")
     return tuple(sorted(sizes))
+
+
+def pad_batch(x: Any, size: int) -> Any:
+    """Repeats the last frame up to a batch size."""
+    missing = size - x.shape[0]
+    if missing == 0:
+        return x
+    xp = np if isinstance(x, np.ndarray) else jnp
+    return xp.concatenate([x, xp.repeat(x[-1:], missing, 0)])

@@ -13,6 +13,7 @@ from ml_collections import ConfigDict
 
 from radejax.core.errors import UserError
 from radejax.data.kradar.labels import AVAILABILITY_FLAGS, LABEL_CLASSES, VERSIONS
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.runs.validation import check_best_metric
 from radejax.simulation.config import SimulationConfig
@@ -77,6 +78,15 @@ def _several(rule: Rule, count: int | None = None, *, distinct: bool = False) ->
     size = "one or more" if count is None else f"{count}"
     names = ", different from each other" * distinct
     return Rule(f"a tuple of {size}{names}, each {rule.expected}", holds)
+
+
+def _some(rule: Rule) -> Rule:
+    """A tuple or list of different entries, or () for all."""
+    several = _several(rule, distinct=True)
+    return Rule(
+        f"{several.expected}; () for all",
+        lambda value: value in ((), []) or several.holds(value),
+    )
 
 
 def _or_none(rule: Rule) -> Rule:
@@ -168,11 +178,14 @@ RULES: dict[str, Rule] = {
     "decode.threshold_inclusive": _BOOL,
     "decode.nms_iou": _SHARE,
     "decode.per_class_nms": _BOOL,
+    "decode.roi": _or_none(_several(_number(), 6)),
+    "decode.raw_yaw": _one_of("nms", "always", "never"),
     "train.batch_size": _COUNT,
     "train.num_epochs": _COUNT,
     "train.learning_rate": _POSITIVE,
     "train.final_learning_rate": _NOT_NEGATIVE,
     "train.weight_decay": _NOT_NEGATIVE,
+    "train.schedule": _one_of("cosine", "cyclic_cosine"),
     "train.warmup_steps": _COUNT_OR_0,
     "train.gradient_clip_norm": _or_none(_POSITIVE),
     "train.ema_decay": _or_none(_BELOW_ONE),
@@ -186,6 +199,8 @@ RULES: dict[str, Rule] = {
     "train.max_skipped_steps": _COUNT_OR_0,
     "data.label_version": _VERSION,
     "data.visibility": _or_none(_several(_one_of(*AVAILABILITY_FLAGS), distinct=True)),
+    "data.sequences": _some(_COUNT),
+    "data.weather": _some(_one_of(*WEATHERS)),
     "data.max_objects": _COUNT,
     "data.azimuth_mapping": _one_of("true", "stretched"),
     "data.num_threads": _COUNT_OR_0,
