@@ -365,18 +365,10 @@ class Detector:
         """Counts frames with cells that no power gives; warns of the first."""
         if count := detector_inputs.num_impossible(frames, is_tesseract):
             with self._lock:
-                is_first, self.num_impossible = (
-                    not self.num_impossible,
-                    self.num_impossible + count,
-                )
+                is_first = self.num_impossible == 0
+                self.num_impossible += count
             if is_first:
-                _log.warning(
-                    "%d of %d frames have cells that are NaN, infinite or otherwise no "
-                    "radar power: their boxes mean nothing (further ones are counted in "
-                    "num_impossible)",
-                    count,
-                    len(frames),
-                )
+                _log.warning(detector_inputs.IMPOSSIBLE, count, len(frames))
 
     def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
         """Images and cameras as arrays; counts the frames without."""

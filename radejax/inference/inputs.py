@@ -60,6 +60,13 @@ def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
     )
 
 
+IMPOSSIBLE = (
+    "%d of %d frames have cells that are NaN, infinite or otherwise no radar power: their "
+    "boxes mean nothing (further ones are counted in num_impossible)"
+)
+"""What a `Detector` says of the first such frames."""
+
+
 def num_impossible(frames: Any, is_tesseract: bool) -> int:
     """Number of frames with a cell that no power gives, NaN for example.
 
