@@ -21,6 +21,8 @@ import numpy as np
 
 from radejax.core.errors import DataError
 
+PathLike = str | os.PathLike[str]
+
 DEFLATE_RATIO = 1032
 """Bytes that deflate makes of one byte at most."""
 
@@ -45,7 +47,7 @@ _DAMAGE = (
 
 
 @contextlib.contextmanager
-def damage_named(where: str | os.PathLike, what: str) -> Iterator[None]:
+def damage_named(where: PathLike, what: str) -> Iterator[None]:
     """Turns what readers raise on damaged files into a `DataError`.
 
     Args:
@@ -63,9 +65,7 @@ def damage_named(where: str | os.PathLike, what: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def open_zip(
-    path: str | os.PathLike, what: str = "a zip file"
-) -> Iterator[zipfile.ZipFile]:
+def open_zip(path: PathLike, what: str = "a zip file") -> Iterator[zipfile.ZipFile]:
     """A zip archive for reading; `DataError` that it is not `what`, where damaged."""
     with contextlib.ExitStack() as stack:
         with damage_named(path, what):
@@ -109,7 +109,7 @@ def read_member(archive: zipfile.ZipFile, name: str, *, max_bytes: int) -> bytes
         return content
 
 
-def read_npy(path: str | os.PathLike) -> np.ndarray:
+def read_npy(path: PathLike) -> np.ndarray:
     """The array of a `.npy` file, without pickles.
 
     Raises:
@@ -128,7 +128,7 @@ def read_npy(path: str | os.PathLike) -> np.ndarray:
         return numbers.reshape(shape, order="F" if is_fortran else "C")
 
 
-def read_npz(path: str | os.PathLike) -> dict[str, np.ndarray]:
+def read_npz(path: PathLike) -> dict[str, np.ndarray]:
     """The arrays of a `.npz` file by name; errors as `read_npy`."""
     if not pathlib.Path(path).exists():
         raise FileNotFoundError(f"{path}: no such file")
@@ -148,7 +148,7 @@ def read_npz(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def _read_header(
-    file: io.BufferedIOBase, where: str | os.PathLike
+    file: io.BufferedIOBase, where: PathLike
 ) -> tuple[np.dtype, tuple[int, ...], bool]:
     """Type, shape and memory order; leaves the file at the first number."""
     version = np.lib.format.read_magic(file)

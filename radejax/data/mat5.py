@@ -18,7 +18,7 @@ import math
 import os
 import struct
 import zlib
-from typing import BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
@@ -77,7 +77,8 @@ def find_array(file: BinaryIO, name: str) -> Layout | None:
     """
     size = os.fstat(file.fileno()).st_size
     file.seek(0)
-    order = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}.get(file.read(128)[124:])
+    orders: dict[bytes, Literal["<", ">"]] = {b"\0\1IM": "<", b"\1\0MI": ">"}
+    order = orders.get(file.read(128)[124:])
     if order is None:
         return None
     names, start = [], 128
@@ -107,7 +108,7 @@ def read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
     """
     if layout.deflated is not None:
         content: bytearray | memoryview = _inflate(file, layout)
-        numbers = memoryview(content)[layout.offset :][: layout.num_bytes]
+        numbers: Any = memoryview(content)[layout.offset :][: layout.num_bytes]
     else:
         file.seek(layout.offset)
         numbers = np.fromfile(file, np.uint8, count=layout.num_bytes)
@@ -131,7 +132,7 @@ def _inflated_head(file: BinaryIO, num_bytes: int) -> bytes:
 def _parse_variable(
     file: BinaryIO,
     head: bytes,
-    order: str,
+    order: Literal["<", ">"],
     name: str,
     begin: int,
     deflated: tuple[int, int] | None,
@@ -191,7 +192,7 @@ def _stored_type(file: BinaryIO, cls: int, stored: int) -> np.dtype:
     raise _damage(file, f"{wanted} stored as type {stored}")
 
 
-def _tag(head: bytes, at: int, order: str) -> tuple[int, int, int, int]:
+def _tag(head: bytes, at: int, order: Literal["<", ">"]) -> tuple[int, int, int, int]:
     """Type, size and begin of an element's content, and where the next element is."""
     (word,) = struct.unpack_from(order + "I", head, at)
     if word >> 16:  # up to four bytes, within the tag
@@ -218,6 +219,7 @@ def _check_size(file: BinaryIO, layout: Layout, size: int, end: int) -> None:
 
 def _inflate(file: BinaryIO, layout: Layout) -> bytearray:
     """All of a deflated variable, never more than it claims; its checksum is compared."""
+    assert layout.deflated is not None
     start, left = layout.deflated
     file.seek(start)
     content, filled = bytearray(layout.inflated), 0

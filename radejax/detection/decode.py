@@ -118,7 +118,7 @@ def decode(
         peaks, nms_iou, per_class=per_class_nms, normalize_yaw=raw_yaw == "never"
     )
     if raw_yaw == "always":
-        peaks = peaks.replace(boxes=_with_raw_footprint(peaks.boxes))
+        peaks = dataclasses.replace(peaks, boxes=_with_raw_footprint(peaks.boxes))
     return _compact(peaks, keep, max_detections)
 
 
