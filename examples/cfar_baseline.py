@@ -26,10 +26,9 @@ from tqdm import tqdm
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
-from radejax.data.records.projections import RecordSource
+from radejax.data.records.projections import RecordSource, record_positions
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.report import Report, write_report
-from radejax.runs.evaluate import record_positions
 from radejax.simulation.radar.tensor import RadarParameters
 
 # The gain only shifts the cross-sections, and the steps between classes with them.

@@ -21,6 +21,7 @@ from tabulate import tabulate
 from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.data.kradar.folders import SIMULATION_MARKER as MARKER
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import Source, load
 from radejax.evaluation.files.predictions import frame_keys
@@ -30,7 +31,6 @@ from radejax.inference.open import load as open_model
 from radejax.runs.data import Sources, data_of_run
 from radejax.runs.pictures import camera_share
 from radejax.simulation.camera.lens import cover_level
-from radejax.simulation.dataset import MARKER
 from radejax.visualize.camera_share import mean_share, write_camera_share
 
 GROUPS = {

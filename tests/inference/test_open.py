@@ -95,7 +95,5 @@ def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> No
     embedded = opening.starting_weights(detector.model, embeddings=tmp_path)
     assert embedded.frozen_sha256 == found.frozen_sha256
     assert embedded.variables is embedded.pretrained is None
-    trained = opening.starting_weights(
-        detector.model.clone(freeze=False), tmp_path / "all"
-    )
+    trained = opening.starting_weights(detector.model.clone(freeze=False))
     assert trained.frozen_sha256 is None
