@@ -132,7 +132,8 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
     command += [f"--data={tmp_path}", f"--workdir={tmp_path / 'run'}"]
     for words, message in (
         (["--sequences=1,x"], "error: --sequences: 'x' is no number, expected 1,5,58"),
-        (["--sequences=1,58", "--weather=fog", "--weather=mist"], "unknown weather"),
+        (["--weather=fog", "--weather=mist"], "config.data.weather is ('fog', 'mist')"),
+        (["--sequences=1,58", "--weather=fog", "--weather=rain"], "no sequence"),
     ):
         ended = subprocess.run(
             [*command, *words],
@@ -146,4 +147,4 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
         assert message in ended.stderr
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["data"]["sequences"] == [1, 58]
-    assert config["data"]["weather"] == ["fog", "mist"]
+    assert config["data"]["weather"] == ["fog", "rain"]
