@@ -152,8 +152,9 @@ def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -
 def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
     state = SimpleNamespace(eval_variables=setup.variables)
     scores = Validation(setup.config, setup.model, setup.data)(state, 7)
-    name = "validation/map_3d_iou30/kradar_r40/score>0.45"
+    name = "validation/map_3d_iou30/coco101/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
+    assert all("/simulated" in key for key in scores.values)
     assert any(key.endswith("/Sedan") for key in scores.values)
     means = [v for k, v in scores.values.items() if k.startswith(name)]
     assert means == [scores.best]
