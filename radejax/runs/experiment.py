@@ -64,12 +64,6 @@ def run(
     """
     started = time.perf_counter()
     check_config.check(config)
-    sharding.check_batch_size(
-        config.train.batch_size,
-        sharding.make_mesh(),
-        "train.batch_size",
-        config.train.num_accumulate,
-    )
     folder = default_workdir(workdir, name)
     model = models.build(config.model)  # what cannot be built fails first
     sharding.check_batch_size(
