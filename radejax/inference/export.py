@@ -16,6 +16,7 @@ import jax
 import jax.export  # not a part of `import jax`
 import jax.numpy as jnp
 from flax import traverse_util
+from ml_collections import ConfigDict
 
 from radejax.core import files
 from radejax.core.errors import UserError
@@ -45,7 +46,7 @@ def export(
     *,
     kind: str = "stablehlo",
     platforms: Sequence[str] = PLATFORMS,
-    training_config: Mapping[str, Any] | None = None,
+    training_config: ConfigDict | None = None,
     with_backbone: bool = False,
 ) -> dict[str, Any]:
     """Writes a folder with the model; existing files of the same names are replaced.

@@ -116,7 +116,9 @@ def write_packed(
         "camera": dataclasses.asdict(detector.camera_options),
         "grid": detector.grid.to_dict(),
         "left_out": left_out,
-        "training_config": training_config and json.loads(training_config.to_json()),
+        "training_config": None
+        if training_config is None
+        else json.loads(training_config.to_json()),
     }
     arrays = {
         name: np.ascontiguousarray(value)

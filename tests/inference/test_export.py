@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
 from radejax import Detector, UserError
 from radejax.geometry.camera import stack_cameras
@@ -86,7 +87,7 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(
 ) -> None:
     detector, projection = small.detector(), small.projections(3)
     folder = tmp_path / "exported"
-    done = export.export(detector, folder, training_config={"seed": 1})
+    done = export.export(detector, folder, training_config=ConfigDict({"seed": 1}))
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "README.md",
