@@ -28,8 +28,9 @@ from radejax.evaluation.files.predictions import frame_keys
 from radejax.evaluation.report import bootstrap
 from radejax.evaluation.report.measure import repair_sizes
 from radejax.inference.open import load as open_model
-from radejax.runs.data import Sources, data_of_run
+from radejax.runs.data import data_of_run
 from radejax.runs.pictures import camera_share
+from radejax.runs.sources import Sources
 from radejax.simulation.camera.lens import cover_level
 from radejax.visualize.camera_share import mean_share, write_camera_share
 

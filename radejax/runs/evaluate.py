@@ -24,7 +24,8 @@ from radejax.evaluation.report.report import Report, write_report
 from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
 from radejax.runs import pictures
-from radejax.runs.data import Data, Sources, data_of_run
+from radejax.runs.data import Data, data_of_run
+from radejax.runs.sources import Sources
 from radejax.training import processes
 
 _log = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ def evaluate(
     exchange_images: int | None = None,
     num_pictures: int | None = None,
     step: int | None = None,
+    remark: str = "",
 ) -> Report | None:
     """Detects on a split as the config says, on all devices, and writes the report.
 
@@ -52,10 +54,11 @@ def evaluate(
         data: To evaluate on.
         workdir: Of the run.
         out: Folder of the results; `evaluation` in the work folder if None.
-        split: "test", "train", "all" or a split file.
+        split: "test", "validation", "train", "all" or a split file.
         exchange_images: Seed; see `evaluate_run`.
         num_pictures: Frames drawn; as the config says if None.
         step: Of the variables, for `source.json`.
+        remark: Behind the name of the run in the report.
 
     Returns:
         The report that was written; None on all processes but the first, which return
@@ -90,7 +93,7 @@ def evaluate(
             predictions,
             table,
             out,
-            report_options(config, workdir.name),
+            report_options(config, f"{workdir.name}{remark}"),
             bootstrap=config.evaluation.bootstrap,
             left_out_before=frames.summary().counts,
             draw_frame=drawer,
@@ -99,17 +102,27 @@ def evaluate(
         if models.has_camera(model):
             pictures.draw_camera_share(model, variables, data, frames, out)
         count = config.evaluation.num_pictures if num_pictures is None else num_pictures
-        drawn = drawer.draw_spread(out / "pictures", count)
-        if drawn:
-            drawer.draw_scenes(out / "scenes.png")
-        if (workdir / "metrics.jsonl").exists():
-            pictures.draw_curves(
-                workdir, out / "training.png", is_simulated=frames.is_simulated
-            )
-        _log.info("drew %d frames in %s", len(drawn), out / "pictures")
+        _draw(drawer, count, workdir, out, is_simulated=frames.is_simulated)
         return report
 
     return processes.main_only(report)
+
+
+def _draw(
+    drawer: pictures.FrameDrawer,
+    count: int,
+    workdir: pathlib.Path,
+    out: pathlib.Path,
+    *,
+    is_simulated: bool,
+) -> None:
+    """Frames of a split, one of each weather, and the losses of the run."""
+    drawn = drawer.draw_spread(out / "pictures", count)
+    if drawn:
+        drawer.draw_scenes(out / "scenes.png")
+    if (workdir / "metrics.jsonl").exists():
+        pictures.draw_curves(workdir, out / "training.png", is_simulated=is_simulated)
+    _log.info("drew %d frames in %s", len(drawn), out / "pictures")
 
 
 def evaluate_run(
@@ -128,9 +141,9 @@ def evaluate_run(
     Args:
         workdir: Of `train.py`.
         step: Of the checkpoint, or "best"; the newest if None.
-        split: "test", "train", "all" or a split file.
-        out: Folder of the results; `evaluation` in the work folder if None, and
-            `evaluation_<name>` for other data.
+        split: "test", "validation", "train", "all" or a split file.
+        out: Folder of the results; `evaluation` in the work folder if None,
+            `evaluation_<name>` for other data, and with `_validation` for that split.
         num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `inference.open.load`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
@@ -150,7 +163,16 @@ def evaluate_run(
     workdir = pathlib.Path(workdir).absolute()
     config, data = data_of_run(loaded, workdir, other)
     name = "evaluation" if other is None else f"evaluation_{other.name}"
+    name += "_validation" if split == "validation" else ""
     name += "" if exchange_images is None else "_exchanged"
+    remark = ""
+    if step == "best" and other is None and split in (data.choosing_split, "all"):
+        remark = f" (chosen on the {data.choosing_split} split)"
+        _log.warning(
+            "the best checkpoint was chosen on the %s split: its numbers on it may not be "
+            "reported",
+            data.choosing_split,
+        )
     if other is not None:
         frames, _ = _frames(data, split, exchange_images)
         require_images(frames, data.images(frames), split)
@@ -168,6 +190,7 @@ def evaluate_run(
         exchange_images=exchange_images,
         num_pictures=num_pictures,
         step=loaded.step,
+        remark=remark,
     )
 
 

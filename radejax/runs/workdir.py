@@ -28,7 +28,7 @@ import radejax
 from radejax.core import files
 from radejax.core.config import base_config
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.runs.data import DataPaths, saved_path
+from radejax.runs.sources import DataPaths, saved_path
 from radejax.training import processes
 
 PathLike = str | os.PathLike

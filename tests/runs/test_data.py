@@ -1,6 +1,7 @@
 """Data folders of a run: found, checked, projected once."""
 
 import pathlib
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,8 @@ from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
-from radejax.runs.data import Data, DataPaths, Sources, open_data
+from radejax.runs.data import Data, open_data
+from radejax.runs.sources import DataPaths, Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 
@@ -121,3 +123,44 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     assert len(part.split(None)) == 3
     del config.data["sequences"], config.data["weather"]  # as runs of before
     assert len(open_data(config, model, sources).frames) == 6
+    _check_validation(config, model, sources, caplog)
+
+
+def _check_validation(
+    config: Any, model: Any, sources: Sources, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Sequence 1 with its damaged frame, and 2, are of the train split; 3 of the test."""
+
+    def sequences(data: Data) -> dict[str, list[int]]:
+        names = ("train", "validation", "test")
+        return {name: [f.sequence for f in data.split(name)] for name in names}
+
+    config.data.validation = (1,)
+    config.classes = ("Sedan", "Motorcycle")
+    with caplog.at_level("INFO", "radejax"):
+        data = open_data(config, model, sources)
+    assert sequences(data) == {"train": [2, 2], "validation": [1], "test": [3, 3]}
+    assert data.choosing_split == "validation"
+    assert "frames left out: held out for validation" in data.split("train").counts
+    held = data.split("validation").class_counts()
+    told = ", ".join(f"{cls} {number}" for cls, number in held.items())
+    expected = f"sequences 1 of the train split are held out, 1 frames beside 2 to train on; {told}"
+    assert expected in caplog.text
+    assert "evaluate_every_epochs is 0: nothing is chosen by them" in caplog.text
+    lacking = [cls for cls, number in held.items() if not number]
+    assert ("in the validation split" in caplog.text) == bool(lacking)
+    config.data.validation = (0.5,)
+    drawn = sequences(open_data(config, model, sources))
+    assert sorted({*drawn["train"], *drawn["validation"]}) == [1, 2]
+    assert not {*drawn["train"]} & {*drawn["validation"]}
+    config.data.validation = (3,)
+    with pytest.raises(
+        UserError, match=r"sequences \[3\], which have no frames in the"
+    ):
+        open_data(config, model, sources)
+    del config.data["validation"], config.data["validation_seed"]  # as runs of before
+    data = open_data(config, model, sources)
+    assert len(data.split("train")) == 3
+    assert data.choosing_split == "test"
+    with pytest.raises(UserError, match="there is no validation split"):
+        data.split("validation")

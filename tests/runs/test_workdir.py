@@ -10,7 +10,7 @@ import pytest
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.runs import workdir
-from radejax.runs.data import DataPaths
+from radejax.runs.sources import DataPaths
 
 
 def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
@@ -48,6 +48,7 @@ def test_another_config_is_refused_and_the_difference_named(
 def test_a_run_older_than_a_field_of_the_config_goes_on(tmp_path: pathlib.Path) -> None:
     config = base_config()
     old = json.loads(config.to_json())
+    del old["data"]["validation"]
     del old["data"]["sequences"], old["seed"], old["train"]["schedule"]
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     (tmp_path / "config.json").write_text(json.dumps(old))
