@@ -261,6 +261,7 @@ RULES: dict[str, Rule] = {
     "simulation.image_width": _COUNT_OR_0,
     "simulation.image_height": _COUNT_OR_0,
     "simulation.cover_lens": _BOOL,
+    "simulation.camera_content": _one_of("scene", "objects"),
     "simulation.lidar_to_radar_m": _several(_number(), 3),
     "simulation.label_distance_m": _POSITIVE,
 }

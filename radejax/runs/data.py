@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import json
 import logging
 import pathlib
 from collections.abc import Sequence
@@ -42,6 +43,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.sources import DataPaths, Sources, check_folders
+from radejax.simulation.config import without_later_fields
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import processes
 
@@ -351,7 +353,9 @@ def data_of_run(
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
     """Folder of a simulated data set, named by its config where none is given."""
     if not data:
-        digest = hashlib.sha256(simulation.to_json().encode()).hexdigest()[:8]
+        # The same folder as before the config had its later fields.
+        values = without_later_fields(json.loads(simulation.to_json()))
+        digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]
         return str(pathlib.Path("data") / f"simulated-{digest}")
     if len(data) != 1:
         raise UserError(f"a simulated data set has one folder, got {list(data)}")

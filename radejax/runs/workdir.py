@@ -29,6 +29,7 @@ from radejax.core import files
 from radejax.core.config import base_config
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.sources import DataPaths, saved_path
+from radejax.simulation.config import default_config
 from radejax.training import processes
 
 PathLike = str | os.PathLike
@@ -68,6 +69,9 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     path = workdir / "config.json"
     if processes.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
+    defaults = json.loads(base_config().to_json())
+    if "simulation" in config:  # of which earlier versions have fewer fields
+        defaults["simulation"] = default_config()
     files.claim(
         path,
         json.loads(config.to_json()) | {"profile": "", "seeds": []},
@@ -75,7 +79,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("watch",),
-        defaults=json.loads(base_config().to_json()),
+        defaults=defaults,
     )
 
 

@@ -1,16 +1,18 @@
 """Data folders of a run: found, checked, projected once."""
 
+import hashlib
 import pathlib
 from typing import Any
 
 import pytest
+from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
-from radejax.runs.data import Data, open_data
+from radejax.runs.data import Data, _simulated_root, open_data
 from radejax.runs.sources import DataPaths, Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 
@@ -67,6 +69,16 @@ def test_frames_are_projected_beside_their_data_once(
     before = written()
     assert prepare().paths == paths
     assert written() == before
+
+
+def test_a_folder_of_before_the_config_had_more_fields_is_found_again() -> None:
+    simulation = ConfigDict(default_config())
+    before = simulation.copy_and_resolve_references()
+    del before["camera_content"]
+    digest = hashlib.sha256(before.to_json().encode()).hexdigest()[:8]
+    assert _simulated_root(simulation, ()) == f"data/simulated-{digest}"
+    simulation.camera_content = "objects"
+    assert _simulated_root(simulation, ()) != f"data/simulated-{digest}"
 
 
 def test_other_data_keep_what_the_run_had_of_the_same_folders(
