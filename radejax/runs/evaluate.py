@@ -19,7 +19,7 @@ from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
 from radejax.data.kradar import Frame, KRadar
 from radejax.evaluation.files.load import tables_from_frames
-from radejax.evaluation.report.measure import Options
+from radejax.evaluation.report.measure import Options, rare_classes
 from radejax.evaluation.report.report import Report, write_report
 from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
@@ -94,6 +94,7 @@ def evaluate(
             table,
             out,
             report_options(config, f"{workdir.name}{remark}"),
+            rare=_rare_classes(config, data),
             bootstrap=config.evaluation.bootstrap,
             left_out_before=frames.summary().counts,
             draw_frame=drawer,
@@ -106,6 +107,12 @@ def evaluate(
         return report
 
     return processes.main_only(report)
+
+
+def _rare_classes(config: ConfigDict, data: Data) -> tuple[tuple[str, str], ...]:
+    """Of the train split of the data, with what may be held out of it."""
+    objects, table = tables_from_frames(data.frames.of_split("train"))
+    return rare_classes(objects, table, config.classes, config.evaluation.roi)
 
 
 def _draw(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import os
 import pathlib
 from collections.abc import Iterable, Sequence
@@ -13,7 +14,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import CLASSES
+from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.kradar import sequences
 from radejax.data.kradar.dataset import KRadar, as_paths
 from radejax.data.kradar.findings import Findings, Summary
@@ -77,7 +78,13 @@ class HealthReport:
             "num_problems": self.num_problems,
             "sequences": [dataclasses.asdict(row) for row in self.sequences],
             "class_counts": [
-                {"split": split, "weather": weather, "class": cls, "objects": number}
+                {
+                    "split": split,
+                    "weather": weather,
+                    "class": cls,
+                    "objects": number,
+                    "share": number / self._totals[split, weather],
+                }
                 for (split, weather, cls), number in sorted(self.class_counts.items())
             ],
             **self.summary.to_dict(),
@@ -90,24 +97,43 @@ class HealthReport:
         parts = [
             f"{len(rows)} sequences in {', '.join(self.roots)}; labels {self.version}",
             tabulate(rows, headers=header),
-            "objects visible to the radar, in its field of view",
+            "objects visible to the radar, in its field of view, and their share of the "
+            f"row; *: under {RARE_SHARE:.0%} of the training objects of a weather",
             self._count_table(),
             self.summary.to_text(),
             f"{self.num_problems:,} problems" if self.num_problems else "no problems",
         ]
         return "\n\n".join(part for part in parts if part)
 
+    @functools.cached_property
+    def _totals(self) -> collections.Counter[tuple[str, ...]]:
+        """Objects by split and weather, "all" too, and by these and class."""
+        totals: collections.Counter[tuple[str, ...]] = collections.Counter()
+        for (split, weather, cls), number in self.class_counts.items():
+            for key in ((split, weather), (split, "all")):
+                totals[key] += number
+                totals[(*key, cls)] += number
+        return totals
+
     def _count_table(self) -> str:
         """Rows split and weather, columns classes."""
-        totals: collections.Counter[tuple[str, str, str]] = collections.Counter()
-        for (split, weather, cls), number in self.class_counts.items():
-            totals[split, weather, cls] += number
-            totals[split, "all", cls] += number
-        keys = sorted(
-            {key[:2] for key in totals}, key=lambda k: (k[0], k[1] == "all", k)
+        keys = [key for key in self._totals if len(key) == 2]
+        keys.sort(key=lambda key: (key[0], key[1] == "all", key))
+        table = [[*key, *(self._cell(key, cls) for cls in CLASSES)] for key in keys]
+        return tabulate(
+            table,
+            headers=["split", "weather", *CLASSES],
+            disable_numparse=True,
+            colalign=["left", "left", *["right"] * len(CLASSES)],
         )
-        table = [[*key, *(totals[(*key, cls)] for cls in CLASSES)] for key in keys]
-        return tabulate(table, headers=["split", "weather", *CLASSES])
+
+    def _cell(self, key: tuple[str, ...], cls: str) -> str:
+        """Number, share of the row, and the mark of a class that is hardly trained on."""
+        number, share = self._totals[(*key, cls)], 0.0
+        if self._totals[key]:
+            share = number / self._totals[key]
+        mark = "*" if key[0] == "train" and share < RARE_SHARE else ""
+        return f"{mark}{number:,} ({100 * share:4.1f} %)"
 
 
 def check_dataset(

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES
+from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation import protocols
-from radejax.evaluation.columns import Columns, are_simulated
+from radejax.evaluation.columns import Columns, are_simulated, in_roi
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.report import published
@@ -55,6 +55,7 @@ class Options:
         plots: Draw curves.
         invalid_sizes: "error", or "false_positive": predicted boxes with a size that is
             not positive overlap nothing but still count.
+        rare: Classes and conditions, from `rare_classes`, whose APs are marked.
         left_out_before: Counts of what loading left out already, to be printed.
         draw_frame: Called with (frame id, path of a picture to write) for each of the
             worst frames, or None.
@@ -74,6 +75,7 @@ class Options:
     worst_frames: int = 10
     plots: bool = True
     invalid_sizes: str = "error"
+    rare: tuple[tuple[str, str], ...] = ()
     left_out_before: Mapping[str, int] = dataclasses.field(default_factory=dict)
     draw_frame: Callable[[int, Any], None] | None = None
 
@@ -221,6 +223,41 @@ def _mean(group: Sequence[Result]) -> Result:
         num_gt=sum(result.num_gt for result in group),
         num_det=sum(result.num_det for result in group),
         num_frames=max(result.num_frames for result in group),
+    )
+
+
+def rare_classes(
+    objects: Columns,
+    frames: Columns,
+    classes: Sequence[str],
+    roi: str | Sequence[float] | None,
+) -> tuple[tuple[str, str], ...]:
+    """Pairs of class and weather with under 2 % of the training objects of that weather.
+
+    Args:
+        objects: Columns of ground truth that is trained on.
+        frames: Their frame table, with weather.
+        classes: Of the detector.
+        roi: Objects outside do not count.
+
+    Returns:
+        The pairs, "all" for all weathers; weathers without any object have none.
+
+    References:
+        DinoRADE, the mark of Table 2, which the narrow region gives, and section 4.2,
+        whose shares are those in the field of view.
+    """
+    inside = in_roi(np.asarray(objects["box"], np.float64).reshape(-1, 7), roi)
+    cls = np.asarray(objects["cls"]).astype(str)[inside]
+    row = np.searchsorted(frames["frame"], np.asarray(objects["frame"])[inside])
+    weather = np.asarray(frames["weather"]).astype(str)[row]
+    masks = {name: weather == name for name in np.unique(weather).tolist()}
+    masks["all"] = np.isin(cls, np.array(classes))
+    return tuple(
+        (name, condition)
+        for condition, mask in masks.items()
+        for name in classes
+        if mask.any() and np.mean(cls[mask] == name) < RARE_SHARE
     )
 
 

@@ -24,8 +24,10 @@ from radejax.evaluation.report.tables import (
     TITLES,
     Key,
     Table,
+    marked,
     number,
     numbers,
+    rare_notes,
     shown,
     terms,
 )
@@ -175,7 +177,9 @@ def table_2(rows: Rows, options: Options, ours: Terms, iou: float = 0.3) -> Tabl
         values = [
             shown(rows, (protocol, name, cls, space, iou)) for name, space in columns
         ]
-        body.append([cls, options.run, *numbers(values)])
+        cells = zip(columns, numbers(values), strict=True)
+        marks = (marked(options, cls, name, cell) for (name, _), cell in cells)
+        body.append([cls, options.run, *marks])
         for row in filter(None, listed):
             theirs = [row[space].get(cls, name) for name, space in columns]
             if all(value is None for value in theirs):
@@ -195,7 +199,7 @@ def table_2(rows: Rows, options: Options, ours: Terms, iou: float = 0.3) -> Tabl
             *(f"{TITLES[name]} {SPACE_TITLES[space]}" for name, space in columns),
         ],
         body,
-        _notes(reasons),
+        [*_notes(reasons), *rare_notes(options)],
     )
 
 

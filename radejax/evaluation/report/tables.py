@@ -93,6 +93,20 @@ def shown(rows: Mapping[Key, Measured], key: Key) -> float | None:
     return None if row is None else row.shown
 
 
+RARE_NOTE = "*: under 2 % of the training objects of that weather in the region."
+
+
+def marked(options: Options, cls: str, condition: str, cell: str) -> str:
+    """The cell, with the mark of a class that is hardly trained on in that condition."""
+    is_rare = (cls, condition) in options.rare and cell.strip("-/ ") != ""
+    return f"*{cell}" if is_rare else cell
+
+
+def rare_notes(options: Options) -> list[str]:
+    """The line below a table with marks."""
+    return [RARE_NOTE] if options.rare else []
+
+
 def terms(rows: Mapping[Key, Measured], protocol: str) -> str:
     """Score cut, frame rule, label version and region, once per table."""
     for key, row in rows.items():
@@ -114,11 +128,14 @@ def class_by_weather(
             [shown(rows, (protocol, name, cls, space, iou)) for space in SPACE_TITLES]
             for name in conditions
         )
-        body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
+        cells = (" / ".join(numbers(pair)) for pair in pairs)
+        marks = zip(conditions, cells, strict=True)
+        body.append([cls, *(marked(options, cls, name, cell) for name, cell in marks)])
     return Table(
         f"AP 3D / BEV at IoU {iou:g}, {protocol}{terms(rows, protocol)}",
         ["Class", *(TITLES.get(name, name) for name in conditions)],
         body,
+        rare_notes(options),
     )
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar, write
-from radejax.data.kradar.check import check_dataset
+from radejax.data.kradar.check import HealthReport, check_dataset
+from radejax.data.kradar.findings import Findings
 from radejax.geometry.radar_grid import RadarGrid
 
 
@@ -30,6 +31,10 @@ def test_healthy_copy(root):
     for cls, number in counts.items():
         assert report.class_counts.get(("train", "fog", cls), 0) == number
     plain = json.loads(json.dumps(report.to_dict()))
+    shares = {}
+    for entry in plain["class_counts"]:
+        shares.setdefault((entry["split"], entry["weather"]), []).append(entry["share"])
+    assert all(sum(values) == pytest.approx(1) for values in shares.values())
     assert plain["num_problems"] == 0
     assert len(plain["sequences"]) == 2
 
@@ -108,3 +113,21 @@ def test_conditions_that_contradict_the_published_ones(root):
         "urban,day,fog; K-Radar published urban,night,normal for sequence 1" in notes[0]
     )
     assert RadarGrid.kradar().shape_drea == (64, 256, 37, 107)
+
+
+def test_classes_that_are_hardly_trained_on_are_marked():
+    counts = {("train", "rain", "Sedan"): 98, ("train", "rain", "Bus or Truck"): 2}
+    counts |= {("train", "fog", "Sedan"): 99, ("train", "fog", "Bus or Truck"): 1}
+    counts |= {("test", "fog", "Sedan"): 1000, ("test", "fog", "Bicycle"): 1}
+    summary = Findings(strict=False).summary()
+    text = HealthReport(["x"], "v2.1", [], counts, summary).to_text()
+    rows = [
+        line.split() for line in text.splitlines() if line[:5] in ("train", "test ")
+    ]
+    found = {(*row[:2],): " ".join(row[2:7]) for row in rows}
+    assert found["train", "rain"].startswith("98 (98.0 %)")
+    assert " 2 ( 2.0 %) " in text  # not under 2 %
+    assert " *1 ( 1.0 %)" in text
+    assert "1,000 (99.9 %) " in text
+    assert not any("*" in " ".join(row) for row in rows if row[0] == "test")
+    assert " *3 ( 1.5 %)" in text  # all weathers

@@ -11,7 +11,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.evaluation.files import load
 from radejax.evaluation.report import compare, paper_tables, report, tables
-from radejax.evaluation.report.measure import Options, Origin
+from radejax.evaluation.report.measure import Options, Origin, rare_classes
 from radejax.evaluation.report.published import Terms, published_rows
 
 AS_PAPERS = Options(
@@ -197,3 +197,24 @@ def test_terms_say_what_differs():
     for name in Terms._fields:
         other = THEIRS._replace(**{name: None})
         assert other.differences(THEIRS).startswith(f"{name.replace('_', ' ')}: ")
+
+
+@pytest.mark.slow  # reads the labels of the train split too
+def test_marks_are_those_that_dinorade_prints(real, shared, tmp_path):
+    labels = shared / "data" / "kradar" / "labels_v2_1.zip"
+    objects, frames = load.tables_from_frames(KRadar(labels=labels, split="train"))
+    rare = rare_classes(objects, frames, CLASSES, NARROW_ROI)
+    (printed,) = published_rows("DinoRADE", "2", space="3d")
+    stars = {(cls, at) for cls, at in rare if printed.get(cls, at) is not None}
+    assert stars == {
+        *(("Motorcycle", "all"), ("Motorcycle", "normal")),
+        *(("Pedestrian", "normal"), ("Pedestrian", "rain"), ("Bus or Truck", "rain")),
+    }
+    _, by_class, _ = _tables(real, tmp_path, rare=rare)
+    rows = {row[0]: row[2:] for row in by_class.rows if row[1] == "mine"}
+    assert [cell[0] == "*" for cell in rows["Motorcycle"][:4]] == [True] * 4
+    assert not any("*" in cell for cell in [*rows["Sedan"], *rows["mean"]])
+    assert tables.RARE_NOTE in by_class.notes
+    text = (tmp_path / "report.txt").read_text()
+    assert tables.RARE_NOTE in text
+    assert any(line.count("*") >= 2 for line in text.splitlines() if "Motorcy" in line)
