@@ -14,6 +14,7 @@ The argument is a list of words, at most one of each group:
   (`params_radcam.py`) are a copy of the radar's and lack keys that its code reads.
   Without one: the paper's, but with the released attention block in the radar branch
   and the losses read at the objects' own bins.
+- sigma: `sigma3`, `sigma0.75`, `adaptive`, `anisotropic`, as in `radenet.py`.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
 What Table 4 reports (Sedan, narrow region, IoU 0.3, AP 3D and BEV): r 61.65 and 66.68,
@@ -78,7 +79,10 @@ CLASS_SETS = ("all", "sedan")
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
-    variant, preset, classes = parse_words(arg, VARIANTS, PRESETS, CLASS_SETS)
+    sigmas = _radenet().SIGMAS
+    variant, preset, sigma, classes = parse_words(
+        arg, VARIANTS, PRESETS, sigmas, CLASS_SETS
+    )
     variant = variant or "rcw"
     config = base_config()
     config.model.input_stem = True
@@ -94,6 +98,8 @@ def get_config(arg: str | None = None) -> ConfigDict:
         # The released ResNet sees colours in [0, 1].
         config.model.image.standardize = variant != "rcw_resnet50"
     config.update_from_flattened_dict(VARIANTS[variant])
+    if sigma is not None:
+        config.loss.update(sigmas[sigma])
     if variant == "r":
         config.model.name = "radenet"
         for section in ("image", "fusion", "axes"):

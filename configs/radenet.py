@@ -12,6 +12,8 @@ The argument is a list of words, at most one of each group:
 - preset: `paper` or `official` (what the released code runs, the padded and stretched
   azimuth axis included). Without one: the paper's, but with the released attention
   block and the losses read at the objects' own bins.
+- sigma: `sigma3`, `sigma0.75` (bins), `adaptive`, `anisotropic` (metres of the object
+  read as bins); the targets that the papers compare, over what preset or default say.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
 What Table III reports (Sedan, narrow region, IoU 0.3, AP 3D and BEV): base 57.96 and
@@ -52,6 +54,7 @@ PRESETS = {
         "train.schedule": "cosine",
         "train.num_epochs": 10,
         "data.azimuth_mapping": "true",
+        "data.validation": (),
         "evaluation.protocols": ("coco101", "exact", "kradar_r40"),
         "evaluation.skip_empty": "protocol",
     },
@@ -68,23 +71,36 @@ PRESETS = {
         "train.schedule": "cyclic_cosine",
         "train.num_epochs": 11,
         "data.azimuth_mapping": "stretched",
+        "data.validation": (),
         "evaluation.protocols": ("coco101",),
         "evaluation.skip_empty": "class",
     },
 }
 """Where the paper and the released code differ, one field a row."""
 
+SIGMAS = {
+    "sigma3": {"sigma": "fixed", "sigma_cells": 3.0},
+    "sigma0.75": {"sigma": "fixed", "sigma_cells": 0.75},
+    "adaptive": {"sigma": "adaptive"},
+    "anisotropic": {"sigma": "anisotropic"},
+}
+"""Fields of `config.loss` for the spread of the heatmap's targets."""
+
 CLASS_SETS = ("all", "sedan")
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
-    variant, preset, classes = parse_words(arg, VARIANTS, PRESETS, CLASS_SETS)
+    variant, preset, sigma, classes = parse_words(
+        arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS
+    )
     config = base_config()
     if preset is not None:
         config.update_from_flattened_dict(PRESETS[preset])
     # After the preset: the base row has no attention in either world.
     config.model.update(VARIANTS[variant or "model"])
+    if sigma is not None:
+        config.loss.update(SIGMAS[sigma])
     if classes == "sedan":
         config.classes = ("Sedan",)
         config.model.num_classes = 1

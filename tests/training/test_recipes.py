@@ -7,15 +7,19 @@ import chex
 import jax
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.config import load_module
-from radejax.core.structures import Batch
+from radejax.core.errors import UserError
+from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.open import starting_weights
 from radejax.interop import radenet_torch
+from radejax.losses.detection import detection_loss
+from radejax.runs import check_config
 from radejax.training import loop, sharding
 from radejax.training.start import Plan
 from radejax.training.state import create_state, make_optimizer, make_schedule
@@ -26,8 +30,9 @@ SIZE = (32, 576)  # the released crop leaves out 280 columns on both sides
 ALL = [
     *(("radenet", words) for words in ("", "paper", "official", "sedan", "stem")),
     *(("radenet", words) for words in ("base", "cbam", "cbam_heads", "expand")),
+    *(("radenet", words) for words in ("sigma0.75", "adaptive", "anisotropic")),
     *(("dinorade", words) for words in ("", "paper", "official", "rc", "r")),
-    *(("dinorade", words) for words in ("rcw_resnet50", "sedan")),
+    *(("dinorade", words) for words in ("rcw_resnet50", "sedan", "sigma3")),
     *((name, "") for name in ("quickstart", "quickstart_fusion")),
     ("simulate_real_scenes", ""),
 ]
@@ -84,6 +89,50 @@ def test_trainings_are_those_of_the_papers(
         floor + (1e-3 - floor) * (1 + phase) / 2,
         rtol=1e-4,
     )
+
+
+@pytest.mark.parametrize("name", ["radenet", "dinorade"])
+@pytest.mark.parametrize("preset", ["", "paper", "official"])
+def test_a_word_for_sigma_changes_the_targets_alone(name: str, preset: str) -> None:
+    plain = _get(name, preset).to_dict()
+    fixed = {"sigma3": 3.0, "sigma0.75": 0.75}
+    for word in (*fixed, "adaptive", "anisotropic"):
+        config = _get(name, f"{preset},{word}").to_dict()
+        check_config.check(ConfigDict(config))
+        loss = config.pop("loss")
+        assert loss["sigma"] == ("fixed" if word in fixed else word)
+        assert loss["sigma_cells"] == fixed.get(word, plain["loss"]["sigma_cells"])
+        others = {**plain["loss"], "sigma": None, "sigma_cells": None}
+        assert {**loss, "sigma": None, "sigma_cells": None} == others
+        assert config == {k: v for k, v in plain.items() if k != "loss"}
+    with pytest.raises(UserError, match="exclude each other"):
+        _get(name, "sigma3,adaptive")
+
+
+def test_every_sigma_has_a_finite_gradient_of_its_own(tiny: Any) -> None:
+    """At the maps; steps of the network with them are among those of all configs."""
+    batch = jax.tree.map(lambda x: x[:2], tiny.frames)
+    rng = np.random.default_rng(0)
+    shape = (2, *tiny.map_grid.projection_shape[:2])
+    maps = DetectionMaps(
+        heatmap_logits=rng.normal(-2, 1, (*shape, 5)).astype(np.float32),
+        box_params=rng.normal(0, 1, (*shape, 8)).astype(np.float32),
+    )
+    words = ("sigma3", "sigma0.75", "adaptive", "anisotropic")
+
+    @jax.jit
+    def focal(maps: DetectionMaps) -> Any:
+        def of(options: Any) -> Any:
+            return jax.value_and_grad(
+                lambda m: detection_loss(m, batch, tiny.map_grid, **options)[1]["focal"]
+            )(maps)
+
+        return [of(_get("radenet", word).loss.to_dict()) for word in words]
+
+    found = focal(maps)
+    chex.assert_tree_all_finite(found)
+    assert len({float(value) for value, _ in found}) == 4
+    assert all(np.abs(gradient.heatmap_logits).max() > 0 for _, gradient in found)
 
 
 def _shrink(config: Any) -> None:
