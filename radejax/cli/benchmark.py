@@ -32,7 +32,7 @@ def benchmark(
     dtype: str | None,
     as_json: bool,
 ) -> None:
-    """Time from radar to boxes on this machine, and each stage's share.
+    """Time from radar to boxes on this machine: stages, and backbone, neck and heads.
 
     SOURCE as for `radejax export`. Batch sizes 1 and 10 unless given.
 

@@ -10,17 +10,28 @@ from .. import small_models as small
 pytestmark = pytest.mark.slow  # compiles each stage on its own
 
 
-def test_stages_add_up_and_are_shown() -> None:
-    detector = small.detector()
+@pytest.mark.parametrize("kind", ["radar", "camera"])
+def test_stages_add_up_and_are_shown(kind: str) -> None:
+    detector = small.detector(kind)
     (row,) = benchmark.measure(detector, (2,), repeats=1)
+    camera = (
+        {"image_backbone", "image_neck", "image_fusion"} if kind == "camera" else ()
+    )
+    assert set(row["parts"]) == {"backbone", "neck", "heads", *camera}
+    assert all(seconds > 0 for seconds in row["parts"].values())
     assert list(row["stages"]) == list(benchmark.STAGES)
     assert row["sum_s"] == pytest.approx(sum(row["stages"].values()))
     assert all(seconds > 0 for seconds in row["stages"].values())
     assert row["frames_per_s"] == pytest.approx(2 / row["whole_s"])
     text = benchmark.as_table([row])
     assert "batch 2" in text
-    shares = [float(part.split(" %")[0]) for part in text.split("(")[1:]]
-    assert sum(shares) == pytest.approx(100, abs=0.3)
+    lines = [line for line in text.splitlines() if " %" in line]
+    shares = {
+        line.split("  ")[0]: float(line.split("(")[1].split(" %")[0]) for line in lines
+    }
+    assert "- image neck" in shares or kind == "radar"
+    stages = [share for name, share in shares.items() if not name.startswith("- ")]
+    assert sum(stages) == pytest.approx(100, abs=0.3)
     assert detector.with_batch_sizes((2,))._run is detector._run
 
 

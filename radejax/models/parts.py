@@ -1,0 +1,57 @@
+"""The parts that a detector calls, with what goes in and what comes out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import flax.linen as nn
+
+
+@dataclasses.dataclass(frozen=True)
+class Call:
+    """One call of a part.
+
+    Attributes:
+        module: The part, of no model: it takes its own share of the variables.
+        args: Arrays that it was called with.
+        kwargs: Settings, such as `train=False`.
+        output: What it returned.
+    """
+
+    module: nn.Module
+    args: tuple[Any, ...]
+    kwargs: Mapping[str, Any]
+    output: Any
+
+
+def calls_of(run: Callable[[], Any], depth: int = 1) -> dict[str, Call]:
+    """The calls of a model's parts while it runs, by their names in the parameters.
+
+    Args:
+        run: Applies or initialises a model, also while it is traced.
+        depth: Most levels of parts: 1 for those of the model itself.
+
+    Returns:
+        In the order in which the calls end: "backbone", "neck", "heads", and with depth
+        2 "backbone/stem"; the last call of a part that is called several times.
+
+    Examples:
+        >>> calls = calls_of(lambda: model.apply(variables, projection))  # doctest: +SKIP
+        >>> calls["neck"].output.shape  # doctest: +SKIP
+        (1, 256, 112, 128)
+    """
+    found: dict[str, Call] = {}
+
+    def record(call: Callable[..., Any], args: Any, kwargs: Any, context: Any) -> Any:
+        output = call(*args, **kwargs)
+        path = context.module.path
+        if context.method_name == "__call__" and 1 <= len(path) <= depth:
+            module = context.module.clone(parent=None)
+            found["/".join(path)] = Call(module, args, kwargs, output)
+        return output
+
+    with nn.intercept_methods(record):
+        run()
+    return found

@@ -1,0 +1,52 @@
+"""The pictures of the networks: shapes of the models, and text that can be read."""
+
+import itertools
+import pathlib
+import runpy
+from types import SimpleNamespace
+
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+networks = SimpleNamespace(
+    **runpy.run_path(str(ROOT / "docs" / "images" / "networks.py"))
+)
+SHAPES = {
+    "radenet": {"64 × 256 × 37 × 107", "32 × 14 × 512", "256 × 112 × 5"},
+    "dinorade": {"720 × 1280 × 3", "256 × 112 × 10 queries", "180 × 320 × 128"},
+}
+PARAMETERS = {"radenet": "26.56 M", "dinorade": "21.60 M"}
+
+
+@pytest.mark.parametrize("name", list(networks.SHEETS))
+def test_pictures_show_the_models_and_no_text_meets_another(name: str) -> None:
+    config, lay_out = networks.SHEETS[name]
+    sheet = lay_out(networks.Network.of(config))
+    lines = {line for block in sheet.blocks for line in block.lines}
+    assert SHAPES[name] <= lines
+    said = " ".join([*lines, *(text for *_, text in sheet.remarks)])
+    assert PARAMETERS[name] in said
+    figure = sheet.draw()
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    (axes,) = figure.axes
+    texts = [text.get_window_extent(renderer) for text in axes.texts]
+    for one, other in itertools.combinations(texts, 2):
+        assert not one.overlaps(other), (one, other)
+    frames = [
+        patch.get_window_extent(renderer)
+        for patch in axes.patches
+        if type(patch).__name__ == "FancyBboxPatch"
+    ]
+    assert len(frames) == len(sheet.blocks)
+    for one, other in itertools.combinations(frames, 2):
+        assert not one.overlaps(other), (one, other)
+    for text in texts:  # within its block, or in none
+        met = [frame for frame in frames if frame.overlaps(text)]
+        assert len(met) <= 1
+        for frame in met:
+            assert frame.x0 <= text.x0
+            assert text.x1 <= frame.x1
+            assert frame.y0 <= text.y0
+            assert text.y1 <= frame.y1
+    assert all(figure.bbox.x0 <= t.x0 and t.x1 <= figure.bbox.x1 for t in texts)
