@@ -51,8 +51,8 @@ class Sources:
         """
         if isinstance(self.data, str):
             raise UserError(f"data must be a list of folders, got {self.data!r}")
-        roots = tuple(saved_path(path) for path in self.data if path)
-        places = {
+        roots = tuple(str(pathlib.Path(path).absolute()) for path in self.data if path)
+        places: dict[str, Any] = {
             field.name: saved_path(getattr(self, field.name))
             for field in dataclasses.fields(DataPaths)
             if field.name != "roots"
