@@ -7,7 +7,7 @@ import functools
 import logging
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,14 +21,22 @@ from radejax.geometry.camera import Camera
 _log = logging.getLogger(__name__)
 
 
+BEFORE = {"lidar_to_radar_z_m": 0.0, "calibration": "sequence"}
+"""What models were trained with when these were no fields yet."""
+
+
 @dataclasses.dataclass(frozen=True)
 class CameraOptions:
     """How images and calibrations are used; `config.data.camera` states the same.
 
     Attributes:
         projection: "raw", "rectified" or "pinhole", see `CameraCalibration.camera`.
-        ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own, the
-            one that its boxes were moved by; or None.
+        ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own; or
+            None.
+        lidar_to_radar_z_m: Its z, which boxes are not moved by; None for what the
+            sensors' set-up says. No part of `ego_from_lidar_m` where that is given.
+        calibration: "sequence" for each sequence's own file, where it has one;
+            "common" for `cam_front0.yml` everywhere, as released.
         resize: Image files of another size than the model's are resized, and their
             calibration with them; otherwise they are an error.
         allow_missing: Frames without an image are predicted from the radar alone and
@@ -37,19 +45,31 @@ class CameraOptions:
 
     projection: ImageKind = "raw"
     ego_from_lidar_m: tuple[float, float, float] | None = None
+    lidar_to_radar_z_m: float | None = None
+    calibration: Literal["sequence", "common"] = "sequence"
     resize: bool = False
     allow_missing: bool = True
 
     @classmethod
     def of_config(cls, data: Mapping[str, Any]) -> CameraOptions:
         """Options of `config.data`; the defaults where it has no camera."""
-        if "camera" not in data:
-            return cls()
-        fields = dict(data["camera"])
+        return cls.of_fields(data["camera"]) if "camera" in data else cls()
+
+    @classmethod
+    def of_fields(cls, fields: Mapping[str, Any]) -> CameraOptions:
+        """Options by name, also of a model of before that lacks some."""
+        fields = BEFORE | dict(fields)
         if fields.get("ego_from_lidar_m") is not None:
             fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: fields[name] for name in names if name in fields})
+        return cls(**fields)
+
+    def shift(self, frame: Frame) -> tuple[float, ...]:
+        """Metres to add to LiDAR positions to get where the radar sees them."""
+        if self.ego_from_lidar_m is not None:
+            return self.ego_from_lidar_m
+        z = self.lidar_to_radar_z_m
+        z = frame.lidar_to_radar_z_m if z is None else z
+        return (*frame.radar_from_lidar_m[:2], z)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,8 +171,8 @@ def camera_inputs(
         return calibration.camera(options.projection)
 
     def camera(frame: Frame) -> Camera:
-        shift = options.ego_from_lidar_m or frame.radar_from_lidar_m
-        return read(str(frame.camera_calibration_path), tuple(map(float, shift)))
+        shift = tuple(map(float, options.shift(frame)))
+        return read(str(frame.camera_calibration_path), shift)
 
     return CameraInputs(
         tuple(

@@ -94,6 +94,7 @@ def front_images(
         visibility=None,
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
+        common_camera=detector.camera_options.calibration == "common",
     )
     options = dataclasses.replace(detector.camera_options, allow_missing=True)
     cameras = camera_inputs(frames, detector.model.image_size, options).cameras

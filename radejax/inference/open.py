@@ -113,7 +113,9 @@ def load_torch(
         model, variables = dinorade_torch.load(
             path_or_state_dict, dinov3=image_backbone, **model_overrides
         )
-        settings["camera_options"] = CameraOptions("pinhole", OFFICIAL_OFFSET_M)
+        settings["camera_options"] = CameraOptions(
+            "pinhole", OFFICIAL_OFFSET_M, calibration="common"
+        )
     else:
         if image_backbone is not None:
             raise UserError("image_backbone is given, but the model is RADE-Net")

@@ -149,9 +149,6 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
     except Exception as error:  # the library's own class is not exported
         raise DataError(f"{folder / WEIGHTS_FILE} is damaged: {error}") from error
     decode = dict(content["decode"])
-    camera = content["camera"]
-    if camera["ego_from_lidar_m"] is not None:
-        camera["ego_from_lidar_m"] = tuple(camera["ego_from_lidar_m"])
     return LoadedModel(
         models.build(content["model"]),
         traverse_util.unflatten_dict(arrays, sep="/"),
@@ -162,7 +159,7 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
             "score_threshold": decode.pop("score_threshold"),
             "nms_iou": decode.pop("nms_iou"),
             "decode_options": decode,
-            "camera_options": CameraOptions(**camera),
+            "camera_options": CameraOptions.of_fields(content["camera"]),
         },
         content["training_config"]
         and ConfigDict(content["training_config"], convert_dict=True),

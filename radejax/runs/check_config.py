@@ -211,6 +211,8 @@ RULES: dict[str, Rule] = {
     "data.label_permutation_seed": _or_none(_COUNT_OR_0),
     "data.camera.projection": _one_of("raw", "rectified", "pinhole"),
     "data.camera.ego_from_lidar_m": _or_none(_several(_number(), 3)),
+    "data.camera.lidar_to_radar_z_m": _or_none(_number()),
+    "data.camera.calibration": _one_of("sequence", "common"),
     "data.camera.resize": _BOOL,
     "data.camera.allow_missing": _BOOL,
     "evaluation.roi": _where(

@@ -198,6 +198,7 @@ class Data:
             visibility=config.data.visibility,
             classes=config.classes,
             camera_calibration=paths.camera_calibration,
+            common_camera=camera is not None and camera.calibration == "common",
             # Runs of before are without these two fields.
             sequence_numbers=config.data.get("sequences") or None,
             weather=config.data.get("weather") or None,

@@ -27,6 +27,7 @@ from ml_collections import ConfigDict
 import radejax
 from radejax.core import files
 from radejax.core.config import base_config
+from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.data import DataPaths, saved_path
 from radejax.training import processes
@@ -68,6 +69,9 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     path = workdir / "config.json"
     if processes.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
+    defaults = json.loads(base_config().to_json())
+    if "camera" in config.data:
+        defaults["data"]["camera"] = BEFORE
     files.claim(
         path,
         json.loads(config.to_json()) | {"profile": "", "seeds": []},
@@ -75,7 +79,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("watch",),
-        defaults=json.loads(base_config().to_json()),
+        defaults=defaults,
     )
 
 

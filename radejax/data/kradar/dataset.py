@@ -66,6 +66,8 @@ class KRadar(Sequence[Frame]):
             and no folder in the roots are left out and counted, if any has one.
         weather: Only sequences of these weathers; None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
+        common_camera: `common/cam_front0.yml` for all sequences, as the released code;
+            otherwise each its own, where it has one.
 
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
@@ -99,6 +101,7 @@ class KRadar(Sequence[Frame]):
         sequence_numbers: Iterable[int] | None = None,
         weather: Iterable[str] | None = None,
         camera_calibration: PathLike | None = None,
+        common_camera: bool = False,
     ) -> None:
         self.version = normalise_version(version)
         self.strict = strict
@@ -113,9 +116,11 @@ class KRadar(Sequence[Frame]):
         if labels is not None:
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
         self.is_simulated = folders.are_simulated(self.split_folders)
+        self._lidar_to_radar_z_m = folders.read_lidar_to_radar_z(self.split_folders)
         self._sequence_numbers = sequence_numbers and tuple(sequence_numbers)
         self._offset = (radar_from_lidar, float(z_offset_m))
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
+        self._common_camera = common_camera
         self._visibility, self._field_of_view = visibility, field_of_view
         self._parsed: dict[Key, _Parsed] = {}
         self._read(split)
@@ -215,6 +220,7 @@ class KRadar(Sequence[Frame]):
                 radar_from_lidar=self._offset[0],
                 z_offset_m=self._offset[1],
                 camera_folders=self._camera_folders,
+                common_camera=self._common_camera,
             )
             for number in sorted({number for number, _ in keys})
         }
@@ -353,6 +359,7 @@ class KRadar(Sequence[Frame]):
             camera,
             info.camera_calibration_path,
             self.is_simulated,
+            self._lidar_to_radar_z_m,
         )
 
 

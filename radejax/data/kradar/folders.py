@@ -19,6 +19,7 @@ from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_json
 from radejax.data.kradar.labels import MAX_LABEL_BYTES, read_label_bytes
+from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 
 SIMULATION_MARKER = "simulation.json"
@@ -217,9 +218,14 @@ def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | 
 
 
 def find_camera_calibration(
-    folders: Sequence[pathlib.Path], sequence: int
+    folders: Sequence[pathlib.Path], sequence: int, *, common_only: bool = False
 ) -> tuple[pathlib.Path | None, bool]:
     """Calibration of the left front camera: of the sequence, else the common one.
+
+    Args:
+        folders: Where it is looked for.
+        sequence: Number of the sequence.
+        common_only: The common one even where the sequence has its own.
 
     Returns:
         The file, None where there is none, and whether it is the sequence's own.
@@ -227,7 +233,7 @@ def find_camera_calibration(
     own = f"seq_{sequence:02d}/cam_1.yml"
     of_sequence = (f"calib_seq_v2/{own}", own)
     common = ("common/cam_front0.yml", "cam_front0.yml")
-    for names, is_own in ((of_sequence, True), (common, False)):
+    for names, is_own in ((of_sequence, True), (common, False))[common_only:]:
         for folder in folders:
             for name in names:
                 if (folder / name).is_file():
@@ -238,6 +244,33 @@ def find_camera_calibration(
 def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
     """Whether the simulator has left its `simulation.json` in one of the folders."""
     return any((folder / SIMULATION_MARKER).is_file() for folder in folders)
+
+
+def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
+    """Metres from LiDAR up to radar as the sensors stand, not as boxes are counted.
+
+    What a simulated data set says of its set-up, else K-Radar's own; its calibration
+    files say nothing of z.
+
+    Raises:
+        DataError: A simulation's file is malformed, or two of them differ.
+    """
+    found: dict[pathlib.Path, float] = {}
+    for path in (folder / SIMULATION_MARKER for folder in folders):
+        if path.is_file():
+            try:
+                shift = read_json(path).get("config", {}).get("lidar_to_radar_m")
+                found[path] = KRADAR_LIDAR_TO_RADAR_Z_M if shift is None else shift[2]
+            except (AttributeError, IndexError, TypeError, KeyError):
+                raise DataError(
+                    f"{path}: config.lidar_to_radar_m is not three numbers"
+                ) from None
+    if len(set(found.values())) > 1:
+        raise DataError(
+            f"different heights of radar over LiDAR in {', '.join(map(str, found))}; data "
+            "sets of different sensors cannot be read as one"
+        )
+    return float(next(iter(found.values()), KRADAR_LIDAR_TO_RADAR_Z_M))
 
 
 def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:

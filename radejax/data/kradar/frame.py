@@ -8,6 +8,7 @@ import pathlib
 import numpy as np
 
 from radejax.data.kradar.labels import Label, LabelHeader
+from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +31,8 @@ class Frame:
         camera_path: Front image (stereo pair), None where it is missing.
         camera_calibration_path: Calibration of the left front camera, or None.
         is_simulated: Nothing of it was measured.
+        lidar_to_radar_z_m: By which the radar itself is above the LiDAR, whatever z
+            was added to the boxes.
     """
 
     sequence: int
@@ -48,6 +51,7 @@ class Frame:
     camera_path: pathlib.Path | None
     camera_calibration_path: pathlib.Path | None
     is_simulated: bool = False
+    lidar_to_radar_z_m: float = KRADAR_LIDAR_TO_RADAR_Z_M
 
     @property
     def key(self) -> str:

@@ -157,6 +157,7 @@ def read_sequence_info(
     radar_from_lidar: tuple[float, float] | None,
     z_offset_m: float,
     camera_folders: Sequence[pathlib.Path],
+    common_camera: bool = False,
 ) -> SequenceInfo:
     """Reads what is in the folders of a sequence and fills in what is not.
 
@@ -167,12 +168,15 @@ def read_sequence_info(
         radar_from_lidar: Offset that replaces the calibration file's.
         z_offset_m: Metres to add to LiDAR z.
         camera_folders: Where camera calibrations are looked for.
+        common_camera: One calibration for all sequences, as the released code does.
     """
     if radar_from_lidar is None:
         x, y = _read_offset(number, folder, findings)
     else:
         x, y = map(float, radar_from_lidar)
-    camera, is_own = folders.find_camera_calibration(camera_folders, number)
+    camera, is_own = folders.find_camera_calibration(
+        camera_folders, number, common_only=common_camera
+    )
     if camera is None:
         findings.counts["sequences without camera calibration"] += 1
     elif not is_own:
