@@ -189,6 +189,7 @@ def _data() -> ConfigDict:
         {
             "label_version": "v2.1",
             "visibility": ("R",),  # what the radar can see
+            "count_disabled": False,  # v1.1 lines without a *, as released
             "sequences": (),  # only these, such as (1, 58); () for all that are there
             "weather": (),  # only these, such as ("fog", "rain"); () for all
             "max_objects": 32,  # per frame; 14 is the most in K-Radar v2.1

@@ -199,6 +199,7 @@ RULES: dict[str, Rule] = {
     "train.max_skipped_steps": _COUNT_OR_0,
     "data.label_version": _VERSION,
     "data.visibility": _or_none(_several(_one_of(*AVAILABILITY_FLAGS), distinct=True)),
+    "data.count_disabled": _BOOL,
     "data.sequences": _some(_COUNT),
     "data.weather": _some(_one_of(*WEATHERS)),
     "data.max_objects": _COUNT,

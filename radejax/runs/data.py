@@ -199,7 +199,8 @@ class Data:
             classes=config.classes,
             camera_calibration=paths.camera_calibration,
             common_camera=camera is not None and camera.calibration == "common",
-            # Runs of before are without these two fields.
+            # Runs of before are without these fields.
+            count_disabled=config.data.get("count_disabled", False),
             sequence_numbers=config.data.get("sequences") or None,
             weather=config.data.get("weather") or None,
         )

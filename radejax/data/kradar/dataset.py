@@ -60,6 +60,7 @@ class KRadar(Sequence[Frame]):
             None: from each sequence's calibration file, else (-2.54, 0.3).
         z_offset_m: Metres to add to LiDAR z: 0 in the papers, 0.7 in K-Radar's code.
         visibility: Availability flags to keep, None for all.
+        count_disabled: Lines of v1.x labels without a `*` count too, as released.
         classes: Classes to keep.
         field_of_view: Keep only boxes whose center is in the field of view.
         sequence_numbers: Only these sequences; None for all. Sequences that have labels
@@ -96,6 +97,7 @@ class KRadar(Sequence[Frame]):
         radar_from_lidar: tuple[float, float] | None = None,
         z_offset_m: float = 0.0,
         visibility: Sequence[str] | None = ("R",),
+        count_disabled: bool = False,
         classes: Sequence[str] = CLASSES,
         field_of_view: bool = True,
         sequence_numbers: Iterable[int] | None = None,
@@ -122,6 +124,7 @@ class KRadar(Sequence[Frame]):
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
         self._common_camera = common_camera
         self._visibility, self._field_of_view = visibility, field_of_view
+        self._count_disabled = count_disabled
         self._parsed: dict[Key, _Parsed] = {}
         self._read(split)
 
@@ -255,7 +258,11 @@ class KRadar(Sequence[Frame]):
                     if isinstance(content, DataError):
                         raise content
                     file = parse_label_file(
-                        content, self.version, where=where, problems=problems
+                        content,
+                        self.version,
+                        where=where,
+                        problems=problems,
+                        count_disabled=self._count_disabled,
                     )
                 except DataError as error:
                     file, problems = None, [Problem("label file", where, str(error))]
