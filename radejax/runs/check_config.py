@@ -274,7 +274,7 @@ def check(config: ConfigDict) -> None:
             first one, what it is and what is expected.
     """
     values = config.to_dict()
-    fields = dict(_fields(values))
+    fields = dict(field_values(values))
     sections = {"", *_SECTIONS}
     if fields.get("model.name") != "radenet":
         sections |= set(_CAMERA_SECTIONS)
@@ -300,12 +300,14 @@ def check(config: ConfigDict) -> None:
     _check_together(config, values)
 
 
-def _fields(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def field_values(
+    values: Mapping[str, Any], path: str = ""
+) -> Iterator[tuple[str, Any]]:
     """Name with dots and value of every field; an empty section counts as one."""
     for key, value in values.items():
         name = f"{path}{key}"
         if isinstance(value, Mapping) and value and name not in RULES:
-            yield from _fields(value, f"{name}.")
+            yield from field_values(value, f"{name}.")
         else:
             yield name, value
 
