@@ -14,7 +14,9 @@ from collections.abc import Callable
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 
+from radejax.cli import main
 from radejax.inference.open import load
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
@@ -52,6 +54,11 @@ def _finish(process: subprocess.Popen) -> str:
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     return output
+
+
+def _radejax(*arguments: object) -> Result:
+    """`evaluate.py` is `radejax evaluate`."""
+    return CliRunner().invoke(main.main, [str(argument) for argument in arguments])
 
 
 def _metrics(folder: pathlib.Path) -> dict:
@@ -99,6 +106,7 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
 ) -> None:
     folder, _ = undisturbed
     first = _metrics(folder)
+    # A process of its own: to the last digit on as many devices as in training.
     subprocess.run(
         [sys.executable, "evaluate.py", f"--workdir={folder / 'run'}"],
         cwd=REPOSITORY,
@@ -108,17 +116,9 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
         timeout=600,
     )
     assert _metrics(folder) == first
-    command = [
-        sys.executable,
-        "-c",
-        "from radejax.cli.main import main; main()",
-        "detect",
-    ]
-    command += [str(folder / "data" / "3"), "--workdir", str(folder / "run")]
-    command += ["--out", str(folder / "boxes"), "--score-threshold", "0", "--json"]
-    done = subprocess.run(
-        command, env=_environment(), check=True, capture_output=True, timeout=600
-    )
+    words = [folder / "data" / "3", "--workdir", folder / "run"]
+    words += ["--out", folder / "boxes", "--score-threshold", "0", "--json"]
+    done = _radejax("detect", *words)
     assert json.loads(done.stdout)["frames"] == 6
     assert len(list((folder / "boxes").glob("3_tesseract_*.json"))) == 6
 
@@ -129,19 +129,11 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     shutil.copytree(folder / "data", tmp_path / "other")
     shutil.rmtree(tmp_path / "other" / "records")
 
-    def evaluate(*arguments: str) -> subprocess.CompletedProcess:
-        command = [sys.executable, "evaluate.py", f"--workdir={folder / 'run'}"]
-        return subprocess.run(
-            [*command, *arguments],
-            cwd=REPOSITORY,
-            env=_environment(),
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
+    def evaluate(*arguments: object) -> Result:
+        return _radejax("evaluate", "--workdir", folder / "run", *arguments)
 
-    done = evaluate(f"--data={tmp_path / 'other'}")
-    assert done.returncode == 0, done.stderr
+    done = evaluate("--data", tmp_path / "other")
+    assert done.exit_code == 0, done.output
     assert (tmp_path / "other" / "records" / "manifest.json").exists()
     found = folder / "run" / "evaluation_other" / "metrics.json"
     assert json.loads(found.read_text())["ap"] == _metrics(folder)["ap"]
@@ -156,7 +148,7 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     ):
         other = () if "data" in flag else (f"--data={tmp_path / 'other'}",)
         done = evaluate(flag, *other)
-        assert done.returncode == 2
+        assert done.exit_code == 2
         assert message in done.stderr
         assert "Traceback" not in done.stderr
 

@@ -95,7 +95,8 @@ def decode(
         ...     num_doppler=4, num_range=16, num_elevation=4, num_azimuth=8)
         >>> logits = jnp.full((1, 16, 8, 2), -9.0).at[0, 5, 3, 1].set(2.0)
         >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
-        >>> found = decode(maps, grid, max_detections=4, score_threshold=0.3)
+        >>> jitted = jax.jit(decode, static_argnames=("grid", "max_detections"))
+        >>> found = jitted(maps, grid, max_detections=4, score_threshold=0.3)
         >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
         ([[1, -1, -1, -1]], 0.8808)
     """
@@ -133,17 +134,17 @@ def suppress(
 
     `normalize_yaw` compares boxes of their regressed size, whatever the length of the
     yaw vector.
+
+    Examples:
+        >>> boxes = jnp.array([[[0.0, 0, 0, 4, 2, 1, 0, 1], [0.5, 0, 0, 4, 2, 1, 0, 1]]])
+        >>> zeros, ones = jnp.zeros((1, 2), int), jnp.ones((1, 2), bool)
+        >>> peaks = Peaks(jnp.zeros((1, 2, 2), int), boxes, ones, zeros, ones, jnp.array([2]))
+        >>> jax.jit(suppress)(peaks, 0.3).tolist()
+        [[True, False]]
     """
     boxes = boxes7_from_8(peaks.boxes) if normalize_yaw else peaks.boxes
-
-    def one_frame(
-        boxes: jax.Array, is_valid: jax.Array, classes: jax.Array
-    ) -> jax.Array:
-        return rotated_nms(
-            boxes, is_valid, nms_iou, classes=classes if per_class else None
-        )
-
-    return jax.vmap(one_frame)(boxes, peaks.is_valid, peaks.classes)
+    classes = peaks.classes if per_class else None
+    return rotated_nms(boxes, peaks.is_valid, nms_iou, classes=classes)
 
 
 def find_peaks(
@@ -159,6 +160,16 @@ def find_peaks(
     """The strongest local maxima of the heatmaps with their boxes, before NMS.
 
     Args and errors are those of `decode`; `max_peaks` is P, cut to the number of bins.
+
+    Examples:
+        >>> grid = RadarGrid.reduced(
+        ...     num_doppler=4, num_range=16, num_elevation=4, num_azimuth=8)
+        >>> logits = jnp.full((1, 16, 8, 2), -9.0).at[0, 5, 3, 1].set(2.0)
+        >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
+        >>> jitted = jax.jit(find_peaks, static_argnames=("grid", "max_peaks"))
+        >>> peaks = jitted(maps, grid, max_peaks=4, score_threshold=0.3)
+        >>> peaks.cell[0, 0].tolist(), int(peaks.classes[0, 0]), int(peaks.num_found[0])
+        ([5, 3], 1, 1)
     """
     _check_shapes(maps, grid)
     if max_peaks < 1:
@@ -209,6 +220,11 @@ def boxes_at(
 
     Raises:
         AssertionError: Shapes are not these.
+
+    Examples:
+        >>> grid = RadarGrid.kradar()
+        >>> boxes_at(jnp.ones((1, 8)), jnp.array([[10, 53]]), grid, z0_m=0.5)[0, 2:4].tolist()
+        [1.5, 1.0]
     """
     chex.assert_shape(params, (*cell.shape[:-1], 8))
     chex.assert_axis_dimension(cell, -1, 2)

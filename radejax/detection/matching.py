@@ -57,6 +57,13 @@ def match_boxes(
     Raises:
         ValueError: `space` is unknown, or only one of the class arrays is given.
         AssertionError: The arrays have not one row per prediction and object.
+
+    Examples:
+        >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [9.0, 0, 0, 4, 2, 1, 0]])
+        >>> all_valid = jnp.array([True, True])
+        >>> found = jax.jit(match_boxes)(cars[::-1], all_valid, cars, all_valid)
+        >>> found.object_idx.tolist()
+        [1, 0]
     """
     if space not in ("bev", "3d"):
         raise ValueError(f"space must be 'bev' or '3d', got {space!r}")

@@ -58,6 +58,10 @@ def roi_bounds(roi: str | Sequence[float] | None) -> tuple[float, ...] | None:
 
     Raises:
         UserError: An unknown name, or not six increasing bounds.
+
+    Examples:
+        >>> roi_bounds([0, 72, -6.4, 6.4, -2, 6])
+        (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
     """
     if roi is None:
         return None
@@ -74,7 +78,13 @@ def roi_bounds(roi: str | Sequence[float] | None) -> tuple[float, ...] | None:
 
 
 def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
-    """`[N]` bool: box centers inside the region, bounds included."""
+    """`[N]` bool: box centers inside the region, bounds included.
+
+    Examples:
+        >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [20.0, 40, 0, 4, 2, 1.5, 0]])
+        >>> in_roi(cars, [0, 72, -6.4, 6.4, -2, 6]).tolist()
+        [True, False]
+    """
     bounds = roi_bounds(roi)
     if bounds is None:
         return np.ones(len(box), bool)
@@ -83,7 +93,12 @@ def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
 
 
 def roi_name(roi: str | Sequence[float] | None) -> str:
-    """A short name of a region for labels and file names."""
+    """A short name of a region for labels and file names.
+
+    Examples:
+        >>> roi_name("narrow"), roi_name(None), roi_name([0, 72, -6, 6, -2, 6])
+        ('narrow', 'none', '0,72,-6,6,-2,6')
+    """
     if roi is None:
         return "none"
     if isinstance(roi, str):
@@ -94,7 +109,12 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
 
 
 def frame_ids(frames: Columns) -> np.ndarray:
-    """`[F]` ids of a frame table, checked to be integers without repetition."""
+    """`[F]` ids of a frame table, checked to be integers without repetition.
+
+    Examples:
+        >>> frame_ids({"frame": np.array([7, 9])}).tolist()
+        [7, 9]
+    """
     if "frame" not in frames:
         raise UserError(f"frames need a column 'frame', found {sorted(frames)}")
     ids = _integers(frames["frame"], "frames")
@@ -113,12 +133,22 @@ def frame_ids(frames: Columns) -> np.ndarray:
 
 
 def are_simulated(frames: Columns | None) -> bool:
-    """Whether a frame table says that frames of it are simulated."""
+    """Whether a frame table says that frames of it are simulated.
+
+    Examples:
+        >>> are_simulated({"frame": np.array([7, 9])})
+        False
+    """
     return frames is not None and bool(np.any(frames.get("simulated", False)))
 
 
 def wanted_columns(scored: bool) -> tuple[str, ...]:
-    """Names of the columns of ground truth or, `scored`, of predictions."""
+    """Names of the columns of ground truth or, `scored`, of predictions.
+
+    Examples:
+        >>> wanted_columns(scored=False)
+        ('frame', 'box', 'cls')
+    """
     return ("frame", "box", "cls", "score")[: 4 if scored else 3]
 
 
@@ -131,6 +161,12 @@ def read_columns(
         UserError: A column is missing or has the wrong shape or type.
         DataError: A value no box may have, named by frame and row: not finite, a size
             that is not positive, a score outside [0, 1].
+
+    Examples:
+        >>> table = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> frame, box, cls, score = read_columns(table, name="ground truth", scored=False)
+        >>> frame.tolist(), box.shape, cls.tolist(), score.tolist()
+        ([0], (1, 7), ['Sedan'], [0.0])
     """
     missing = [column for column in wanted_columns(scored) if column not in table]
     if missing:
@@ -200,6 +236,11 @@ def class_indices(
 
     Raises:
         DataError: A class name that is neither asked for nor one of K-Radar's.
+
+    Examples:
+        >>> cls, frame = np.array(["Sedan", "Bicycle"]), np.array([0, 0])
+        >>> class_indices(cls, frame, ["Sedan"], name="ground truth").tolist()
+        [0, -1]
     """
     index_of = dict.fromkeys((*classes, *KNOWN_CLASSES), -1)
     index_of |= {name: i for i, name in enumerate(classes)}
@@ -219,6 +260,10 @@ def dense_frames(frame: np.ndarray, ids: np.ndarray, *, name: str) -> np.ndarray
 
     Raises:
         DataError: A frame that the table does not have.
+
+    Examples:
+        >>> dense_frames(np.array([9, 7, 7]), np.array([7, 9]), name="predictions").tolist()
+        [1, 0, 0]
     """
     order = np.argsort(ids, kind="stable")
     position = np.searchsorted(ids[order], frame)

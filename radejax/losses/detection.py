@@ -61,9 +61,8 @@ def detection_loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Weighted sum of the three losses over a batch, and its parts; in float32.
 
-    The regression losses are means over the matched boxes of a frame, then over all
-    frames; frames without any count as 0. All run over the whole batch, so that one
-    sharded over devices gives the same result.
+    The regression losses are means over the matched boxes of a frame (0 without any),
+    then over all frames of the whole batch, also of one sharded over devices.
 
     Args:
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
@@ -93,17 +92,20 @@ def detection_loss(
 
     References:
         RADE-Net, equation (17).
+
+    Examples:
+        >>> maps = DetectionMaps(jnp.zeros((1, 256, 107, 2)), jnp.ones((1, 256, 107, 8)))
+        >>> car = jnp.array([[[20.0, 0, 0, 4, 2, 1.5, 0, 1]]])
+        >>> batch = Batch(None, car, jnp.array([[0]]), jnp.array([[True]]), frame=None)
+        >>> loss = jax.jit(detection_loss, static_argnames="grid")
+        >>> float(loss(maps, batch, RadarGrid.kradar())[0])
+        4.0
     """
     _check(maps, batch, grid, matching)
     boxes, is_valid = _objects(batch, is_frame_valid)
-    target = gaussian_heatmap(
-        boxes,
-        batch.classes,
-        is_valid,
-        grid,
-        num_classes=maps.heatmap_logits.shape[-1],
-        sigma=sigma,
-        sigma_cells=sigma_cells,
+    draw = partial(gaussian_heatmap, num_classes=maps.heatmap_logits.shape[-1])
+    target = draw(
+        boxes, batch.classes, is_valid, grid, sigma=sigma, sigma_cells=sigma_cells
     )
     focal = focal_loss(maps.heatmap_logits, target, is_frame_valid=is_frame_valid)
     pair = _pairs_at_centers if matching == "center" else partial(_after_nms, nms)
@@ -111,11 +113,9 @@ def detection_loss(
     for_gwd = _with_unit_yaw(predicted) if normalize_yaw else predicted
     gwd = gwd_loss(for_gwd, wanted, gwd_tau, gwd_transform)
     l1 = jnp.mean(smooth_l1(predicted - wanted), axis=-1)
-    parts = {
-        "focal": focal,
-        "gwd": _mean_of_frames(gwd, is_matched, is_frame_valid),
-        "smooth_l1": _mean_of_frames(l1, is_matched, is_frame_valid),
-    }
+    parts = {"focal": focal}
+    for name, values in (("gwd", gwd), ("smooth_l1", l1)):
+        parts[name] = _mean_of_frames(values, is_matched, is_frame_valid)
     total = _weighted_sum(parts, weights, normalize)
     parts["weighted_sum"] = _weighted_sum(parts, weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
@@ -144,6 +144,13 @@ def whole_batch_loss(
         `[P, 3]` weights: the mean over the parts of their losses, so weighted and not
         normalised, has the gradient of the batch. Then what `detection_loss` gives for
         the batch: total and its parts.
+
+    Examples:
+        >>> parts = dict.fromkeys(("focal", "gwd", "smooth_l1"), jnp.array([1.0, 3.0]))
+        >>> parts["num_positive"] = jnp.array([1, 1])
+        >>> _, total, whole = whole_batch_loss(parts, 100)
+        >>> float(total), float(whole["focal"])
+        (4.0, 2.0)
     """
     positive = parts["num_positive"].astype(jnp.float32)
     of_part = jnp.where(positive > 0, positive, num_bins)
@@ -179,6 +186,10 @@ def smooth_l1(difference: jax.Array) -> jax.Array:
 
     `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
     loses the digits of small differences.
+
+    Examples:
+        >>> smooth_l1(jnp.array([0.5, 3.0])).tolist()
+        [0.125, 2.5]
     """
     size = jnp.abs(difference)
     return jnp.where(size < 1.0, 0.5 * size * size, size - 0.5)

@@ -3,8 +3,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.detection.matching import match_boxes
+from radejax.detection import matching
 from radejax.geometry.rotated_iou import bev_iou_np, iou_3d_np
+
+match_boxes = jax.jit(matching.match_boxes, static_argnames=("one_to_one", "space"))
 
 
 def squares(x, side=4.0, z=0.0):
@@ -91,7 +93,7 @@ def test_one_to_one_equals_the_python_loop(space, oracle):
     predicted, objects = random_boxes(30), random_boxes(20)
     iou = oracle(np.repeat(predicted, 20, 0), np.tile(objects, (30, 1)))
     expected = python_one_to_one(iou.reshape(30, 20), 0.1)
-    found = jax.jit(match_boxes, static_argnames=("one_to_one", "space"))(
+    found = match_boxes(
         predicted,
         np.ones(30, bool),
         objects,

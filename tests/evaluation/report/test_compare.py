@@ -1,18 +1,14 @@
-import os
-import pathlib
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from radejax.cli.evaluate import evaluate
 from radejax.core.errors import UserError
 from radejax.evaluation.files import kitti, predictions
 from radejax.evaluation.files.load import Source
 from radejax.evaluation.report import compare as commands
 from radejax.evaluation.report.measure import Options
 
-ROOT = pathlib.Path(__file__).resolve().parents[3]
 OPTIONS = Options(roi=None, plots=False, protocols=("exact", "kradar_r40"))
 
 
@@ -96,15 +92,8 @@ def test_frames_without_sequences_cannot_be_compared(scene, tmp_path):
         )
 
 
-def run(*arguments, **settings):
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg"}
-    return subprocess.run(
-        [sys.executable, str(ROOT / "evaluate.py"), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=environment,
-        **settings,
-    )
+def run(*arguments):
+    return CliRunner().invoke(evaluate, [str(argument) for argument in arguments])
 
 
 def test_command_line(stored):
@@ -115,14 +104,14 @@ def test_command_line(stored):
         "--protocols", "exact,kradar_r40", "--iou", "0.3", "--classes", "Sedan",
         "--bootstrap", "10",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert "AP 3D / BEV at IoU 0.3, exact" in done.stdout
     assert (folder / "out" / "metrics.json").is_file()
     compared = run(
         "--compare", folder / "out", folder / "out", "--bootstrap", 20,
         "--roi", "none", "--classes", "Sedan",
     )  # fmt: skip
-    assert compared.returncode == 0, compared.stderr
+    assert compared.exit_code == 0, compared.stderr
     assert "B - A" in compared.stdout
 
 
@@ -137,7 +126,7 @@ def test_command_line(stored):
 )
 def test_wrong_use_is_one_line_and_exit_code_2(arguments, message):
     done = run(*arguments)
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
@@ -147,5 +136,5 @@ def test_bad_content_is_one_line_and_exit_code_1(tmp_path):
     done = run(
         "--predictions", tmp_path / "p.csv", "--ground_truth", tmp_path / "p.csv"
     )
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert "lacks columns" in done.stderr
