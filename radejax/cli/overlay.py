@@ -14,10 +14,12 @@ ANIMATIONS = (".gif", ".mp4")
 
 
 @click.command(cls=options.Command)
-@click.argument("name", metavar="FRAME")
+@click.argument("name", metavar="[FRAME]", default="")
 @options.data_roots
 @options.labels
 @options.label_version
+@options.sequences
+@options.weather
 @click.option("--out", type=options.FILE, default="overlay.png", show_default=True)
 @click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
 @click.option(
@@ -28,6 +30,8 @@ def overlay(
     roots: tuple[pathlib.Path, ...],
     labels: pathlib.Path | None,
     label_version: str,
+    sequence_numbers: tuple[int, ...] | None,
+    weather: tuple[str, ...] | None,
     out: pathlib.Path,
     slices: bool,
     max_frames: int | None,
@@ -36,7 +40,7 @@ def overlay(
     """Draw one frame's labels on radar and camera: the first look at new data.
 
     FRAME is sequence/radar_lidar, or a sequence: its first frame, or all of them where
-    --out ends in .gif or .mp4.
+    --out ends in .gif or .mp4. So are --sequences and --weather without a FRAME.
 
     Example: radejax overlay 1/00033_00001 --data ROOT
     """
@@ -46,15 +50,20 @@ def overlay(
     from radejax.visualize import animate, bev
 
     sequence, _, frame_name = name.partition("/")
-    if not sequence.isdigit():
+    if sequence.isdecimal():
+        sequence_numbers = (int(sequence),)
+    elif name or not (sequence_numbers or weather):
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
     frames = KRadar(
         roots,
         labels,
         version=label_version,
-        sequence_numbers=[int(sequence)],
+        sequence_numbers=sequence_numbers,
+        weather=weather,
         visibility=None,
     )
+    if not len(frames):
+        raise UserError("no frames of these sequences and weathers")
     found = [frame for frame in frames if frame_name in ("", frame.name)]
     if not found:
         raise UserError(

@@ -153,6 +153,7 @@ def _decode() -> ConfigDict:
             # Where the length of the regressed (sin, cos) scales a box: "nms" alone,
             # "always" (results too, as the released evaluator has it), "never".
             "raw_yaw": "nms",
+            "clip_sizes": True,  # regressed sizes that are not positive; False: released
         }
     )
 
@@ -215,7 +216,8 @@ def _evaluation() -> ConfigDict:
             "protocols": ("coco101", "exact", "kradar_r40"),
             "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
-            "score_threshold": 0.3,
+            "score_threshold": 0.3,  # of all protocols but "exact", which has no cut
+            "min_score": 0.05,  # predictions are kept from here on
             "bootstrap": 0,  # resamples of sequences for intervals; 1000 is plenty
             "batch_size": 8,
             "num_pictures": 8,

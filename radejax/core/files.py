@@ -9,10 +9,11 @@ import json
 import logging
 import os
 import pathlib
+import shutil
 import socket
 import stat
 import types
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import IO, Any
 
 from radejax.core.errors import DataError, DiskFullError, UserError
@@ -52,6 +53,33 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def swapped_in(folder: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """A temporary folder beside, of which all moves into `folder` at the end of the block.
+
+    What has the same name there is replaced, folders whole; the rest stays. After an error
+    `folder` is what it was; after a kill too, unless it came between two of these moves.
+
+    Raises:
+        DiskFullError: No space is left on the disk.
+    """
+    folder = pathlib.Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_path(folder)
+    _remove_stale(folder.parent.glob(_stale_pattern(folder.name)))
+    try:
+        with disk_full(folder):
+            temporary.mkdir()
+            yield temporary
+            folder.mkdir(exist_ok=True)
+            for path in sorted(temporary.iterdir()):
+                if (folder / path.name).is_dir():
+                    (folder / path.name).rename(temporary / f".old {path.name}")
+                path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -107,11 +135,21 @@ def remove_stale(folder: pathlib.Path, name: str = "*") -> None:
         folder: Looked at with all folders in it.
         name: Of the files that they were to become; may have wildcards.
     """
-    host = socket.gethostname()
-    for path in folder.rglob(f".{name}.{host}.*.tmp"):
+    _remove_stale(folder.rglob(_stale_pattern(name)))
+
+
+def _stale_pattern(name: str) -> str:
+    return f".{name}.{socket.gethostname()}.*.tmp"
+
+
+def _remove_stale(paths: Iterable[pathlib.Path]) -> None:
+    for path in list(paths):
         process = path.name.split(".")[-2]
         if process.isdecimal() and not is_running(int(process)):
-            path.unlink(missing_ok=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def is_running(process: int) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 
 from radejax.core.errors import UserError
-from radejax.core.structures import DetectionMaps, Detections
+from radejax.core.structures import MIN_SIZE_M, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
@@ -56,6 +56,7 @@ def decode(
     threshold_inclusive: bool = False,
     z0_m: float | jax.Array = 0.0,
     raw_yaw: Literal["nms", "always", "never"] = "nms",
+    clip_sizes: bool = True,
 ) -> Detections:
     """Boxes of a batch of detection maps.
 
@@ -81,6 +82,7 @@ def decode(
             box: "nms" alone; "always", so that results have that length and width, and
             a short vector shrinks a box in every overlap, as in the released NMS and
             evaluator; "never".
+        clip_sizes: Sizes are `MIN_SIZE_M` at least; the released code's may be negative.
 
     Returns:
         Detections by descending score; equal scores in order of range, then azimuth.
@@ -100,12 +102,7 @@ def decode(
         >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
         ([[1, -1, -1, -1]], 0.8808)
     """
-    if max_detections < 1:
-        raise ValueError(f"max_detections must be at least 1, got {max_detections}")
-    if raw_yaw not in ("nms", "always", "never"):
-        raise UserError(
-            f'decode.raw_yaw is {raw_yaw!r}, expected "nms", "always" or "never"'
-        )
+    _check_options(max_detections, raw_yaw)
     peaks = find_peaks(
         maps,
         grid,
@@ -115,11 +112,14 @@ def decode(
         threshold_inclusive=threshold_inclusive,
         z0_m=z0_m,
     )
+    clip = _with_positive_sizes if clip_sizes else lambda boxes: boxes
+    peaks = dataclasses.replace(peaks, boxes=clip(peaks.boxes))
     keep = suppress(
         peaks, nms_iou, per_class=per_class_nms, normalize_yaw=raw_yaw == "never"
     )
     if raw_yaw == "always":
-        peaks = dataclasses.replace(peaks, boxes=_with_raw_footprint(peaks.boxes))
+        boxes = clip(_with_raw_footprint(peaks.boxes))
+        peaks = dataclasses.replace(peaks, boxes=boxes)
     return _compact(peaks, keep, max_detections)
 
 
@@ -242,6 +242,11 @@ def _with_raw_footprint(boxes: jax.Array) -> jax.Array:
     return boxes.at[..., 3:5].multiply(norm)
 
 
+def _with_positive_sizes(boxes: jax.Array) -> jax.Array:
+    """`[..., 8]` boxes, sizes clipped from below."""
+    return boxes.at[..., 3:6].max(MIN_SIZE_M)
+
+
 def _max_3x3(values: jax.Array) -> jax.Array:
     """Maximum over each bin and its neighbours in range and azimuth: `[B, R, A, C]`."""
     for axis in (1, 2):
@@ -315,6 +320,15 @@ def _pad_rows(detections: Detections, count: int) -> Detections:
 def _flat_cells(values: jax.Array) -> jax.Array:
     """`[B, R, A, C]` -> `[B, R * A, C]`."""
     return values.reshape(values.shape[0], -1, values.shape[-1])
+
+
+def _check_options(max_detections: int, raw_yaw: str) -> None:
+    if max_detections < 1:
+        raise ValueError(f"max_detections must be at least 1, got {max_detections}")
+    if raw_yaw not in ("nms", "always", "never"):
+        raise UserError(
+            f'decode.raw_yaw is {raw_yaw!r}, expected "nms", "always" or "never"'
+        )
 
 
 def _check_shapes(maps: DetectionMaps, grid: RadarGrid) -> None:

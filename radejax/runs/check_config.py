@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ml_collections import ConfigDict
@@ -15,7 +15,6 @@ from radejax.core.errors import UserError
 from radejax.data.kradar.labels import AVAILABILITY_FLAGS, LABEL_CLASSES, VERSIONS
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.runs.validation import check_best_metric
 from radejax.simulation.config import SimulationConfig
 
 
@@ -180,6 +179,7 @@ RULES: dict[str, Rule] = {
     "decode.per_class_nms": _BOOL,
     "decode.roi": _or_none(_several(_number(), 6)),
     "decode.raw_yaw": _one_of("nms", "always", "never"),
+    "decode.clip_sizes": _BOOL,
     "train.batch_size": _COUNT,
     "train.num_epochs": _COUNT,
     "train.learning_rate": _POSITIVE,
@@ -216,15 +216,20 @@ RULES: dict[str, Rule] = {
     "data.camera.calibration": _one_of("sequence", "common"),
     "data.camera.resize": _BOOL,
     "data.camera.allow_missing": _BOOL,
-    "evaluation.roi": _where(
-        _several(_number(), 6),
-        "x0 < x1, y0 < y1, z0 < z1",
-        lambda value: all(a < b for a, b in zip(value[::2], value[1::2], strict=True)),
+    "evaluation.roi": _or_none(
+        _where(
+            _several(_number(), 6),
+            "x0 < x1, y0 < y1, z0 < z1",
+            lambda value: all(
+                a < b for a, b in zip(value[::2], value[1::2], strict=True)
+            ),
+        )
     ),
     "evaluation.protocols": _several(_one_of(*PROTOCOLS), distinct=True),
     "evaluation.skip_empty": _one_of("protocol", "class", "frame", "none"),
     "evaluation.iou_thresholds": _several(_BELOW_ONE, distinct=True),
     "evaluation.score_threshold": _SHARE,
+    "evaluation.min_score": _SHARE,
     "evaluation.bootstrap": _COUNT_OR_0,
     "evaluation.batch_size": _COUNT,
     "evaluation.num_pictures": _COUNT_OR_0,
@@ -288,16 +293,41 @@ def check(config: ConfigDict) -> None:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean config.{near[0]}?" if near else ""
             raise UserError(f"config.{name} is not a field of this config{hint}")
-        if not RULES[name].holds(value):
-            raise UserError(
-                f"config.{name} is {value!r}, expected {RULES[name].expected}"
-            )
+        check_field(name, value)
     for name in known:
         if name not in fields:
             raise UserError(
                 f"config.{name} is missing, expected {RULES[name].expected}"
             )
     _check_together(config, values)
+
+
+def check_field(name: str, value: Any) -> None:
+    """`UserError` for an impossible value of a field that there is, by its dotted name."""
+    if not RULES[name].holds(value):
+        raise UserError(f"config.{name} is {value!r}, expected {RULES[name].expected}")
+
+
+def check_best_metric(name: str, iou_thresholds: Sequence[float]) -> None:
+    """Refuses a `train.best_metric` that validations do not compute.
+
+    Args:
+        name: Such as "map_3d_iou30".
+        iou_thresholds: Of `config.evaluation`.
+
+    Raises:
+        UserError: Names those that there are.
+    """
+    known = [
+        f"map_{space}_iou{100 * iou:.4g}"
+        for space in ("bev", "3d")
+        for iou in iou_thresholds
+    ]
+    if name not in known:
+        raise UserError(
+            f"train.best_metric is {name!r}; with these evaluation.iou_thresholds it "
+            f"can be one of {', '.join(known)}"
+        )
 
 
 def field_values(

@@ -8,7 +8,7 @@ import hashlib
 import logging
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -61,6 +61,7 @@ class Sources:
         data: K-Radar folders. Without any a config may say what to simulate.
         labels: Label revision, see `KRadar`; the sequences' own if None.
         label_version: Its version, in place of the config's.
+        sequences: Only these, and only of this `weather`, in place of the config's.
         records: Folder of projected frames, beside the first of `data` if None.
         camera_calibration: Folder of camera calibrations, the data's own if None.
         embeddings: Folder of `radejax embed`, in place of images.
@@ -70,6 +71,8 @@ class Sources:
     data: Sequence[str] = ()
     labels: str | None = None
     label_version: str | None = None
+    sequences: Sequence[int] = ()
+    weather: Sequence[str] = ()
     records: str | None = None
     camera_calibration: str | None = None
     embeddings: str | None = None
@@ -106,10 +109,11 @@ class Sources:
 
     @property
     def name(self) -> str:
-        """What tells results on them from others: names of the folder and labels."""
+        """What tells results on them from others: folder, labels, sequences, weather."""
         parts = [pathlib.Path(path).resolve().name for path in self.data[:1]]
         if self.labels is not None:
             parts.append(pathlib.Path(self.labels).resolve().stem)
+        parts += ["-".join(map(str, part)) for part in (self.sequences, self.weather)]
         return "_".join(filter(None, parts)) or "other"
 
 
@@ -290,13 +294,10 @@ class Data:
             gain_db=options.gain_db,
             gain_slope_db=options.gain_slope_db,
         )
-        loading = LoaderOptions(
-            batch_size=train.batch_size // jax.process_count(),
-            seed=seed,
-            num_threads=options.num_threads,
-            num_workers=options.num_workers,
-        )
-        return make_loader(table, loading, augment=augment)
+        loading = {name: options[name] for name in ("num_threads", "num_workers")}
+        batch_size = train.batch_size // jax.process_count()
+        loader = LoaderOptions(batch_size=batch_size, seed=seed, **loading)
+        return make_loader(table, loader, augment=augment)
 
 
 def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
@@ -314,8 +315,7 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
             backbone; no space left.
         FileNotFoundError: A folder that was named is not there.
     """
-    if sources.camera_calibration is not None:  # simulating takes long
-        check_folders([sources.camera_calibration])
+    check_folders(filter(None, [sources.camera_calibration]))  # simulating takes long
     simulation = config.get("simulation")
     if not sources.data and simulation is None:
         raise UserError(
@@ -331,8 +331,7 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     if count := len(data.split("train")):  # projecting takes long
         check_enough(count, config.train.batch_size)
     data.project()
-    lost = len(data.frames) - len(data.split(None))
-    if lost:
+    if lost := len(data.frames) - len(data.split(None)):
         _log.warning(
             f"{lost} of {len(data.frames)} frames were left out when they were projected; "
             f"manifest.json in {data.paths.records} says why"
@@ -353,28 +352,32 @@ def data_of_run(
         FileNotFoundError: A folder is not there.
     """
     config, own = loaded.config, loaded.run.get("data")
-    paths = own = own and DataPaths.from_dict(own)
-    if other is not None:
-        paths = other.paths(own)
+    own = own and DataPaths.from_dict(own)
+    paths = own if other is None else other.paths(own)
     if paths is None:
         raise UserError(
             f"{workdir}: trained on frames that were never written, there is no "
             "split to evaluate on; give --data ROOT, or use `radejax detect`"
         )
     if other is not None:
+        config = config.copy_and_resolve_references()
         if other.label_version is not None:
-            config = config.copy_and_resolve_references()
             config.data.label_version = other.label_version
+        if other.sequences or other.weather or own is None or paths.roots != own.roots:
+            part = {"sequences": other.sequences, "weather": other.weather}
+            config.data.update({name: tuple(of) for name, of in part.items()})
         grid = read_grid(list(map(pathlib.Path, paths.roots)))
         if grid != loaded.grid:
             raise UserError(
                 f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
                 f"{workdir} was trained on {describe_grid(loaded.grid)}"
             )
-        is_blind = models.has_camera(loaded.model) and (
-            IMAGE_BACKBONE not in loaded.variables["params"]
-        )
-        if is_blind and paths.embeddings is None:
+        has_backbone = IMAGE_BACKBONE in loaded.variables["params"]
+        if (
+            models.has_camera(loaded.model)
+            and not has_backbone
+            and paths.embeddings is None
+        ):
             raise UserError(
                 f"{workdir} is without the weights of its image backbone: give "
                 "--image_backbone FOLDER, or --embeddings FOLDER of these images"
@@ -392,7 +395,7 @@ def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
     return data[0]
 
 
-def check_folders(paths: Sequence[str]) -> None:
+def check_folders(paths: Iterable[str]) -> None:
     """`FileNotFoundError` for a folder that is not there."""
     for path in paths:
         if not pathlib.Path(path).is_dir():

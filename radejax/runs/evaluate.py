@@ -15,15 +15,17 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
+from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
 from radejax.data.kradar import Frame, KRadar
 from radejax.evaluation.files.load import tables_from_frames
+from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.report import Report, write_report
 from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.runs import pictures
+from radejax.runs import check_config, pictures
 from radejax.runs.data import Data, Sources, data_of_run
 from radejax.training import processes
 
@@ -40,8 +42,8 @@ def evaluate(
     out: pathlib.Path | None = None,
     split: str = "test",
     exchange_images: int | None = None,
-    num_pictures: int | None = None,
     step: int | None = None,
+    **options: Any,
 ) -> Report | None:
     """Detects on a split as the config says, on all devices, and writes the report.
 
@@ -54,8 +56,8 @@ def evaluate(
         out: Folder of the results; `evaluation` in the work folder if None.
         split: "test", "train", "all" or a split file.
         exchange_images: Seed; see `evaluate_run`.
-        num_pictures: Frames drawn; as the config says if None.
         step: Of the variables, for `source.json`.
+        **options: Fields of the report's `Options` in place of the config's.
 
     Returns:
         The report that was written; None on all processes but the first, which return
@@ -68,15 +70,18 @@ def evaluate(
     out = workdir / "evaluation" if out is None else out
     predictor = make_predictor(config, model, data)
     predictor.update(variables)
-    batch_size, images = config.evaluation.batch_size, data.images(seen)
-    predictions = predict_dataset(
-        predictor, data.records, seen, batch_size, images=images
-    )
+    size, images = config.evaluation.batch_size, data.images(seen)
+    predictions = predict_dataset(predictor, data.records, seen, size, images=images)
 
     def report() -> Report:
-        out.mkdir(parents=True, exist_ok=True)
+        with files.swapped_in(out) as folder:
+            made = write(folder)
+        names = (path.relative_to(folder) for path in made.files)
+        return dataclasses.replace(made, files=[out / name for name in names])
+
+    def write(folder: pathlib.Path) -> Report:
         source = source_of(data, split, exchange_images)
-        files.write_json(out / "source.json", {"step": step, **source})
+        files.write_json(folder / "source.json", {"step": step, **source})
         drawer = pictures.FrameDrawer(
             data.records,
             frames,
@@ -85,29 +90,26 @@ def evaluate(
             score_threshold=config.decode.score_threshold,
         )
         ground_truth, table = tables_from_frames(frames, split)
-        report = write_report(
+        made = write_report(
             ground_truth,
             predictions,
             table,
-            out,
+            folder,
             report_options(config, workdir.name),
             bootstrap=config.evaluation.bootstrap,
             left_out_before=frames.summary().counts,
             draw_frame=drawer,
+            **options,
         )
-        _log.info("step %s, split %s\n%s", step, split, report.text)
+        _log.info("step %s, split %s\n%s", step, split, made.text)
         if models.has_camera(model):
-            pictures.draw_camera_share(model, variables, data, frames, out)
-        count = config.evaluation.num_pictures if num_pictures is None else num_pictures
-        drawn = drawer.draw_spread(out / "pictures", count)
-        if drawn:
-            drawer.draw_scenes(out / "scenes.png")
-        if (workdir / "metrics.jsonl").exists():
-            pictures.draw_curves(
-                workdir, out / "training.png", is_simulated=frames.is_simulated
-            )
-        _log.info("drew %d frames in %s", len(drawn), out / "pictures")
-        return report
+            pictures.draw_camera_share(model, variables, data, frames, folder)
+        if drawer.draw_spread(folder / "pictures", config.evaluation.num_pictures):
+            drawer.draw_scenes(folder / "scenes.png")
+        pictures.draw_curves(
+            workdir, folder / "training.png", is_simulated=frames.is_simulated
+        )
+        return made
 
     return processes.main_only(report)
 
@@ -118,10 +120,10 @@ def evaluate_run(
     step: Step = None,
     split: str = "test",
     out: PathLike | None = None,
-    num_pictures: int | None = None,
     image_backbone: PathLike | None = None,
     exchange_images: int | None = None,
     other: Sources | None = None,
+    **changes: Any,
 ) -> Report | None:
     """Evaluates a run's checkpoint as its config says, on all devices.
 
@@ -131,12 +133,14 @@ def evaluate_run(
         split: "test", "train", "all" or a split file.
         out: Folder of the results; `evaluation` in the work folder if None, and
             `evaluation_<name>` for other data.
-        num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `inference.open.load`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
             control of what a radar-camera model knows from the images. `out` then ends
             in `_exchanged`.
         other: Other data than the run's own; projected if they are not yet.
+        **changes: Fields of `config.evaluation` in place of the run's, and `classes`,
+            some of the run's, `run` and `invalid_sizes` of the report's `Options`. A
+            `score_threshold` or `skip_empty` that is given here holds for `exact` too.
 
     Returns:
         The report that was written; None on all processes but the first.
@@ -144,11 +148,18 @@ def evaluate_run(
     Raises:
         UserError: There are no frames of the split, or images to exchange; the run has
             no data and none are given; other data do not fit the run, or `out` has
-            results on others.
+            results on others. Or a change that is impossible.
     """
     loaded = load(workdir, step=step, image_backbone=image_backbone)
     workdir = pathlib.Path(workdir).absolute()
-    config, data = data_of_run(loaded, workdir, other)
+    if loaded.config is None:
+        raise UserError(
+            f"{workdir} has no config of a run: give a work folder of train.py"
+        )
+    config, options = _changed(loaded.config, changes)
+    config, data = data_of_run(
+        dataclasses.replace(loaded, config=config), workdir, other
+    )
     name = "evaluation" if other is None else f"evaluation_{other.name}"
     name += "" if exchange_images is None else "_exchanged"
     if other is not None:
@@ -166,9 +177,34 @@ def evaluate_run(
         out=pathlib.Path(out or workdir / name),
         split=split,
         exchange_images=exchange_images,
-        num_pictures=num_pictures,
         step=loaded.step,
+        **options,
     )
+
+
+def _changed(
+    config: ConfigDict, changes: Mapping[str, Any]
+) -> tuple[ConfigDict, dict[str, Any]]:
+    """The config of a run with changes of its `evaluation`, and those of `Options`.
+
+    Fields that are younger than the run stand at their default.
+    """
+    values = base_config().evaluation.to_dict()
+    options = {name: v for name, v in changes.items() if name not in values}
+    values |= config.evaluation.to_dict()
+    for name in changes.keys() - options.keys():
+        check_config.check_field(f"evaluation.{name}", changes[name])
+        values[name] = changes[name]
+    if unknown := sorted(set(options.get("classes", ())) - set(config.classes)):
+        raise UserError(
+            f"classes has {unknown[0]!r}, expected some of the run's: "
+            f"{', '.join(config.classes)}"
+        )
+    if changes.keys() & {"score_threshold", "skip_empty"}:
+        options["uncut"] = ()
+    config = config.copy_and_resolve_references()
+    config.evaluation = ConfigDict(values)
+    return config, options
 
 
 def source_of(
@@ -179,6 +215,8 @@ def source_of(
         "split": split,
         "exchange_images": exchange_images,
         "label_version": data.options.label_version,
+        "sequences": list(data.options.get("sequences") or ()),
+        "weather": list(data.options.get("weather") or ()),
         "simulated": data.frames.is_simulated,
         **dataclasses.asdict(data.paths),
         "roots": list(data.paths.roots),  # as JSON has them
@@ -189,9 +227,9 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     """`UserError` if a folder has results on other data than these."""
     if not (out / "source.json").exists():
         return
-    names = ("roots", "labels", "label_version", "split")
+    names = ("roots", "labels", "label_version", "split", "sequences", "weather")
     found, wanted = (
-        {name: values.get(name) for name in names}
+        {name: values.get(name) or None for name in names}
         for values in (files.read_json(out / "source.json"), source)
     )
     files.require_same(found, wanted, f"{out} has other results", mend="give --out")
@@ -240,16 +278,21 @@ def make_predictor(
     data: Data,
     mesh: jax.sharding.Mesh | None = None,
 ) -> Predictor:
-    """Predictor with the score threshold of evaluations, still without variables."""
-    threshold = config.evaluation.score_threshold
+    """Predictor of all that evaluations keep, still without variables."""
     return Predictor(
         model,
         data.records.grid,
         classes=config.classes,
-        decode={**config.decode, "score_threshold": threshold},
+        decode={**config.decode, "score_threshold": _lowest_score(config)},
         azimuth_mapping=config.data.azimuth_mapping,
         mesh=mesh,
     )
+
+
+def _lowest_score(config: ConfigDict) -> float:
+    """Score from which on predictions are kept."""
+    options = config.evaluation
+    return min(options.min_score, options.score_threshold)
 
 
 def report_options(config: ConfigDict, name: str) -> Options:
@@ -260,8 +303,10 @@ def report_options(config: ConfigDict, name: str) -> Options:
         classes=tuple(config.classes),
         protocols=tuple(options.protocols),
         iou_thresholds=tuple(options.iou_thresholds),
-        roi=tuple(options.roi),
+        roi=options.roi and tuple(options.roi),
         score_threshold=options.score_threshold,
+        uncut=(RECOMMENDED,),
+        min_score=_lowest_score(config),
         skip_empty=None if options.skip_empty == "none" else options.skip_empty,
         label_version=config.data.label_version,
         invalid_sizes="false_positive",

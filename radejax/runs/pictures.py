@@ -32,7 +32,7 @@ class FrameDrawer:
         records: Projections.
         frames: The data set.
         predictions: Columns as `predict_dataset` returns.
-        roi: Region of the evaluation, x, y, z from and to in metres.
+        roi: Region of the evaluation, x, y, z from and to in metres, or None.
         score_threshold: Predictions from here on are drawn, as a detector in use would
             show them.
     """
@@ -43,14 +43,14 @@ class FrameDrawer:
         frames: Sequence[Frame],
         predictions: Mapping[str, np.ndarray],
         *,
-        roi: Sequence[float],
+        roi: Sequence[float] | None,
         score_threshold: float,
     ) -> None:
         self._records = records
         self._frames = frames
         self._positions = record_positions(records, frames)
         self._predictions = predictions
-        self._roi = tuple(roi)
+        self._roi = roi
         self._score_threshold = score_threshold
 
     def __call__(self, index: int, path: str | os.PathLike) -> None:
@@ -120,7 +120,9 @@ def _simulated(is_simulated: bool) -> str:
 def draw_curves(
     workdir: pathlib.Path, path: pathlib.Path, *, is_simulated: bool = False
 ) -> None:
-    """Draws the losses of a run over its steps into a picture file."""
+    """Draws the losses of a run, if it has any, over its steps into a picture file."""
+    if not (workdir / "metrics.jsonl").exists():
+        return
     title = f"{workdir.name}{_simulated(is_simulated)}"
     figure = curves.draw_training(workdir / "metrics.jsonl", title=title)
     bev.save_figure(figure, path)

@@ -41,6 +41,7 @@ def test_the_first_frame_of_a_sequence_is_drawn(
         ("first", "expected sequence/radar_lidar"),
         ("1/00000_00000", "no frame 00000_00000 in sequence 1; there are"),
         ("7", "no labels of sequences [7]"),
+        ("", "expected sequence/radar_lidar"),
     ],
 )
 def test_a_frame_that_is_not_there_is_named(
@@ -63,3 +64,16 @@ def test_slices_and_a_sequence_in_motion(
     assert '"frames": 1' in done.output
     with Image.open(tmp_path / "all.gif") as picture:
         assert picture.format == "GIF"
+
+
+def test_a_part_of_the_data_is_drawn(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    weather = (root / "1" / "description.txt").read_text().strip().split(",")[2]
+    done = _run("", root, "--weather", weather, "--out", tmp_path / "part.png")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "part.png").is_file()
+    other = "rain" if weather == "fog" else "fog"
+    done = _run("", root, "--sequences", 1, "--weather", other)
+    assert done.exit_code == 2
+    assert "no frames of these sequences and weathers" in done.output

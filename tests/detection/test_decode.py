@@ -21,7 +21,7 @@ CASES = ("padded_wide_roi", "padded_no_roi", "unpadded_wide_roi", "unpadded_no_r
 GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimuth=12)
 C = 3
 SIZES = ("grid", "max_detections", "pre_nms", "per_class_nms")
-FLAGS = ("threshold_inclusive", "raw_yaw")
+FLAGS = ("threshold_inclusive", "raw_yaw", "clip_sizes")
 
 _decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
 _find_peaks = jax.jit(
@@ -435,3 +435,31 @@ def test_wrong_shapes_are_refused():
         run(maps_of(logits, params), GRID, pre_nms=0)
     with pytest.raises(ValueError, match=r"roi must be \[6\]"):
         run(maps_of(logits, params), GRID, roi=np.zeros(4))
+
+
+@pytest.mark.parametrize("raw_yaw", ["nms", "always"])
+def test_a_size_is_never_negative(raw_yaw):
+    logits = jnp.full((2, 20, 12, C), -9.0)
+    logits = logits.at[0, [5, 15], [3, 9], 1].set(2.0).at[1, 5, 3, 0].set(2.0)
+    params = (
+        jnp.ones((2, 20, 12, 8))
+        .at[0, 5, 3]
+        .set(jnp.array([0, 0, 0, -0.2, 1.5, 0, 0, 0]))
+    )
+
+    def run(**options):
+        settings = {"max_detections": 4, "score_threshold": 0.3, "raw_yaw": raw_yaw}
+        maps = DetectionMaps(logits, params)
+        return decode(maps, grid=GRID, **settings, **options)
+
+    found, released = run(), run(clip_sizes=False)
+    least = np.float32(0.01)
+    width = 1.5 if raw_yaw == "nms" else least  # the yaw vector's length is 0
+    np.testing.assert_array_equal(found.boxes[0, 0, 3:6], [least, width, least])
+    assert found.num_clipped.tolist() == [1, 0]
+    np.testing.assert_array_equal(found.boxes[0, 1], released.boxes[0, 1])
+    assert float(released.boxes[0, 0, 3]) == (
+        np.float32(-0.2) if raw_yaw == "nms" else 0.0
+    )
+    assert load_config("configs/radenet.py:official").decode.clip_sizes is False
+    assert load_config("configs/radenet.py").decode.clip_sizes is True

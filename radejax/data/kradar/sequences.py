@@ -224,9 +224,16 @@ def _read_conditions(
     path = None if folder is None else folder.find(".", "description.txt")
     if path is not None:
         try:
-            return read_description(path)
+            conditions = read_description(path)
         except DataError as error:
             findings.report("description", str(path), str(error))
+        else:
+            if conditions.weather not in (*WEATHERS, "unknown"):
+                findings.notes.append(
+                    f"{path}: weather {conditions.weather!r} is none of K-Radar's: "
+                    f"{', '.join(WEATHERS)}"
+                )
+            return conditions
     findings.counts["sequences with built-in conditions"] += 1
     return KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
 

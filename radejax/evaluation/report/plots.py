@@ -47,7 +47,7 @@ def draw(
                 RECOMMENDED,
                 iou_thresholds=iou,
                 spaces=space,
-                score_threshold=options.score_threshold,
+                score_threshold=options.cut(RECOMMENDED),
                 weights=mask,
             )
             for name, mask in masks.items()

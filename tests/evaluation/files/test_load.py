@@ -1,3 +1,4 @@
+import dataclasses
 import types
 
 import numpy as np
@@ -27,6 +28,22 @@ def test_ground_truth_by_id_without_a_frame_table(random_scene, tmp_path):
     _, _, frames, _ = load.load(tmp_path / "found.npz", source, ("Sedan",))
     both = np.union1d(truth["frame"], found["frame"])
     np.testing.assert_array_equal(frames["frame"], both)
+
+
+def test_a_part_of_the_frames(stored, random_scene):
+    folder, source = stored
+    _, _, whole, _ = load.load(folder / "found.json", source, ("Sedan",))
+    part = dataclasses.replace(source, weather=("fog", "rain"))
+    truth, found, frames, _ = load.load(folder / "found.json", part, ("Sedan",))
+    chosen = whole["frame"][np.isin(whole["weather"], ("fog", "rain"))]
+    assert 0 < chosen.size < whole["frame"].size
+    np.testing.assert_array_equal(frames["frame"], chosen)
+    for table in (truth, found):
+        assert set(table["frame"]) <= set(chosen.tolist())
+        assert len(table["box"]) == len(table["frame"]) > 0
+    none = dataclasses.replace(source, sequences=(77,))
+    with pytest.raises(UserError, match="no frames of sequence 77; there are "):
+        load.load(folder / "found.json", none, ("Sedan",))
 
 
 def test_labels_of_kradar(shared, tmp_path):

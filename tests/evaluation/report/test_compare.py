@@ -1,3 +1,6 @@
+import dataclasses
+import json
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -7,6 +10,7 @@ from radejax.core.errors import UserError
 from radejax.evaluation.files import kitti, predictions
 from radejax.evaluation.files.load import Source
 from radejax.evaluation.report import compare as commands
+from radejax.evaluation.report import report
 from radejax.evaluation.report.measure import Options
 
 OPTIONS = Options(roi=None, plots=False, protocols=("exact", "kradar_r40"))
@@ -82,6 +86,33 @@ def test_comparison_of_two_reports(stored, scene):
     assert len(rows) % 2 == 0
     with pytest.raises(UserError, match="at least two runs"):
         commands.compare_files([folder / "few"], None, Source(), OPTIONS)
+
+
+def test_predictions_that_were_stored_cut_say_so(stored, scene):
+    folder, _ = stored
+    truth, found, frames = scene
+    kept = {k: v[found["score"] > 0.3] for k, v in found.items()}
+    for name, table, min_score in (("old", kept, 0.3), ("new", found, 0.05)):
+        options = dataclasses.replace(
+            OPTIONS, score_threshold=0.3, uncut=("exact",), min_score=min_score
+        )
+        made = report.write_report(truth, table, frames, folder / name, options)
+        cuts = {r.result.protocol: r.result.score_threshold for r in made.rows}
+        assert cuts == {"exact": min_score, "kradar_r40": 0.3}
+        (folder / name / "source.json").write_text('{"roots": []}')
+    path = folder / "old" / "metrics.json"
+    content = json.loads(path.read_text())
+    del content["options"]["min_score"]  # as runs of before wrote it
+    path.write_text(json.dumps(content))
+    old = commands.evaluate_files(folder / "old", folder / "a", Source(), OPTIONS)
+    assert "has predictions from score 0.3 on only" in old.metrics["warnings"][0]
+    assert "WARNING: " in old.text
+    assert "/exact/score>0.3/" in old.metrics["ap"][0]["name"]
+    new = commands.evaluate_files(folder / "new", folder / "b", Source(), OPTIONS)
+    assert new.metrics["warnings"] == []
+    runs = [folder / "old", folder / "new"]
+    _, rows = commands.compare_files(runs, None, Source(), OPTIONS, resamples=10)
+    assert {row.difference for row in rows} == {0.0}  # both above what one has stored
 
 
 def test_frames_without_sequences_cannot_be_compared(scene, tmp_path):

@@ -1,13 +1,15 @@
 import csv
+import errno
 import json
 import math
+import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, DiskFullError, UserError
 from radejax.evaluation.average_precision import evaluate
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
@@ -132,7 +134,14 @@ def test_tables_stand_beside_the_published_rows(written):
     for cell in ("85.4", "77.42", "64.06", "RADE-Net, Table II", "DinoRADE, Table 1"):
         assert cell in text
     latex = (out / "tables.tex").read_text()
-    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") > 5
+    count = latex.count(r"\begin{tabular}")
+    assert count > 5
+    for part in (r"\end{tabular}", r"\toprule", r"\begin{table}[t]", r"\caption{"):
+        assert latex.count(part) == count
+    assert latex.count(r"\begin{adjustbox}{max width=\columnwidth}") == count
+    captions = [line for line in latex.splitlines() if line.startswith(r"\caption{")]
+    assert any(r"kradar\_r40, score$>$0, skip=frame" in line for line in captions)
+    assert not any(re.search(r"[^\\$][_&%><]", line[9:]) for line in captions)
 
 
 def test_differences_are_ours_minus_theirs(written):
@@ -183,6 +192,7 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
     truth, found, frames = scene
     broken = {**found, "box": found["box"].copy()}
     broken["box"][5, 3] = -0.2
+    broken["box"][[6, 7], [4, 5]] = np.float32(0.01)  # as decoding clips them
     with pytest.raises(DataError, match=r"row 5: l of the box is -0.2 m"):
         report.write_report(truth, broken, frames, tmp_path, **TERMS)
     assert not list(tmp_path.iterdir())
@@ -197,11 +207,39 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
     )
     what = "predictions: size not positive, kept as false positives"
     assert made.metrics["left_out"][what] == 1
+    assert made.metrics["left_out"]["predictions: size clipped to 0.01 m, kept"] == 2
     whole = evaluate(truth, found, protocol="exact", frames=frames)
     row = made.rows[0].result
     assert row.num_det == whole[0].num_det
     with pytest.raises(UserError, match='"error" or "false_positive"'):
         measure.repair_sizes(found, "drop")
+
+
+def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
+    out, terms = tmp_path / "out", {"protocols": ("exact",), **TERMS}
+
+    def draw(frame, path):
+        path.write_text(f"first, {frame}")
+
+    report.write_report(*scene, out, draw_frame=draw, worst_frames=4, **terms)
+    (out / "notes.txt").write_text("mine")
+
+    def content():
+        return {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+
+    before = content()
+
+    def fill(frame, path):
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with pytest.raises(DiskFullError, match="no space left on the disk of"):
+        report.write_report(*scene, out, draw_frame=fill, run="second", **terms)
+    assert content() == before
+    made = report.write_report(*scene, out, draw_frame=draw, worst_frames=2, **terms)
+    after = content()
+    assert set(made.files) == set(after) - {out / "notes.txt"}
+    assert len(list((out / "worst_frames").iterdir())) == 2  # of this evaluation alone
 
 
 def test_conditions_are_in_the_papers_order():
