@@ -75,7 +75,7 @@ def main(arguments: list[str]) -> None:
             entry.join_processes(*place)
         from radejax.core.config import config_name
         from radejax.runs import experiment, seeds
-        from radejax.runs.data import Sources
+        from radejax.runs.sources import Sources
 
         config = _CONFIG.value
         if _SEQUENCES.value is not None:

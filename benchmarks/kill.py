@@ -28,7 +28,7 @@ from radejax.cli import entry
 from radejax.core.config import load_module
 from radejax.inference.open import load
 from radejax.runs import experiment
-from radejax.runs.data import Sources
+from radejax.runs.sources import Sources
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 

@@ -28,8 +28,9 @@ from radejax.evaluation.files.predictions import frame_keys
 from radejax.evaluation.report import bootstrap
 from radejax.evaluation.report.measure import repair_sizes
 from radejax.inference.open import load as open_model
-from radejax.runs.data import Sources, data_of_run
+from radejax.runs.data import data_of_run
 from radejax.runs.pictures import camera_share
+from radejax.runs.sources import Sources
 from radejax.simulation.camera.lens import cover_level
 from radejax.visualize.camera_share import mean_share, write_camera_share
 
@@ -52,7 +53,8 @@ def lens_of_frames(root, frames):
     simulation = files.read_json(marker)["config"]
     if simulation["scenes"] != "procedural":
         raise UserError(f"{root}: the lens is known of procedural scenes only")
-    if not simulation["cover_lens"]:
+    is_drawn = simulation.get("camera_content", "scene") == "scene"
+    if not simulation["cover_lens"] or not is_drawn:
         return np.full(len(frames["sequence"]), "clear")
     levels, counts = [], collections.Counter()  # frames count from 0 in a sequence
     for sequence, weather in zip(frames["sequence"], frames["weather"], strict=True):

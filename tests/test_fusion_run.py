@@ -24,8 +24,9 @@ from radejax.inference.predict import predict_dataset
 from radejax.interop import image_backbone
 from radejax.models import build
 from radejax.runs import experiment
-from radejax.runs.data import Data, DataPaths, Sources, data_of_run
+from radejax.runs.data import Data, data_of_run
 from radejax.runs.evaluate import evaluate_run
+from radejax.runs.sources import DataPaths, Sources
 from radejax.training import sharding
 
 pytestmark = pytest.mark.slow  # several programs to compile

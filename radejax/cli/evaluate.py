@@ -29,7 +29,11 @@ _COMMON = (
     _flag("predictions", "File or folder."),
     _flag("compare", "Runs: folders of reports, or predictions.", metavar="A"),
     _flag("out", "Folder of the report; beside the predictions or in the workdir."),
-    _flag("split", "train, test, all or a split file.", default="test"),
+    _flag(
+        "split",
+        "train, test, all or a split file; of a run also validation.",
+        default="test",
+    ),
     _flag("debug", "Show tracebacks of user errors.", is_flag=True),
 )
 _DATA = (
@@ -151,8 +155,8 @@ def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
 
 def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any], str]:
     """Runs the detector of a run over a split; the config of the run has the options."""
-    from radejax.runs.data import Sources
     from radejax.runs.evaluate import evaluate_run
+    from radejax.runs.sources import Sources
 
     entry.set_up_jax()
     other = {name: flags[name] or () for name in ("sequences", "weather")}

@@ -193,6 +193,10 @@ def _data() -> ConfigDict:
             "count_disabled": False,  # v1.1 lines without a *, as released
             "sequences": (),  # only these, such as (1, 58); () for all that are there
             "weather": (),  # only these, such as ("fog", "rain"); () for all
+            # Whole sequences of the train split that choose the best checkpoint and are
+            # not trained on: numbers, or one share that is drawn, (0.1,); () for none.
+            "validation": (),
+            "validation_seed": 0,  # of that draw; seeds of a run do not change it
             "max_objects": 32,  # per frame; 14 is the most in K-Radar v2.1
             "azimuth_mapping": "true",  # "stretched": released checkpoints
             "num_threads": 2,  # that prepare batches

@@ -108,6 +108,14 @@ _BELOW_ONE = _number("a number from 0 to below 1", lambda value: 0 <= value < 1)
 _AXIS = _where(
     _several(_number(), 2), "not all 0", lambda value: any(x != 0 for x in value)
 )
+_HELD_OUT = Rule(
+    "a tuple of sequence numbers, different from each other, or of one share between 0 "
+    "and 1, such as (0.1,); () for none",
+    lambda value: (
+        _some(_COUNT).holds(value)
+        or _several(_number(fits=lambda share: 0 < share < 1), 1).holds(value)
+    ),
+)
 _VERSION = _one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
 
 RULES: dict[str, Rule] = {
@@ -202,6 +210,8 @@ RULES: dict[str, Rule] = {
     "data.count_disabled": _BOOL,
     "data.sequences": _some(_COUNT),
     "data.weather": _some(_one_of(*WEATHERS)),
+    "data.validation": _HELD_OUT,
+    "data.validation_seed": _SEED,
     "data.max_objects": _COUNT,
     "data.azimuth_mapping": _one_of("true", "stretched"),
     "data.num_threads": _COUNT_OR_0,
@@ -259,6 +269,7 @@ RULES: dict[str, Rule] = {
     "simulation.image_width": _COUNT_OR_0,
     "simulation.image_height": _COUNT_OR_0,
     "simulation.cover_lens": _BOOL,
+    "simulation.camera_content": _one_of("scene", "objects"),
     "simulation.lidar_to_radar_m": _several(_number(), 3),
     "simulation.label_distance_m": _POSITIVE,
 }

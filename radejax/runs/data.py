@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import json
 import logging
-import os
 import pathlib
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import flax.linen as nn
 import grain
@@ -30,6 +29,7 @@ from radejax.data.cameras import (
 from radejax.data.frame_table import make_table
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.folders import read_grid
+from radejax.data.kradar.splits import held_out
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
 from radejax.data.records.arrays import ArrayRecords
@@ -42,105 +42,12 @@ from radejax.data.records.projections import (
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.runs.sources import DataPaths, Sources, check_folders
+from radejax.simulation.config import without_later_fields
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import processes
 
 _log = logging.getLogger(__name__)
-
-
-def saved_path(path: str | os.PathLike | None) -> str | None:
-    """Absolute path as a run keeps it."""
-    return None if path is None else str(pathlib.Path(path).absolute())
-
-
-@dataclasses.dataclass(frozen=True)
-class Sources:
-    """What a user says of the data; what is None is found, made or the run's own.
-
-    Attributes:
-        data: K-Radar folders. Without any a config may say what to simulate.
-        labels: Label revision, see `KRadar`; the sequences' own if None.
-        label_version: Its version, in place of the config's.
-        sequences: Only these, and only of this `weather`, in place of the config's.
-        records: Folder of projected frames, beside the first of `data` if None.
-        camera_calibration: Folder of camera calibrations, the data's own if None.
-        embeddings: Folder of `radejax embed`, in place of images.
-        image_backbone: Weights of the image backbone.
-    """
-
-    data: Sequence[str] = ()
-    labels: str | None = None
-    label_version: str | None = None
-    sequences: Sequence[int] = ()
-    weather: Sequence[str] = ()
-    records: str | None = None
-    camera_calibration: str | None = None
-    embeddings: str | None = None
-    image_backbone: str | None = None
-
-    def paths(self, own: DataPaths | None = None) -> DataPaths:
-        """Where they are.
-
-        Args:
-            own: Of a run that these stand for: what is None stays as the run had it,
-                unless `data` are other folders.
-
-        Raises:
-            UserError: No folders here, and the run has none.
-            FileNotFoundError: A folder that was named is not there.
-        """
-        if isinstance(self.data, str):
-            raise UserError(f"data must be a list of folders, got {self.data!r}")
-        roots = tuple(saved_path(path) for path in self.data if path)
-        places = {
-            field.name: saved_path(getattr(self, field.name))
-            for field in dataclasses.fields(DataPaths)
-            if field.name != "roots"
-        }
-        if own is not None and roots in ((), own.roots):
-            kept = dataclasses.asdict(own)
-            places = {k: kept[k] if v is None else v for k, v in places.items()}
-            roots = own.roots
-        if not roots:
-            raise UserError(f"data must be a list of folders, got {self.data!r}")
-        check_folders([*roots, *filter(None, [places["camera_calibration"]])])
-        places["records"] = places["records"] or str(pathlib.Path(roots[0]) / "records")
-        return DataPaths(roots, **places)
-
-    @property
-    def name(self) -> str:
-        """What tells results on them from others: folder, labels, sequences, weather."""
-        parts = [pathlib.Path(path).resolve().name for path in self.data[:1]]
-        if self.labels is not None:
-            parts.append(pathlib.Path(self.labels).resolve().stem)
-        parts += ["-".join(map(str, part)) for part in (self.sequences, self.weather)]
-        return "_".join(filter(None, parts)) or "other"
-
-
-@dataclasses.dataclass(frozen=True)
-class DataPaths:
-    """Where the data of a run are, absolute; `Sources` says of what.
-
-    Attributes:
-        roots: K-Radar folders.
-        labels: Folder or zip of a label revision, or None for the sequences' own.
-        records: Folder of projected frames.
-        embeddings: Folder of embedded images, or None for the images themselves.
-        image_backbone: Weights of the image backbone, or None.
-        camera_calibration: Folder of camera calibrations; the roots' own if None.
-    """
-
-    roots: tuple[str, ...]
-    labels: str | None
-    records: str
-    embeddings: str | None = None
-    image_backbone: str | None = None
-    camera_calibration: str | None = None
-
-    @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> DataPaths:
-        """Inverse of `dataclasses.asdict`, also after JSON."""
-        return cls(**{**fields, "roots": tuple(fields["roots"])})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -242,17 +149,50 @@ class Data:
         return {}
 
     def split(self, name: str | None) -> KRadar:
-        """Frames of "train", "test" or a split file; all for None.
+        """Frames of "train", "validation", "test" or a split file; all for None.
 
         Without those that were left out when they were projected, which are counted.
+        Sequences that `options.validation` holds out of "train" are "validation".
+
+        Raises:
+            UserError: No such split, or sequences to hold out that are not there.
         """
         if name not in self._splits:
-            frames = self.frames if name is None else self.frames.of_split(name)
+            if name in ("train", "validation"):
+                frames = self._part_of_train(name)
+            else:
+                frames = self.frames if name is None else self.frames.of_split(name)
             skipped = skipped_frames(self.paths.records)
             if any(frame.key in skipped for frame in frames):
                 frames = frames.without(skipped, "no record of them")
             self._splits[name] = frames
         return self._splits[name]
+
+    def _part_of_train(self, name: str) -> KRadar:
+        """What the train split leaves to train on, or what is held out of it."""
+        frames = self.frames.of_split("train")
+        # Runs of before are without these two fields.
+        chosen = self.options.get("validation") or ()
+        if name == "validation" and not chosen:
+            raise UserError(
+                "there is no validation split: config.data.validation holds no sequences "
+                "out of the train split, such as (5, 21), or a tenth of them by (0.1,)"
+            )
+        if not chosen or not len(frames):
+            return frames
+        numbers = {frame.sequence for frame in frames}
+        held = held_out(numbers, chosen, self.options.get("validation_seed", 0))
+        if name == "train":
+            other, reason = held, "held out for validation"
+        else:
+            other, reason = numbers.difference(held), "of sequences to train on"
+        keys = {frame.key for frame in frames if frame.sequence in other}
+        return frames.without(keys, reason)
+
+    @property
+    def choosing_split(self) -> str:
+        """By which the best checkpoint is chosen: "validation", "test" without one."""
+        return "validation" if self.options.get("validation") else "test"
 
     def images(self, frames: Sequence[Frame]) -> CameraInputs | None:
         """Images and cameras of frames; None for a model without a camera.
@@ -328,6 +268,13 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
         sources = dataclasses.replace(sources, data=(root,))
     data = Data.open(config, model, sources.paths())
     _log.info("%s", data.frames.summary().to_text())
+    if config.data.get("validation"):
+        _tell_what_is_held_out(data)
+        if not config.train.evaluate_every_epochs:
+            _log.info(
+                "config.train.evaluate_every_epochs is 0: nothing is chosen by them; "
+                "evaluate.py --split validation looks at them afterwards"
+            )
     if count := len(data.split("train")):  # projecting takes long
         check_enough(count, config.train.batch_size)
     data.project()
@@ -337,6 +284,25 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
             f"manifest.json in {data.paths.records} says why"
         )
     return data
+
+
+def _tell_what_is_held_out(data: Data) -> None:
+    """The sequences and their objects, with a warning for a class that they lack."""
+    frames, num_left = data.split("validation"), len(data.split("train"))
+    counts = frames.class_counts()
+    _log.info(
+        "validation: sequences %s of the train split are held out, %d frames beside %d "
+        "to train on; %s",
+        ", ".join(map(str, sorted({frame.sequence for frame in frames}))),
+        len(frames),
+        num_left,
+        ", ".join(f"{cls} {number}" for cls, number in counts.items()),
+    )
+    if absent := [cls for cls, number in counts.items() if not number]:
+        _log.warning(
+            "no %s in the validation split: it does not help to choose a checkpoint",
+            " and no ".join(absent),
+        )
 
 
 def data_of_run(
@@ -388,15 +354,10 @@ def data_of_run(
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
     """Folder of a simulated data set, named by its config where none is given."""
     if not data:
-        digest = hashlib.sha256(simulation.to_json().encode()).hexdigest()[:8]
+        # The same folder as before the config had its later fields.
+        values = without_later_fields(json.loads(simulation.to_json()))
+        digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]
         return str(pathlib.Path("data") / f"simulated-{digest}")
     if len(data) != 1:
         raise UserError(f"a simulated data set has one folder, got {list(data)}")
     return data[0]
-
-
-def check_folders(paths: Iterable[str]) -> None:
-    """`FileNotFoundError` for a folder that is not there."""
-    for path in paths:
-        if not pathlib.Path(path).is_dir():
-            raise FileNotFoundError(f"no such folder: {saved_path(path)}")

@@ -26,7 +26,8 @@ from radejax.evaluation.report.report import Report, write_report
 from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
 from radejax.runs import check_config, pictures
-from radejax.runs.data import Data, Sources, data_of_run
+from radejax.runs.data import Data, data_of_run
+from radejax.runs.sources import Sources
 from radejax.training import processes
 
 _log = logging.getLogger(__name__)
@@ -43,6 +44,7 @@ def evaluate(
     split: str = "test",
     exchange_images: int | None = None,
     step: int | None = None,
+    remark: str = "",
     **options: Any,
 ) -> Report | None:
     """Detects on a split as the config says, on all devices, and writes the report.
@@ -54,9 +56,10 @@ def evaluate(
         data: To evaluate on.
         workdir: Of the run.
         out: Folder of the results; `evaluation` in the work folder if None.
-        split: "test", "train", "all" or a split file.
+        split: "test", "validation", "train", "all" or a split file.
         exchange_images: Seed; see `evaluate_run`.
         step: Of the variables, for `source.json`.
+        remark: Behind the name of the run in the report.
         **options: Fields of the report's `Options` in place of the config's.
 
     Returns:
@@ -95,7 +98,7 @@ def evaluate(
             predictions,
             table,
             folder,
-            report_options(config, workdir.name),
+            report_options(config, f"{workdir.name}{remark}"),
             bootstrap=config.evaluation.bootstrap,
             left_out_before=frames.summary().counts,
             draw_frame=drawer,
@@ -114,6 +117,23 @@ def evaluate(
     return processes.main_only(report)
 
 
+def _draw(
+    drawer: pictures.FrameDrawer,
+    count: int,
+    workdir: pathlib.Path,
+    out: pathlib.Path,
+    *,
+    is_simulated: bool,
+) -> None:
+    """Frames of a split, one of each weather, and the losses of the run."""
+    drawn = drawer.draw_spread(out / "pictures", count)
+    if drawn:
+        drawer.draw_scenes(out / "scenes.png")
+    if (workdir / "metrics.jsonl").exists():
+        pictures.draw_curves(workdir, out / "training.png", is_simulated=is_simulated)
+    _log.info("drew %d frames in %s", len(drawn), out / "pictures")
+
+
 def evaluate_run(
     workdir: PathLike,
     *,
@@ -130,9 +150,9 @@ def evaluate_run(
     Args:
         workdir: Of `train.py`.
         step: Of the checkpoint, or "best"; the newest if None.
-        split: "test", "train", "all" or a split file.
-        out: Folder of the results; `evaluation` in the work folder if None, and
-            `evaluation_<name>` for other data.
+        split: "test", "validation", "train", "all" or a split file.
+        out: Folder of the results; `evaluation` in the work folder if None,
+            `evaluation_<name>` for other data, and with `_validation` for that split.
         image_backbone: Weights of a frozen backbone, see `inference.open.load`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
             control of what a radar-camera model knows from the images. `out` then ends
@@ -161,7 +181,16 @@ def evaluate_run(
         dataclasses.replace(loaded, config=config), workdir, other
     )
     name = "evaluation" if other is None else f"evaluation_{other.name}"
+    name += "_validation" if split == "validation" else ""
     name += "" if exchange_images is None else "_exchanged"
+    remark = ""
+    if step == "best" and other is None and split in (data.choosing_split, "all"):
+        remark = f" (chosen on the {data.choosing_split} split)"
+        _log.warning(
+            "the best checkpoint was chosen on the %s split: its numbers on it may not be "
+            "reported",
+            data.choosing_split,
+        )
     if other is not None:
         frames, _ = _frames(data, split, exchange_images)
         require_images(frames, data.images(frames), split)
@@ -178,6 +207,7 @@ def evaluate_run(
         split=split,
         exchange_images=exchange_images,
         step=loaded.step,
+        remark=remark,
         **options,
     )
 

@@ -19,8 +19,9 @@ from radejax.data.kradar import Frame
 from radejax.inference.open import PathLike, StartingWeights, starting_weights
 from radejax.losses.detection import AfterNms
 from radejax.runs import check_config
-from radejax.runs.data import Data, Sources, open_data
+from radejax.runs.data import Data, open_data
 from radejax.runs.evaluate import evaluate
+from radejax.runs.sources import Sources
 from radejax.runs.validation import Validation
 from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
 from radejax.training import loop, processes, sharding
@@ -33,8 +34,16 @@ _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {folder}:
   checkpoints/     the trained model
   metrics.jsonl    losses by step (tensorboard --logdir {folder})
 Evaluate again:    python evaluate.py --workdir {folder}
-Boxes for a folder of frames:
+{best}Boxes for a folder of frames:
                    radejax detect --workdir {folder} --out boxes FOLDER"""
+
+_BEST = """Best on the way:   python evaluate.py --workdir {folder} --checkpoint best
+                   chosen on the {split} split: {word}
+"""
+_MAY_BE_REPORTED = {
+    "validation": "its numbers on the test split may be reported",
+    "test": "its numbers on that may not be reported (config.data.validation)",
+}
 
 
 def run(
@@ -92,7 +101,11 @@ def run(
         if has_test:
             evaluate(config, model, result.state.eval_variables, data, folder)
     minutes = (time.perf_counter() - started) / 60
-    _log.info(_CLOSING.format(minutes=minutes, folder=files.relative(folder)))
+    place, split, best = files.relative(folder), data.choosing_split, ""
+    if config.train.evaluate_every_epochs:
+        word = _MAY_BE_REPORTED[split]
+        best = _BEST.format(folder=place, split=split, word=word)
+    _log.info(_CLOSING.format(minutes=minutes, folder=place, best=best))
     return folder
 
 

@@ -1,4 +1,4 @@
-"""Evaluation while a run trains: metrics and pictures of the test split."""
+"""Evaluation while a run trains: metrics and pictures of what it holds out."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from radejax.training.watch import Scores
 class Validation:
     """Called by the training loop with a state and its step.
 
+    On the sequences of `data.validation`, or on the test split where there are none.
     Every process takes part in the predictions and comes to the same numbers.
 
     Args:
@@ -43,8 +44,7 @@ class Validation:
         mesh: All devices if None.
 
     Raises:
-        UserError: No frames of the test split, or no such metric as
-            `train.best_metric`.
+        UserError: No frames to evaluate on, or no such metric as `train.best_metric`.
     """
 
     def __init__(
@@ -57,10 +57,10 @@ class Validation:
         self._config, self._records = config, data.records
         self._options = report_options(config, "training")
         check_best_metric(config.train.best_metric, self._options.iou_thresholds)
-        self._frames = data.split("test")
+        self._frames = data.split(data.choosing_split)
         if not len(self._frames):
             raise UserError(
-                "no frames of the test split to evaluate on during training; set "
+                f"no frames of the {data.choosing_split} split to evaluate on during training; set "
                 "train.evaluate_every_epochs=0"
             )
         self._images = data.images(self._frames)
@@ -77,7 +77,7 @@ class Validation:
         step: int,
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
-        """Scores of the state's (averaged) parameters on the test split.
+        """Scores of the state's (averaged) parameters.
 
         Raises:
             processes.Stopped: `should_stop`, asked at every batch, said so.

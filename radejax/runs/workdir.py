@@ -29,7 +29,8 @@ from radejax.core import files
 from radejax.core.config import base_config
 from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.runs.data import DataPaths, saved_path
+from radejax.runs.sources import DataPaths, saved_path
+from radejax.simulation.config import default_config
 from radejax.training import processes
 
 PathLike = str | os.PathLike
@@ -72,6 +73,8 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     defaults = json.loads(base_config().to_json())
     if "camera" in config.data:
         defaults["data"]["camera"] = BEFORE
+    if "simulation" in config:  # of which earlier versions have fewer fields
+        defaults["simulation"] = default_config()
     files.claim(
         path,
         json.loads(config.to_json()) | {"profile": "", "seeds": []},

@@ -36,6 +36,9 @@ CONDITIONS = (
 )
 
 
+_LATER_FIELDS = {"camera_content": "scene"}
+"""What configs and data sets of earlier versions are without."""
+
 FULL_SIZE = {
     "grid": "kradar",
     "radar": {},
@@ -67,6 +70,8 @@ class SimulationConfig:
         image_width: Of one of the two stereo images; 0 for none.
         image_height: The same.
         cover_lens: Let bad weather cover the lens, as often as in K-Radar.
+        camera_content: "scene" draws all that a camera sees; "objects" silhouettes of the
+            objects alone, in the colour of their class: what a perfect image would give.
         lidar_to_radar_m: Radar position = LiDAR position + this; z as in K-Radar's own
             loaders.
         label_distance_m: Farther objects get no label.
@@ -98,6 +103,7 @@ class SimulationConfig:
     image_width: int = 320
     image_height: int = 180
     cover_lens: bool = True
+    camera_content: str = "scene"
     lidar_to_radar_m: tuple[float, float, float] = (-2.54, 0.3, 0.7)
     label_distance_m: float = 90.0
 
@@ -108,7 +114,7 @@ class SimulationConfig:
         Raises:
             UserError: A field is unknown, missing or has a value out of range.
         """
-        values = plain(values)
+        values = _LATER_FIELDS | plain(values)
         names = [f.name for f in dataclasses.fields(cls)]
         for key in values:
             if key not in names:
@@ -157,6 +163,11 @@ class SimulationConfig:
                 f".output must be 'tesseract' or 'projection', got {self.output!r}",
             ),
             (
+                self.camera_content not in ("scene", "objects"),
+                ".camera_content must be 'scene' or 'objects', got "
+                f"{self.camera_content!r}",
+            ),
+            (
                 len(self.lidar_to_radar_m) != 3,
                 ".lidar_to_radar_m must be three numbers",
             ),
@@ -191,8 +202,9 @@ class SimulationConfig:
             ) from None
 
     def to_json(self) -> str:
-        """Canonical text: equal configs give equal text."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+        """Canonical text: equal configs give equal text, also that of earlier versions."""
+        values = without_later_fields(dataclasses.asdict(self))
+        return json.dumps(values, sort_keys=True)
 
     def fingerprint(self) -> str:
         """Short hash of everything the files depend on."""
@@ -202,6 +214,15 @@ class SimulationConfig:
     def conditions(self, number: int) -> tuple[str, str, str]:
         """Environment, time and weather of sequence `number` (from 1)."""
         return CONDITIONS[(number - 1) % len(CONDITIONS)]
+
+
+def without_later_fields(values: dict[str, Any]) -> dict[str, Any]:
+    """Less the fields at their defaults that earlier data sets were made without."""
+    return {
+        name: value
+        for name, value in values.items()
+        if name not in _LATER_FIELDS or value != _LATER_FIELDS[name]
+    }
 
 
 def default_config() -> dict[str, Any]:

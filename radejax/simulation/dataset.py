@@ -201,7 +201,11 @@ class _SequenceWriter:
         )
         if pair := _cameras(config):
             self.renderer = CameraRenderer(
-                sequence, pair, seed, cover_lens=config.cover_lens
+                sequence,
+                pair,
+                seed,
+                cover_lens=config.cover_lens,
+                content=config.camera_content,
             )
 
     def write(self, spec: FrameSpec) -> None:

@@ -10,8 +10,8 @@ from online_training import train_online
 from radejax import Detector
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
-from radejax.runs.data import Sources
 from radejax.runs.evaluate import evaluate_run
+from radejax.runs.sources import Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import sharding
 from radejax.training.checkpoints import Checkpoints

@@ -15,8 +15,9 @@ from radejax.data.records.job import project_dataset
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
-from radejax.runs.data import Data, DataPaths
+from radejax.runs.data import Data
 from radejax.runs.evaluate import make_predictor
+from radejax.runs.sources import DataPaths
 from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import processes, sharding

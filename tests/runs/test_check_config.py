@@ -74,6 +74,11 @@ WRONG = [
     ("data.label_version", "v3"),
     ("data.visibility", "R"),
     ("data.visibility", ("X",)),
+    ("data.validation", 0.1),
+    ("data.validation", (1.0,)),
+    ("data.validation", (0.1, 0.2)),
+    ("data.validation", (5, 5)),
+    ("data.validation_seed", -1),
     ("data.max_objects", 0),
     ("data.num_threads", -1),
     ("data.mirror_probability", 1.5),
@@ -92,6 +97,7 @@ WRONG = [
     ("watch.profile_steps", (5, 2)),
     ("simulation.seed", -1),
     ("simulation.output", "video"),
+    ("simulation.camera_content", "boxes"),
     ("simulation.train_sequences", 2.5),
     ("simulation.label_distance_m", NAN),
     ("simulation.lidar_to_radar_m", [0.0, 0.0]),
@@ -172,7 +178,8 @@ def test_what_one_field_asks_of_another() -> None:
 def _words(name: str) -> list[str]:
     module = load_module(CONFIGS / f"{name}.py")
     if name.startswith("quickstart"):
-        return ["", "short"] + ["radar", "radar,short"] * name.endswith("fusion")
+        words = ["radar", "radar,short", "silhouettes", "silhouettes,short"]
+        return ["", "short"] + words * name.endswith("fusion")
     groups = [
         ["", *getattr(module, names, ())]
         for names in ("VARIANTS", "PRESETS", "CLASS_SETS")

@@ -1,18 +1,27 @@
 """Data folders of a run: found, checked, projected once."""
 
 import dataclasses
+import hashlib
 import pathlib
 import shutil
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
-from radejax.runs.data import Data, DataPaths, Sources, data_of_run, open_data
+from radejax.runs.data import (
+    Data,
+    _simulated_root,
+    data_of_run,
+    open_data,
+)
+from radejax.runs.sources import DataPaths, Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 
@@ -68,6 +77,16 @@ def test_frames_are_projected_beside_their_data_once(
     before = written()
     assert prepare().paths == paths
     assert written() == before
+
+
+def test_a_folder_of_before_the_config_had_more_fields_is_found_again() -> None:
+    simulation = ConfigDict(default_config())
+    before = simulation.copy_and_resolve_references()
+    del before["camera_content"]
+    digest = hashlib.sha256(before.to_json().encode()).hexdigest()[:8]
+    assert _simulated_root(simulation, ()) == f"data/simulated-{digest}"
+    simulation.camera_content = "objects"
+    assert _simulated_root(simulation, ()) != f"data/simulated-{digest}"
 
 
 def test_other_data_keep_what_the_run_had_of_the_same_folders(
@@ -142,3 +161,44 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     assert tuple(config.data.sequences) == (1, 3)
     del config.data["sequences"], config.data["weather"]  # as runs of before
     assert len(open_data(config, model, sources).frames) == 6
+    _check_validation(config, model, sources, caplog)
+
+
+def _check_validation(
+    config: Any, model: Any, sources: Sources, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Sequence 1 with its damaged frame, and 2, are of the train split; 3 of the test."""
+
+    def sequences(data: Data) -> dict[str, list[int]]:
+        names = ("train", "validation", "test")
+        return {name: [f.sequence for f in data.split(name)] for name in names}
+
+    config.data.validation = (1,)
+    config.classes = ("Sedan", "Motorcycle")
+    with caplog.at_level("INFO", "radejax"):
+        data = open_data(config, model, sources)
+    assert sequences(data) == {"train": [2, 2], "validation": [1], "test": [3, 3]}
+    assert data.choosing_split == "validation"
+    assert "frames left out: held out for validation" in data.split("train").counts
+    held = data.split("validation").class_counts()
+    told = ", ".join(f"{cls} {number}" for cls, number in held.items())
+    expected = f"sequences 1 of the train split are held out, 1 frames beside 2 to train on; {told}"
+    assert expected in caplog.text
+    assert "evaluate_every_epochs is 0: nothing is chosen by them" in caplog.text
+    lacking = [cls for cls, number in held.items() if not number]
+    assert ("in the validation split" in caplog.text) == bool(lacking)
+    config.data.validation = (0.5,)
+    drawn = sequences(open_data(config, model, sources))
+    assert sorted({*drawn["train"], *drawn["validation"]}) == [1, 2]
+    assert not {*drawn["train"]} & {*drawn["validation"]}
+    config.data.validation = (3,)
+    with pytest.raises(
+        UserError, match=r"sequences \[3\], which have no frames in the"
+    ):
+        open_data(config, model, sources)
+    del config.data["validation"], config.data["validation_seed"]  # as runs of before
+    data = open_data(config, model, sources)
+    assert len(data.split("train")) == 3
+    assert data.choosing_split == "test"
+    with pytest.raises(UserError, match="there is no validation split"):
+        data.split("validation")

@@ -1,6 +1,9 @@
 """What is done to the frames of a run before it is evaluated."""
 
 import dataclasses
+import pathlib
+from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +16,7 @@ from radejax.core.structures import DetectionMaps
 from radejax.data.kradar.frame import Frame
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.runs import evaluate
 from radejax.runs.evaluate import _changed, report_options, with_images_exchanged
 
 
@@ -107,3 +111,43 @@ def test_every_option_is_given_when_evaluating() -> None:
     ):
         with pytest.raises(UserError, match=message):
             _changed(old, changes)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Loaded:
+    config: ConfigDict
+    model: None = None
+    variables: None = None
+    step: int = 3
+
+
+@pytest.mark.parametrize(
+    ("choosing", "split", "step", "folder", "remark"),
+    [
+        ("test", "test", "best", "evaluation", "chosen on the test split"),
+        ("test", "test", None, "evaluation", ""),
+        ("validation", "test", "best", "evaluation", ""),
+        ("validation", "validation", None, "evaluation_validation", ""),
+        ("validation", "all", "best", "evaluation", "chosen on the validation split"),
+    ],
+)
+def test_numbers_on_what_chose_the_checkpoint_are_marked(
+    choosing: str,
+    split: str,
+    step: str | None,
+    folder: str,
+    remark: str,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    written: dict[str, Any] = {}
+    data = SimpleNamespace(choosing_split=choosing)
+    loaded = _Loaded(_config())
+    monkeypatch.setattr(evaluate, "load", lambda *_, **__: loaded)
+    monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (None, data))
+    monkeypatch.setattr(evaluate, "evaluate", lambda *_, **named: written.update(named))
+    evaluate.evaluate_run(tmp_path, step=step, split=split)
+    assert written["out"] == tmp_path / folder
+    assert written["remark"] == (f" ({remark})" if remark else "")
+    assert ("may not be reported" in caplog.text) == bool(remark)

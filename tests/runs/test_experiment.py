@@ -1,6 +1,7 @@
 """Work folders, names and messages of whole runs."""
 
 import collections
+import json
 import pathlib
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,12 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.inference.open import StartingWeights
 from radejax.losses.detection import AfterNms
-from radejax.runs import experiment
-from radejax.runs.data import Sources
+from radejax.runs import experiment, validation
+from radejax.runs.sources import Sources
 from radejax.runs.workdir import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import loop, sharding
+from radejax.training.checkpoints import Checkpoints
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 
@@ -87,8 +89,11 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
 
 
 def test_labels_are_read_once_and_the_model_is_built_once(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    """And the sequences that are held out choose the best checkpoint."""
     parsed: collections.Counter = collections.Counter()
     built = []
     parse, build = dataset.parse_label_file, models.build
@@ -102,18 +107,35 @@ def test_labels_are_read_once_and_the_model_is_built_once(
     mesh = sharding.make_mesh(1)
     monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
     config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
-    config.simulation.update(frames_per_sequence=2, output="projection")
+    config.simulation.update(
+        train_sequences=3, frames_per_sequence=2, output="projection"
+    )
+    config.data.validation = (2,)
     config.model.update(widths=(8, 8), decoder_width=8, num_groups=4)
     config.train.update(num_epochs=1, evaluate_every_epochs=1)
     config.evaluation.num_pictures = 1
-    folder = experiment.run(
-        config,
-        name="x",
-        workdir=tmp_path / "run",
-        sources=Sources(data=(str(tmp_path / "data"),)),
+    evaluated = []
+    make = validation.tables_from_frames
+    monkeypatch.setattr(
+        validation, "tables_from_frames", lambda f: evaluated.extend(f) or make(f)
     )
-    assert (folder / "evaluation" / "metrics.json").exists()
-    assert len(parsed) == 6
+    with caplog.at_level("INFO", "radejax"):
+        folder = experiment.run(
+            config,
+            name="x",
+            workdir=tmp_path / "run",
+            sources=Sources(data=(str(tmp_path / "data"),)),
+        )
+    assert [frame.sequence for frame in evaluated] == [2, 2]
+    frames = json.loads((folder / "evaluation" / "frames.json").read_text())
+    assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
+    assert "chosen on the validation split: its numbers on the test split may" in (
+        caplog.text
+    )
+    with Checkpoints(folder / "checkpoints", read_only=True) as checkpoints:
+        _, info, _ = checkpoints.restore_variables()
+        assert info["same"]["frames to train on"] == 4
+    assert len(parsed) == 8
     assert set(parsed.values()) == {1}
     assert len(built) == 1
 

@@ -13,7 +13,7 @@ from ml_collections import config_flags
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.runs import seeds
-from radejax.runs.data import Sources
+from radejax.runs.sources import Sources
 
 HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
 

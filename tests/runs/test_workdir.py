@@ -6,11 +6,13 @@ import subprocess
 import sys
 
 import pytest
+from ml_collections import ConfigDict
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.runs import workdir
-from radejax.runs.data import DataPaths
+from radejax.runs.sources import DataPaths
+from radejax.simulation.config import default_config
 
 from .. import small_models as small
 
@@ -50,6 +52,9 @@ def test_another_config_is_refused_and_the_difference_named(
 def test_a_run_older_than_a_field_of_the_config_goes_on(tmp_path: pathlib.Path) -> None:
     config = base_config()
     old = json.loads(config.to_json())
+    config.simulation = ConfigDict(default_config())
+    old["simulation"] = default_config()
+    del old["simulation"]["camera_content"], old["data"]["validation"]
     del old["data"]["sequences"], old["seed"], old["train"]["schedule"]
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     (tmp_path / "config.json").write_text(json.dumps(old))

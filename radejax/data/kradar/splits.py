@@ -8,6 +8,8 @@ import os
 import pathlib
 from collections.abc import Collection, Iterable, Sequence
 
+import numpy as np
+
 from radejax.core.errors import UserError
 from radejax.data.kradar import folders, sequences
 from radejax.data.kradar.findings import Findings
@@ -105,6 +107,45 @@ def check_weather(names: Iterable[str]) -> tuple[str, ...]:
     if not names:
         raise UserError(f"no weather given; available: {', '.join(known)}")
     return names
+
+
+def held_out(
+    sequences: Collection[int], validation: Sequence[float], seed: int
+) -> list[int]:
+    """Whole sequences of the train split that a run keeps for validation, sorted.
+
+    Args:
+        sequences: Numbers of those that have frames to train on.
+        validation: Numbers of sequences; or one share of them above 0 and below 1, which
+            is drawn, at least one sequence; () for none.
+        seed: Of the draw.
+
+    Raises:
+        UserError: A sequence that is not there, or none is left to train on.
+
+    Examples:
+        >>> held_out({1, 2, 5}, (5,), 0)
+        [5]
+        >>> len(held_out(range(1, 59), (0.1,), 0))
+        6
+    """
+    here = sorted(set(sequences))
+    if len(validation) == 1 and 0 < validation[0] < 1:
+        count = max(1, round(validation[0] * len(here)))
+        chosen = {int(n) for n in np.random.default_rng(seed).permutation(here)[:count]}
+    else:
+        chosen = {int(number) for number in validation}
+    if absent := sorted(chosen.difference(here)):
+        raise UserError(
+            f"config.data.validation holds out sequences {absent}, which have no frames in "
+            f"the train split; there are {here}"
+        )
+    if chosen and len(chosen) == len(here):
+        raise UserError(
+            f"config.data.validation is {tuple(validation)}: of the sequences {here} of "
+            "the train split none is left to train on"
+        )
+    return sorted(chosen)
 
 
 def read_split_entries(

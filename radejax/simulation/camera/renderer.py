@@ -37,6 +37,10 @@ _SNOW = np.array([214, 218, 222.0])
 _MARKING = np.array([226, 226, 220.0])
 _HEADLIGHT = (0.16, (255, 250, 225))
 _REAR_LIGHT = (0.05, (230, 40, 30))
+_CLASS_COLORS = np.array(  # of silhouettes, in the order of `CLASSES`
+    [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255)], float
+)
+_HALF_BRIGHT_M = 20.0
 
 
 def stereo_calibration(
@@ -126,6 +130,7 @@ class CameraRenderer:
         calibrations: Left and right camera.
         seed: Colours of the objects, drops and flakes.
         cover_lens: Let bad weather cover the lens at times.
+        content: "scene", or "objects": their silhouettes alone, see `silhouettes`.
     """
 
     def __init__(
@@ -135,10 +140,11 @@ class CameraRenderer:
         seed: int,
         *,
         cover_lens: bool = True,
+        content: str = "scene",
     ) -> None:
         self.sequence = sequence
         self.calibrations = calibrations
-        self.cover_lens, self.seed = cover_lens, seed
+        self.cover_lens, self.seed, self.content = cover_lens, seed, content
         self.grounds = [trace_ground(c, sequence.ground_m) for c in calibrations]
         rng = np.random.default_rng([seed, sequence.name, 7])
         self.colors = shapes.object_colors(sequence.tracks.cls, rng)
@@ -159,6 +165,8 @@ class CameraRenderer:
 
     def _one(self, frame: SceneFrame, side: int) -> np.ndarray:
         """`[H, W, 3]` image of one camera."""
+        if self.content == "objects":
+            return self.silhouettes(frame, side)
         calibration = self.calibrations[side]
         canvas = Image.fromarray(self._background(frame, self.grounds[side]))
         draw = ImageDraw.Draw(canvas)
@@ -175,6 +183,22 @@ class CameraRenderer:
             level = lens.cover_level(self.seed, name, index, weather)
             rng = np.random.default_rng([self.seed, name, side, block, 6])
             canvas = lens.cover_lens(canvas, level, air.is_snow, brightness, rng)
+        return np.asarray(canvas)
+
+    def silhouettes(self, frame: SceneFrame, side: int) -> np.ndarray:
+        """`[H, W, 3]` uint8: objects in the colour of their class on black.
+
+        The nearer the brighter, half as bright at 20 m, near ones before far ones, in
+        any weather and light: what a camera that knows classes and distances would see.
+        """
+        calibration = self.calibrations[side]
+        canvas = Image.new("RGB", (calibration.width, calibration.height))
+        draw = ImageDraw.Draw(canvas)
+        for polygon in self.polygons(frame, side):
+            if polygon.box >= 0:  # not the roadside
+                share = _HALF_BRIGHT_M / (_HALF_BRIGHT_M + polygon.depth_m)
+                color = _CLASS_COLORS[frame.cls[polygon.box]] * share
+                draw.polygon(polygon.points, fill=tuple(color.astype(int).tolist()))
         return np.asarray(canvas)
 
     def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:

@@ -4,7 +4,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.data.kradar import write
 from radejax.data.kradar.findings import Findings
 from radejax.data.kradar.folders import LabelSource
-from radejax.data.kradar.splits import read_split_entries, select_frames
+from radejax.data.kradar.splits import held_out, read_split_entries, select_frames
 
 KEYS = [(1, f"{i:05d}_{i:05d}") for i in range(8)] + [(2, "00000_00000")]
 
@@ -72,3 +72,21 @@ def test_errors(tmp_path):
     assert findings.counts["split entries of sequences that are not here"] == 1
     with pytest.raises(FileNotFoundError, match="1/00099_00099: in split train"):
         select(tmp_path, strict=True, split="train")
+
+
+def test_whole_sequences_are_held_out_by_number_or_by_a_drawn_share():
+    here = range(1, 59)
+    assert held_out(here, (), 0) == []
+    assert held_out([9, 2, 5], (9, 2), 0) == [2, 9]
+    drawn = [held_out(here, (0.1,), seed) for seed in (0, 0, 1)]
+    assert [len(numbers) for numbers in drawn] == [6, 6, 6]
+    assert drawn[0] == drawn[1] != drawn[2]
+    assert held_out(reversed(here), (0.1,), 0) == drawn[0]
+    assert len(held_out([3, 4, 5], (0.1,), 0)) == 1  # never none
+    with pytest.raises(
+        UserError, match=r"holds out sequences \[7\], .*there are \[3, 4"
+    ):
+        held_out([3, 4], (3, 7), 0)
+    for all_of_them in ((3, 4), (0.9,)):
+        with pytest.raises(UserError, match="none is left to train on"):
+            held_out([3, 4], all_of_them, 0)

@@ -1,14 +1,18 @@
 """Drawn objects lie where labels and calibration say, to the pixel."""
 
+import json
+
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
+from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import read_labels
 from radejax.geometry.calibration import CameraCalibration
 from radejax.simulation.camera import lens
 from radejax.simulation.camera import renderer as camera
+from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.scene import Reflectors, Road, Sequence, Tracks
 from radejax.simulation.world.traffic import make_sequence
@@ -217,3 +221,42 @@ class TestImage:
             "full": (0.8, 1.0),
         }[level]
         assert low <= changed.mean() <= high
+
+
+class TestSilhouettes:
+    def test_objects_alone_in_the_colour_of_their_class_brighter_when_nearer(self):
+        boxes = [[40.0, 4.0, -0.15, 4.5, 1.9, 1.5, 0.2], POSES[2][1], POSES[4][1]]
+        pair, images = camera.stereo_calibration(OFFSET, 320, 180), []
+        for time, weather in (("day", "normal"), ("night", "heavysnow")):
+            sequence = make_scene(
+                boxes, ["Sedan", "Sedan", "Pedestrian"], time=time, weather=weather
+            )
+            renderer = camera.CameraRenderer(sequence, pair, 0, content="objects")
+            frame = sequence.frame(0)
+            images.append(renderer.render(frame))
+        image, mask = images[0], object_mask(renderer, frame)
+        np.testing.assert_array_equal(images[1], image)
+        np.testing.assert_array_equal(image[:, :320].any(-1), mask >= 0)
+        far, near, person = (
+            np.unique(image[:, :320][mask == i], axis=0) for i in range(3)
+        )
+        assert len(far) == len(near) == len(person) == 1  # flat
+        origin = camera.shapes.camera_position(pair[0])
+        for color, channel, box in ((far, 0, 0), (near, 0, 1), (person, 2, 2)):
+            depth = np.linalg.norm(np.array(boxes[box][:3]) - origin)
+            expected = np.eye(3)[channel] * int(255 * 20 / (20 + depth))
+            np.testing.assert_array_equal(color[0], expected)
+        assert near[0, 0] > 1.4 * far[0, 0]
+
+    def test_a_data_set_of_before_is_one_of_whole_scenes(self):
+        old = default_config()
+        del old["camera_content"]
+        scene = SimulationConfig.from_mapping(old)
+        assert scene == SimulationConfig.from_mapping(default_config())
+        assert "camera_content" not in scene.to_json()
+        objects = default_config() | {"camera_content": "objects"}
+        other = SimulationConfig.from_mapping(objects)
+        assert other.fingerprint() != scene.fingerprint()
+        assert SimulationConfig.from_mapping(json.loads(other.to_json())) == other
+        with pytest.raises(UserError, match="must be 'scene' or 'objects', got 'x'"):
+            SimulationConfig.from_mapping(old | {"camera_content": "x"})
