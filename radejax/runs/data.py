@@ -8,7 +8,7 @@ import hashlib
 import logging
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -27,9 +27,8 @@ from radejax.data.cameras import (
     check_embeddable,
     require_images,
 )
+from radejax.data.dataset import DATA_SETS, FrameSequence, LabelledFrames
 from radejax.data.frame_table import make_table
-from radejax.data.kradar import Frame, KRadar
-from radejax.data.kradar.folders import read_grid
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
 from radejax.data.records.arrays import ArrayRecords
@@ -155,7 +154,7 @@ class Data:
     """
 
     paths: DataPaths
-    frames: KRadar
+    frames: LabelledFrames
     classes: tuple[str, ...]
     options: ConfigDict
     camera: CameraOptions | None
@@ -191,7 +190,7 @@ class Data:
                 "embeddings are given, but config.model.name is "
                 f"{config.model.name!r}, which has no camera"
             )
-        frames = KRadar(
+        frames = _reader(config.data.get("format", "kradar"))(
             paths.roots,
             paths.labels,
             version=config.data.label_version,
@@ -232,10 +231,10 @@ class Data:
         return RecordSource(self.paths.records, grid=self.grid)
 
     @functools.cached_property
-    def _splits(self) -> dict[str | None, KRadar]:
+    def _splits(self) -> dict[str | None, LabelledFrames]:
         return {}
 
-    def split(self, name: str | None) -> KRadar:
+    def split(self, name: str | None) -> LabelledFrames:
         """Frames of "train", "test" or a split file; all for None.
 
         Without those that were left out when they were projected, which are counted.
@@ -248,7 +247,7 @@ class Data:
             self._splits[name] = frames
         return self._splits[name]
 
-    def images(self, frames: Sequence[Frame]) -> CameraInputs | None:
+    def images(self, frames: FrameSequence) -> CameraInputs | None:
         """Images and cameras of frames; None for a model without a camera.
 
         Raises:
@@ -259,7 +258,7 @@ class Data:
         return camera_inputs(frames, self.image_size, self.camera, self.features)
 
     def training_batches(
-        self, frames: Sequence[Frame], train: ConfigDict, seed: int
+        self, frames: FrameSequence, train: ConfigDict, seed: int
     ) -> grain.DatasetIterator[Batch]:
         """An endless, shuffled, checkpointable iterator over batches of this process.
 
@@ -363,12 +362,6 @@ def data_of_run(
         if other.label_version is not None:
             config = config.copy_and_resolve_references()
             config.data.label_version = other.label_version
-        grid = read_grid(list(map(pathlib.Path, paths.roots)))
-        if grid != loaded.grid:
-            raise UserError(
-                f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
-                f"{workdir} was trained on {describe_grid(loaded.grid)}"
-            )
         is_blind = models.has_camera(loaded.model) and (
             IMAGE_BACKBONE not in loaded.variables["params"]
         )
@@ -377,7 +370,22 @@ def data_of_run(
                 f"{workdir} is without the weights of its image backbone: give "
                 "--image_backbone FOLDER, or --embeddings FOLDER of these images"
             )
-    return config, Data.open(config, loaded.model, paths, grid=loaded.grid)
+    data = Data.open(config, loaded.model, paths, grid=loaded.grid)
+    if other is not None and data.frames.grid != loaded.grid:
+        raise UserError(
+            f"{', '.join(paths.roots)}: the radar has {describe_grid(data.frames.grid)}, "
+            f"{workdir} was trained on {describe_grid(loaded.grid)}"
+        )
+    return config, data
+
+
+def _reader(name: str) -> Callable[..., LabelledFrames]:
+    """Of a data set's format."""
+    if name not in DATA_SETS:
+        raise UserError(
+            f"config.data.format is {name!r}, expected one of {', '.join(DATA_SETS)}"
+        )
+    return DATA_SETS[name]
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

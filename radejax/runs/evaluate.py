@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -17,7 +17,7 @@ from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
-from radejax.data.kradar import Frame, KRadar
+from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.report import Report, write_report
@@ -199,7 +199,7 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
 
 def _frames(
     data: Data, split: str, exchange_images: int | None
-) -> tuple[KRadar, Sequence[Frame]]:
+) -> tuple[LabelledFrames, FrameSequence]:
     """Frames of a split, and the same as the model is to see them."""
     frames = data.split(None if split == "all" else split)
     if not len(frames):
@@ -214,7 +214,7 @@ def _frames(
     return frames, with_images_exchanged(frames, exchange_images)
 
 
-def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
+def with_images_exchanged(frames: FrameSequence, seed: int) -> list[LabelledFrame]:
     """The frames, each with the image and calibration of another one.
 
     Raises:
@@ -226,8 +226,9 @@ def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
     order = np.random.default_rng(seed).permutation(given)
     exchanged = list(frames)
     for own, other in zip(order, np.roll(order, 1), strict=True):
+        frame: Any = frames[own]
         exchanged[own] = dataclasses.replace(
-            frames[own],
+            frame,
             camera_path=frames[other].camera_path,
             camera_calibration_path=frames[other].camera_calibration_path,
         )

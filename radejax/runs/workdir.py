@@ -26,7 +26,7 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax.core import files
-from radejax.core.config import base_config
+from radejax.core.config import renewed
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.data import DataPaths, saved_path
 from radejax.training import processes
@@ -75,7 +75,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("watch",),
-        defaults=json.loads(base_config().to_json()),
+        renewed=renewed,
     )
 
 
