@@ -91,11 +91,10 @@ def _draw(frame: Any, grid: Any, slices: bool) -> Any:
     """
     from radejax.core.structures import WIDE_ROI
     from radejax.data.images import front_view
-    from radejax.data.tesseract import read_projection
     from radejax.visualize import bev, projections
     from radejax.visualize.canvas import Scene
 
-    projection = read_projection(frame, grid)
+    projection = frame.read_projection(grid)
     title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
     if slices:
         figure = projections.draw_slices(projection, grid)

@@ -7,10 +7,12 @@ same fields. Values are plain and resolved: no paths, no devices, nothing comput
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import pathlib
 import types
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any
 
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
@@ -100,6 +102,29 @@ def base_config() -> ConfigDict:
     return config
 
 
+def renewed(
+    config: Mapping[str, Any], before: Mapping[str, Any] = types.MappingProxyType({})
+) -> dict[str, Any]:
+    """Plain values of a config of an earlier version, as the present one has them.
+
+    Fields that it lacks are as they were `before` they could be chosen, else at their
+    default; weights of losses in a row, `(2.0, 1.0, 1.0)`, get their names.
+    """
+    loss = config.get("loss", {})
+    if isinstance(loss.get("weights"), list | tuple):
+        names = ("focal", "gwd", "smooth_l1")
+        by_name = dict(zip(names, loss["weights"], strict=True))
+        config = {**config, "loss": {**loss, "weights": by_name}}
+    return _filled_up(_filled_up(config, before), json.loads(base_config().to_json()))
+
+
+def _filled_up(found: Any, defaults: Any) -> Any:
+    """A tree of values with those that it lacks."""
+    if not (isinstance(found, Mapping) and isinstance(defaults, Mapping)):
+        return found
+    return {**defaults, **{k: _filled_up(v, defaults.get(k)) for k, v in found.items()}}
+
+
 def _model() -> ConfigDict:
     return ConfigDict(
         {
@@ -112,6 +137,7 @@ def _model() -> ConfigDict:
             "num_groups": 32,
             "cbam": "official",  # "paper": attention alone; "off"
             "input_stem": False,
+            "backbone": "unet",
             "neck": "dilated",  # "plain"
             "heads": "expanded",  # "default"
             "pad_multiple": 8,
@@ -132,11 +158,12 @@ def _loss() -> ConfigDict:
             "gwd_tau": 1.65,
             "normalize_yaw": False,
             "matching": "center",  # "nms", with the thresholds of `decode`
-            "weights": (2.0, 1.0, 1.0),  # focal, GWD, smooth L1
+            "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
             "normalize": True,  # divide each part by its own value
             # Boxes are z0 + dz. The paper prints no value for its sensor height.
             "z0_m": 0.0,
-        }
+        },
+        type_safe=False,  # config files of before have weights=(2.0, 1.0, 1.0)
     )
 
 
@@ -188,6 +215,7 @@ def _train() -> ConfigDict:
 def _data() -> ConfigDict:
     return ConfigDict(
         {
+            "format": "kradar",
             "label_version": "v2.1",
             "visibility": ("R",),  # what the radar can see
             "count_disabled": False,  # v1.1 lines without a *, as released

@@ -12,8 +12,7 @@ import pathlib
 import shutil
 import socket
 import stat
-import types
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import IO, Any
 
 from radejax.core.errors import DataError, DiskFullError, UserError
@@ -215,7 +214,7 @@ def claim(
     mend: str = "choose another folder, or delete that one",
     name: str = "",
     ignore: Collection[str] = (),
-    defaults: Mapping[str, Any] = types.MappingProxyType({}),
+    renewed: Callable[[Any], Any] = lambda found: found,
 ) -> None:
     """Makes a folder the place of one job, or checks that it is this job's already.
 
@@ -227,7 +226,7 @@ def claim(
         mend: What to do then.
         name: Of the whole, before the fields' names in the message.
         ignore: Fields that may differ.
-        defaults: What a field stands at where the file is older than the field.
+        renewed: Brings what an earlier version wrote to the present form.
 
     Raises:
         UserError: The folder is another job's; names the fields that differ. Or it is
@@ -238,11 +237,10 @@ def claim(
     if path.parent.is_file():
         raise UserError(f"{path.parent} is a file, expected a folder")
     try:
-        found = read_json(path)
+        found = renewed(read_json(path))
     except FileNotFoundError:
         write_json(path, wanted)
         return
-    found = _filled_up(found, defaults)
     require_same(
         {field: value for field, value in found.items() if field not in ignore},
         {field: value for field, value in wanted.items() if field not in ignore},
@@ -250,13 +248,6 @@ def claim(
         mend=mend,
         name=name,
     )
-
-
-def _filled_up(found: Any, defaults: Any) -> Any:
-    """A tree of values with those that it lacks."""
-    if not (isinstance(found, Mapping) and isinstance(defaults, Mapping)):
-        return found
-    return {**defaults, **{k: _filled_up(v, defaults.get(k)) for k, v in found.items()}}
 
 
 def require_same(

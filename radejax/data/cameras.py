@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import logging
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 
 from radejax.core.errors import UserError
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.images import read_left_image
-from radejax.data.kradar.frame import Frame
 from radejax.data.records.arrays import ArrayRecords
 from radejax.geometry.calibration import CameraCalibration, ImageKind
 from radejax.geometry.camera import Camera
@@ -63,7 +62,7 @@ class CameraOptions:
             fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
         return cls(**fields)
 
-    def shift(self, frame: Frame) -> tuple[float, ...]:
+    def shift(self, frame: LabelledFrame) -> tuple[float, ...]:
         """Metres to add to LiDAR positions to get where the radar sees them."""
         if self.ego_from_lidar_m is not None:
             return self.ego_from_lidar_m
@@ -111,7 +110,7 @@ class CameraInputs:
 
 
 def camera_inputs(
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     image_size: tuple[int, int],
     options: CameraOptions,
     features: ArrayRecords | None = None,
@@ -156,9 +155,10 @@ def camera_inputs(
             len(frames),
         )
 
-    @functools.cache
-    def read(path: str, shift: tuple[float, ...]) -> Camera:
-        calibration = CameraCalibration.from_kradar(path, ego_from_lidar_m=shift)
+    cameras: dict[Any, Camera] = {}
+
+    def read(frame: LabelledFrame, shift: tuple[float, ...]) -> Camera:
+        path, calibration = frame.camera_calibration_path, frame.read_calibration(shift)
         if (calibration.height, calibration.width) != tuple(image_size):
             height, width = image_size
             if not options.resize:
@@ -170,9 +170,12 @@ def camera_inputs(
             calibration = calibration.resized(width, height)
         return calibration.camera(options.projection)
 
-    def camera(frame: Frame) -> Camera:
+    def camera(frame: LabelledFrame) -> Camera:
         shift = tuple(map(float, options.shift(frame)))
-        return read(str(frame.camera_calibration_path), shift)
+        place = frame.camera_calibration_path, shift
+        if place not in cameras:
+            cameras[place] = read(frame, shift)
+        return cameras[place]
 
     return CameraInputs(
         tuple(
@@ -188,7 +191,7 @@ def camera_inputs(
 
 
 def _check_embedded(
-    frames: Sequence[Frame], record: np.ndarray, features: ArrayRecords
+    frames: FrameSequence, record: np.ndarray, features: ArrayRecords
 ) -> None:
     """`UserError` for frames whose image is there but was not embedded."""
     forgotten = [
@@ -223,7 +226,7 @@ def check_embeddable(*, freeze: bool, mirror_probability: float) -> None:
 
 
 def require_images(
-    frames: Sequence[Frame], inputs: CameraInputs | None, split: str = "train"
+    frames: FrameSequence, inputs: CameraInputs | None, split: str = "train"
 ) -> None:
     """`UserError` if no frame has both an image and a calibration.
 

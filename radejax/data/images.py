@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 
 from radejax.core.errors import DataError
-from radejax.data.kradar.frame import Frame
+from radejax.data.dataset import LabelledFrame
 from radejax.geometry.calibration import CameraCalibration
 
 _MAX_PIXELS = 8192
@@ -58,7 +58,7 @@ def read_left_image(
 
 
 def front_view(
-    frame: Frame,
+    frame: LabelledFrame,
 ) -> tuple[np.ndarray | None, CameraCalibration | None]:
     """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
 
@@ -72,8 +72,6 @@ def front_view(
         return None, None
     camera = None
     if frame.camera_calibration_path is not None:
-        camera = CameraCalibration.from_kradar(
-            frame.camera_calibration_path, ego_from_lidar_m=frame.radar_from_lidar_m
-        )
+        camera = frame.read_calibration()
     size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
     return read_left_image(frame.camera_path, size, resize=True), camera

@@ -25,6 +25,7 @@ from ml_collections import ConfigDict
 import radejax
 from radejax import models
 from radejax.core import files
+from radejax.core.config import renewed
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.geometry.radar_grid import RadarGrid
@@ -162,7 +163,7 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
             "camera_options": CameraOptions.of_fields(content["camera"]),
         },
         content["training_config"]
-        and ConfigDict(content["training_config"], convert_dict=True),
+        and ConfigDict(renewed(content["training_config"]), convert_dict=True),
     )
 
 

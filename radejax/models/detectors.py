@@ -34,7 +34,8 @@ def build(config: Mapping[str, Any]) -> nn.Module:
         raise UserError(
             f"config.model.name is {name}; available models: {sorted(_MAKERS)}"
         )
-    return _MAKERS[config["name"]](config)
+    # Models of before the field have that backbone.
+    return _MAKERS[config["name"]]({"backbone": "unet", **config})
 
 
 def has_camera(model: nn.Module) -> bool:

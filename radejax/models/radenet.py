@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -17,10 +17,10 @@ import jax.numpy as jnp
 
 from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
-from radejax.models.backbone import Backbone
+from radejax.models.backbone import BACKBONES
 from radejax.models.cbam import CBAMKind
-from radejax.models.heads import HeadKind, Heads
-from radejax.models.neck import Neck, NeckKind
+from radejax.models.heads import HEADS, Heads
+from radejax.models.neck import NECKS
 
 DTYPES = ("float32", "bfloat16")
 
@@ -44,8 +44,7 @@ class RadeNet(nn.Module):
         num_groups: Groups of every normalisation; must divide every width.
         cbam: "official", "paper" or None; see `radejax.models.cbam.CBAM`.
         input_stem: Encode Doppler and elevation apart first.
-        neck: "dilated" or "plain".
-        heads: "expanded" or "default".
+        backbone, neck, heads: Of `BACKBONES`, `NECKS` and `HEADS`.
         pad_multiple: Multiple of 2 ** len(widths).
         crop_output: Cut the maps back to the projection's bins.
         dtype: "float32" or "bfloat16", of the computation; outputs are float32.
@@ -61,8 +60,9 @@ class RadeNet(nn.Module):
     num_groups: int = 32
     cbam: CBAMKind | None = "official"
     input_stem: bool = False
-    neck: NeckKind = "dilated"
-    heads: HeadKind = "expanded"
+    backbone: str = "unet"
+    neck: str = "dilated"
+    heads: str = "expanded"
     pad_multiple: int = 8
     crop_output: bool = False
     dtype: str = "float32"
@@ -90,6 +90,7 @@ class RadeNet(nn.Module):
 
 def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
     """What makes backbone, neck and heads, which DinoRADE has as well."""
+    check_choices(radar)
     stage = nn.remat if radar.remat == "full" else lambda module: module
     shared = {
         "num_groups": radar.num_groups,
@@ -97,7 +98,7 @@ def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
         "remat": radar.remat != "none",
     }
     backbone = functools.partial(
-        stage(Backbone),
+        stage(BACKBONES[radar.backbone]),
         doppler_bins=radar.doppler_bins,
         widths=radar.widths,
         decoder_width=radar.decoder_width,
@@ -105,7 +106,7 @@ def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
         input_stem=radar.input_stem,
         **shared,
     )
-    neck = functools.partial(stage(Neck), kind=radar.neck, **shared)
+    neck = functools.partial(stage(NECKS[radar.neck]), **shared)
     heads = functools.partial(
         stage(Heads),
         num_classes=radar.num_classes,
@@ -114,6 +115,15 @@ def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
         **shared,
     )
     return backbone, neck, heads
+
+
+def check_choices(radar: RadeNet) -> None:
+    """`UserError` for a choice by name that there is not; names those that there are."""
+    for field, choices in _CHOICES.items():
+        if (found := getattr(radar, field)) not in choices:
+            raise UserError(
+                f"config.model.{field} is {found!r}, expected one of {tuple(choices)}"
+            )
 
 
 def padded_input(projection: jax.Array, radar: RadeNet) -> jax.Array:
@@ -161,12 +171,13 @@ def own_fields(
 FIELDS = own_fields(RadeNet)
 """Fields of a model config beside `name`."""
 
-_CHOICES = {
-    "cbam": ("official", "paper", "off", None),
-    "neck": ("dilated", "plain"),
-    "heads": ("expanded", "default"),
+_CHOICES: dict[str, Collection[Any]] = {
+    "cbam": ("official", "paper", None),
+    "backbone": BACKBONES,
+    "neck": NECKS,
+    "heads": HEADS,
     "dtype": DTYPES,
-    "remat": (*REMAT, False, True),  # as configs of earlier versions say it
+    "remat": REMAT,
 }
 
 
@@ -181,17 +192,13 @@ def from_config(config: Mapping[str, Any]) -> RadeNet:
     """
     fields = {key: config[key] for key in config if key != "name"}
     check_keys(fields, FIELDS, "model")
-    for key, choices in _CHOICES.items():
-        if fields[key] not in choices:
-            raise UserError(
-                f"config.model.{key} is {fields[key]!r}, expected one of {choices}"
-            )
     fields["widths"] = tuple(fields["widths"])
     if fields["cbam"] == "off":
         fields["cbam"] = None
     if isinstance(fields["remat"], bool):
-        fields["remat"] = "blocks" if fields["remat"] else "none"
+        fields["remat"] = "blocks" if fields["remat"] else "none"  # of 0.1
     model = RadeNet(**fields)
+    check_choices(model)
     _check_sizes(model)
     return model
 

@@ -15,6 +15,7 @@ from radejax.core.errors import UserError
 from radejax.data.kradar.labels import AVAILABILITY_FLAGS, LABEL_CLASSES, VERSIONS
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
+from radejax.losses.detection import loss_names
 from radejax.simulation.config import SimulationConfig
 
 
@@ -96,6 +97,15 @@ def _where(rule: Rule, text: str, fits: Callable[[Any], bool]) -> Rule:
     return Rule(f"{rule.expected}; {text}", lambda v: rule.holds(v) and fits(v))
 
 
+def _are_weights(value: Any) -> bool:
+    """By name; or of focal, GWD and smooth L1 in a row, as in earlier versions."""
+    if isinstance(value, Mapping):
+        is_known, value = set(value) <= set(loss_names()), tuple(value.values())
+    else:
+        is_known = _several(_NOT_NEGATIVE, 3).holds(value)
+    return is_known and all(map(_NOT_NEGATIVE.holds, value)) and any(value)
+
+
 _BOOL = Rule("True or False", _is_bool)
 _TEXT = Rule("text", lambda value: isinstance(value, str))
 _MAPPING = Rule("a mapping of fields", lambda value: isinstance(value, Mapping))
@@ -126,7 +136,8 @@ RULES: dict[str, Rule] = {
         lambda value: value in ((), []) or _several(_SEED, distinct=True).holds(value),
     ),
     "profile": _TEXT,
-    # The model: what its parts need of each other is told when it is built.
+    # The model: which parts there are, and what they need of each other, is told when
+    # it is built.
     "model.name": _one_of("radenet", "dinorade"),
     "model.num_classes": _COUNT,
     "model.doppler_bins": _COUNT,
@@ -136,8 +147,9 @@ RULES: dict[str, Rule] = {
     "model.num_groups": _COUNT,
     "model.cbam": _one_of("official", "paper", "off", None),
     "model.input_stem": _BOOL,
-    "model.neck": _one_of("dilated", "plain"),
-    "model.heads": _one_of("expanded", "default"),
+    "model.backbone": _TEXT,
+    "model.neck": _TEXT,
+    "model.heads": _TEXT,
     "model.pad_multiple": _COUNT,
     "model.crop_output": _BOOL,
     "model.dtype": _one_of("float32", "bfloat16"),
@@ -177,7 +189,10 @@ RULES: dict[str, Rule] = {
     "loss.gwd_tau": _POSITIVE,
     "loss.normalize_yaw": _BOOL,
     "loss.matching": _one_of("center", "nms"),
-    "loss.weights": _where(_several(_NOT_NEGATIVE, 3), "not all 0", any),
+    "loss.weights": Rule(
+        f"numbers of at least 0, not all 0, by names of {', '.join(loss_names())}",
+        lambda value: _are_weights(value),
+    ),
     "loss.normalize": _BOOL,
     "loss.z0_m": _number(),
     "decode.max_detections": _COUNT,
@@ -205,6 +220,7 @@ RULES: dict[str, Rule] = {
     "train.evaluate_every_epochs": _COUNT_OR_0,
     "train.best_metric": _TEXT,
     "train.max_skipped_steps": _COUNT_OR_0,
+    "data.format": _TEXT,
     "data.label_version": _VERSION,
     "data.visibility": _or_none(_several(_one_of(*AVAILABILITY_FLAGS), distinct=True)),
     "data.count_disabled": _BOOL,

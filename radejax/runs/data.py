@@ -8,7 +8,7 @@ import hashlib
 import json
 import logging
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import flax.linen as nn
 import grain
@@ -26,9 +26,8 @@ from radejax.data.cameras import (
     check_embeddable,
     require_images,
 )
+from radejax.data.dataset import DATA_SETS, FrameSequence, LabelledFrames
 from radejax.data.frame_table import make_table
-from radejax.data.kradar import Frame, KRadar
-from radejax.data.kradar.folders import read_grid
 from radejax.data.kradar.splits import held_out
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
@@ -66,7 +65,7 @@ class Data:
     """
 
     paths: DataPaths
-    frames: KRadar
+    frames: LabelledFrames
     classes: tuple[str, ...]
     options: ConfigDict
     camera: CameraOptions | None
@@ -102,7 +101,7 @@ class Data:
                 "embeddings are given, but config.model.name is "
                 f"{config.model.name!r}, which has no camera"
             )
-        frames = KRadar(
+        frames = _reader(config.data.get("format", "kradar"))(
             paths.roots,
             paths.labels,
             version=config.data.label_version,
@@ -145,10 +144,10 @@ class Data:
         return RecordSource(self.paths.records, grid=self.grid)
 
     @functools.cached_property
-    def _splits(self) -> dict[str | None, KRadar]:
+    def _splits(self) -> dict[str | None, LabelledFrames]:
         return {}
 
-    def split(self, name: str | None) -> KRadar:
+    def split(self, name: str | None) -> LabelledFrames:
         """Frames of "train", "validation", "test" or a split file; all for None.
 
         Without those that were left out when they were projected, which are counted.
@@ -168,7 +167,7 @@ class Data:
             self._splits[name] = frames
         return self._splits[name]
 
-    def _part_of_train(self, name: str) -> KRadar:
+    def _part_of_train(self, name: str) -> LabelledFrames:
         """What the train split leaves to train on, or what is held out of it."""
         frames = self.frames.of_split("train")
         # Runs of before are without these two fields.
@@ -194,7 +193,7 @@ class Data:
         """By which the best checkpoint is chosen: "validation", "test" without one."""
         return "validation" if self.options.get("validation") else "test"
 
-    def images(self, frames: Sequence[Frame]) -> CameraInputs | None:
+    def images(self, frames: FrameSequence) -> CameraInputs | None:
         """Images and cameras of frames; None for a model without a camera.
 
         Raises:
@@ -205,7 +204,7 @@ class Data:
         return camera_inputs(frames, self.image_size, self.camera, self.features)
 
     def training_batches(
-        self, frames: Sequence[Frame], train: ConfigDict, seed: int
+        self, frames: FrameSequence, train: ConfigDict, seed: int
     ) -> grain.DatasetIterator[Batch]:
         """An endless, shuffled, checkpointable iterator over batches of this process.
 
@@ -332,23 +331,30 @@ def data_of_run(
         if other.sequences or other.weather or own is None or paths.roots != own.roots:
             part = {"sequences": other.sequences, "weather": other.weather}
             config.data.update({name: tuple(of) for name, of in part.items()})
-        grid = read_grid(list(map(pathlib.Path, paths.roots)))
-        if grid != loaded.grid:
-            raise UserError(
-                f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
-                f"{workdir} was trained on {describe_grid(loaded.grid)}"
-            )
-        has_backbone = IMAGE_BACKBONE in loaded.variables["params"]
-        if (
-            models.has_camera(loaded.model)
-            and not has_backbone
-            and paths.embeddings is None
-        ):
+        is_blind = models.has_camera(loaded.model) and (
+            IMAGE_BACKBONE not in loaded.variables["params"]
+        )
+        if is_blind and paths.embeddings is None:
             raise UserError(
                 f"{workdir} is without the weights of its image backbone: give "
                 "--image_backbone FOLDER, or --embeddings FOLDER of these images"
             )
-    return config, Data.open(config, loaded.model, paths, grid=loaded.grid)
+    data = Data.open(config, loaded.model, paths, grid=loaded.grid)
+    if other is not None and data.frames.grid != loaded.grid:
+        raise UserError(
+            f"{', '.join(paths.roots)}: the radar has {describe_grid(data.frames.grid)}, "
+            f"{workdir} was trained on {describe_grid(loaded.grid)}"
+        )
+    return config, data
+
+
+def _reader(name: str) -> Callable[..., LabelledFrames]:
+    """Of a data set's format."""
+    if name not in DATA_SETS:
+        raise UserError(
+            f"config.data.format is {name!r}, expected one of {', '.join(DATA_SETS)}"
+        )
+    return DATA_SETS[name]
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

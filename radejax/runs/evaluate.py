@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -18,7 +18,7 @@ from radejax.core import files
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
-from radejax.data.kradar import Frame, KRadar
+from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report.measure import Options
@@ -51,8 +51,7 @@ def evaluate(
 
     Args:
         config: Of the run.
-        model: What `config.model` describes.
-        variables: Of the model.
+        model, variables: What `config.model` describes.
         data: To evaluate on.
         workdir: Of the run.
         out: Folder of the results; `evaluation` in the work folder if None.
@@ -60,31 +59,24 @@ def evaluate(
         exchange_images: Seed; see `evaluate_run`.
         step: Of the variables, for `source.json`.
         remark: Behind the name of the run in the report.
-        **options: Fields of the report's `Options` in place of the config's.
+        **options: Of the report's `Options`, in place of the config's.
 
     Returns:
-        The report that was written; None on all processes but the first, which return
-        when it is there.
+        The report that was written; None on all processes but the first.
 
     Raises:
-        UserError: There are no frames of the split, or images to exchange.
+        UserError: No frames of the split, or images to exchange.
     """
     frames, seen = _frames(data, split, exchange_images)
-    out = workdir / "evaluation" if out is None else out
+    out = out or workdir / "evaluation"
     predictor = make_predictor(config, model, data)
     predictor.update(variables)
     size, images = config.evaluation.batch_size, data.images(seen)
     predictions = predict_dataset(predictor, data.records, seen, size, images=images)
 
-    def report() -> Report:
-        with files.swapped_in(out) as folder:
-            made = write(folder)
-        names = (path.relative_to(folder) for path in made.files)
-        return dataclasses.replace(made, files=[out / name for name in names])
-
     def write(folder: pathlib.Path) -> Report:
-        source = source_of(data, split, exchange_images)
-        files.write_json(folder / "source.json", {"step": step, **source})
+        source = {"step": step, **source_of(data, split, exchange_images)}
+        files.write_json(folder / "source.json", source)
         drawer = pictures.FrameDrawer(
             data.records,
             frames,
@@ -114,24 +106,13 @@ def evaluate(
         )
         return made
 
+    def report() -> Report:
+        with files.swapped_in(out) as folder:
+            made = write(folder)
+        placed = [out / path.relative_to(folder) for path in made.files]
+        return dataclasses.replace(made, files=placed)
+
     return processes.main_only(report)
-
-
-def _draw(
-    drawer: pictures.FrameDrawer,
-    count: int,
-    workdir: pathlib.Path,
-    out: pathlib.Path,
-    *,
-    is_simulated: bool,
-) -> None:
-    """Frames of a split, one of each weather, and the losses of the run."""
-    drawn = drawer.draw_spread(out / "pictures", count)
-    if drawn:
-        drawer.draw_scenes(out / "scenes.png")
-    if (workdir / "metrics.jsonl").exists():
-        pictures.draw_curves(workdir, out / "training.png", is_simulated=is_simulated)
-    _log.info("drew %d frames in %s", len(drawn), out / "pictures")
 
 
 def evaluate_run(
@@ -267,7 +248,7 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
 
 def _frames(
     data: Data, split: str, exchange_images: int | None
-) -> tuple[KRadar, Sequence[Frame]]:
+) -> tuple[LabelledFrames, FrameSequence]:
     """Frames of a split, and the same as the model is to see them."""
     frames = data.split(None if split == "all" else split)
     if not len(frames):
@@ -282,7 +263,7 @@ def _frames(
     return frames, with_images_exchanged(frames, exchange_images)
 
 
-def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
+def with_images_exchanged(frames: FrameSequence, seed: int) -> list[LabelledFrame]:
     """The frames, each with the image and calibration of another one.
 
     Raises:
@@ -294,8 +275,9 @@ def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
     order = np.random.default_rng(seed).permutation(given)
     exchanged = list(frames)
     for own, other in zip(order, np.roll(order, 1), strict=True):
+        frame: Any = frames[own]
         exchanged[own] = dataclasses.replace(
-            frames[own],
+            frame,
             camera_path=frames[other].camera_path,
             camera_calibration_path=frames[other].camera_calibration_path,
         )

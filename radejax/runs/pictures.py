@@ -12,12 +12,13 @@ import flax.linen as nn
 import jax
 import numpy as np
 
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import decode, model_inputs
 from radejax.data.frame_table import make_table
 from radejax.data.images import front_view
-from radejax.data.kradar import Frame
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource, record_positions
+from radejax.losses.detection import loss_names
 from radejax.runs.data import Data
 from radejax.visualize import bev, curves
 from radejax.visualize.camera_share import average_by_group, write_camera_share
@@ -40,7 +41,7 @@ class FrameDrawer:
     def __init__(
         self,
         records: RecordSource,
-        frames: Sequence[Frame],
+        frames: FrameSequence,
         predictions: Mapping[str, np.ndarray],
         *,
         roi: Sequence[float] | None,
@@ -124,7 +125,9 @@ def draw_curves(
     if not (workdir / "metrics.jsonl").exists():
         return
     title = f"{workdir.name}{_simulated(is_simulated)}"
-    figure = curves.draw_training(workdir / "metrics.jsonl", title=title)
+    series = curves.read_metrics(workdir / "metrics.jsonl")
+    parts = [name for name in loss_names() if name in series]
+    figure = curves.draw_training(series, keys=parts, title=title)
     bev.save_figure(figure, path)
 
 
@@ -132,7 +135,7 @@ def draw_camera_share(
     model: nn.Module,
     variables: Mapping[str, Any],
     data: Data,
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     out: pathlib.Path,
 ) -> None:
     """Writes `camera_share.json` and `camera_share.png`, see `camera_share`."""
@@ -145,9 +148,9 @@ def camera_share(
     model: nn.Module,
     variables: Mapping[str, Any],
     data: Data,
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     *,
-    group: Callable[[Frame], str] = lambda frame: frame.weather,
+    group: Callable[[LabelledFrame], str] = lambda frame: frame.weather,
     max_frames: int = 256,
     batch_size: int = 8,
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:

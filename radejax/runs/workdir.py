@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import pathlib
@@ -26,7 +27,7 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax.core import files
-from radejax.core.config import base_config
+from radejax.core.config import renewed
 from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.sources import DataPaths, saved_path
@@ -70,11 +71,11 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     path = workdir / "config.json"
     if processes.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
-    defaults = json.loads(base_config().to_json())
+    before: dict[str, Any] = {}  # of what earlier versions have fewer fields
     if "camera" in config.data:
-        defaults["data"]["camera"] = BEFORE
-    if "simulation" in config:  # of which earlier versions have fewer fields
-        defaults["simulation"] = default_config()
+        before["data"] = {"camera": BEFORE}
+    if "simulation" in config:
+        before["simulation"] = default_config()
     files.claim(
         path,
         json.loads(config.to_json()) | {"profile": "", "seeds": []},
@@ -82,7 +83,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("watch",),
-        defaults=defaults,
+        renewed=functools.partial(renewed, before=before),
     )
 
 

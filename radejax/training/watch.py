@@ -23,6 +23,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.losses.detection import loss_names
 from radejax.training import processes
 from radejax.training.checkpoints import BEST
 from radejax.training.clock import StepClock, seconds_since_start
@@ -31,8 +32,6 @@ _log = logging.getLogger(__name__)
 
 Values = Mapping[str, float]
 Pictures = Mapping[str, np.ndarray]
-
-_ON_THE_BAR = ("focal", "gwd", "smooth_l1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +118,7 @@ class Watch:
         with self.timing("compute"):  # the metrics have to be waited for
             values = {k: float(np.asarray(v)) for k, v in metrics.items()}
         speed = self._speed(step)
-        text = [f"{k} {v:.4g}" for k, v in values.items() if k in _ON_THE_BAR]
+        text = [f"{k} {v:.4g}" for k, v in values.items() if k in loss_names()]
         if speed:
             text.append(f"{speed['frames_per_s']:.1f} frames/s")
             text.append(f"wait {speed['data_wait_share']:.0%}")

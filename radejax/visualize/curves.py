@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from radejax.core.errors import DataError, UserError
 from radejax.visualize.canvas import SERIES_COLORS, new_figure
 
-LOSS_KEYS = ("focal", "gwd", "smooth_l1")
 _LINE_STYLES = ("-", "--", "-.", ":")
 _AXIS_LABELS = {
     "frames_per_s": "frames per second",
@@ -135,7 +134,7 @@ def draw_training(
 
     Args:
         metrics: Path of `metrics.jsonl`, or name to `(step [N], value [N])`.
-        keys: Names to show; by default the loss parts that are there.
+        keys: Names to show; by default the weighted sum of the losses where it is there.
         smoothing: Share of the run over which the bold line averages.
         title: Title of the figure.
 
@@ -143,7 +142,7 @@ def draw_training(
         UserError: A key is not in the metrics; lists those that are.
     """
     series = metrics if isinstance(metrics, Mapping) else read_metrics(metrics)
-    keys = keys or [k for k in LOSS_KEYS if k in series] or sorted(series)[:3]
+    keys = keys or [k for k in ("weighted_sum",) if k in series] or sorted(series)[:3]
     unknown = [key for key in keys if key not in series]
     if unknown or not keys:
         raise UserError(

@@ -1,5 +1,6 @@
 """Configs: words, presets, the rows of the papers' tables; every one can be built."""
 
+import json
 import pathlib
 from typing import Any
 
@@ -7,7 +8,13 @@ import jax
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config, config_name, load_module, parse_words
+from radejax.core.config import (
+    base_config,
+    config_name,
+    load_module,
+    parse_words,
+    renewed,
+)
 from radejax.core.errors import UserError
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -83,3 +90,19 @@ def test_words_that_do_not_go_together_are_refused() -> None:
 def test_names_of_runs() -> None:
     assert config_name("configs/quickstart.py") == "quickstart"
     assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
+
+
+def test_a_config_of_before_is_brought_to_the_present_form() -> None:
+    now = json.loads(base_config().to_json())
+    before = json.loads(base_config().to_json())
+    before["loss"]["weights"] = [2.0, 1.0, 0.5]
+    del before["data"]["sequences"], before["seed"]
+    now["loss"]["weights"]["smooth_l1"] = 0.5
+    assert renewed(before) == renewed(now) == now
+
+
+def test_a_config_file_of_before_lists_the_weights_of_losses() -> None:
+    config = base_config()
+    config.loss.weights = (2.0, 1.0, 0.5)
+    by_name = renewed(config.to_dict())["loss"]["weights"]
+    assert by_name == {"focal": 2.0, "gwd": 1.0, "smooth_l1": 0.5}

@@ -31,6 +31,11 @@ class _Frame:
     radar_from_lidar_m: tuple = (-2.54, 0.3, 0.0)
     lidar_to_radar_z_m: float = 0.7
 
+    def read_calibration(self, shift):
+        return CameraCalibration.from_kradar(
+            self.camera_calibration_path, ego_from_lidar_m=shift
+        )
+
 
 def frame_cameras(frames, image_size, **options):
     options = CameraOptions(**{"allow_missing": False, **options})

@@ -8,10 +8,9 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
-from ml_collections import ConfigDict
 
 from radejax import Detector, UserError, models
-from radejax.core.config import load_module
+from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
@@ -27,9 +26,9 @@ def _equal(a: Any, b: Any) -> None:
 
 def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> None:
     detector = small.detector(nms_iou=0.2, azimuth_mapping="stretched")
-    content = packed.write_packed(
-        tmp_path, detector, training_config=ConfigDict({"seed": 3})
-    )
+    config = base_config()
+    config.seed = 3
+    content = packed.write_packed(tmp_path, detector, training_config=config)
     assert content["left_out"] == []
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "config.json",
@@ -40,7 +39,12 @@ def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> No
     assert loaded.classes == detector.classes
     assert (loaded.nms_iou, loaded.score_threshold) == (0.2, 0.1)
     _equal(loaded(small.projections(3)), detector(small.projections(3)))
-    assert load(tmp_path).config.to_dict() == {"seed": 3}
+    assert load(tmp_path).config.to_json() == config.to_json()
+    # A neck that this version does not have is not taken for another.
+    content["model"]["neck"] = "strips"
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"neck is 'strips', expected .*dilated.*plain"):
+        load(tmp_path)
 
 
 @pytest.mark.slow

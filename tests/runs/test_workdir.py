@@ -56,6 +56,7 @@ def test_a_run_older_than_a_field_of_the_config_goes_on(tmp_path: pathlib.Path) 
     old["simulation"] = default_config()
     del old["simulation"]["camera_content"], old["data"]["validation"]
     del old["data"]["sequences"], old["seed"], old["train"]["schedule"]
+    old["loss"]["weights"] = [2.0, 1.0, 1.0]
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     (tmp_path / "config.json").write_text(json.dumps(old))
     with workdir.claimed(tmp_path, config):

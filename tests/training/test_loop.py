@@ -171,7 +171,7 @@ def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
     losses = _losses(workdir)
     with pytest.raises(
         UserError,
-        match=r"something else: sha256 of their keys: ab there, cd now\. Give",
+        match=r"something else: sha256 of their keys is 'ab' there and 'cd' here; give",
     ):
         run(workdir, info={"same": same | {"sha256 of their keys": "cd"}})
     assert _losses(workdir) == losses

@@ -17,21 +17,20 @@ import os
 import pathlib
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from tqdm import tqdm
 
 from radejax.core.errors import DataError, UserError
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import check_encoding, encode, num_clipped
-from radejax.data.kradar import Frame, KRadar
 from radejax.data.records import files
 from radejax.data.records.plan import claim_folder, dtype_there
 from radejax.data.records.projections import (
     Manifest,
     write_manifest,
 )
-from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.geometry.radar_grid import RadarGrid
 
 _SMALL_JOB_CELLS = 3e9  # some 50 of K-Radar's tesseracts, a few seconds
@@ -78,24 +77,20 @@ class ProjectionReport:
         return "\n".join(lines)
 
 
-_Source = tuple[str, pathlib.Path | None, pathlib.Path | None]
-"""Key, tesseract and released projection of a frame."""
-
-
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """One file of records: picklable, without boxes and labels."""
+    """One file of records, to be pickled."""
 
     folder: pathlib.Path
     name: str
-    frames: list[_Source]
+    frames: list[LabelledFrame]
     grid: RadarGrid
     encoding: str
     skip_bad: bool
 
 
 def project_dataset(
-    frames: KRadar | Sequence[Frame],
+    frames: FrameSequence,
     out_dir: str | os.PathLike,
     *,
     grid: RadarGrid | None = None,
@@ -140,12 +135,12 @@ def project_dataset(
     index, count = parse_shard(shard)
     out_dir = pathlib.Path(out_dir)
     dtype = check_encoding(dtype or dtype_there(out_dir))
-    sources = [(f.key, f.tesseract_path, f.projection_path) for f in frames]
+    sources = list(frames)
     if not sources:
         raise UserError("no frames to project")
     if frames_per_file < 1:
         raise UserError(f"frames_per_file must be at least 1, got {frames_per_file}")
-    keys = "\n".join(key for key, *_ in sources)
+    keys = "\n".join(frame.key for frame in sources)
     plan = {
         "dtype": dtype,
         "num_frames": len(sources),
@@ -187,14 +182,14 @@ def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
 
 
 def _count_earlier(
-    sources: list[_Source], earlier: Manifest, report: ProjectionReport
-) -> list[_Source]:
+    frames: list[LabelledFrame], earlier: Manifest, report: ProjectionReport
+) -> list[LabelledFrame]:
     """The frames of which a finished job has nothing; the others are counted."""
     recorded, skipped = set(earlier.frames), earlier.skipped
-    report.skipped = {key: skipped[key] for key, *_ in sources if key in skipped}
-    report.num_found = sum(key in recorded for key, *_ in sources)
+    report.skipped = {f.key: skipped[f.key] for f in frames if f.key in skipped}
+    report.num_found = sum(frame.key in recorded for frame in frames)
     report.num_frames = report.num_found + len(report.skipped)
-    return [s for s in sources if s[0] not in recorded and s[0] not in skipped]
+    return [f for f in frames if f.key not in recorded and f.key not in skipped]
 
 
 def _count_finished(task: _Task, report: ProjectionReport, keep_skipped: bool) -> bool:
@@ -311,10 +306,10 @@ def _project_task(
     began = time.perf_counter()
     timings = {"reading": 0.0}
     with files.RecordFileWriter(task.folder, task.name) as writer:
-        for source in task.frames:
-            key = source[0]
+        for frame in task.frames:
+            key = frame.key
             try:
-                projection = _projection(source, task.grid, timings)
+                projection = frame.read_projection(task.grid, timings)
             except (DataError, FileNotFoundError, OSError) as error:
                 if not task.skip_bad:
                     raise DataError(
@@ -330,36 +325,24 @@ def _project_task(
     return entry, timings["reading"], time.perf_counter() - began
 
 
-def _projection(source: _Source, grid: RadarGrid, timings: dict[str, float]) -> Any:
-    """The projection of one frame, from its tesseract or, without one, from `.npy`."""
-    _, tesseract, npy = source
-    if tesseract is not None:
-        return project_file(tesseract, shape_drea=grid.shape_drea, timings=timings)
-    if npy is not None:
-        return read_projection_npy(npy, projection_shape=grid.projection_shape)
-    raise FileNotFoundError("no tesseract in any root")
-
-
 def _finish(
     out_dir: pathlib.Path,
     names: list[str],
     grid: RadarGrid,
     dtype: str,
-    sources: list[_Source],
+    frames: list[LabelledFrame],
     earlier: Manifest | None,
 ) -> bool:
     """Writes the manifest of the folder, after an earlier one's, if every file is there."""
     entries = [files.read_manifest_of(out_dir, name) for name in names]
     if any(entry is None for entry in entries):
         return False
+    paths = [frame.radar_path for frame in frames if frame.radar_path is not None]
+    num_released = sum(path.suffix == ".npy" for path in paths)
     described = {
-        "tesseracts": sum(tesseract is not None for _, tesseract, _ in sources),
-        "released_projections": sum(
-            tesseract is None and npy is not None for _, tesseract, npy in sources
-        ),
-        "folders": sorted(
-            {str(p.parents[2]) for _, *paths in sources for p in paths if p}
-        ),
+        "tesseracts": len(paths) - num_released,
+        "released_projections": num_released,
+        "folders": sorted({str([path, *path.parents][:4][-1]) for path in paths}),
     }
     if earlier is not None:
         for name, value in earlier.sources.items():

@@ -12,15 +12,14 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from radejax.core.errors import UserError
 from radejax.core.files import write_text
+from radejax.data.dataset import FrameSequence
 from radejax.data.encoding import MAX_ERROR_DB, check_encoding
-from radejax.data.kradar.frame import Frame
 from radejax.data.records.arrays import MANIFEST, ArrayRecords, read_manifest_json
 from radejax.data.records.files import RecordFile, damage_named
 from radejax.geometry.radar_grid import RadarGrid
@@ -160,7 +159,7 @@ class RecordSource(ArrayRecords):
         return {"projection": self.read(int(index)), "frame": int(index)}
 
 
-def record_positions(records: RecordSource, frames: Sequence[Frame]) -> list[int]:
+def record_positions(records: RecordSource, frames: FrameSequence) -> list[int]:
     """Index of the record of every frame.
 
     Raises:
