@@ -26,6 +26,9 @@ NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
 WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 """K-Radar's wide region: x, y, z from and to, metres, ego frame."""
 
+ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
+"""Regions by name; bounds are inclusive, and of box centers."""
+
 
 @struct.dataclass
 class Batch:

@@ -9,6 +9,7 @@ from PIL import Image
 
 from radejax.cli.overlay import overlay
 from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.visualize import bev
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +64,25 @@ def test_slices_and_a_sequence_in_motion(
     assert '"frames": 1' in done.output
     with Image.open(tmp_path / "all.gif") as picture:
         assert picture.format == "GIF"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), "narrow region"),
+        (("--roi", "wide"), "wide region"),
+        (("--roi=none",), None),
+    ],
+)
+def test_the_region_is_that_of_the_evaluation_and_named(
+    arguments: tuple[str, ...],
+    expected: str | None,
+    root: pathlib.Path,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = []
+    monkeypatch.setattr(bev, "save_figure", lambda figure, _: drawn.append(figure))
+    assert _run("1", root, "--out", tmp_path / "a.png", *arguments).exit_code == 0
+    texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert texts[1:] == ([expected] if expected else [])

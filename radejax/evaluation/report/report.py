@@ -293,7 +293,10 @@ def _draw(
     if options.draw_frame is not None:
         folder = out_dir / "worst_frames"
         folder.mkdir(exist_ok=True)
-        for rank, entry in enumerate(metrics["worst_frames"]):
-            written.append(folder / f"{rank:02d}_frame_{entry['frame']}.png")
+        for entry in metrics["worst_frames"]:
+            name = f"frame_{entry['frame']}"
+            if {"name", "sequence"} <= set(entry):
+                name = f"{entry['sequence']:02d}_{entry['name']}"
+            written.append(folder / f"{name}.png")
             options.draw_frame(entry["frame"], written[-1])
     return written
