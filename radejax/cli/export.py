@@ -32,6 +32,7 @@ from radejax.cli import entry, options
     is_flag=True,
     help="Keep the image transformer's weights. DINOv3's may not be passed on.",
 )
+@click.option("--half", is_flag=True, help="Store float16; of huggingface.")
 def export(
     source: pathlib.Path,
     out: pathlib.Path,
@@ -39,6 +40,7 @@ def export(
     platforms: str,
     image_backbone: pathlib.Path | None,
     with_backbone: bool,
+    half: bool,
     as_json: bool,
 ) -> None:
     """Write a model as a folder that works elsewhere.
@@ -63,6 +65,7 @@ def export(
         platforms=tuple(platforms.split(",")),
         training_config=loaded.config,
         with_backbone=with_backbone,
+        half=half,
     )
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:

@@ -48,6 +48,7 @@ def export(
     platforms: Sequence[str] = PLATFORMS,
     training_config: ConfigDict | None = None,
     with_backbone: bool = False,
+    half: bool = False,
 ) -> dict[str, Any]:
     """Writes a folder with the model; existing files of the same names are replaced.
 
@@ -59,22 +60,30 @@ def export(
         platforms: That the program shall run on: of `KNOWN_PLATFORMS`; "gpu" is CUDA.
         training_config: Kept in `config.json`.
         with_backbone: Keep the image transformer's weights, see `write_packed`.
+        half: Store float16; "huggingface" alone.
 
     Returns:
         "kind", "folder", "bytes" and "left_out".
 
     Raises:
-        UserError: An unknown kind or platform; or a program would need an image
+        UserError: An unknown kind or platform; half of a program, which takes float32
+            weights; or a program would need an image
             backbone that is left out.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
+    if half and kind == "stablehlo":
+        raise UserError("--half: a program takes float32; give --format huggingface")
     platforms = _checked_platforms(platforms)
     folder = pathlib.Path(folder)
     if kind == "stablehlo":
         program = stablehlo(detector, platforms, with_backbone=with_backbone)
     content = packed.write_packed(
-        folder, detector, training_config=training_config, with_backbone=with_backbone
+        folder,
+        detector,
+        training_config=training_config,
+        with_backbone=with_backbone,
+        half=half,
     )
     if kind == "stablehlo":
         with files.atomic_write(folder / PROGRAM_FILE) as file:
@@ -82,7 +91,7 @@ def export(
         _copy_loader(folder)
         files.write_text(folder / "README.md", _program_readme(detector, platforms))
     else:
-        files.write_text(folder / "README.md", _model_card(detector, content))
+        files.write_text(folder / "README.md", _model_card(detector, content, half))
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return {
         "kind": kind,
@@ -225,7 +234,14 @@ under `left_out`, and `camera` a dictionary of arrays: `cam_from_ego` [B, 3, 4],
 """
 
 
-def _model_card(detector: Detector, content: Mapping[str, Any]) -> str:
+def _model_card(detector: Detector, content: Mapping[str, Any], half: bool) -> str:
+    simulation = (content["training_config"] or {}).get("simulation") or {}
+    origin = (
+        "Before publishing, check the licence of the data that the weights were trained on\n"
+        "(K-Radar: CC BY-NC-ND)."
+    )
+    if simulation.get("scenes") == "procedural":
+        origin = "Trained on simulated data alone: it does not know real radar frames."
     name = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}[content["model"]["name"]]
     left_out = ""
     if content["left_out"]:
@@ -254,8 +270,7 @@ detector(projection).to_list()   # [B, {", ".join(map(str, detector.grid.project
 ```
 {left_out}
 `config.json` holds the model, the sensor's grid, the decoding thresholds and the training
-config; `model.safetensors` the weights, float32, by their names in Flax.
+config; `model.safetensors` the weights, float{16 if half else 32}, by their names in Flax.
 
-Before publishing, check the licence of the data that the weights were trained on (K-Radar:
-CC BY-NC-ND).
+{origin}
 """
