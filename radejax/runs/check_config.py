@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any
 
 from ml_collections import ConfigDict
@@ -271,38 +271,43 @@ def check(config: ConfigDict) -> None:
             first one, what it is and what is expected.
     """
     values = config.to_dict()
-    fields = dict(_fields(values))
+    found = dict(fields(values))
     sections = {"", *_SECTIONS}
-    if fields.get("model.name") != "radenet":
+    if found.get("model.name") != "radenet":
         sections |= set(_CAMERA_SECTIONS)
     if "simulation" in values:
         sections.add("simulation")
     known = [name for name in RULES if name.rpartition(".")[0] in sections]
-    for name, value in fields.items():
+    for name, value in found.items():
         if any(rule.startswith(f"{name}.") for rule in known):
             raise UserError(f"config.{name} is {value!r}, expected a section of fields")
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean config.{near[0]}?" if near else ""
-            raise UserError(f"config.{name} is not a field of this config{hint}")
+        check_name(name, known)
         if not RULES[name].holds(value):
             raise UserError(
                 f"config.{name} is {value!r}, expected {RULES[name].expected}"
             )
     for name in known:
-        if name not in fields:
+        if name not in found:
             raise UserError(
                 f"config.{name} is missing, expected {RULES[name].expected}"
             )
     _check_together(config, values)
 
 
-def _fields(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def check_name(name: str, known: Collection[str]) -> None:
+    """`UserError` with the nearest name for a field that is not among those known."""
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean config.{near[0]}?" if near else ""
+        raise UserError(f"config.{name} is not a field of this config{hint}")
+
+
+def fields(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     """Name with dots and value of every field; an empty section counts as one."""
     for key, value in values.items():
         name = f"{path}{key}"
         if isinstance(value, Mapping) and value and name not in RULES:
-            yield from _fields(value, f"{name}.")
+            yield from fields(value, f"{name}.")
         else:
             yield name, value
 

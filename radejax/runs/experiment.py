@@ -32,7 +32,7 @@ _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {folder}:
   evaluation/      metrics.json, metrics.csv, tables, pictures
   checkpoints/     the trained model
   metrics.jsonl    losses by step (tensorboard --logdir {folder})
-Evaluate again:    python evaluate.py --workdir {folder}
+Evaluate again:    radejax evaluate --workdir {folder}
 Boxes for a folder of frames:
                    radejax detect --workdir {folder} --out boxes FOLDER"""
 
