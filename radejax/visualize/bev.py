@@ -184,6 +184,7 @@ def draw_frame(
         loc="lower center",
         bbox_to_anchor=(0.765, polar_place[1] + polar_place[3] + 0.01),
         ncols=3,
+        fontsize=8,  # counts, threshold and the region's name fit
         frameon=False,
     )
     if scene.title:
