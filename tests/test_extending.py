@@ -23,8 +23,9 @@ from radejax.models.backbone import BACKBONES
 from radejax.models.heads import HEADS
 from radejax.models.neck import NECKS
 from radejax.runs import check_config, experiment
-from radejax.runs.data import Data, Sources
+from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run
+from radejax.runs.sources import Sources
 from radejax.training import sharding
 
 from . import small_models as small

@@ -75,7 +75,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Path,
 @pytest.mark.timeout(900)
 def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
     folder, output = undisturbed
-    for line in ("simulate", "project", "train", "detect", "Done in", "evaluate.py"):
+    for line in (
+        "simulate",
+        "project",
+        "train",
+        "detect",
+        "Done in",
+        "radejax evaluate",
+    ):
         assert line in output
     run = folder / "run"
     assert _metrics(folder)
@@ -170,7 +177,7 @@ def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
 def test_wrong_use_is_one_line_and_exit_code_2(undisturbed: tuple) -> None:
     folder, _ = undisturbed
     for flag, message in (
-        ("--config.train.batchsize=3", 'Did you mean "batch_size"'),
+        ("--config.train.batchsize=3", "did you mean config.train.batch_size?"),
         ("--config=configs/nope.py", "no such config file: configs/nope.py"),
         (
             "--config=configs/radenet.py:big",

@@ -39,6 +39,7 @@ from radejax.cli import entry, options
     show_default=True,
     help="Frames of a call, of ONNX files.",
 )
+@click.option("--half", is_flag=True, help="Store float16; of huggingface.")
 def export(
     source: pathlib.Path,
     out: pathlib.Path,
@@ -47,6 +48,7 @@ def export(
     image_backbone: pathlib.Path | None,
     with_backbone: bool,
     batch_size: int,
+    half: bool,
     as_json: bool,
 ) -> None:
     """Write a model as a folder that works elsewhere.
@@ -73,6 +75,7 @@ def export(
         training_config=loaded.config,
         with_backbone=with_backbone,
         batch_size=batch_size,
+        half=half,
     )
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:

@@ -23,6 +23,13 @@ ANIMATIONS = (".gif", ".mp4")
 @click.option("--out", type=options.FILE, default="overlay.png", show_default=True)
 @click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
 @click.option(
+    "--roi",
+    type=click.Choice(["narrow", "wide", "none"]),
+    default="narrow",
+    show_default=True,
+    help="Region of interest, as of `radejax evaluate`.",
+)
+@click.option(
     "--max-frames", type=options.COUNT, help="Of an animation; all by default."
 )
 def overlay(
@@ -34,6 +41,7 @@ def overlay(
     weather: tuple[str, ...] | None,
     out: pathlib.Path,
     slices: bool,
+    roi: str,
     max_frames: int | None,
     as_json: bool,
 ) -> None:
@@ -72,24 +80,24 @@ def overlay(
         )
     if out.suffix.lower() in ANIMATIONS:
         found = found[:max_frames]
-        drawn = (_draw(frame, frames.grid, slices) for frame in found)
+        drawn = (_draw(frame, frames.grid, slices, roi) for frame in found)
         total = len(found)
         animate.animate(tqdm.tqdm(drawn, "draw", total, unit="frame"), out)
     else:
         found = found[:1]
-        bev.save_figure(_draw(found[0], frames.grid, slices), out)
+        bev.save_figure(_draw(found[0], frames.grid, slices, roi), out)
     options.echo_result(
         as_json, {"picture": str(out), "frames": len(found)}, f"drew {out}"
     )
 
 
-def _draw(frame: Any, grid: Any, slices: bool) -> Any:
+def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
     """Figure of one frame: planes of the radar, or radar map and camera image.
 
     Raises:
         UserError: It has neither tesseract nor projection.
     """
-    from radejax.core.structures import WIDE_ROI
+    from radejax.core.structures import ROIS
     from radejax.data.images import front_view
     from radejax.visualize import bev, projections
     from radejax.visualize.canvas import Scene
@@ -97,7 +105,8 @@ def _draw(frame: Any, grid: Any, slices: bool) -> Any:
     projection = frame.read_projection(grid)
     title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
     if slices:
-        figure = projections.draw_slices(projection, grid)
+        objects = frame.boxes, list(frame.classes)
+        figure = projections.draw_slices(projection, grid, ground_truth=objects)
         figure.suptitle(title)
         return figure
     image, camera = front_view(frame)
@@ -105,7 +114,7 @@ def _draw(frame: Any, grid: Any, slices: bool) -> Any:
         projection,
         grid,
         ground_truth=(frame.boxes, list(frame.classes)),
-        roi=WIDE_ROI,
+        roi=ROIS.get(roi),
         image=image,
         camera=camera,
         title=title,

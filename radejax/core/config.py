@@ -20,6 +20,9 @@ from ml_collections.config_dict import placeholder
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 
+CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
+"""Those that come along: in a checkout a link to the folder beside the package."""
+
 
 def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:
     """Splits the part after the colon of `--config file.py:word,word`.
@@ -65,17 +68,40 @@ def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
     return module
 
 
-def load_config(path_and_words: str) -> ConfigDict:
-    """The config of a file such as "configs/radenet.py:stem".
+def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
+    """File of a config: a path, or the name of one that comes with radejax.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        UserError: A word is unknown.
+        UserError: There is none; says which names there are.
+
+    Examples:
+        >>> config_file("quickstart").name
+        'quickstart.py'
     """
-    path, _, words = path_and_words.partition(":")
-    if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(f"no such config file: {path}")
-    get_config = load_module(path).get_config
+    path = pathlib.Path(name)
+    own = CONFIGS / f"{path.stem}.py"
+    if not path.suffix and path.name == str(name) and own.is_file():
+        return own
+    if path.suffix == ".py" and path.is_file():
+        return path
+    names = ", ".join(sorted(file.stem for file in CONFIGS.glob("*.py")))
+    hint = f"; did you mean {path.stem}?" if own.is_file() else ""
+    raise UserError(
+        f"no such config file: {name}; give a .py file, or one of {names}{hint}"
+    )
+
+
+def load_config(path_and_words: str) -> ConfigDict:
+    """The config of a file or name such as "my/config.py" or "radenet:stem".
+
+    Raises:
+        UserError: There is no such file, it makes no config, or a word is unknown.
+    """
+    name, _, words = path_and_words.partition(":")
+    path = config_file(name)
+    get_config = getattr(load_module(path), "get_config", None)
+    if get_config is None:
+        raise UserError(f"{path} has no function get_config()")
     return get_config(words) if words else get_config()
 
 

@@ -29,6 +29,9 @@ MIN_SIZE_M = 0.01
 WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 """K-Radar's wide region: x, y, z from and to, metres, ego frame."""
 
+ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
+"""Regions by name; bounds are inclusive, and of box centers."""
+
 
 @struct.dataclass
 class Batch:

@@ -13,13 +13,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import BOX_FIELDS, CLASSES, NARROW_ROI, WIDE_ROI
+from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not asked for are ignored."""
-
-ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
-"""Regions of interest: x, y, z bounds in metres, inclusive, for box centers (ego)."""
 
 Columns = Mapping[str, np.ndarray]
 """A table: frames, ground truth or predictions by the name of the column."""

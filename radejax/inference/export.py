@@ -49,6 +49,7 @@ def export(
     training_config: ConfigDict | None = None,
     with_backbone: bool = False,
     batch_size: int = 1,
+    half: bool = False,
 ) -> dict[str, Any]:
     """Writes a folder with the model; existing files of the same names are replaced.
 
@@ -62,15 +63,19 @@ def export(
         training_config: Kept in `config.json`.
         with_backbone: Keep the image transformer's weights, see `write_packed`.
         batch_size: Frames of a call of the ONNX files.
+        half: Store float16; "huggingface" alone.
 
     Returns:
         "kind", "folder", "bytes" and "left_out".
 
     Raises:
-        UserError: An unknown kind or platform; ONNX without jax2onnx.
+        UserError: An unknown kind or platform; ONNX without jax2onnx; half
+            of a program, which takes float32 weights.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
+    if half and kind != "huggingface":
+        raise UserError("--half: a program takes float32; give --format huggingface")
     platforms = _checked_platforms(platforms)
     folder = pathlib.Path(folder)
     programs: dict[str, bytes] = {}
@@ -87,7 +92,11 @@ def export(
         shapes = _input_shapes(detector, batch_size, is_embedded)
         programs = export_onnx.onnx_files(detector, variables, shapes)
     content = packed.write_packed(
-        folder, detector, training_config=training_config, with_backbone=with_backbone
+        folder,
+        detector,
+        training_config=training_config,
+        with_backbone=with_backbone,
+        half=half,
     )
     for name, program in programs.items():
         with files.atomic_write(folder / name) as file:
@@ -98,7 +107,7 @@ def export(
     elif kind == "onnx":
         text = _onnx_readme(detector, batch_size)
     else:
-        text = _model_card(detector, content)
+        text = _model_card(detector, content, half)
     files.write_text(folder / "README.md", text)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return {
@@ -285,7 +294,14 @@ under `left_out`, and `camera` a dictionary of arrays: `cam_from_ego` [B, 3, 4],
 """
 
 
-def _model_card(detector: Detector, content: Mapping[str, Any]) -> str:
+def _model_card(detector: Detector, content: Mapping[str, Any], half: bool) -> str:
+    simulation = (content["training_config"] or {}).get("simulation") or {}
+    origin = (
+        "Before publishing, check the licence of the data that the weights were trained on\n"
+        "(K-Radar: CC BY-NC-ND)."
+    )
+    if simulation.get("scenes") == "procedural":
+        origin = "Trained on simulated data alone: it does not know real radar frames."
     name = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}[content["model"]["name"]]
     left_out = ""
     if content["left_out"]:
@@ -314,8 +330,7 @@ detector(projection).to_list()   # [B, {", ".join(map(str, detector.grid.project
 ```
 {left_out}
 `config.json` holds the model, the sensor's grid, the decoding thresholds and the training
-config; `model.safetensors` the weights, float32, by their names in Flax.
+config; `model.safetensors` the weights, float{16 if half else 32}, by their names in Flax.
 
-Before publishing, check the licence of the data that the weights were trained on (K-Radar:
-CC BY-NC-ND).
+{origin}
 """

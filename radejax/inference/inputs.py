@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.structures import NARROW_ROI, WIDE_ROI
+from radejax.core.structures import ROIS
 from radejax.data.cameras import CameraOptions, no_camera
 from radejax.data.images import read_left_image
 from radejax.data.projection import MAX_LEVEL
@@ -282,9 +282,8 @@ def _check_count(what: str, found: int, expected: int) -> None:
 
 def named_region(roi: Sequence[float] | str | None) -> Sequence[float] | None:
     """Limits of a region that may be named."""
-    named = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
-    if isinstance(roi, str) and roi in named:
-        return named[roi]
+    if isinstance(roi, str) and roi in ROIS:
+        return ROIS[roi]
     if roi is not None and (isinstance(roi, str) or len(roi) != 6):
         raise UserError(f"roi {roi!r}, expected narrow, wide or x0, x1, y0, y1, z0, z1")
     return roi

@@ -72,6 +72,7 @@ def write_packed(
     *,
     training_config: ConfigDict | None = None,
     with_backbone: bool = False,
+    half: bool = False,
 ) -> dict[str, Any]:
     """Writes `config.json` and `model.safetensors`.
 
@@ -81,6 +82,7 @@ def write_packed(
         training_config: Kept in `config.json` to be read.
         with_backbone: Keep the image transformer's weights. DINOv3's are for own
             machines and not to be passed on.
+        half: Store float16, to half the size; it is computed in float32 as ever.
 
     Returns:
         The content of `config.json`.
@@ -122,7 +124,7 @@ def write_packed(
         else json.loads(training_config.to_json()),
     }
     arrays = {
-        name: np.ascontiguousarray(value)
+        name: np.ascontiguousarray(value, np.float16 if half else None)
         for name, value in traverse_util.flatten_dict(variables, sep="/").items()
     }
     folder.mkdir(parents=True, exist_ok=True)
@@ -152,7 +154,9 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
     decode = dict(content["decode"])
     return LoadedModel(
         models.build(content["model"]),
-        traverse_util.unflatten_dict(arrays, sep="/"),
+        traverse_util.unflatten_dict(
+            {name: x.astype(np.float32) for name, x in arrays.items()}, sep="/"
+        ),
         RadarGrid.from_dict(content["grid"]),
         {
             "classes": tuple(content["classes"]),

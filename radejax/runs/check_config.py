@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from ml_collections import ConfigDict
@@ -306,27 +306,32 @@ def check(config: ConfigDict) -> None:
             first one, what it is and what is expected.
     """
     values = config.to_dict()
-    fields = dict(field_values(values))
+    found = dict(field_values(values))
     sections = {"", *_SECTIONS}
-    if fields.get("model.name") != "radenet":
+    if found.get("model.name") != "radenet":
         sections |= set(_CAMERA_SECTIONS)
     if "simulation" in values:
         sections.add("simulation")
     known = [name for name in RULES if name.rpartition(".")[0] in sections]
-    for name, value in fields.items():
+    for name, value in found.items():
         if any(rule.startswith(f"{name}.") for rule in known):
             raise UserError(f"config.{name} is {value!r}, expected a section of fields")
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean config.{near[0]}?" if near else ""
-            raise UserError(f"config.{name} is not a field of this config{hint}")
+        check_name(name, known)
         check_field(name, value)
     for name in known:
-        if name not in fields:
+        if name not in found:
             raise UserError(
                 f"config.{name} is missing, expected {RULES[name].expected}"
             )
     _check_together(config, values)
+
+
+def check_name(name: str, known: Collection[str]) -> None:
+    """`UserError` with the nearest name for a field that is not among those known."""
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean config.{near[0]}?" if near else ""
+        raise UserError(f"config.{name} is not a field of this config{hint}")
 
 
 def check_field(name: str, value: Any) -> None:
@@ -336,19 +341,10 @@ def check_field(name: str, value: Any) -> None:
 
 
 def check_best_metric(name: str, iou_thresholds: Sequence[float]) -> None:
-    """Refuses a `train.best_metric` that validations do not compute.
-
-    Args:
-        name: Such as "map_3d_iou30".
-        iou_thresholds: Of `config.evaluation`.
-
-    Raises:
-        UserError: Names those that there are.
-    """
+    """`UserError` for a metric that validations at these thresholds do not compute."""
+    spaces = ("bev", "3d")
     known = [
-        f"map_{space}_iou{100 * iou:.4g}"
-        for space in ("bev", "3d")
-        for iou in iou_thresholds
+        f"map_{space}_iou{100 * i:.4g}" for space in spaces for i in iou_thresholds
     ]
     if name not in known:
         raise UserError(

@@ -259,7 +259,7 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     if not sources.data and simulation is None:
         raise UserError(
             "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
-            "config that simulates them, such as configs/quickstart.py"
+            "config that simulates them, such as quickstart"
         )
     if simulation is not None:
         root = _simulated_root(simulation, sources.data)

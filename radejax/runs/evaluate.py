@@ -258,7 +258,7 @@ def _frames(
     if data.camera is None:
         raise UserError(
             "config.model.name is 'radenet', which has no camera; expected 'dinorade', "
-            "for example configs/dinorade.py"
+            "for example --config dinorade"
         )
     return frames, with_images_exchanged(frames, exchange_images)
 

@@ -33,11 +33,11 @@ _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {folder}:
   evaluation/      metrics.json, metrics.csv, tables, pictures
   checkpoints/     the trained model
   metrics.jsonl    losses by step (tensorboard --logdir {folder})
-Evaluate again:    python evaluate.py --workdir {folder}
+Evaluate again:    radejax evaluate --workdir {folder}
 {best}Boxes for a folder of frames:
                    radejax detect --workdir {folder} --out boxes FOLDER"""
 
-_BEST = """Best on the way:   python evaluate.py --workdir {folder} --checkpoint best
+_BEST = """Best on the way:   radejax evaluate --workdir {folder} --checkpoint best
                    chosen on the {split} split: {word}
 """
 _MAY_BE_REPORTED = {

@@ -16,6 +16,7 @@ from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import decode, model_inputs
 from radejax.data.frame_table import make_table
 from radejax.data.images import front_view
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource, record_positions
 from radejax.losses.detection import loss_names
@@ -79,6 +80,7 @@ class FrameDrawer:
             ground_truth=(frame.boxes, list(frame.classes)),
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
             roi=self._roi,
+            score_threshold=self._score_threshold,
             image=image,
             camera=camera,
             title=f"{frame.weather} ({frame.key}){_simulated(frame.is_simulated)}",
@@ -94,7 +96,7 @@ class FrameDrawer:
             best = fullest.setdefault(frame.weather, i)
             if len(frame.boxes) > len(self._frames[best].boxes):
                 fullest[frame.weather] = i
-        scenes = [self._scene(i) for i in fullest.values()]
+        scenes = [self._scene(fullest[w]) for w in sorted(fullest, key=_place)]
         figure = draw_scenes(scenes)
         bev.save_figure(figure, path)
 
@@ -111,6 +113,11 @@ class FrameDrawer:
             paths.append(folder / f"{frame.sequence:02d}_{frame.name}.png")
             self(index, paths[-1])
         return paths
+
+
+def _place(weather: str) -> int:
+    """Of a weather in every table; unknown ones come last."""
+    return WEATHERS.index(weather) if weather in WEATHERS else len(WEATHERS)
 
 
 def _simulated(is_simulated: bool) -> str:

@@ -24,7 +24,7 @@ _AXIS_LABELS = {
 
 
 def draw_precision_recall(
-    curves: Mapping[str, tuple[Any, Any]] | Iterable[Any],
+    curves: Mapping[str, tuple[Any, Any] | None] | Iterable[Any],
     *,
     ax: Axes | None = None,
     title: str | None = None,
@@ -34,7 +34,8 @@ def draw_precision_recall(
     Lines differ in colour and in dash pattern.
 
     Args:
-        curves: Name to `(recall [K], precision [K])`, both in [0, 1]; or results of
+        curves: Name to `(recall [K], precision [K])`, both in [0, 1], or to None, which
+            keeps the looks of the others the same from panel to panel; or results of
             `evaluation.average_precision.evaluate`, which are named by class and AP.
             Results of classes without any object are left out.
         ax: Where to draw; a new figure by default.
@@ -48,7 +49,10 @@ def draw_precision_recall(
         curves, name = _named_curves(curves)
         title = title or name
     ax = new_figure(5.2, 4.6, layout="constrained").add_subplot() if ax is None else ax
-    for i, (label, (recall, precision)) in enumerate(curves.items()):
+    for i, (label, curve) in enumerate(curves.items()):
+        if curve is None:
+            continue
+        recall, precision = curve
         recall, precision = np.asarray(recall, float), np.asarray(precision, float)
         if recall.ndim != 1 or recall.shape != precision.shape:
             raise UserError(
@@ -67,7 +71,15 @@ def draw_precision_recall(
     ax.title.set_fontsize(9)
     ax.grid(alpha=0.3)
     if curves:
-        ax.legend(fontsize=8, loc="lower left")
+        # Below the axes, where it covers no curve.
+        columns = 1 if len(curves) < 4 else 2
+        ax.legend(
+            fontsize=7,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.16),
+            ncols=columns,
+            frameon=False,
+        )
     return ax
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 from radejax.cli.overlay import overlay
 from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.visualize import bev
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +78,25 @@ def test_a_part_of_the_data_is_drawn(
     done = _run("", root, "--sequences", 1, "--weather", other)
     assert done.exit_code == 2
     assert "no frames of these sequences and weathers" in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), "narrow region"),
+        (("--roi", "wide"), "wide region"),
+        (("--roi=none",), None),
+    ],
+)
+def test_the_region_is_that_of_the_evaluation_and_named(
+    arguments: tuple[str, ...],
+    expected: str | None,
+    root: pathlib.Path,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = []
+    monkeypatch.setattr(bev, "save_figure", lambda figure, _: drawn.append(figure))
+    assert _run("1", root, "--out", tmp_path / "a.png", *arguments).exit_code == 0
+    texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert texts[1:] == ([expected] if expected else [])

@@ -10,6 +10,7 @@ import pytest
 import safetensors.numpy
 
 from radejax import Detector, UserError, models
+from radejax.cli.demo import MODEL
 from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
@@ -45,6 +46,37 @@ def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> No
     (tmp_path / "config.json").write_text(json.dumps(content))
     with pytest.raises(UserError, match=r"neck is 'strips', expected .*dilated.*plain"):
         load(tmp_path)
+
+
+def test_a_model_stored_in_half_is_half_and_computes_in_float32(
+    tmp_path: pathlib.Path,
+) -> None:
+    detector = small.detector()
+    for half in (False, True):
+        packed.write_packed(tmp_path / str(half), detector, half=half)
+    sizes = [
+        (tmp_path / n / packed.WEIGHTS_FILE).stat().st_size for n in ("False", "True")
+    ]
+    assert sizes[1] < 0.6 * sizes[0]
+    found = packed.read_packed(tmp_path / "True").variables
+
+    def same(ours: Any, theirs: Any) -> None:
+        assert ours.dtype == np.float32
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-7)
+
+    jax.tree.map(same, found, dict(detector.variables))
+
+
+def test_the_demo_comes_with_a_small_model_of_simulated_data() -> None:
+    files = list(MODEL.iterdir())
+    assert sum(path.stat().st_size for path in files) < 4e6
+    loaded = packed.read_packed(MODEL)
+    card = (MODEL / "README.md").read_text()
+    assert "float16" in card
+    assert "simulated data alone" in card
+    assert "CC BY" not in card
+    assert loaded.config.simulation.scenes == "procedural"  # nothing of K-Radar in it
+    assert loaded.grid.projection_shape == (64, 56, 25)
 
 
 @pytest.mark.slow

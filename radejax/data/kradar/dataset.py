@@ -67,8 +67,7 @@ class KRadar(Sequence[Frame]):
             and no folder in the roots are left out and counted, if any has one.
         weather: Only sequences of these weathers; None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
-        common_camera: `common/cam_front0.yml` for all sequences, as the released code;
-            otherwise each its own, where it has one.
+        common_camera: `common/cam_front0.yml` for all sequences, as released.
 
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
@@ -179,12 +178,16 @@ class KRadar(Sequence[Frame]):
 
     def _open_labels(self, labels: PathLike | None) -> folders.LabelSource:
         """The label source; `UserError` when there is nothing in it."""
+        if not self.folders:
+            meant = folders.nearby_roots(self.roots)
+            if meant or labels is None:
+                hint = f"; try {', '.join(map(str, meant))}" if meant else ""
+                raise UserError(
+                    "no sequence folders (1, 2, ...) in "
+                    f"{', '.join(map(str, self.roots))}{hint}"
+                )
         if labels is not None:
             return folders.labels_from(pathlib.Path(labels))
-        if not self.folders:
-            raise UserError(
-                f"no sequence folders (1, 2, ...) in {', '.join(map(str, self.roots))}"
-            )
         source = folders.own_labels(self.folders, self.version)
         if not source.files:
             raise UserError(

@@ -31,6 +31,8 @@ _OWN_LABEL_FOLDERS = {
     "v2.0": ("info_label_v2_0", "info_label_v2", "info_label"),
     "v2.1": ("info_label_v2_1", "info_label"),
 }
+# As labels have it; isdecimal is also true of the digits of other scripts.
+_IS_SEQUENCE = re.compile(r"[0-9]{1,6}")
 _SEQUENCE_NAME = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
 _LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
 
@@ -76,8 +78,7 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
         if not root.is_dir():
             raise FileNotFoundError(f"{root}: no such folder, expected a K-Radar root")
         for folder in sorted(root.iterdir()):
-            # As labels have it; isdecimal is also true of the digits of other scripts.
-            if re.fullmatch(r"[0-9]{1,6}", folder.name) and folder.is_dir():
+            if _IS_SEQUENCE.fullmatch(folder.name) and folder.is_dir():
                 same = found.setdefault(int(folder.name), [])
                 if same and same[-1].parent == root:
                     raise DataError(
@@ -86,6 +87,19 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
                     )
                 same.append(folder)
     return {number: SequenceFolder(found[number]) for number in sorted(found)}
+
+
+def nearby_roots(roots: Sequence[pathlib.Path]) -> list[pathlib.Path]:
+    """Up to three roots that may be meant by a sequence's folder or a root's parent."""
+    found = []
+    for root in (pathlib.Path(os.path.abspath(root)) for root in roots):
+        inside = sorted(root.iterdir())
+        has_radar = any(p.name.startswith(("radar_", "info_label")) for p in inside)
+        if _IS_SEQUENCE.fullmatch(root.name) and has_radar:
+            found.append(root.parent)
+        folders = [p for p in inside if p.is_dir() and os.access(p, os.R_OK)]
+        found += [path for path in folders if find_sequences([path])]
+    return found[:3]
 
 
 class LabelSource:

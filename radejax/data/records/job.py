@@ -15,6 +15,7 @@ import math
 import multiprocessing
 import os
 import pathlib
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -244,10 +245,16 @@ def _run_in_processes(tasks: list[_Task], num_workers: int, bar: tqdm) -> Iterat
         initargs=(done, stop),
     )
     with pool:
-        pending = {
-            pool.submit(_project_in_worker, task, slot)
-            for slot, task in enumerate(tasks)
-        }
+        # Ctrl-C is for this process: those that start now inherit the mask, and `stop`
+        # tells them.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            pending = {
+                pool.submit(_project_in_worker, task, slot)
+                for slot, task in enumerate(tasks)
+            }
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             while pending:
                 finished, pending = concurrent.futures.wait(

@@ -319,6 +319,8 @@ def _draw(
         plots.draw(data, frames, options, folder)
     if options.draw_frame is not None:
         (folder / "worst_frames").mkdir()
-        for rank, entry in enumerate(metrics["worst_frames"]):
-            name = f"{rank:02d}_frame_{entry['frame']}.png"
-            options.draw_frame(entry["frame"], folder / "worst_frames" / name)
+        for entry in metrics["worst_frames"]:
+            name = f"frame_{entry['frame']}"
+            if {"name", "sequence"} <= set(entry):
+                name = f"{entry['sequence']:02d}_{entry['name']}"
+            options.draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")

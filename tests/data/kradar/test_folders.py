@@ -38,6 +38,19 @@ def test_sequence_spread_over_roots(tmp_path):
         folders.find_sequences([tmp_path / "c"])
 
 
+def test_a_sequence_or_a_parent_as_root_is_answered_with_the_root(tmp_path):
+    touch(tmp_path / "disk/kradar/7/info_label/00004_00001.txt")
+    touch(tmp_path / "disk/other/readme.txt")
+    meant = rf"in {tmp_path}/\S+; try {tmp_path}/disk/kradar$"
+    for wrong in ("disk/kradar/7", "disk"):
+        with pytest.raises(UserError, match=meant):
+            KRadar(tmp_path / wrong)
+        with pytest.raises(UserError, match=meant):
+            KRadar(tmp_path / wrong, tmp_path / "labels.zip")
+    with pytest.raises(UserError, match=r"other$"):
+        KRadar(tmp_path / "disk/other")
+
+
 @pytest.mark.parametrize(
     ("version", "folder"),
     [("v1.0", "info_label"), ("v2.0", "info_label_v2"), ("v2.1", "info_label")],

@@ -113,6 +113,34 @@ def test_resumes_after_a_kill(root, tmp_path):
         np.testing.assert_array_equal(records[i]["projection"], wanted)
 
 
+@pytest.mark.slow
+def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
+    out = tmp_path / "out"
+    blocked = root / "2/radar_tesseract/tesseract_00005.mat"
+    blocked.unlink()
+    os.mkfifo(blocked)  # the worker waits there until it is opened below
+    # Started in the background, Ctrl-C would be ignored by all of them.
+    command = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    )
+    command += "from radejax.cli.main import main; main(prog_name='radejax')"
+    job = subprocess.Popen(
+        [sys.executable, "-c", command, "project", root, "--out", out, "--workers=1"],
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    with blocked.open("wb"):  # returns when the worker reads
+        os.killpg(job.pid, signal.SIGINT)
+        time.sleep(1.0)
+        assert job.poll() is None  # waits for its worker
+    _, errors = job.communicate(timeout=120)
+    assert job.returncode == 130
+    assert errors.rstrip().splitlines()[-1] == "error: interrupted"
+    assert "Traceback" not in errors
+
+
 def wait_until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():

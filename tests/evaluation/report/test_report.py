@@ -5,6 +5,7 @@ import math
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from radejax.core.errors import DataError, DiskFullError, UserError
 from radejax.evaluation.average_precision import evaluate
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.report import measure, paper_tables, report, tables
+from radejax.evaluation.report import measure, paper_tables, plots, report, tables
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.published import published_rows
+from radejax.visualize.canvas import SERIES_COLORS
 
 TERMS = {"roi": None, "plots": False}
 
@@ -290,3 +292,37 @@ def test_matplotlib_waits_until_something_is_drawn():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert b"radejax.evaluation.report.report" in done.stdout
     assert b"matplotlib" not in done.stdout
+
+
+def test_panels_of_curves_say_the_protocol_and_none_is_blank():
+    def result(cls, is_defined):
+        line = np.array([0.0, 1.0])
+        values = {"cls": cls, "ap": 50.0, "is_defined": is_defined}
+        return SimpleNamespace(**values, recall=line, precision=line)
+
+    everywhere = [result("Sedan", True), result("Bicycle", True), result("Bus", False)]
+    in_fog = [result("Sedan", False), result("Bicycle", False), result("Bus", False)]
+    rain = [result("Sedan", True), *in_fog[1:]]
+    results = {"all": everywhere, "fog": in_fog, "rain": rain}
+    figure = plots._precision_recall(results, "exact, bev, IoU 0.3")
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["Sedan, exact, bev, IoU 0.3", "Bicycle, exact, bev, IoU 0.3"]
+    names = [[line.get_label()[:4] for line in ax.lines] for ax in figure.axes]
+    assert names == [["all,", "rain"], ["all,"]]
+    # Fog has a colour of its own where it is not drawn: rain's is the third.
+    assert figure.axes[0].lines[1].get_color() == SERIES_COLORS[2]
+
+
+def test_worst_frames_are_named_like_other_pictures(scene, tmp_path):
+    truth, found, frames = scene
+    ids = np.asarray(frames["frame"])
+    names = {"name": np.array([f"{i:05d}_00001" for i in ids]), "sequence": ids + 3}
+    report.write_report(
+        truth, found, {**frames, **names}, tmp_path, worst_frames=2,
+        draw_frame=lambda frame, path: path.write_text(str(frame)), **TERMS
+    )  # fmt: skip
+    drawn = sorted((tmp_path / "worst_frames").iterdir())
+    assert len(drawn) == 2
+    for path in drawn:
+        frame = int(path.read_text())
+        assert path.name == f"{frame + 3:02d}_{frame:05d}_00001.png"
