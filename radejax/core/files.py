@@ -15,6 +15,7 @@ import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import IO, Any
 
+from radejax.core import schema
 from radejax.core.errors import DataError, DiskFullError, UserError
 
 _log = logging.getLogger(__name__)
@@ -99,20 +100,52 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
-    """Reads a JSON file.
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Reads a text file, without a byte order mark.
 
     Raises:
         FileNotFoundError: Names the file.
-        DataError: The file is not valid JSON; names it and the place.
+        DataError: It is a folder, or not UTF-8; names the line.
     """
     try:
-        text = pathlib.Path(path).read_text(encoding="utf-8")
-        return json.loads(text, parse_int=_parse_int)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not valid JSON: {error}") from error
+        content = pathlib.Path(path).read_bytes()
     except (IsADirectoryError, NotADirectoryError):
-        raise DataError(f"{path} is not valid JSON: it is no file") from None
+        raise DataError(f"{path}: is no file, expected a text file") from None
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise DataError(
+            f"{path}:{line}: byte {content[error.start]:#04x} is not UTF-8 text"
+        ) from None
+
+
+def read_json(path: str | os.PathLike[str], hint: Any = Any, *, mend: str = "") -> Any:
+    """Reads a JSON file.
+
+    Args:
+        path: The file.
+        hint: What it must hold, see `schema.check`.
+        mend: What to do where it does not.
+
+    Raises:
+        FileNotFoundError: Names the file.
+        DataError: The file is not valid JSON, or holds something else; names it and the
+            place.
+    """
+    try:
+        return parse_json(read_text(path), hint, str(path))
+    except DataError as error:
+        raise DataError(f"{error}{'; ' * bool(mend)}{mend}") from None
+
+
+def parse_json(text: str, hint: Any, where: str) -> Any:
+    """As `read_json`, of a text; `where` names it in errors."""
+    try:
+        value = json.loads(text, parse_int=_parse_int)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where} is not valid JSON: {error}") from None
+    return schema.check(value, hint, where)
 
 
 def _parse_int(digits: str) -> int:
@@ -237,7 +270,7 @@ def claim(
     if path.parent.is_file():
         raise UserError(f"{path.parent} is a file, expected a folder")
     try:
-        found = renewed(read_json(path))
+        found = renewed(read_json(path, dict[str, Any]))
     except FileNotFoundError:
         write_json(path, wanted)
         return

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import pathlib
 from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 
+from radejax.core import schema
 from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.images import read_left_image
@@ -55,12 +57,15 @@ class CameraOptions:
         return cls.of_fields(data["camera"]) if "camera" in data else cls()
 
     @classmethod
-    def of_fields(cls, fields: Mapping[str, Any]) -> CameraOptions:
-        """Options by name, also of a model of before that lacks some."""
-        fields = BEFORE | dict(fields)
-        if fields.get("ego_from_lidar_m") is not None:
-            fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
-        return cls(**fields)
+    def of_fields(
+        cls, fields: Mapping[str, Any], where: str | os.PathLike = ""
+    ) -> CameraOptions:
+        """Options by name, also of a model of before that lacks some.
+
+        Raises:
+            DataError: One is of another type; names the file `where` they are from.
+        """
+        return schema.check(BEFORE | dict(fields), cls, str(where), "camera")
 
     def shift(self, frame: LabelledFrame) -> tuple[float, ...]:
         """Metres to add to LiDAR positions to get where the radar sees them."""

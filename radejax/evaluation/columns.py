@@ -15,6 +15,8 @@ import numpy as np
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS
 
+_MOST = 1e6  # metres and radians: far from where squares are no numbers any more
+
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not asked for are ignored."""
 
@@ -190,7 +192,7 @@ def read_columns(
                 f"{name}: column {column!r} has shape {values.shape}, expected ({num},)"
             )
     for bad, first, must in (
-        (~np.isfinite(box), 0, "is {}, expected a finite number"),
+        (~(np.abs(box) <= _MOST), 0, f"is {{}}, expected a number up to {_MOST:g}"),
         (box[:, 3:6] <= 0, 3, "is {:g} m, expected a size above 0"),
     ):
         if bad.any():

@@ -21,7 +21,7 @@ from radejax.interop.radenet_names import (
     torch_names,
     torch_shapes,
 )
-from radejax.interop.state_dict import read_state_dict, to_numpy
+from radejax.interop.state_dict import is_tensor, read_state_dict, shorten, to_numpy
 from radejax.models.radenet import FIELDS, RadeNet, from_config
 
 StateDict = Mapping[str, Any]
@@ -129,8 +129,8 @@ def _to_params(model: RadeNet, tensors: StateDict, source: str) -> dict[str, Any
     ]
     if problems:
         raise DataError(
-            f"{source} does not fit {_model_text(model)}; {len(problems)} problems:\n  "
-            + "\n  ".join(problems)
+            f"{source} does not fit {_model_text(model)}; {len(problems)} problems: "
+            + shorten(problems, "; ")
         )
     flat = {
         path: np.array(
@@ -277,8 +277,8 @@ _PART = re.compile(r"(?:^|\.)((?:backbone|neck|head)\.)")
 def _state_dicts(content: Any, key: str) -> Any:
     if not isinstance(content, Mapping):
         return
-    tensors = {n: v for n, v in content.items() if hasattr(v, "shape")}
-    if any(isinstance(n, str) and _PART.search(n) for n in tensors):
+    tensors = {n: v for n, v in content.items() if is_tensor(n, v)}
+    if any(map(_PART.search, tensors)):
         yield key, tensors
         return
     for name, value in content.items():

@@ -9,13 +9,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from typing import Any, Literal, get_type_hints
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from radejax.core.errors import UserError
+from radejax.core import schema
+from radejax.core.errors import DataError, UserError
 from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import BACKBONES
 from radejax.models.cbam import CBAMKind
@@ -179,6 +180,14 @@ _CHOICES: dict[str, Collection[Any]] = {
     "dtype": DTYPES,
     "remat": REMAT,
 }
+HINTS = {k: hint for k, hint in get_type_hints(RadeNet).items() if k in FIELDS} | {
+    "cbam": Literal["official", "paper", "off"] | None,
+    "dtype": Literal[DTYPES],
+    "remat": Literal[REMAT] | bool,  # True and False in earlier versions
+}
+"""What the fields may be."""
+
+_MOST = 1 << 16  # channels, groups, classes
 
 
 def from_config(config: Mapping[str, Any]) -> RadeNet:
@@ -192,7 +201,7 @@ def from_config(config: Mapping[str, Any]) -> RadeNet:
     """
     fields = {key: config[key] for key in config if key != "name"}
     check_keys(fields, FIELDS, "model")
-    fields["widths"] = tuple(fields["widths"])
+    fields = check_values(fields, HINTS)
     if fields["cbam"] == "off":
         fields["cbam"] = None
     if isinstance(fields["remat"], bool):
@@ -218,14 +227,28 @@ def check_keys(
         )
 
 
+def check_values(fields: Mapping[str, Any], hints: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of `config.model`; `UserError` for one that is of another type."""
+    try:
+        return schema.check(fields, dict(hints), "", "config.model")
+    except DataError as error:
+        raise UserError(str(error)) from None
+
+
 def _check_sizes(model: RadeNet) -> None:
+    names = ("num_classes", "doppler_bins", "elevation_bins", "num_groups")
+    for name in names:
+        if not 1 <= getattr(model, name) <= _MOST:
+            raise UserError(
+                f"config.model.{name} is {getattr(model, name)}, expected 1 to {_MOST}"
+            )
     if not 0.0 < model.heatmap_prior < 1.0:
         raise UserError(
             f"config.model.heatmap_prior is {model.heatmap_prior}, expected a "
             "probability between 0 and 1"
         )
     stride = 2 ** len(model.widths)
-    if model.pad_multiple < 1 or model.pad_multiple % stride:
+    if not 1 <= model.pad_multiple <= _MOST or model.pad_multiple % stride:
         raise UserError(
             f"config.model.pad_multiple is {model.pad_multiple}; {len(model.widths)} "
             f"levels need a multiple of {stride}"
@@ -237,8 +260,8 @@ def _check_sizes(model: RadeNet) -> None:
     if model.input_stem:
         widths["widths[0] / 2 (input stem)"] = model.widths[0] // 2
     for name, width in widths.items():
-        if width < 1 or width % model.num_groups:
+        if not 1 <= width <= _MOST or width % model.num_groups:
             raise UserError(
                 f"config.model: {name} = {width} is not a multiple of "
-                f"num_groups = {model.num_groups}"
+                f"num_groups = {model.num_groups} up to {_MOST}"
             )

@@ -241,7 +241,7 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     names = ("roots", "labels", "label_version", "split", "sequences", "weather")
     found, wanted = (
         {name: values.get(name) or None for name in names}
-        for values in (files.read_json(out / "source.json"), source)
+        for values in (files.read_json(out / "source.json", dict[str, Any]), source)
     )
     files.require_same(found, wanted, f"{out} has other results", mend="give --out")
 

@@ -96,7 +96,8 @@ def run_info(
     """
     init_from = saved_path(init_from)
     if init_from is None and (workdir / "run.json").exists():
-        init_from = files.read_json(workdir / "run.json").get("init_from")
+        saved = files.read_json(workdir / "run.json", {"init_from?": str | None})
+        init_from = saved.get("init_from")
     return {
         "data": dataclasses.asdict(paths),
         "init_from": init_from,

@@ -22,7 +22,7 @@ from tensorboardX import summary
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.losses.detection import loss_names
 from radejax.training import processes
 from radejax.training.checkpoints import BEST
@@ -164,13 +164,15 @@ class _Jsonl:
             self._drop_after(start_step)
 
     def _drop_after(self, step: int) -> None:
-        kept = []
-        for line in self._path.read_text().splitlines():
+        kept, lines = [], files.read_text(self._path).splitlines()
+        for number, line in enumerate(lines, 1):
+            where = f"{self._path}, line {number}"
             try:
-                if json.loads(line)["step"] <= step:
+                if files.parse_json(line, {"step": float}, where)["step"] <= step:
                     kept.append(line + "\n")
-            except json.JSONDecodeError:  # the line a killed run was writing
-                break
+            except DataError:
+                if number < len(lines):  # not the one a killed run was writing
+                    raise
         files.write_text(self._path, "".join(kept))
 
     def write(self, step: int, values: Values, _: Pictures) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.visualize.canvas import SERIES_COLORS, new_figure
 
@@ -115,20 +115,18 @@ def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndar
     if not path.is_file():
         raise FileNotFoundError(f"no metrics of a run at {path}")
     series: dict[str, list[tuple[float, float]]] = {}
-    lines = path.read_text(encoding="utf-8").split("\n")
+    lines = files.read_text(path).split("\n")
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
         try:
-            record = json.loads(line)
-            step = float(record.pop("step"))
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            where = f"{path}, line {number}"
+            record = files.parse_json(line, {"step": float}, where)
+        except DataError:
             if number == len(lines):
                 break
-            raise DataError(
-                f"{path}, line {number}: expected a JSON object with a step, got "
-                f"{line[:60]!r}"
-            ) from error
+            raise
+        step = float(record.pop("step"))
         for name, value in record.items():
             if isinstance(value, int | float):
                 series.setdefault(name, []).append((step, float(value)))

@@ -44,7 +44,7 @@ def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> No
     # A neck that this version does not have is not taken for another.
     content["model"]["neck"] = "strips"
     (tmp_path / "config.json").write_text(json.dumps(content))
-    with pytest.raises(UserError, match=r"neck is 'strips', expected .*dilated.*plain"):
+    with pytest.raises(DataError, match=r"neck is 'strips', expected .*dilated.*plain"):
         load(tmp_path)
 
 
@@ -125,7 +125,9 @@ def test_damaged_and_absent_folders_are_named(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-8])
-    with pytest.raises(DataError, match=r"model.safetensors is damaged"):
+    with pytest.raises(
+        DataError, match=r"model.safetensors: damaged, not a safetensors"
+    ):
         Detector.from_checkpoint(tmp_path)
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"format": "other"}))
@@ -151,3 +153,26 @@ def test_grid_survives_json_exactly(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
     assert load(tmp_path).grid == small.small_grid()
     assert RadarGrid.kradar() != small.small_grid()
+
+
+def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> None:
+    packed.write_packed(tmp_path, small.detector())
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    model, decode = content["model"], content["decode"]
+    for change, message in (
+        ({"classes": ["Sedan"]}, "1 classes, expected 5, as model.num_classes"),
+        ({"decode": {**decode, "nms_iou": 2}}, r"nms_iou 2, .*from 0 to 1"),
+        ({"decode": {**decode, "nms": 1}}, r"decode has unknown \['nms'\]"),
+        ({"camera": {"projection": "x"}}, "camera.projection is 'x', expected one of"),
+        (
+            {"model": {**model, "widths": 8}},
+            "config.model.widths is 8, expected a list",
+        ),
+        ({"model": {**model, "num_groups": 0}}, "num_groups is 0, expected 1 to"),
+        ({"model": {**model, "decoder_width": 16}}, "do not fit config.model"),
+        ({"grid": {}}, "grid lacks range_m"),
+    ):
+        path.write_text(json.dumps(content | change))
+        with pytest.raises(DataError, match=rf"config\.json: .*{message}"):
+            packed.read_packed(tmp_path)

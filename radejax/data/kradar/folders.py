@@ -297,11 +297,7 @@ def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
     for root in roots:
         path = root / "radar_grid.json"
         if path.is_file():
-            content = read_json(path)
-            try:
-                found[path] = RadarGrid.from_dict(content)
-            except (ValueError, KeyError, TypeError) as error:
-                raise DataError(f"{path}: no radar grid: {error!r}") from None
+            found[path] = read_json(path, RadarGrid)
     if len(set(found.values())) > 1:
         raise DataError(
             f"different sensor axes in {', '.join(map(str, found))}; data sets of "

@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from radejax.core.errors import DataError
+from radejax.core.files import read_text
 from radejax.data.kradar import folders
 from radejax.data.kradar.findings import Findings
 from radejax.data.kradar.folders import SequenceFolder
@@ -284,9 +285,4 @@ def split_by_rule(names: Iterable[str], split: str) -> list[str]:
 
 def _read_lines(path: str | os.PathLike) -> list[str]:
     """Lines of a small text file; `DataError` if it is none."""
-    try:
-        return pathlib.Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise DataError(f"{path}:1: not a UTF-8 text file") from None
-    except IsADirectoryError:
-        raise DataError(f"{path}: is a folder, expected a text file") from None
+    return read_text(path).splitlines()

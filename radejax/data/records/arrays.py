@@ -3,43 +3,46 @@
 from __future__ import annotations
 
 import bisect
+import collections
 import itertools
+import math
 import os
 import pathlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from radejax.core.errors import DataError
 from radejax.core.files import read_json
-from radejax.data.records.files import (
-    READER_OPTIONS,
-    RecordFile,
-    damage_named,
-    sha256,
-)
+from radejax.data.records.files import MEND, READER_OPTIONS, RecordFile, sha256
 
 MANIFEST = "manifest.json"
 
 
-def read_manifest_json(folder: pathlib.Path, kind: tuple[str, int]) -> dict[str, Any]:
+def read_manifest_json(
+    folder: pathlib.Path, kind: tuple[str, int], hint: Mapping[str, Any]
+) -> dict[str, Any]:
     """What `manifest.json` of a folder says, of a format and version.
+
+    Args:
+        folder: Of records.
+        kind: Format and version.
+        hint: What it must hold beside these and its `files`, see `schema.check`.
 
     Raises:
         DataError: It is damaged or of another format or version.
     """
     path = folder / MANIFEST
-    with damage_named(path):
-        content = read_json(path)
-        found = content["format"], content["version"]
-        if found != kind:
-            raise DataError(
-                f"{path}: {found[0]} version {found[1]}, this radejax reads {kind[0]} "
-                f"version {kind[1]}"
-            )
-        return content
+    content = read_json(path, {"format": str, "version": int}, mend=MEND)
+    found = content["format"], content["version"]
+    if found != kind:
+        raise DataError(
+            f"{path}: {found[0][:80]} version {found[1]}, this radejax reads {kind[0]} "
+            f"version {kind[1]}"
+        )
+    return read_json(path, {**hint, "files": list[RecordFile]}, mend=MEND)
 
 
 class ArrayRecords(Sequence[Any]):
@@ -69,6 +72,12 @@ class ArrayRecords(Sequence[Any]):
         self.folder = pathlib.Path(folder)
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
         self.frames = list(itertools.chain.from_iterable(f.frames for f in files))
+        if len(set(self.frames)) < len(self.frames):
+            counts = collections.Counter(self.frames)
+            raise DataError(
+                f"{self.folder / MANIFEST}: frame {counts.most_common(1)[0][0][:80]} is "
+                "there twice"
+            )
         self._files = list(files)
         self._ends = list(itertools.accumulate(len(f.frames) for f in files))
         self._open()
@@ -97,7 +106,7 @@ class ArrayRecords(Sequence[Any]):
             content = self._reader(number).read([position])[0]
         except Exception as error:  # the reader raises several types
             raise self._damaged(number, position, str(error)) from None
-        if len(content) != self.dtype.itemsize * int(np.prod(self.shape)):
+        if len(content) != self.dtype.itemsize * math.prod(self.shape):
             raise self._damaged(number, position, f"{len(content)} bytes")
         return np.frombuffer(content, self.dtype).reshape(self.shape)
 

@@ -13,13 +13,13 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
 from radejax.core import files as core_files
-from radejax.core.errors import DataError
+
+MEND = "delete it, and write the records again"
+"""What to do with a damaged manifest."""
 
 # One record a group: random access then reads one frame, not its neighbours.
 WRITER_OPTIONS = "group_size:1,uncompressed"
@@ -46,10 +46,10 @@ class RecordFile:
     sha256: str
     num_clipped: int
 
-    @classmethod
-    def from_dict(cls, fields: dict[str, Any]) -> RecordFile:
-        """Inverse of `dataclasses.asdict`; `KeyError` for a missing field."""
-        return cls(**{f.name: fields[f.name] for f in dataclasses.fields(cls)})
+    def __post_init__(self) -> None:
+        is_plain = pathlib.PurePath(self.name).name == self.name
+        if not is_plain or "\0" in self.name or len(self.name) > 100:
+            raise ValueError(f"{self.name[:80]!r} is no name of a file")
 
 
 def file_name(index: int, count: int, what: str = "projections") -> str:
@@ -127,23 +127,11 @@ def read_manifest_of(folder: pathlib.Path, name: str) -> RecordFile | None:
     """
     path = manifest_path(folder, name)
     try:
-        with damage_named(path):
-            entry = RecordFile.from_dict(core_files.read_json(path))
+        entry: RecordFile = core_files.read_json(path, RecordFile, mend=MEND)
         size = (folder / name).stat().st_size
     except FileNotFoundError:
         return None
     return entry if size == entry.num_bytes else None
-
-
-@contextlib.contextmanager
-def damage_named(path: pathlib.Path) -> Iterator[None]:
-    """Turns what reading the fields of a damaged manifest raises into a `DataError`."""
-    try:
-        yield
-    except DataError:
-        raise
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: damaged manifest ({error!r}); delete it") from None
 
 
 def sha256(path: pathlib.Path) -> str:

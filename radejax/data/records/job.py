@@ -352,8 +352,8 @@ def _finish(
         "folders": sorted({str([path, *path.parents][:4][-1]) for path in paths}),
     }
     if earlier is not None:
-        for name, value in earlier.sources.items():
-            described[name] += value
+        for name, value in described.items():
+            described[name] = value + earlier.sources.get(name, type(value)())
         described["folders"] = sorted(set(described["folders"]))
         entries = [*earlier.files, *entries]
     write_manifest(out_dir, Manifest(grid, dtype, described, entries))

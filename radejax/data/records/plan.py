@@ -6,7 +6,9 @@ import pathlib
 from typing import Any
 
 from radejax.core import files
+from radejax.data.encoding import Encoding
 from radejax.data.records.arrays import MANIFEST
+from radejax.data.records.files import MEND
 from radejax.data.records.projections import Manifest, read_manifest
 
 PLAN = "plan.json"
@@ -16,7 +18,9 @@ _WHAT = "projections"
 def dtype_there(folder: pathlib.Path) -> str:
     """Type of the records of a folder; the usual one where there are none yet."""
     path = folder / PLAN
-    return files.read_json(path)["dtype"] if path.is_file() else "float16"
+    if not path.is_file():
+        return "float16"
+    return files.read_json(path, {"dtype": Encoding}, mend=MEND)["dtype"]
 
 
 def claim_folder(

@@ -19,9 +19,9 @@ import numpy as np
 from radejax.core.errors import UserError
 from radejax.core.files import write_text
 from radejax.data.dataset import FrameSequence
-from radejax.data.encoding import MAX_ERROR_DB, check_encoding
+from radejax.data.encoding import MAX_ERROR_DB, Encoding
 from radejax.data.records.arrays import MANIFEST, ArrayRecords, read_manifest_json
-from radejax.data.records.files import RecordFile, damage_named
+from radejax.data.records.files import RecordFile
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"
@@ -98,14 +98,18 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         raise FileNotFoundError(
             f"{folder}: no {MANIFEST}{hint if folder.is_dir() else ''}"
         )
-    fields = read_manifest_json(folder, (FORMAT, FORMAT_VERSION))
-    with damage_named(path):
-        return Manifest(
-            RadarGrid.from_dict(fields["grid"]),
-            check_encoding(fields["encoding"]["dtype"]),
-            fields["sources"],
-            [RecordFile.from_dict(entry) for entry in fields["files"]],
-        )
+    hint = {
+        "grid": RadarGrid,
+        "encoding": {"dtype": Encoding},
+        "sources": {
+            "tesseracts?": int,
+            "released_projections?": int,
+            "folders?": list[str],
+        },
+    }
+    fields = read_manifest_json(folder, (FORMAT, FORMAT_VERSION), hint)
+    encoding = fields["encoding"]["dtype"]
+    return Manifest(fields["grid"], encoding, fields["sources"], fields["files"])
 
 
 def skipped_frames(folder: str | os.PathLike) -> dict[str, str]:

@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 import pathlib
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -217,13 +218,12 @@ def _read_folder(
     """Numbers of the files in a folder, if there is one, and columns of all lines."""
     numbers, rows = [], []
     for path in sorted(folder.glob("*.txt")) if folder else ():
-        if not path.stem.isdecimal():
+        if not re.fullmatch("[0-9]{1,9}", path.stem):
             raise DataError(
                 f"{path}: expected a file named by its number, as 000012.txt"
             )
         numbers.append(int(path.stem))
-        text = path.read_text(encoding="utf-8")
-        for number, line in enumerate(text.splitlines(), 1):
+        for number, line in enumerate(files.read_text(path).splitlines(), 1):
             if row := _read_line(line, scored, f"{path}: line {number}"):
                 rows.append((numbers[-1], *row))
     columns = {
@@ -259,7 +259,7 @@ def _frame_table(numbers: list[int], desc: pathlib.Path | None) -> Columns:
     tags = []
     for number in numbers:
         path = desc / f"{number:06d}.txt"
-        words = path.read_text(encoding="utf-8").split() if path.is_file() else []
+        words = files.read_text(path).split() if path.is_file() else []
         tags.append(words if len(words) == 3 else ["unknown"] * 3)
     columns = np.array(tags, dtype=str).reshape(-1, 3).T
     return ids | dict(zip(DESCRIPTION, columns, strict=True))

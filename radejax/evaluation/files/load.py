@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core import files, schema
+from radejax.core.errors import DataError, UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import are_simulated
 from radejax.evaluation.columns import Columns
@@ -155,10 +155,17 @@ def stored_from(path: PathLike) -> float:
 
 def _read_frames(path: PathLike) -> Columns:
     """A frame table written by `report.write_report`."""
-    content = files.read_json(path)
-    if not isinstance(content, dict) or "frame" not in content:
-        raise UserError(f"{path}: expected an object of columns with 'frame'")
-    return {name: np.asarray(column) for name, column in content.items()}
+    column = list[int] | list[str] | list[bool] | list[float]
+    columns = files.read_json(path, dict[str, column])
+    hint = {"frame": list[int], "name?": list[str], "sequence?": list[int]}
+    columns = schema.check(columns, hint, str(path))
+    for name, column in columns.items():
+        if len(column) != len(columns["frame"]):
+            raise DataError(
+                f"{path}: column {name!r} has {len(column)} entries for "
+                f"{len(columns['frame'])} frames"
+            )
+    return {name: np.asarray(column) for name, column in columns.items()}
 
 
 def _of_detect(folder: pathlib.Path, found: Columns, frames: Columns) -> Columns:
@@ -175,7 +182,9 @@ def _frames_of_report(path: pathlib.Path) -> Columns:
     frames = dict(_read_frames(path / "frames.json"))
     source = path / "source.json"
     if "simulated" not in frames and source.is_file():
-        roots = map(pathlib.Path, files.read_json(source)["roots"])
+        roots = map(
+            pathlib.Path, files.read_json(source, {"roots": list[str]})["roots"]
+        )
         frames["simulated"] = np.full(frames["frame"].size, are_simulated([*roots]))
     return frames
 

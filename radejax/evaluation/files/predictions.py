@@ -11,12 +11,13 @@ import csv
 import io
 import json
 import pathlib
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from radejax.core import files
+from radejax.core import files, schema
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS
@@ -118,7 +119,7 @@ def find_frames(
     # Rows of a frame are neighbours, and a million of them are looked up once a frame.
     first = np.flatnonzero(np.append(True, named[1:] != named[:-1]))
     text = [_strip(str(name)) for name in named[first].tolist()]
-    if all(name.lstrip("-").isdecimal() for name in text):
+    if all(re.fullmatch("-?[0-9]{1,18}", name) for name in text):
         found = [int(name) for name in text]
     elif frames is None:
         raise DataError(f"{where}: frames are named ({text[0]!r}), but none are known")
@@ -172,15 +173,18 @@ def _read_json(path: pathlib.Path) -> Columns:
         columns = content
     else:
         columns = _columns_of_records(_records(content, path), path)
-    types = {"frame": None, "cls": None, "box": np.float64, "score": np.float64}
-    try:
-        return {
-            name: np.asarray(columns[name], dtype)
-            for name, dtype in types.items()
-            if name in columns
-        }
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{path}: a box or score is not a number: {error}") from error
+    columns = schema.check(columns, _JSON, str(path))
+    names = [name.removesuffix("?") for name in _JSON]
+    return {name: np.asarray(columns[name]) for name in names if name in columns}
+
+
+_JSON = {
+    "frame?": list[int] | list[str],
+    "cls?": list[str],
+    "box?": list[tuple[float, float, float, float, float, float, float]],
+    "score?": list[float],
+}
+"""Columns; which of them must be there `read_table` knows."""
 
 
 def _records(content: Any, path: pathlib.Path) -> Iterator[dict]:
@@ -221,18 +225,24 @@ def _columns_of_records(records: Iterator[dict], path: pathlib.Path) -> dict[str
 
 
 def _read_csv(path: pathlib.Path) -> Columns:
-    with open(path, encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
+    reader = csv.DictReader(
+        io.StringIO(files.read_text(path), newline=""), skipinitialspace=True
+    )
+    frame, cls, values = [], [], []
+    try:
         header = reader.fieldnames or []
         missing = [n for n in ("frame", "cls", *BOX_FIELDS) if n not in header]
         if missing:
-            raise DataError(f"{path}: line 1: lacks columns {missing}; found {header}")
+            raise DataError(
+                f"{path}: line 1: lacks columns {missing}; found {str(header)[:200]}"
+            )
         numbers = [n for n in (*BOX_FIELDS, "score") if n in header]
-        frame, cls, values = [], [], []
         for line in reader:
             frame.append(line["frame"])
             cls.append(line["cls"])
             values.append([_number(line[n], n, path, reader.line_num) for n in numbers])
+    except csv.Error as error:
+        raise DataError(f"{path}: line {reader.line_num}: {error}") from None
     table = np.array(values, np.float64).reshape(-1, len(numbers))
     columns = {"frame": np.array(frame), "cls": np.array(cls, str), "box": table[:, :7]}
     if "score" in numbers:
@@ -245,7 +255,7 @@ def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float
         return float(text)
     except (TypeError, ValueError):
         raise DataError(
-            f"{path}: line {line}: {name} is {text!r}, expected a number"
+            f"{path}: line {line}: {name} is {text!r:.80}, expected a number"
         ) from None
 
 

@@ -205,5 +205,5 @@ def test_grid_of_the_roots(tmp_path):
     with pytest.raises(DataError, match="different sensor axes"):
         folders.read_grid([a, b])
     touch(b / "radar_grid.json", '{"range_m": 3}')
-    with pytest.raises(DataError, match=r"radar_grid\.json: no radar grid"):
+    with pytest.raises(DataError, match=r"radar_grid\.json: it lacks azimuth_rad"):
         folders.read_grid([b])

@@ -4,7 +4,7 @@ import types
 import numpy as np
 import pytest
 
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.evaluation.files import load, predictions
 from radejax.evaluation.files.load import Source
 
@@ -16,7 +16,12 @@ def test_ground_truth_has_to_come_from_somewhere(stored):
     with pytest.raises(FileNotFoundError, match=r"none\.json"):
         load.load(folder / "none.json", source, ("Sedan",))
     (folder / "frames.json").write_text("[]")
-    with pytest.raises(UserError, match="expected an object of columns"):
+    with pytest.raises(
+        DataError, match=r"frames\.json: it is \[\], expected an object"
+    ):
+        load.load(folder / "found.json", source, ("Sedan",))
+    (folder / "frames.json").write_text('{"frame": [1, 2], "name": ["a"]}')
+    with pytest.raises(DataError, match="column 'name' has 1 entries for 2 frames"):
         load.load(folder / "found.json", source, ("Sedan",))
 
 
