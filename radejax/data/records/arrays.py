@@ -19,13 +19,14 @@ from radejax.data.records.files import (
     RecordFile,
     damage_named,
     sha256,
+    unshuffled,
 )
 
 MANIFEST = "manifest.json"
 
 
 def read_manifest_json(folder: pathlib.Path, kind: tuple[str, int]) -> dict[str, Any]:
-    """What `manifest.json` of a folder says, of a format and version.
+    """What `manifest.json` of a folder says, of a format up to a version.
 
     Raises:
         DataError: It is damaged or of another format or version.
@@ -34,10 +35,10 @@ def read_manifest_json(folder: pathlib.Path, kind: tuple[str, int]) -> dict[str,
     with damage_named(path):
         content = read_json(path)
         found = content["format"], content["version"]
-        if found != kind:
+        if found[0] != kind[0] or not 1 <= found[1] <= kind[1]:
             raise DataError(
                 f"{path}: {found[0]} version {found[1]}, this radejax reads {kind[0]} "
-                f"version {kind[1]}"
+                f"up to version {kind[1]}"
             )
         return content
 
@@ -50,6 +51,7 @@ class ArrayRecords(Sequence[Any]):
         files: What its manifest says about them.
         shape: Of every array.
         dtype: Of every array.
+        compressed: Their bytes are shuffled, see `files.shuffled`.
         verify: Compare the checksums of all files (reads them whole). Their sizes and
             record counts are always checked.
 
@@ -64,9 +66,10 @@ class ArrayRecords(Sequence[Any]):
         shape: tuple[int, ...],
         dtype: np.dtype,
         *,
+        compressed: bool = False,
         verify: bool = False,
     ) -> None:
-        self.folder = pathlib.Path(folder)
+        self.folder, self._compressed = pathlib.Path(folder), compressed
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
         self.frames = list(itertools.chain.from_iterable(f.frames for f in files))
         self._files = list(files)
@@ -99,7 +102,8 @@ class ArrayRecords(Sequence[Any]):
             raise self._damaged(number, position, str(error)) from None
         if len(content) != self.dtype.itemsize * int(np.prod(self.shape)):
             raise self._damaged(number, position, f"{len(content)} bytes")
-        return np.frombuffer(content, self.dtype).reshape(self.shape)
+        decode = unshuffled if self._compressed else np.frombuffer
+        return decode(content, self.dtype).reshape(self.shape)
 
     def index_of(self) -> dict[str, int]:
         """Record index by frame key."""

@@ -13,10 +13,13 @@ PLAN = "plan.json"
 _WHAT = "projections"
 
 
-def dtype_there(folder: pathlib.Path) -> str:
-    """Type of the records of a folder; the usual one where there are none yet."""
+_USUAL = {"dtype": "float16", "compress": False}
+
+
+def encoding_there(folder: pathlib.Path) -> dict[str, Any]:
+    """How a folder stores records, "dtype" and "compress"; as usual where none are yet."""
     path = folder / PLAN
-    return files.read_json(path)["dtype"] if path.is_file() else "float16"
+    return _USUAL | (files.read_json(path) if path.is_file() else {})
 
 
 def claim_folder(
@@ -52,6 +55,7 @@ def claim_folder(
         mend="choose another folder, delete that one, or finish it with the frames that "
         "it was begun with: a finished one serves all label revisions",
         ignore=("num_frames", "frames_sha256", "frames_per_file") if is_done else (),
+        defaults={"compress": False},
     )
     if is_same or not is_done:
         return None, _WHAT

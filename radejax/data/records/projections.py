@@ -26,7 +26,8 @@ from radejax.data.records.files import RecordFile, damage_named
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""The newest that is read. Records that are not compressed are version 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +39,14 @@ class Manifest:
         encoding: "float16", "uint8" or "float32".
         sources: Where the projections come from.
         files: Files of records; record i of the folder is the i-th of their frames.
+        compressed: Records are byte-shuffled and compressed, see `files.shuffled`.
     """
 
     grid: RadarGrid
     encoding: str
     sources: dict[str, Any]
     files: list[RecordFile]
+    compressed: bool = False
 
     @property
     def frames(self) -> list[str]:
@@ -59,10 +62,11 @@ class Manifest:
         """Plain values, for JSON."""
         return {
             "format": FORMAT,
-            "version": FORMAT_VERSION,
+            "version": 2 if self.compressed else 1,
             "grid": self.grid.to_dict(),
             "encoding": {
                 "dtype": self.encoding,
+                "compressed": self.compressed,
                 "max_error_db": MAX_ERROR_DB[self.encoding],
                 "num_clipped": sum(f.num_clipped for f in self.files),
             },
@@ -106,6 +110,7 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
             check_encoding(fields["encoding"]["dtype"]),
             fields["sources"],
             [RecordFile.from_dict(entry) for entry in fields["files"]],
+            fields["encoding"].get("compressed", False),
         )
 
 
@@ -153,6 +158,7 @@ class RecordSource(ArrayRecords):
             self.manifest.files,
             self.grid.projection_shape,
             np.dtype(self.manifest.encoding),
+            compressed=self.manifest.compressed,
             verify=verify,
         )
 

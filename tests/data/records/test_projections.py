@@ -137,7 +137,7 @@ def test_a_flipped_byte_is_found(copy):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, r"radejax-projections version 2, this .* reads .* version 1"),
+        ({"version": 3}, r"radejax-projections version 3, this .* up to version 2"),
         ({"format": "x"}, r"x version 1, this radejax reads radejax-projections"),
         ({"grid": {}}, r"damaged manifest"),
         ({"files": [{}]}, r"damaged manifest"),
