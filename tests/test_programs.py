@@ -47,11 +47,12 @@ def facts(programs: types.ModuleType) -> Any:
 
 CASES = [
     ("radar", "train_step", "cuda"),
-    pytest.param("radar", "train_step", "tpu", marks=pytest.mark.slow),
-    pytest.param("camera", "detector", "cuda", marks=pytest.mark.slow),
+    ("radar", "train_step", "tpu"),
+    ("camera", "detector", "cuda"),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "task", "platform"), CASES)
 def test_accelerators_get_lean_programs(
     facts: Any, kind: str, task: str, platform: str
