@@ -16,7 +16,13 @@ import numpy as np
 
 from radejax.core.errors import DataError
 from radejax.core.files import read_json
-from radejax.data.records.files import MEND, READER_OPTIONS, RecordFile, sha256
+from radejax.data.records.files import (
+    MEND,
+    READER_OPTIONS,
+    RecordFile,
+    sha256,
+    unshuffled,
+)
 
 MANIFEST = "manifest.json"
 
@@ -24,7 +30,7 @@ MANIFEST = "manifest.json"
 def read_manifest_json(
     folder: pathlib.Path, kind: tuple[str, int], hint: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """What `manifest.json` of a folder says, of a format and version.
+    """What `manifest.json` of a folder says, of a format up to a version.
 
     Args:
         folder: Of records.
@@ -37,10 +43,10 @@ def read_manifest_json(
     path = folder / MANIFEST
     content = read_json(path, {"format": str, "version": int}, mend=MEND)
     found = content["format"], content["version"]
-    if found != kind:
+    if found[0] != kind[0] or not 1 <= found[1] <= kind[1]:
         raise DataError(
             f"{path}: {found[0][:80]} version {found[1]}, this radejax reads {kind[0]} "
-            f"version {kind[1]}"
+            f"up to version {kind[1]}"
         )
     return read_json(path, {**hint, "files": list[RecordFile]}, mend=MEND)
 
@@ -53,6 +59,7 @@ class ArrayRecords(Sequence[Any]):
         files: What its manifest says about them.
         shape: Of every array.
         dtype: Of every array.
+        compressed: Their bytes are shuffled, see `files.shuffled`.
         verify: Compare the checksums of all files (reads them whole). Their sizes and
             record counts are always checked.
 
@@ -67,9 +74,10 @@ class ArrayRecords(Sequence[Any]):
         shape: tuple[int, ...],
         dtype: np.dtype,
         *,
+        compressed: bool = False,
         verify: bool = False,
     ) -> None:
-        self.folder = pathlib.Path(folder)
+        self.folder, self._compressed = pathlib.Path(folder), compressed
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
         self.frames = list(itertools.chain.from_iterable(f.frames for f in files))
         if len(set(self.frames)) < len(self.frames):
@@ -108,7 +116,8 @@ class ArrayRecords(Sequence[Any]):
             raise self._damaged(number, position, str(error)) from None
         if len(content) != self.dtype.itemsize * math.prod(self.shape):
             raise self._damaged(number, position, f"{len(content)} bytes")
-        return np.frombuffer(content, self.dtype).reshape(self.shape)
+        decode = unshuffled if self._compressed else np.frombuffer
+        return decode(content, self.dtype).reshape(self.shape)
 
     def index_of(self) -> dict[str, int]:
         """Record index by frame key."""

@@ -27,7 +27,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import check_encoding, encode, num_clipped
 from radejax.data.records import files
-from radejax.data.records.plan import claim_folder, dtype_there
+from radejax.data.records.plan import claim_folder, encoding_there
 from radejax.data.records.projections import (
     Manifest,
     write_manifest,
@@ -80,13 +80,12 @@ class ProjectionReport:
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """One file of records, to be pickled."""
+    """One file of records, to be pickled; `kind` is the manifest as yet without files."""
 
     folder: pathlib.Path
     name: str
     frames: list[LabelledFrame]
-    grid: RadarGrid
-    encoding: str
+    kind: Manifest
     skip_bad: bool
 
 
@@ -96,6 +95,7 @@ def project_dataset(
     *,
     grid: RadarGrid | None = None,
     dtype: str | None = None,
+    compress: bool | None = None,
     shard: str | tuple[int, int] = (0, 1),
     num_workers: int | None = None,
     frames_per_file: int = 64,
@@ -112,6 +112,8 @@ def project_dataset(
         grid: Sensor axes; None takes those of `frames`.
         dtype: Type of the records: "float16", "uint8" or "float32"; None: of those that
             are there, else "float16".
+        compress: Byte-shuffled zstd: a third of the bytes, read in more time; None: as
+            what is there, else not.
         shard: `(i, n)` or `"i/n"`, i from 0: this run does every n-th file.
         num_workers: Processes; 0: this one; None: one a core, or for a job that is done
             before they have started, this one.
@@ -135,7 +137,7 @@ def project_dataset(
         raise UserError("a plain list of frames has no grid: give grid=")
     index, count = parse_shard(shard)
     out_dir = pathlib.Path(out_dir)
-    dtype = check_encoding(dtype or dtype_there(out_dir))
+    kind = _empty_manifest(out_dir, grid, dtype, compress)
     sources = list(frames)
     if not sources:
         raise UserError("no frames to project")
@@ -143,7 +145,8 @@ def project_dataset(
         raise UserError(f"frames_per_file must be at least 1, got {frames_per_file}")
     keys = "\n".join(frame.key for frame in sources)
     plan = {
-        "dtype": dtype,
+        "dtype": kind.encoding,
+        "compress": kind.compressed,
         "num_frames": len(sources),
         "frames_per_file": frames_per_file,
         "frames_sha256": hashlib.sha256(keys.encode()).hexdigest(),
@@ -156,18 +159,26 @@ def project_dataset(
     starts = range(0, len(sources), frames_per_file)
     names = [files.file_name(i, len(starts), what) for i in range(len(starts))]
     tasks = [
-        _Task(out_dir, name, sources[i : i + frames_per_file], grid, dtype, skip_bad)
+        _Task(out_dir, name, sources[i : i + frames_per_file], kind, skip_bad)
         for name, i in zip(names, starts, strict=True)
     ][index::count]
     report.num_frames += sum(len(task.frames) for task in tasks)
     keep = skip_bad or not retry_skipped
     todo = [task for task in tasks if not _count_finished(task, report, keep)]
     _run(todo, report, num_workers, progress)
-    report.is_complete = not names or _finish(
-        out_dir, names, grid, dtype, sources, earlier
-    )
+    report.is_complete = not names or _finish(out_dir, names, kind, sources, earlier)
     report.seconds = time.perf_counter() - began
     return report
+
+
+def _empty_manifest(
+    folder: pathlib.Path, grid: RadarGrid, dtype: str | None, compress: bool | None
+) -> Manifest:
+    """Grid and encoding of what is written; None: as what is there."""
+    there = encoding_there(folder)
+    if compress is None:
+        compress = there["compress"]
+    return Manifest(grid, check_encoding(dtype or there["dtype"]), {}, [], compress)
 
 
 def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
@@ -217,7 +228,7 @@ def _run(
     bar = tqdm(total=total, unit="frame", desc="project", disable=not progress)
     if num_workers is None:
         cells = sum(
-            len(task.frames) * math.prod(task.grid.shape_drea) for task in tasks
+            len(task.frames) * math.prod(task.kind.grid.shape_drea) for task in tasks
         )
         num_workers = (os.cpu_count() or 1) if cells > _SMALL_JOB_CELLS else 0
     reading = working = 0.0
@@ -312,11 +323,12 @@ def _project_task(
     """Projects one file of records; returns its manifest, reading and working time."""
     began = time.perf_counter()
     timings = {"reading": 0.0}
-    with files.RecordFileWriter(task.folder, task.name) as writer:
+    grid, encoding, compress = task.kind.grid, task.kind.encoding, task.kind.compressed
+    with files.RecordFileWriter(task.folder, task.name, compress=compress) as writer:
         for frame in task.frames:
             key = frame.key
             try:
-                projection = frame.read_projection(task.grid, timings)
+                projection = frame.read_projection(grid, timings)
             except (DataError, FileNotFoundError, OSError) as error:
                 if not task.skip_bad:
                     raise DataError(
@@ -325,8 +337,8 @@ def _project_task(
                     ) from None
                 writer.skipped[key] = str(error)
             else:
-                writer.num_clipped += num_clipped(projection, task.encoding)
-                writer.write(key, encode(projection, task.encoding))
+                writer.num_clipped += num_clipped(projection, encoding)
+                writer.write(key, encode(projection, encoding))
             count_frame(1)
         entry = writer.commit()
     return entry, timings["reading"], time.perf_counter() - began
@@ -335,8 +347,7 @@ def _project_task(
 def _finish(
     out_dir: pathlib.Path,
     names: list[str],
-    grid: RadarGrid,
-    dtype: str,
+    kind: Manifest,
     frames: list[LabelledFrame],
     earlier: Manifest | None,
 ) -> bool:
@@ -356,5 +367,5 @@ def _finish(
             described[name] = value + earlier.sources.get(name, type(value)())
         described["folders"] = sorted(set(described["folders"]))
         entries = [*earlier.files, *entries]
-    write_manifest(out_dir, Manifest(grid, dtype, described, entries))
+    write_manifest(out_dir, dataclasses.replace(kind, sources=described, files=entries))
     return True

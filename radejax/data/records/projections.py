@@ -25,7 +25,8 @@ from radejax.data.records.files import RecordFile
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""The newest that is read. Records that are not compressed are version 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +38,14 @@ class Manifest:
         encoding: "float16", "uint8" or "float32".
         sources: Where the projections come from.
         files: Files of records; record i of the folder is the i-th of their frames.
+        compressed: Records are byte-shuffled and compressed, see `files.shuffled`.
     """
 
     grid: RadarGrid
     encoding: str
     sources: dict[str, Any]
     files: list[RecordFile]
+    compressed: bool = False
 
     @property
     def frames(self) -> list[str]:
@@ -58,10 +61,11 @@ class Manifest:
         """Plain values, for JSON."""
         return {
             "format": FORMAT,
-            "version": FORMAT_VERSION,
+            "version": 2 if self.compressed else 1,
             "grid": self.grid.to_dict(),
             "encoding": {
                 "dtype": self.encoding,
+                "compressed": self.compressed,
                 "max_error_db": MAX_ERROR_DB[self.encoding],
                 "num_clipped": sum(f.num_clipped for f in self.files),
             },
@@ -100,7 +104,7 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         )
     hint = {
         "grid": RadarGrid,
-        "encoding": {"dtype": Encoding},
+        "encoding": {"dtype": Encoding, "compressed?": bool},
         "sources": {
             "tesseracts?": int,
             "released_projections?": int,
@@ -108,8 +112,14 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         },
     }
     fields = read_manifest_json(folder, (FORMAT, FORMAT_VERSION), hint)
-    encoding = fields["encoding"]["dtype"]
-    return Manifest(fields["grid"], encoding, fields["sources"], fields["files"])
+    encoding = fields["encoding"]
+    return Manifest(
+        fields["grid"],
+        encoding["dtype"],
+        fields["sources"],
+        fields["files"],
+        encoding.get("compressed", False),
+    )
 
 
 def skipped_frames(folder: str | os.PathLike) -> dict[str, str]:
@@ -156,6 +166,7 @@ class RecordSource(ArrayRecords):
             self.manifest.files,
             self.grid.projection_shape,
             np.dtype(self.manifest.encoding),
+            compressed=self.manifest.compressed,
             verify=verify,
         )
 

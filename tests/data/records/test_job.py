@@ -206,6 +206,41 @@ def test_eight_bits_state_what_they_lose(kradar_root, tmp_path):
     assert encoding["num_clipped"] == 0
 
 
+@pytest.mark.parametrize("dtype", ["float16", "uint8", "float32"])
+def test_compressed_records_are_the_same(kradar_root, tmp_path, dtype):
+    data, plain, small = KRadar(kradar_root), tmp_path / "plain", tmp_path / "small"
+    run(data, plain, dtype=dtype)
+    run(data[:8], small, grid=data.grid, dtype=dtype, compress=True)
+    assert run(data, small).num_projected == 4  # as what is there
+    wanted, found = RecordSource(plain), RecordSource(small, verify=True)
+    assert (wanted.manifest.compressed, found.manifest.compressed) == (False, True)
+    for i in range(12):
+        x = found[i]["projection"]
+        assert (x.dtype, x.shape) == (np.dtype(dtype), data.grid.projection_shape)
+        np.testing.assert_array_equal(x, wanted[i]["projection"])
+    # Earlier versions read what is not compressed and refuse what is.
+    versions = [
+        json.loads((x / "manifest.json").read_text())["version"] for x in (small, plain)
+    ]
+    assert versions == [2, 1]
+
+
+def test_records_of_a_folder_are_compressed_or_not(kradar_root, tmp_path):
+    data = KRadar(kradar_root)
+    run(data, tmp_path, shard="0/2", compress=True)
+    with pytest.raises(UserError, match="compress is True there and False here"):
+        run(data, tmp_path, compress=False)
+    assert run(data, tmp_path).is_complete
+    other = tmp_path / "other"
+    run(data, other, shard="0/2")
+    plan = json.loads((other / "plan.json").read_text())
+    del plan["compress"]  # as versions before wrote it
+    (other / "plan.json").write_text(json.dumps(plan))
+    with pytest.raises(UserError, match="compress is False there and True here"):
+        run(data, other, compress=True)
+    assert run(data, other).is_complete
+
+
 def test_a_folder_keeps_to_its_plan(kradar_root, tmp_path):
     data = KRadar(kradar_root)
     run(data, tmp_path)

@@ -141,7 +141,7 @@ FILE |= {"num_clipped": 0}
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, r"radejax-projections version 2, this .* reads .* version 1"),
+        ({"version": 3}, r"radejax-projections version 3, this .* up to version 2"),
         ({"format": "x"}, r"x version 1, this radejax reads radejax-projections"),
         ({"grid": {}}, r"grid lacks range_m"),
         ({"files": [{}]}, r"files\[0\] lacks name, frames.*; delete it"),
