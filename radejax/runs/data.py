@@ -8,7 +8,7 @@ import hashlib
 import logging
 import os
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -27,7 +27,7 @@ from radejax.data.cameras import (
     check_embeddable,
     require_images,
 )
-from radejax.data.dataset import DATA_SETS, FrameSequence, LabelledFrames
+from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.frame_table import make_table
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
@@ -190,7 +190,7 @@ class Data:
                 "embeddings are given, but config.model.name is "
                 f"{config.model.name!r}, which has no camera"
             )
-        frames = _reader(config.data.get("format", "kradar"))(
+        frames = data_set(config.data.get("format", "kradar"))(
             paths.roots,
             paths.labels,
             version=config.data.label_version,
@@ -377,15 +377,6 @@ def data_of_run(
             f"{workdir} was trained on {describe_grid(loaded.grid)}"
         )
     return config, data
-
-
-def _reader(name: str) -> Callable[..., LabelledFrames]:
-    """Of a data set's format."""
-    if name not in DATA_SETS:
-        raise UserError(
-            f"config.data.format is {name!r}, expected one of {', '.join(DATA_SETS)}"
-        )
-    return DATA_SETS[name]
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

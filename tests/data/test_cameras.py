@@ -7,6 +7,7 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.kradar import Frame
 from radejax.geometry.calibration import CameraCalibration
 
 CALIBRATION = CameraCalibration.from_angles(
@@ -27,6 +28,8 @@ class _Frame:
     camera_path: str | None
     camera_calibration_path: str | None
     radar_from_lidar_m: tuple = (-2.54, 0.3, 0.0)
+
+    read_calibration = Frame.read_calibration
 
 
 def frame_cameras(frames, image_size, **options):
