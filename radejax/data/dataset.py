@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from radejax.core.errors import UserError
 from radejax.data.kradar.dataset import KRadar
 from radejax.data.kradar.findings import Summary
 from radejax.geometry.calibration import CameraCalibration
@@ -107,3 +108,12 @@ FrameSequence = LabelledFrames | Sequence[LabelledFrame]
 DATA_SETS: dict[str, Callable[..., LabelledFrames]] = {"kradar": KRadar}
 """What `config.data.format` may name: called with roots, labels and the options of
 `KRadar`, of which another may ignore those that it has no use for."""
+
+
+def data_set(name: str) -> Callable[..., LabelledFrames]:
+    """What opens data sets of a format; `UserError` for one that there is not."""
+    if name not in DATA_SETS:
+        raise UserError(
+            f"config.data.format is {name!r}, expected one of {', '.join(DATA_SETS)}"
+        )
+    return DATA_SETS[name]

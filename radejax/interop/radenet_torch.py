@@ -203,8 +203,8 @@ def _infer_neck(shapes: Mapping[str, Any]) -> str:
     kinds = [kind for kind, part in known.items() if part in found]
     if not kinds and found:
         raise DataError(
-            f"the neck has neck.neck.0.{sorted(found)[0]}, expected neck.neck.0.conv1 "
-            "(neck 'dilated') or neck.neck.0.conv ('plain')"
+            f"neck.neck.0 has {', '.join(sorted(found))}, expected conv1 (neck 'dilated') "
+            "or conv ('plain')"
         )
     return kinds[0] if kinds else "plain"
 

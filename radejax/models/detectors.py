@@ -34,8 +34,7 @@ def build(config: Mapping[str, Any]) -> nn.Module:
         raise UserError(
             f"config.model.name is {name}; available models: {sorted(_MAKERS)}"
         )
-    # Models of before the field have that backbone.
-    return _MAKERS[config["name"]]({"backbone": "unet", **config})
+    return _MAKERS[config["name"]](config)
 
 
 def has_camera(model: nn.Module) -> bool:

@@ -199,7 +199,8 @@ def from_config(config: Mapping[str, Any]) -> RadeNet:
     Raises:
         UserError: A key is missing or unknown, or a value is not possible.
     """
-    fields = {key: config[key] for key in config if key != "name"}
+    # Models of before the field have that backbone.
+    fields = {"backbone": "unet"} | {k: config[k] for k in config if k != "name"}
     check_keys(fields, FIELDS, "model")
     fields = check_values(fields, HINTS)
     if fields["cbam"] == "off":

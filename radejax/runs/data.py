@@ -8,7 +8,7 @@ import hashlib
 import json
 import logging
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import flax.linen as nn
 import grain
@@ -26,7 +26,7 @@ from radejax.data.cameras import (
     check_embeddable,
     require_images,
 )
-from radejax.data.dataset import DATA_SETS, FrameSequence, LabelledFrames
+from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.frame_table import make_table
 from radejax.data.kradar.splits import held_out
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
@@ -101,7 +101,7 @@ class Data:
                 "embeddings are given, but config.model.name is "
                 f"{config.model.name!r}, which has no camera"
             )
-        frames = _reader(config.data.get("format", "kradar"))(
+        frames = data_set(config.data.get("format", "kradar"))(
             paths.roots,
             paths.labels,
             version=config.data.label_version,
@@ -346,15 +346,6 @@ def data_of_run(
             f"{workdir} was trained on {describe_grid(loaded.grid)}"
         )
     return config, data
-
-
-def _reader(name: str) -> Callable[..., LabelledFrames]:
-    """Of a data set's format."""
-    if name not in DATA_SETS:
-        raise UserError(
-            f"config.data.format is {name!r}, expected one of {', '.join(DATA_SETS)}"
-        )
-    return DATA_SETS[name]
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

@@ -7,6 +7,7 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.kradar import Frame
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import project
 from radejax.simulation.camera.renderer import stereo_calibration
@@ -35,6 +36,8 @@ class _Frame:
         return CameraCalibration.from_kradar(
             self.camera_calibration_path, ego_from_lidar_m=shift
         )
+
+    read_calibration = Frame.read_calibration
 
 
 def frame_cameras(frames, image_size, **options):
