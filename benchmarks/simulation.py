@@ -2,7 +2,7 @@
 
     python benchmarks/simulation.py                            # full size, on CPU
     python benchmarks/simulation.py --grid quickstart
-    python benchmarks/simulation.py --rows 64 --batch 16       # on a GPU or TPU
+    python benchmarks/simulation.py --batch 16                 # on a GPU or TPU
 
 Every piece runs in a process of its own, so that its peak memory is its own. Pieces:
 
@@ -62,7 +62,7 @@ class Bench:
     """One rainy urban sequence, and everything that makes frames of it."""
 
     def __init__(self, arguments):
-        self.frames, self.rows = arguments.frames, arguments.rows
+        self.frames = arguments.frames
         self.batch_size = arguments.batch
         values = default_config()
         if arguments.grid == "kradar":
@@ -86,7 +86,7 @@ class Bench:
         ]
 
     def run(self, output):
-        return lambda i: self.simulator.run(self.inputs[i], output, self.rows)
+        return lambda i: self.simulator.run(self.inputs[i], output)
 
     def tesseract(self):
         measure("tesseract", self.run("tesseract"), self.frames)
@@ -105,7 +105,6 @@ class Bench:
             tensor.simulate,
             grid=self.simulator.grid,
             parameters=self.simulator.parameters,
-            rows_per_step=self.rows,
         )
         run = jax.jit(jax.vmap(one))
         count = len(self.inputs)
@@ -164,7 +163,6 @@ def main():
     )
     parser.add_argument("--grid", default="kradar", choices=["kradar", "quickstart"])
     parser.add_argument("--frames", type=int, default=4)
-    parser.add_argument("--rows", type=int, default=1, help="range rows per step")
     parser.add_argument("--batch", type=int, default=0, help="frames in one call")
     parser.add_argument("--piece", choices=PIECES, help="only this one, in here")
     arguments = parser.parse_args()

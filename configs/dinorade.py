@@ -32,6 +32,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from radejax.core.config import base_config, load_module, parse_words
+from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 
@@ -59,6 +60,7 @@ PRESETS = {
         "model.fusion.invalid": "drop",
         "model.image.standardize": True,
         "data.camera.projection": "raw",
+        "data.camera.lidar_to_radar_z_m": KRADAR_LIDAR_TO_RADAR_Z_M,
     },
     "official": {
         "loss.sigma_cells": 3.0,
@@ -70,6 +72,7 @@ PRESETS = {
         "model.image.standardize": True,
         "data.camera.projection": "pinhole",
         "data.camera.ego_from_lidar_m": OFFICIAL_OFFSET_M,
+        "data.camera.calibration": "common",
     },
 }
 """Where the paper and the released code differ, beside RADE-Net's own rows."""
@@ -161,9 +164,12 @@ def _camera() -> ConfigDict:
             # "raw": the image as recorded, with lens distortion; "rectified",
             # "pinhole" (no distortion, as released).
             "projection": "raw",
-            # Shift from LiDAR to radar; None: each sequence's own, by which its boxes
-            # are moved too.
+            # Shift from LiDAR to radar; None: each sequence's own.
             "ego_from_lidar_m": placeholder(tuple),
+            # Its z, which boxes are not moved by. None: as the sensors stand, K-Radar's
+            # 0.7 or what a simulation says.
+            "lidar_to_radar_z_m": placeholder(float),
+            "calibration": "sequence",  # "common": cam_front0.yml for all, as released
             # Images of another size than model.image.size: resized, or an error.
             "resize": False,
             # Frames without an image: radar alone, counted; False is an error.

@@ -36,7 +36,6 @@ class OnlineBatches:
         max_objects: Rows for boxes, N of `Batch`.
         seed: Which frames are drawn, and their noise; the scenes follow the config's
             own seed.
-        rows_per_step: Range rows at a time: 1 on CPU, 64 or more on accelerators.
         num_threads: Threads that prepare scatterers.
         start_step: First step; to resume, the step reached.
 
@@ -52,7 +51,6 @@ class OnlineBatches:
         batch_size: int,
         max_objects: int,
         seed: int = 0,
-        rows_per_step: int = 1,
         num_threads: int = 2,
         start_step: int = 0,
     ) -> None:
@@ -67,7 +65,7 @@ class OnlineBatches:
             if spec.split == "train"
         ]
         self._batch_size, self._max_objects = batch_size, max_objects
-        self._seed, self._rows_per_step = seed, rows_per_step
+        self._seed = seed
         self.step, self.num_cut = start_step, 0
         self._pool = concurrent.futures.ThreadPoolExecutor(max(num_threads, 1))
         self._lock = threading.Lock()
@@ -137,7 +135,6 @@ class OnlineBatches:
             np.stack([key for _, _, key, *_ in frames]),
             self.grid,
             self._parameters,
-            self._rows_per_step,
         )
         return Batch(
             projection=projection,
@@ -148,14 +145,13 @@ class OnlineBatches:
         )
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4, 5))
-def _simulate_batch(scatterers, noise, keys, grid, parameters, rows_per_step):
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _simulate_batch(scatterers, noise, keys, grid, parameters):
     """`[B, R, A, D+E]` projections of a batch."""
     one = functools.partial(
         tensor.simulate,
         grid=grid,
         parameters=parameters,
-        rows_per_step=rows_per_step,
     )
     return jax.vmap(one)(scatterers, noise, keys)
 

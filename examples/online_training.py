@@ -85,7 +85,6 @@ def train_online(
             batch_size=batch_size,
             max_objects=config.data.max_objects,
             seed=config.seed,
-            rows_per_step=1 if jax.default_backend() == "cpu" else 64,
             num_threads=config.data.num_threads,
         )
         _log.info("%d frames to draw from, simulated anew", len(batches.frame_names))

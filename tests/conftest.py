@@ -1,16 +1,22 @@
 """Settings shared by all tests."""
 
+import logging
 import os
 import pathlib
 import tempfile
 import types
+from collections.abc import Iterator
 
 import pytest
 from absl import flags
 
-# Compiling takes most of the time here, so LLVM optimises nothing; read by `import jax`.
-# With XLA_FLAGS= in the environment programs are what users get: CI's slow tests.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+# Compiling takes most of the time here: LLVM optimises nothing, and fusions are emitted
+# the older way, which compiles several times as fast. Read by `import jax`. With XLA_FLAGS=
+# in the environment programs are what users get: CI's slow tests.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false",
+)
 
 import jax
 
@@ -22,7 +28,8 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="radejax-test-cache-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache.name
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+_CACHED_FROM_SECS = 0.2
+jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM_SECS)
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 8)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -31,6 +38,17 @@ flags.FLAGS.mark_as_parsed()
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 GOLDEN = pathlib.Path(__file__).resolve().parent / "golden"
+
+
+@pytest.fixture(autouse=True)
+def _process_as_it_was() -> Iterator[None]:
+    """Commands set up log and JAX for their process; here that is every later test."""
+    log = logging.getLogger("radejax")
+    before = log.handlers[:], log.level, log.propagate
+    yield
+    log.handlers[:], log.propagate = before[0], before[2]
+    log.setLevel(before[1])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM_SECS)
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,6 @@ import pathlib
 import re
 import runpy
 import shlex
-import subprocess
 import sys
 import tomllib
 
@@ -20,7 +19,9 @@ import pytest
 
 from radejax.cli import main
 from radejax.cli.evaluate import evaluate
+from radejax.cli.train import train
 from radejax.core.config import load_config
+from radejax.runs.override import override
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [
@@ -35,6 +36,7 @@ HELP = "tests/test_documented_commands.py::test_a_script_explains_itself"
 # The test, or the line of .ci/run, that runs each kind of command for real.
 RUN_IN = {
     "train.py": "tests/test_quickstart.py::test_from_nothing_to_metrics_and_pictures",
+    "radejax train": "tests/cli/test_train.py::test_train_takes_a_part_of_the_data",
     "evaluate.py": "tests/test_quickstart.py"
     "::test_evaluate_reproduces_the_table_and_detect_writes_boxes",
     "radejax simulate": "tests/test_documented_commands.py"
@@ -45,6 +47,7 @@ RUN_IN = {
     "::test_project_then_nothing_is_left_to_project",
     "radejax overlay": "tests/test_documented_commands.py::test_overlay_draws_a_frame",
     "radejax view": "tests/test_documented_commands.py::test_view_writes_a_recording",
+    "radejax demo": ".ci/run: radejax demo",
     "radejax detect": ".ci/run: radejax detect --workdir",
     "radejax evaluate": "tests/cli/test_main.py"
     "::test_evaluate_scores_predictions_in_files",
@@ -109,7 +112,9 @@ def test_there_are_commands_on_the_pages() -> None:
 def test_a_documented_command_is_understood(page: str, command: str) -> None:
     words = shlex.split(command, comments=True)
     program, arguments = words[0], words[1:]
-    if program == "radejax":
+    if program == "radejax" and arguments[0] == "train":
+        _check_train(_without_placeholders(arguments[1:]))
+    elif program == "radejax":
         _check_radejax(arguments)
     elif program in ("python", "python3") and arguments[0].endswith(".py"):
         _check_script(arguments[0], _without_placeholders(arguments[1:]))
@@ -150,21 +155,6 @@ def _check_radejax(arguments: list[str], command: click.Command = main.main) -> 
         assert given.get(parameter.name) or not parameter.required, parameter.name
 
 
-@functools.cache
-def _absl_flags(script: str) -> set[str]:
-    done = subprocess.run(
-        [sys.executable, script, "--help"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
-    assert f"{script}:" in done.stdout, done.stderr[-2000:]
-    names = re.findall(r"^\s+--(?:\[no\])?(\w+)", done.stdout, re.MULTILINE)
-    return set(names)
-
-
 def _check_script(script: str, arguments: list[str]) -> None:
     path = ROOT / script
     assert path.is_file(), f"no such script: {script}"
@@ -176,19 +166,20 @@ def _check_script(script: str, arguments: list[str]) -> None:
     if script == "evaluate.py":
         _check_radejax([word for word in arguments if word != "..."], evaluate)
         return
-    config = None
-    for i, flag in enumerate(arguments):
-        if flag in ("--config",) or flag.startswith("--config="):
-            name = flag.partition("=")[2] or arguments[i + 1]
-            config = None if name == "..." else load_config(str(ROOT / name))
-    for flag in flags:
-        name = flag[2:].partition("=")[0]
-        if name.startswith("config."):
-            assert config is not None
-            *sections, field = name.split(".")[1:]
-            assert field in functools.reduce(lambda c, key: c[key], sections, config)
-        else:
-            assert name == "config" or name in _absl_flags(script)
+    _check_train(arguments)
+
+
+def _check_train(arguments: list[str]) -> None:
+    """Config, words, fields and their values are understood."""
+    if not arguments:  # mentioned by name alone
+        return
+    names = ["radenet" if word == "..." else word for word in arguments]
+    context = click.Context(train, **train.context_settings)
+    train.parse_args(context, names)
+    settings = load_config(context.params["config"])
+    values = {"S": "0", "LABELS.zip": "labels.zip"}
+    texts = context.meta["fields"].items()
+    override(settings, {name: values.get(text, text) for name, text in texts})
 
 
 def _check_pip(arguments: list[str]) -> None:

@@ -66,6 +66,11 @@ def check(
     help="Of records that are there already, else float16.",
 )
 @click.option(
+    "--compress/--no-compress",
+    default=None,
+    help="A third of the bytes, slower to read; as what is there, else not.",
+)
+@click.option(
     "--workers",
     "num_workers",
     type=options.COUNT,

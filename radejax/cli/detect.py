@@ -22,8 +22,18 @@ from radejax.cli import entry, options
 )
 @click.option("--out", required=True, type=options.FOLDER, help="Folder of the boxes.")
 @click.option("--step", type=options.STEP, help="Of a run; the newest by default.")
+@options.sequences
+@options.weather
 @click.option("--score-threshold", type=float, help="Instead of the config's.")
 @click.option("--nms-iou", type=float, help="Instead of the config's.")
+@click.option(
+    "--format",
+    "file_format",
+    type=click.Choice(["json", "kitti"]),
+    default="json",
+    show_default=True,
+    help="kitti: preds/000000.txt as K-Radar's tools write them.",
+)
 @click.option("--batch-size", type=options.COUNT, default=8, show_default=True)
 @click.option(
     "--labels", type=options.EXISTING, help="Revision that names frames' images."
@@ -36,12 +46,13 @@ def detect(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Find boxes in every frame below the folders; one JSON file a frame.
+    """Find boxes in every frame below the folders; one file a frame.
 
     The model is a run, its checkpoints, one of them, an exported folder or an official
     .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
     files, or such a file itself. No labels are needed; a radar-camera model finds a
-    frame's image by its label file, and goes by the radar alone without.
+    frame's image by its label file, and goes by the radar alone without. What is
+    written is scored by `radejax evaluate --predictions OUT --data ROOT`.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
@@ -50,6 +61,8 @@ def detect(
     entry.set_up_jax()
     count = detect_files(source, roots, out, **settings)
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
+    if count["clipped"]:
+        text += f"; {count['clipped']} with a size that was clipped to be positive"
     if "radar_alone" in count:
         text += f"; {count['radar_alone']} without an image, from the radar alone"
     options.echo_result(as_json, {**count, "out": str(out)}, text)

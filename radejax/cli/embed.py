@@ -12,7 +12,7 @@ from radejax.cli import entry, options
 
 @click.command(cls=options.Command)
 @options.roots
-@click.option("--config", required=True, help="As of train.py, :words too.")
+@click.option("--config", required=True, help="As of `radejax train`, :words too.")
 @click.option(
     "--image-backbone",
     required=True,
@@ -42,7 +42,7 @@ def embed(
 
     Resumes where it stopped. Training then takes --embeddings OUT in place of images.
 
-    Example: radejax embed /disk1/kradar --config configs/dinorade.py
+    Example: radejax embed /disk1/kradar --config dinorade
     --image-backbone dinov3-vits16 --out /fast/embeddings
     """
     from radejax import models

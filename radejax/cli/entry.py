@@ -6,9 +6,11 @@ JAX and absl are imported by the functions that use them: `--help` should not wa
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import pathlib
+import signal
 import socket
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,6 +20,7 @@ from radejax.core.files import is_no_space
 
 FAILED = 1
 WRONG_USE = 2
+INTERRUPTED = 128 + signal.SIGINT
 
 _WRONG_PATH = (
     FileNotFoundError,
@@ -31,14 +34,20 @@ _WRONG_PATH = (
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with one line instead of a traceback for the user's errors.
 
-    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk:
-    see `core.errors`.
+    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk, 130
+    for an interrupt: see `core.errors`. Where the caller closed standard error, what is
+    said goes nowhere instead of into the next file that is opened.
 
     Args:
         debug: Let the traceback through.
     """
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for the program's life
     try:
         yield
+    except KeyboardInterrupt as error:
+        second = f" ({error})" if str(error) else ""
+        _fail(UserError(f"interrupted{second}"), INTERRUPTED, debug)
     except ValueError as error:
         if not hasattr(error, "exit_code"):
             raise
@@ -46,9 +55,9 @@ def exit_codes(*, debug: bool = False) -> Iterator[None]:
     except _WRONG_PATH as error:
         _fail(error, WRONG_USE, debug)
     except OSError as error:
-        if not is_no_space(error):
+        if error.errno != errno.EROFS and not is_no_space(error):
             raise
-        _fail(error, FAILED, debug)
+        _fail(error, WRONG_USE if error.errno == errno.EROFS else FAILED, debug)
 
 
 def _fail(error: Exception, code: int, debug: bool) -> None:
@@ -59,6 +68,8 @@ def _fail(error: Exception, code: int, debug: bool) -> None:
         message = f"{error.strerror}: {error.filename}"
         if isinstance(error, FileNotFoundError):
             message = f"no such file or folder: {error.filename}"
+        if error.errno == errno.EROFS:
+            message += "; name another place (--out, --workdir, --records, --data)"
     sys.stderr.write(f"error: {message}\n")
     raise SystemExit(code)
 
@@ -88,40 +99,6 @@ def check_leftovers(arguments: Sequence[str]) -> None:
             f"unexpected arguments: {' '.join(arguments)}; several folders are "
             "--data A,B or --data A --data B"
         )
-
-
-def parse_flags(argv: Sequence[str]) -> list[str]:
-    """Parses absl flags and the config; an unknown field is one line and exit code 2.
-
-    For `app.run(main, flags_parser=parse_flags)`.
-    """
-    from absl import flags
-
-    try:
-        with exit_codes():
-            _check_config_file(argv)
-            return flags.FLAGS(argv)
-    except (flags.Error, AttributeError, KeyError, ValueError, TypeError) as error:
-        # ml_collections reports unknown fields by AttributeError or KeyError, whose
-        # text names the nearest field, and values of a wrong type by the other two.
-        text = str(error.args[0] if error.args else error)
-        # An error inside get_config comes as the text of its traceback.
-        text = text.rsplit(f"{UserError.__name__}: ", 1)[-1]
-        text = text.replace("\\n", " ").replace("\\'", "'")
-        if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"":
-            text = text[1:-1]
-        sys.stderr.write("error: " + " ".join(text.split()) + "\n")
-        raise SystemExit(WRONG_USE) from None
-
-
-def _check_config_file(argv: Sequence[str]) -> None:
-    """`UserError` for a config file that is not there, which absl reports too late."""
-    for flag, following in zip(argv, [*argv[1:], ""], strict=True):
-        name, _, value = flag.partition("=")
-        if name.lstrip("-") == "config" and name.startswith("-"):
-            path = (value or following).partition(":")[0]
-            if not pathlib.Path(path).is_file():
-                raise UserError(f"no such config file: {path}")
 
 
 def join_processes(
@@ -189,6 +166,7 @@ def set_up_jax(*, cache: bool = True) -> None:
             JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
     """
     import jax
+    from absl import flags
     from absl import logging as absl_logging
 
     log = logging.getLogger("radejax")
@@ -199,6 +177,7 @@ def set_up_jax(*, cache: bool = True) -> None:
         log.setLevel(logging.INFO)
         log.propagate = False
     absl_logging.set_verbosity(absl_logging.WARNING)  # orbax tells every step it takes
+    flags.FLAGS.mark_as_parsed()  # grain's worker processes read one of theirs
     if not cache:
         return
     home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import click
 
 from radejax.cli import entry
-from radejax.cli.options import STEP, Command, echo_result, split_words
+from radejax.cli.options import STEP, Command, echo_result, numbers, split_words
 from radejax.core.errors import UserError
 
 
@@ -39,6 +40,14 @@ _DATA = (
     _list("data", "Roots of K-Radar; with --workdir other ones than the run's."),
     _flag("labels", "Folder or zip of a label revision."),
     _flag("label-version", "v1.0, v1.1, v2.0, v2.1 (default), or a run's own."),
+    click.Option(
+        ["--sequences"],
+        multiple=True,
+        callback=numbers,
+        metavar="1,58",
+        help="Only frames of these.",
+    ),
+    _list("weather", "Only frames of these: fog,rain."),
 )
 _DATA_OF_RUNS = (
     _flag("records", "For a run: projected frames; made beside the data if missing."),
@@ -46,6 +55,9 @@ _DATA_OF_RUNS = (
     _flag("embeddings", "For a run: folder of `radejax embed` of other images."),
 )
 _RUNS = (
+    _flag("min-score", "Of a run: predictions are kept from here on.", type=float),
+    _flag("batch-size", "Of a run: frames at once.", type=int),
+    _flag("num-pictures", "Of a run: frames drawn.", type=int),
     click.Option(
         ["--checkpoint", "--step", "checkpoint"],
         type=STEP,
@@ -63,33 +75,47 @@ _RUNS = (
 _FILES = (
     _flag("ground-truth", "File of ground truth."),
     _flag("frames", "JSON of frame columns, for it."),
-    _list("classes", "K-Radar's five by default."),
-    _list("protocols", "All by default."),
-    _list("iou", "IoU thresholds; 0.3,0.5,0.7 by default."),
-    _flag("roi", "narrow, wide or none.", default="narrow"),
-    _flag("score-threshold", "Predictions need more than this.", default=0.0),
+    _flag("z-offset", "Metres to add to the z of predictions.", default=0.0),
+    _flag("yaw-degrees", "Yaws of predictions are degrees.", is_flag=True),
+)
+_SCORING = (
+    _list("classes", "K-Radar's five, or the run's, by default."),
+    _list("protocols", "Beside exact; all, or the run's, by default."),
+    click.Option(
+        ["--iou", "--iou-thresholds", "iou_thresholds"],
+        multiple=True,
+        callback=split_words,
+        metavar="A,B,...",
+        help="IoU thresholds; 0.3,0.5,0.7, or the run's, by default.",
+    ),
+    _flag(
+        "roi", "narrow, wide, none or x0,x1,y0,y1,z0,z1; narrow, or the run's, if none."
+    ),
+    _flag("score-threshold", "Predictions need more; 0, or the run's.", type=float),
+    _flag(
+        "skip-empty",
+        "Frames left out: without the class, without any object, none; each protocol's "
+        "own by default.",
+        type=click.Choice(["protocol", "class", "frame", "none"]),
+    ),
     _flag(
         "bootstrap",
-        "Resamples of sequences for intervals: 200 by default, 2000 in --compare; "
-        "0: none.",
+        "Resamples of sequences for intervals: 200 by default, 2000 in --compare, the "
+        "run's; 0: none.",
         type=int,
     ),
     _flag("name", "Name of the run in tables."),
     _flag(
         "invalid-sizes",
-        "Predicted sizes that are not positive.",
+        "Predicted sizes that are not positive: an error by default.",
         type=click.Choice(["error", "false_positive"]),
-        default="error",
     ),
 )
 _OF_OTHER_DATA = {option.name for option in _DATA + _DATA_OF_RUNS}
-_BY_CONFIG = (
-    "config.evaluation of the run says that; its predictions can be scored again by "
-    "--predictions WORKDIR/evaluation"
-)
+_ALL = [*_COMMON, *_DATA, *_DATA_OF_RUNS, *_RUNS, *_FILES, *_SCORING]
 
 
-@click.command(cls=Command, params=[*_COMMON, *_DATA, *_DATA_OF_RUNS, *_RUNS, *_FILES])
+@click.command(cls=Command, params=_ALL)
 @click.pass_context
 def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     """Score a run, or predictions made elsewhere, or compare two and more.
@@ -114,8 +140,8 @@ def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     given = {name for name in flags if ctx.get_parameter_source(name) is typed}
     others = _FILES if is_run else _RUNS + _DATA_OF_RUNS
     if lost := [option.name for option in others if option.name in given]:
-        reason = _BY_CONFIG if is_run else "only with --workdir"
-        raise UserError(f"--{', --'.join(lost)}: {reason}")
+        names = ", --".join(lost).replace("_", "-")
+        raise UserError(f"--{names}: only {'without' if is_run else 'with'} --workdir")
     if is_run:
         if "data" in given and not flags["data"]:
             raise UserError("--data names no folder")
@@ -133,7 +159,8 @@ def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any
     from radejax.runs.sources import Sources
 
     entry.set_up_jax()
-    other = {name: flags[name] for name in _OF_OTHER_DATA}
+    other = {name: flags[name] or () for name in ("sequences", "weather")}
+    other |= {name: flags[name] for name in _OF_OTHER_DATA - other.keys()}
     report = evaluate_run(
         flags["workdir"],
         step=flags["checkpoint"],
@@ -142,6 +169,8 @@ def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any
         image_backbone=flags["image_backbone"],
         exchange_images=flags["exchange_images"],
         other=Sources(**other) if has_other else None,
+        **_scoring(flags),
+        **_given(flags, "min_score", "batch_size", "num_pictures"),
     )
     # The table has been logged already, to standard error.
     return report.metrics, f"Written to {report.files[0].parent}"
@@ -184,27 +213,45 @@ def _source(flags: dict[str, Any]) -> Any:
         split=None if flags["split"] == "all" else flags["split"],
         ground_truth=flags["ground_truth"],
         frames=flags["frames"],
+        sequences=flags["sequences"] or (),
+        weather=flags["weather"],
+        z_offset_m=flags["z_offset"],
+        yaw_degrees=flags["yaw_degrees"],
     )
 
 
 def _options(flags: dict[str, Any], name: str) -> Any:
     from radejax.evaluation.report.measure import Options
 
+    values = {"run": name, "label_version": flags["label_version"] or "v2.1"}
+    values |= {"bootstrap": 200, **_scoring(flags)}
+    if values.get("skip_empty") == "none":
+        values["skip_empty"] = None
+    return Options(**values)
+
+
+def _scoring(flags: dict[str, Any]) -> dict[str, Any]:
+    """What was said of the scores, by the names of `Options` and `config.evaluation`."""
+    from radejax.evaluation.columns import roi_bounds
+
+    values = _given(flags, *(option.name for option in _SCORING))
+    if "name" in values:
+        values["run"] = values.pop("name")
+    if "iou_thresholds" in values:
+        values["iou_thresholds"] = _floats("iou", values["iou_thresholds"])
+    if (roi := values.get("roi")) is not None:
+        if "," in roi:
+            roi = _floats("roi", roi.split(","))
+        values["roi"] = None if roi == "none" else roi_bounds(roi)
+    return values
+
+
+def _given(flags: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: flags[name] for name in names if flags[name] not in (None, ())}
+
+
+def _floats(name: str, words: Sequence[str]) -> tuple[float, ...]:
     try:
-        thresholds = tuple(float(word) for word in flags["iou"])
+        return tuple(map(float, words))
     except ValueError:
-        raise UserError(
-            f"--iou must be numbers, got {','.join(flags['iou'])}"
-        ) from None
-    chosen = {key: flags[key] for key in ("classes", "protocols") if flags[key]}
-    if thresholds:
-        chosen["iou_thresholds"] = thresholds
-    return Options(
-        run=flags["name"] or name,
-        score_threshold=flags["score_threshold"],
-        roi=None if flags["roi"] == "none" else flags["roi"],
-        label_version=flags["label_version"] or "v2.1",
-        bootstrap=200 if flags["bootstrap"] is None else flags["bootstrap"],
-        invalid_sizes=flags["invalid_sizes"],
-        **chosen,
-    )
+        raise UserError(f"--{name} must be numbers, got {','.join(words)}") from None

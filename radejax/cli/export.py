@@ -15,12 +15,12 @@ from radejax.cli import entry, options
 @click.option(
     "--format",
     "kind",
-    type=click.Choice(["stablehlo", "huggingface"]),
+    type=click.Choice(["stablehlo", "onnx", "huggingface"]),
     default="stablehlo",
     show_default=True,
 )
 @click.option(
-    "--platforms", default="cpu,cuda,tpu", show_default=True, help="Of the program."
+    "--platforms", default="cpu,cuda,tpu", show_default=True, help="Of StableHLO."
 )
 @click.option(
     "--image-backbone",
@@ -32,6 +32,14 @@ from radejax.cli import entry, options
     is_flag=True,
     help="Keep the image transformer's weights. DINOv3's may not be passed on.",
 )
+@click.option(
+    "--batch-size",
+    type=options.COUNT,
+    default=1,
+    show_default=True,
+    help="Frames of a call, of ONNX files.",
+)
+@click.option("--half", is_flag=True, help="Store float16; of huggingface.")
 def export(
     source: pathlib.Path,
     out: pathlib.Path,
@@ -39,13 +47,16 @@ def export(
     platforms: str,
     image_backbone: pathlib.Path | None,
     with_backbone: bool,
+    batch_size: int,
+    half: bool,
     as_json: bool,
 ) -> None:
     """Write a model as a folder that works elsewhere.
 
     SOURCE is the work folder of a run, its checkpoints, one of them, an exported folder
     or an official .pth file. "stablehlo" needs jax alone to run, for any batch size;
-    "huggingface" is weights, config and model card. Detector.from_checkpoint reads both.
+    "onnx" is for ONNX Runtime and TensorRT, for one; "huggingface" is weights, config and
+    model card. Detector.from_checkpoint reads all.
 
     Example: radejax export runs/quickstart --out exported
     """
@@ -63,6 +74,8 @@ def export(
         platforms=tuple(platforms.split(",")),
         training_config=loaded.config,
         with_backbone=with_backbone,
+        batch_size=batch_size,
+        half=half,
     )
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:

@@ -6,24 +6,28 @@ import click
 
 from radejax.cli.benchmark import benchmark
 from radejax.cli.data import data, project
+from radejax.cli.demo import demo
 from radejax.cli.detect import detect
 from radejax.cli.embed import embed
 from radejax.cli.evaluate import evaluate
 from radejax.cli.export import export
 from radejax.cli.overlay import overlay
 from radejax.cli.simulate import simulate
+from radejax.cli.train import train
 from radejax.cli.view import view
 
 
 @click.group(
     commands=[
+        demo,
         simulate,
         data,
         project,
         overlay,
         view,
-        detect,
+        train,
         evaluate,
+        detect,
         embed,
         export,
         benchmark,
@@ -33,8 +37,5 @@ from radejax.cli.view import view
 @click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
 @click.version_option(package_name="radejax")
 def main(debug: bool) -> None:
-    """3D object detection in 4D radar tensors: data, detection, pictures.
-
-    Training is `python train.py`.
-    """
+    """3D object detection in 4D radar tensors: data, training, pictures."""
     del debug  # read by Command

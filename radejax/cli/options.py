@@ -61,10 +61,10 @@ labels = click.option(
 label_version = click.option("--label-version", default="v2.1", show_default=True)
 
 
-def _numbers(
+def numbers(
     context: click.Context, parameter: click.Parameter, values: Any
 ) -> tuple[int, ...] | None:
-    """Of sequences: None for all."""
+    """Callback of `--sequences`: None for all."""
     try:
         return entry.numbers(parameter.opts[0], values) or None
     except UserError as error:
@@ -76,7 +76,7 @@ sequences = click.option(
     "--sequence",
     "sequence_numbers",
     multiple=True,
-    callback=_numbers,
+    callback=numbers,
     metavar="1,58",
     help="Only these; all by default.",
 )

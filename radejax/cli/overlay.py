@@ -14,12 +14,21 @@ ANIMATIONS = (".gif", ".mp4")
 
 
 @click.command(cls=options.Command)
-@click.argument("name", metavar="FRAME")
+@click.argument("name", metavar="[FRAME]", default="")
 @options.data_roots
 @options.labels
 @options.label_version
+@options.sequences
+@options.weather
 @click.option("--out", type=options.FILE, default="overlay.png", show_default=True)
 @click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
+@click.option(
+    "--roi",
+    type=click.Choice(["narrow", "wide", "none"]),
+    default="narrow",
+    show_default=True,
+    help="Region of interest, as of `radejax evaluate`.",
+)
 @click.option(
     "--max-frames", type=options.COUNT, help="Of an animation; all by default."
 )
@@ -28,15 +37,18 @@ def overlay(
     roots: tuple[pathlib.Path, ...],
     labels: pathlib.Path | None,
     label_version: str,
+    sequence_numbers: tuple[int, ...] | None,
+    weather: tuple[str, ...] | None,
     out: pathlib.Path,
     slices: bool,
+    roi: str,
     max_frames: int | None,
     as_json: bool,
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
     FRAME is sequence/radar_lidar, or a sequence: its first frame, or all of them where
-    --out ends in .gif or .mp4.
+    --out ends in .gif or .mp4. So are --sequences and --weather without a FRAME.
 
     Example: radejax overlay 1/00033_00001 --data ROOT
     """
@@ -46,15 +58,20 @@ def overlay(
     from radejax.visualize import animate, bev
 
     sequence, _, frame_name = name.partition("/")
-    if not sequence.isdigit():
+    if sequence.isdecimal():
+        sequence_numbers = (int(sequence),)
+    elif name or not (sequence_numbers or weather):
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
     frames = KRadar(
         roots,
         labels,
         version=label_version,
-        sequence_numbers=[int(sequence)],
+        sequence_numbers=sequence_numbers,
+        weather=weather,
         visibility=None,
     )
+    if not len(frames):
+        raise UserError("no frames of these sequences and weathers")
     found = [frame for frame in frames if frame_name in ("", frame.name)]
     if not found:
         raise UserError(
@@ -63,33 +80,33 @@ def overlay(
         )
     if out.suffix.lower() in ANIMATIONS:
         found = found[:max_frames]
-        drawn = (_draw(frame, frames.grid, slices) for frame in found)
+        drawn = (_draw(frame, frames.grid, slices, roi) for frame in found)
         total = len(found)
         animate.animate(tqdm.tqdm(drawn, "draw", total, unit="frame"), out)
     else:
         found = found[:1]
-        bev.save_figure(_draw(found[0], frames.grid, slices), out)
+        bev.save_figure(_draw(found[0], frames.grid, slices, roi), out)
     options.echo_result(
         as_json, {"picture": str(out), "frames": len(found)}, f"drew {out}"
     )
 
 
-def _draw(frame: Any, grid: Any, slices: bool) -> Any:
+def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
     """Figure of one frame: planes of the radar, or radar map and camera image.
 
     Raises:
         UserError: It has neither tesseract nor projection.
     """
-    from radejax.core.structures import WIDE_ROI
+    from radejax.core.structures import ROIS
     from radejax.data.images import front_view
-    from radejax.data.tesseract import read_projection
     from radejax.visualize import bev, projections
     from radejax.visualize.canvas import Scene
 
-    projection = read_projection(frame, grid)
+    projection = frame.read_projection(grid)
     title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
     if slices:
-        figure = projections.draw_slices(projection, grid)
+        objects = frame.boxes, list(frame.classes)
+        figure = projections.draw_slices(projection, grid, ground_truth=objects)
         figure.suptitle(title)
         return figure
     image, camera = front_view(frame)
@@ -97,7 +114,7 @@ def _draw(frame: Any, grid: Any, slices: bool) -> Any:
         projection,
         grid,
         ground_truth=(frame.boxes, list(frame.classes)),
-        roi=WIDE_ROI,
+        roi=ROIS.get(roi),
         image=image,
         camera=camera,
         title=title,

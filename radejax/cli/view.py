@@ -54,7 +54,7 @@ def view(
         visibility=None,
         **part,
     )
-    complete = [f for f in frames if f.tesseract_path or f.projection_path]
+    complete = [frame for frame in frames if frame.radar_path]
     if not complete:
         raise UserError(
             f"no tesseract or projection for any of {len(frames)} labelled frames"
@@ -79,11 +79,10 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
     import numpy as np
 
     from radejax.data.images import front_view
-    from radejax.data.tesseract import read_projection
     from radejax.visualize.canvas import Scene
 
     for frame in frames:
-        projection = read_projection(frame, grid)
+        projection = frame.read_projection(grid)
         image, calibration = front_view(frame)
         found = None
         if detector is not None:

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, one_line
 
 PathLike = str | os.PathLike[str]
 
@@ -60,7 +60,7 @@ def damage_named(where: PathLike, what: str) -> Iterator[None]:
         raise
     except _DAMAGE as error:
         raise DataError(
-            f"{where}: damaged, not {what} ({type(error).__name__}: {str(error)[:200]})"
+            f"{where}: damaged, not {what} ({type(error).__name__}: {one_line(error)})"
         ) from None
 
 
@@ -145,6 +145,17 @@ def read_npz(path: PathLike) -> dict[str, np.ndarray]:
                 array = numbers.reshape(shape, order="F" if is_fortran else "C")
                 arrays[name.removesuffix(".npy")] = array
     return arrays
+
+
+def read_safetensors(path: PathLike) -> dict[str, np.ndarray]:
+    """The arrays of a safetensors file by name; errors as `read_npy`."""
+    import safetensors.numpy  # by few of those who read archives
+
+    with damage_named(path, "a safetensors file"):
+        try:
+            return safetensors.numpy.load_file(path)
+        except safetensors.SafetensorError as error:
+            raise ValueError(error) from None
 
 
 def _read_header(

@@ -7,16 +7,21 @@ same fields. Values are plain and resolved: no paths, no devices, nothing comput
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import pathlib
 import types
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any
 
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
+"""Those that come along: in a checkout a link to the folder beside the package."""
 
 
 def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:
@@ -63,17 +68,40 @@ def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
     return module
 
 
-def load_config(path_and_words: str) -> ConfigDict:
-    """The config of a file such as "configs/radenet.py:stem".
+def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
+    """File of a config: a path, or the name of one that comes with radejax.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        UserError: A word is unknown.
+        UserError: There is none; says which names there are.
+
+    Examples:
+        >>> config_file("quickstart").name
+        'quickstart.py'
     """
-    path, _, words = path_and_words.partition(":")
-    if not pathlib.Path(path).is_file():
-        raise FileNotFoundError(f"no such config file: {path}")
-    get_config = load_module(path).get_config
+    path = pathlib.Path(name)
+    own = CONFIGS / f"{path.stem}.py"
+    if not path.suffix and path.name == str(name) and own.is_file():
+        return own
+    if path.suffix == ".py" and path.is_file():
+        return path
+    names = ", ".join(sorted(file.stem for file in CONFIGS.glob("*.py")))
+    hint = f"; did you mean {path.stem}?" if own.is_file() else ""
+    raise UserError(
+        f"no such config file: {name}; give a .py file, or one of {names}{hint}"
+    )
+
+
+def load_config(path_and_words: str) -> ConfigDict:
+    """The config of a file or name such as "my/config.py" or "radenet:stem".
+
+    Raises:
+        UserError: There is no such file, it makes no config, or a word is unknown.
+    """
+    name, _, words = path_and_words.partition(":")
+    path = config_file(name)
+    get_config = getattr(load_module(path), "get_config", None)
+    if get_config is None:
+        raise UserError(f"{path} has no function get_config()")
     return get_config(words) if words else get_config()
 
 
@@ -100,6 +128,29 @@ def base_config() -> ConfigDict:
     return config
 
 
+def renewed(
+    config: Mapping[str, Any], before: Mapping[str, Any] = types.MappingProxyType({})
+) -> dict[str, Any]:
+    """Plain values of a config of an earlier version, as the present one has them.
+
+    Fields that it lacks are as they were `before` they could be chosen, else at their
+    default; weights of losses in a row, `(2.0, 1.0, 1.0)`, get their names.
+    """
+    loss = config.get("loss", {})
+    if isinstance(loss.get("weights"), list | tuple):
+        names = ("focal", "gwd", "smooth_l1")
+        by_name = dict(zip(names, loss["weights"], strict=True))
+        config = {**config, "loss": {**loss, "weights": by_name}}
+    return _filled_up(_filled_up(config, before), json.loads(base_config().to_json()))
+
+
+def _filled_up(found: Any, defaults: Any) -> Any:
+    """A tree of values with those that it lacks."""
+    if not (isinstance(found, Mapping) and isinstance(defaults, Mapping)):
+        return found
+    return {**defaults, **{k: _filled_up(v, defaults.get(k)) for k, v in found.items()}}
+
+
 def _model() -> ConfigDict:
     return ConfigDict(
         {
@@ -112,6 +163,7 @@ def _model() -> ConfigDict:
             "num_groups": 32,
             "cbam": "official",  # "paper": attention alone; "off"
             "input_stem": False,
+            "backbone": "unet",
             "neck": "dilated",  # "plain"
             "heads": "expanded",  # "default"
             "pad_multiple": 8,
@@ -132,11 +184,12 @@ def _loss() -> ConfigDict:
             "gwd_tau": 1.65,
             "normalize_yaw": False,
             "matching": "center",  # "nms", with the thresholds of `decode`
-            "weights": (2.0, 1.0, 1.0),  # focal, GWD, smooth L1
+            "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
             "normalize": True,  # divide each part by its own value
             # Boxes are z0 + dz. The paper prints no value for its sensor height.
             "z0_m": 0.0,
-        }
+        },
+        type_safe=False,  # config files of before have weights=(2.0, 1.0, 1.0)
     )
 
 
@@ -153,6 +206,7 @@ def _decode() -> ConfigDict:
             # Where the length of the regressed (sin, cos) scales a box: "nms" alone,
             # "always" (results too, as the released evaluator has it), "never".
             "raw_yaw": "nms",
+            "clip_sizes": True,  # regressed sizes that are not positive; False: released
         }
     )
 
@@ -187,8 +241,10 @@ def _train() -> ConfigDict:
 def _data() -> ConfigDict:
     return ConfigDict(
         {
+            "format": "kradar",
             "label_version": "v2.1",
             "visibility": ("R",),  # what the radar can see
+            "count_disabled": False,  # v1.1 lines without a *, as released
             "sequences": (),  # only these, such as (1, 58); () for all that are there
             "weather": (),  # only these, such as ("fog", "rain"); () for all
             # Whole sequences of the train split that choose the best checkpoint and are
@@ -218,7 +274,8 @@ def _evaluation() -> ConfigDict:
             "protocols": ("coco101", "exact", "kradar_r40"),
             "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
-            "score_threshold": 0.3,
+            "score_threshold": 0.3,  # of all protocols but "exact", which has no cut
+            "min_score": 0.05,  # predictions are kept from here on
             "bootstrap": 0,  # resamples of sequences for intervals; 1000 is plenty
             "batch_size": 8,
             "num_pictures": 8,

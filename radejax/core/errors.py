@@ -4,8 +4,23 @@ Command line programs turn every `ValueError` with an `exit_code` into one line 
 traceback: 2 for wrong use, 1 for a file that is not what it should be and a full disk.
 """
 
+_LONGEST = 2000
 
-class UserError(ValueError):
+
+def one_line(error: BaseException | str) -> str:
+    """What an error of another library says, as a message of ours quotes it."""
+    return " ".join(str(error).split())[:200]
+
+
+class _OneLine(ValueError):
+    """Whatever a message quotes, it is one line and not endless."""
+
+    def __init__(self, message: object = "") -> None:
+        text = str(message).replace("\n", " ")
+        super().__init__(text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ...")
+
+
+class UserError(_OneLine):
     """A wrong argument, config field, folder or combination of them."""
 
     exit_code = 2
@@ -17,7 +32,7 @@ class DiskFullError(UserError):
     exit_code = 1
 
 
-class DataError(ValueError):
+class DataError(_OneLine):
     """A file that is missing parts, malformed or damaged; the message names it."""
 
     exit_code = 1

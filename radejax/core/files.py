@@ -9,12 +9,13 @@ import json
 import logging
 import os
 import pathlib
+import shutil
 import socket
 import stat
-import types
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import IO, Any
 
+from radejax.core import schema
 from radejax.core.errors import DataError, DiskFullError, UserError
 
 _log = logging.getLogger(__name__)
@@ -55,6 +56,33 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
 
 
 @contextlib.contextmanager
+def swapped_in(folder: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """A temporary folder beside, of which all moves into `folder` at the end of the block.
+
+    What has the same name there is replaced, folders whole; the rest stays. After an error
+    `folder` is what it was; after a kill too, unless it came between two of these moves.
+
+    Raises:
+        DiskFullError: No space is left on the disk.
+    """
+    folder = pathlib.Path(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_path(folder)
+    _remove_stale(folder.parent.glob(_stale_pattern(folder.name)))
+    try:
+        with disk_full(folder):
+            temporary.mkdir()
+            yield temporary
+            folder.mkdir(exist_ok=True)
+            for path in sorted(temporary.iterdir()):
+                if (folder / path.name).is_dir():
+                    (folder / path.name).rename(temporary / f".old {path.name}")
+                path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     """As `atomic_path`: an open binary file that becomes `path`."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -72,20 +100,52 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
-    """Reads a JSON file.
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Reads a text file, without a byte order mark.
 
     Raises:
         FileNotFoundError: Names the file.
-        DataError: The file is not valid JSON; names it and the place.
+        DataError: It is a folder, or not UTF-8; names the line.
     """
     try:
-        text = pathlib.Path(path).read_text(encoding="utf-8")
-        return json.loads(text, parse_int=_parse_int)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not valid JSON: {error}") from error
+        content = pathlib.Path(path).read_bytes()
     except (IsADirectoryError, NotADirectoryError):
-        raise DataError(f"{path} is not valid JSON: it is no file") from None
+        raise DataError(f"{path}: is no file, expected a text file") from None
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise DataError(
+            f"{path}:{line}: byte {content[error.start]:#04x} is not UTF-8 text"
+        ) from None
+
+
+def read_json(path: str | os.PathLike[str], hint: Any = Any, *, mend: str = "") -> Any:
+    """Reads a JSON file.
+
+    Args:
+        path: The file.
+        hint: What it must hold, see `schema.check`.
+        mend: What to do where it does not.
+
+    Raises:
+        FileNotFoundError: Names the file.
+        DataError: The file is not valid JSON, or holds something else; names it and the
+            place.
+    """
+    try:
+        return parse_json(read_text(path), hint, str(path))
+    except DataError as error:
+        raise DataError(f"{error}{'; ' * bool(mend)}{mend}") from None
+
+
+def parse_json(text: str, hint: Any, where: str) -> Any:
+    """As `read_json`, of a text; `where` names it in errors."""
+    try:
+        value = json.loads(text, parse_int=_parse_int)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where} is not valid JSON: {error}") from None
+    return schema.check(value, hint, where)
 
 
 def _parse_int(digits: str) -> int:
@@ -107,11 +167,21 @@ def remove_stale(folder: pathlib.Path, name: str = "*") -> None:
         folder: Looked at with all folders in it.
         name: Of the files that they were to become; may have wildcards.
     """
-    host = socket.gethostname()
-    for path in folder.rglob(f".{name}.{host}.*.tmp"):
+    _remove_stale(folder.rglob(_stale_pattern(name)))
+
+
+def _stale_pattern(name: str) -> str:
+    return f".{name}.{socket.gethostname()}.*.tmp"
+
+
+def _remove_stale(paths: Iterable[pathlib.Path]) -> None:
+    for path in list(paths):
         process = path.name.split(".")[-2]
         if process.isdecimal() and not is_running(int(process)):
-            path.unlink(missing_ok=True)
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def is_running(process: int) -> bool:
@@ -177,7 +247,7 @@ def claim(
     mend: str = "choose another folder, or delete that one",
     name: str = "",
     ignore: Collection[str] = (),
-    defaults: Mapping[str, Any] = types.MappingProxyType({}),
+    renewed: Callable[[Any], Any] = lambda found: found,
 ) -> None:
     """Makes a folder the place of one job, or checks that it is this job's already.
 
@@ -189,7 +259,7 @@ def claim(
         mend: What to do then.
         name: Of the whole, before the fields' names in the message.
         ignore: Fields that may differ.
-        defaults: What a field stands at where the file is older than the field.
+        renewed: Brings what an earlier version wrote to the present form.
 
     Raises:
         UserError: The folder is another job's; names the fields that differ. Or it is
@@ -200,11 +270,10 @@ def claim(
     if path.parent.is_file():
         raise UserError(f"{path.parent} is a file, expected a folder")
     try:
-        found = read_json(path)
+        found = renewed(read_json(path, dict[str, Any]))
     except FileNotFoundError:
         write_json(path, wanted)
         return
-    found = _filled_up(found, defaults)
     require_same(
         {field: value for field, value in found.items() if field not in ignore},
         {field: value for field, value in wanted.items() if field not in ignore},
@@ -212,13 +281,6 @@ def claim(
         mend=mend,
         name=name,
     )
-
-
-def _filled_up(found: Any, defaults: Any) -> Any:
-    """A tree of values with those that it lacks."""
-    if not (isinstance(found, Mapping) and isinstance(defaults, Mapping)):
-        return found
-    return {**defaults, **{k: _filled_up(v, defaults.get(k)) for k, v in found.items()}}
 
 
 def require_same(

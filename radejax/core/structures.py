@@ -27,8 +27,14 @@ BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
 NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
 """K-Radar's benchmark region: x, y, z from and to, metres, ego frame."""
 
+MIN_SIZE_M = 0.01
+"""What sizes of decoded boxes are clipped to: none is negative."""
+
 WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 """K-Radar's wide region: x, y, z from and to, metres, ego frame."""
+
+ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
+"""Regions by name; bounds are inclusive, and of box centers."""
 
 
 @struct.dataclass
@@ -87,6 +93,13 @@ class Detections:
     is_valid: jax.Array
     num_cut: jax.Array
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
+
+    @property
+    def num_clipped(self) -> np.ndarray:
+        """`[B]` detections of a size that was regressed below `MIN_SIZE_M`."""
+        sizes = np.asarray(self.boxes)[..., 3:6]
+        is_clipped = (sizes <= np.float32(MIN_SIZE_M)).any(-1)
+        return (is_clipped & np.asarray(self.is_valid)).sum(-1)
 
     def to_columns(self, classes: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The valid rows of all frames as plain columns, as evaluation takes them.

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import logging
+import os
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import numpy as np
 
+from radejax.core import schema
 from radejax.core.errors import UserError
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.images import read_left_image
-from radejax.data.kradar.frame import Frame
 from radejax.data.records.arrays import ArrayRecords
 from radejax.geometry.calibration import CameraCalibration, ImageKind
 from radejax.geometry.camera import Camera
 
 _log = logging.getLogger(__name__)
+
+
+BEFORE = {"lidar_to_radar_z_m": 0.0, "calibration": "sequence"}
+"""What models were trained with when these were no fields yet."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +32,12 @@ class CameraOptions:
 
     Attributes:
         projection: "raw", "rectified" or "pinhole", see `CameraCalibration.camera`.
-        ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own, the
-            one that its boxes were moved by; or None.
+        ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own; or
+            None.
+        lidar_to_radar_z_m: Its z, which boxes are not moved by; None for what the
+            sensors' set-up says. No part of `ego_from_lidar_m` where that is given.
+        calibration: "sequence" for each sequence's own file, where it has one;
+            "common" for `cam_front0.yml` everywhere, as released.
         resize: Image files of another size than the model's are resized, and their
             calibration with them; otherwise they are an error.
         allow_missing: Frames without an image are predicted from the radar alone and
@@ -37,19 +46,34 @@ class CameraOptions:
 
     projection: ImageKind = "raw"
     ego_from_lidar_m: tuple[float, float, float] | None = None
+    lidar_to_radar_z_m: float | None = None
+    calibration: Literal["sequence", "common"] = "sequence"
     resize: bool = False
     allow_missing: bool = True
 
     @classmethod
     def of_config(cls, data: Mapping[str, Any]) -> CameraOptions:
         """Options of `config.data`; the defaults where it has no camera."""
-        if "camera" not in data:
-            return cls()
-        fields = dict(data["camera"])
-        if fields.get("ego_from_lidar_m") is not None:
-            fields["ego_from_lidar_m"] = tuple(fields["ego_from_lidar_m"])
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**{name: fields[name] for name in names if name in fields})
+        return cls.of_fields(data["camera"]) if "camera" in data else cls()
+
+    @classmethod
+    def of_fields(
+        cls, fields: Mapping[str, Any], where: str | os.PathLike = ""
+    ) -> CameraOptions:
+        """Options by name, also of a model of before that lacks some.
+
+        Raises:
+            DataError: One is of another type; names the file `where` they are from.
+        """
+        return schema.check(BEFORE | dict(fields), cls, str(where), "camera")
+
+    def shift(self, frame: LabelledFrame) -> tuple[float, ...]:
+        """Metres to add to LiDAR positions to get where the radar sees them."""
+        if self.ego_from_lidar_m is not None:
+            return self.ego_from_lidar_m
+        z = self.lidar_to_radar_z_m
+        z = frame.lidar_to_radar_z_m if z is None else z
+        return (*frame.radar_from_lidar_m[:2], z)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +115,7 @@ class CameraInputs:
 
 
 def camera_inputs(
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     image_size: tuple[int, int],
     options: CameraOptions,
     features: ArrayRecords | None = None,
@@ -136,9 +160,10 @@ def camera_inputs(
             len(frames),
         )
 
-    @functools.cache
-    def read(path: str, shift: tuple[float, ...]) -> Camera:
-        calibration = CameraCalibration.from_kradar(path, ego_from_lidar_m=shift)
+    cameras: dict[Any, Camera] = {}
+
+    def read(frame: LabelledFrame, shift: tuple[float, ...]) -> Camera:
+        path, calibration = frame.camera_calibration_path, frame.read_calibration(shift)
         if (calibration.height, calibration.width) != tuple(image_size):
             height, width = image_size
             if not options.resize:
@@ -150,9 +175,12 @@ def camera_inputs(
             calibration = calibration.resized(width, height)
         return calibration.camera(options.projection)
 
-    def camera(frame: Frame) -> Camera:
-        shift = options.ego_from_lidar_m or frame.radar_from_lidar_m
-        return read(str(frame.camera_calibration_path), tuple(map(float, shift)))
+    def camera(frame: LabelledFrame) -> Camera:
+        shift = tuple(map(float, options.shift(frame)))
+        place = frame.camera_calibration_path, shift
+        if place not in cameras:
+            cameras[place] = read(frame, shift)
+        return cameras[place]
 
     return CameraInputs(
         tuple(
@@ -168,7 +196,7 @@ def camera_inputs(
 
 
 def _check_embedded(
-    frames: Sequence[Frame], record: np.ndarray, features: ArrayRecords
+    frames: FrameSequence, record: np.ndarray, features: ArrayRecords
 ) -> None:
     """`UserError` for frames whose image is there but was not embedded."""
     forgotten = [
@@ -203,7 +231,7 @@ def check_embeddable(*, freeze: bool, mirror_probability: float) -> None:
 
 
 def require_images(
-    frames: Sequence[Frame], inputs: CameraInputs | None, split: str = "train"
+    frames: FrameSequence, inputs: CameraInputs | None, split: str = "train"
 ) -> None:
     """`UserError` if no frame has both an image and a calibration.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.data.projection import LOG_SCALE_DB
 
-ENCODINGS = ("float16", "uint8", "float32")
+Encoding = Literal["float16", "uint8", "float32"]
+ENCODINGS = get_args(Encoding)
 MAX_ERROR_DB = {
     # Half a step of the type below 1, in normalised units, times the scale.
     "float16": 2.0**-12 * LOG_SCALE_DB,

@@ -11,7 +11,7 @@ import numpy as np
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.cameras import CameraInputs
-from radejax.data.kradar.frame import Frame
+from radejax.data.dataset import FrameSequence
 from radejax.data.records.projections import RecordSource, record_positions
 from radejax.geometry.boxes import boxes8_from_7
 
@@ -51,7 +51,7 @@ class FrameTable:
 
 def make_table(
     records: RecordSource,
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     *,
     max_objects: int,
     classes: Sequence[str] = CLASSES,

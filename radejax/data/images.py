@@ -7,10 +7,10 @@ import pathlib
 import numpy as np
 
 from radejax.core.errors import DataError
-from radejax.data.kradar.frame import Frame
+from radejax.data.dataset import LabelledFrame
 from radejax.geometry.calibration import CameraCalibration
 
-_MAX_PIXELS = 8192
+_MAX_SIDE, _MAX_PIXELS = 8192, 1 << 25
 
 IMAGE_SIZE = (720, 1280)
 """Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
@@ -35,10 +35,10 @@ def read_left_image(
     try:
         with Image.open(path) as file:
             found = file.size
-            if max(found) > _MAX_PIXELS:
+            if max(found) > _MAX_SIDE or found[0] * found[1] > _MAX_PIXELS:
                 raise DataError(
                     f"{path}: {found[0]} x {found[1]} pixels, expected at most "
-                    f"{_MAX_PIXELS} in each direction"
+                    f"{_MAX_SIDE} in each direction and {_MAX_PIXELS} in all"
                 )
             if not resize and found not in ((2 * width, height), (width, height)):
                 raise DataError(
@@ -58,7 +58,7 @@ def read_left_image(
 
 
 def front_view(
-    frame: Frame,
+    frame: LabelledFrame,
 ) -> tuple[np.ndarray | None, CameraCalibration | None]:
     """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
 
@@ -72,8 +72,6 @@ def front_view(
         return None, None
     camera = None
     if frame.camera_calibration_path is not None:
-        camera = CameraCalibration.from_kradar(
-            frame.camera_calibration_path, ego_from_lidar_m=frame.radar_from_lidar_m
-        )
+        camera = frame.read_calibration()
     size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
     return read_left_image(frame.camera_path, size, resize=True), camera

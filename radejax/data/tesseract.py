@@ -13,9 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from radejax.core.archives import DEFLATE_RATIO, read_npy
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError
 from radejax.data import mat5
-from radejax.data.kradar.frame import Frame
 from radejax.data.projection import MAX_LEVEL, project, project_columns
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -210,8 +209,15 @@ def read_projection_npy(
     return projection
 
 
-def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
+def read_frame(
+    path: str | pathlib.Path, grid: RadarGrid, timings: dict[str, float] | None = None
+) -> np.ndarray:
     """`[R, A, D+E]` float32 projection of a tesseract file or a released projection.
+
+    Args:
+        path: Of the file.
+        grid: Axes of the radar.
+        timings: As for `project_file`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -221,20 +227,7 @@ def read_frame(path: str | pathlib.Path, grid: RadarGrid) -> np.ndarray:
         shape = grid.projection_shape
         projection = read_projection_npy(path, projection_shape=shape)
         return projection.astype(np.float32)
-    return project_file(path, shape_drea=grid.shape_drea)
-
-
-def read_projection(frame: Frame, grid: RadarGrid) -> np.ndarray:
-    """`[R, A, D+E]` float32 projection of a frame: from its tesseract, or the released one.
-
-    Raises:
-        UserError: The frame has neither.
-        FileNotFoundError, DataError: As `read_frame`.
-    """
-    path = frame.tesseract_path or frame.projection_path
-    if path is None:
-        raise UserError(f"frame {frame.key} has no tesseract or projection")
-    return read_frame(path, grid)
+    return project_file(path, shape_drea=grid.shape_drea, timings=timings)
 
 
 def _layout(

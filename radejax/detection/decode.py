@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 
 from radejax.core.errors import UserError
-from radejax.core.structures import DetectionMaps, Detections
+from radejax.core.structures import MIN_SIZE_M, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
@@ -56,6 +56,7 @@ def decode(
     threshold_inclusive: bool = False,
     z0_m: float | jax.Array = 0.0,
     raw_yaw: Literal["nms", "always", "never"] = "nms",
+    clip_sizes: bool = True,
 ) -> Detections:
     """Boxes of a batch of detection maps.
 
@@ -81,6 +82,7 @@ def decode(
             box: "nms" alone; "always", so that results have that length and width, and
             a short vector shrinks a box in every overlap, as in the released NMS and
             evaluator; "never".
+        clip_sizes: Sizes are `MIN_SIZE_M` at least; the released code's may be negative.
 
     Returns:
         Detections by descending score; equal scores in order of range, then azimuth.
@@ -95,16 +97,12 @@ def decode(
         ...     num_doppler=4, num_range=16, num_elevation=4, num_azimuth=8)
         >>> logits = jnp.full((1, 16, 8, 2), -9.0).at[0, 5, 3, 1].set(2.0)
         >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
-        >>> found = decode(maps, grid, max_detections=4, score_threshold=0.3)
+        >>> jitted = jax.jit(decode, static_argnames=("grid", "max_detections"))
+        >>> found = jitted(maps, grid, max_detections=4, score_threshold=0.3)
         >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
         ([[1, -1, -1, -1]], 0.8808)
     """
-    if max_detections < 1:
-        raise ValueError(f"max_detections must be at least 1, got {max_detections}")
-    if raw_yaw not in ("nms", "always", "never"):
-        raise UserError(
-            f'decode.raw_yaw is {raw_yaw!r}, expected "nms", "always" or "never"'
-        )
+    _check_options(max_detections, raw_yaw)
     peaks = find_peaks(
         maps,
         grid,
@@ -114,11 +112,14 @@ def decode(
         threshold_inclusive=threshold_inclusive,
         z0_m=z0_m,
     )
+    clip = _with_positive_sizes if clip_sizes else lambda boxes: boxes
+    peaks = dataclasses.replace(peaks, boxes=clip(peaks.boxes))
     keep = suppress(
         peaks, nms_iou, per_class=per_class_nms, normalize_yaw=raw_yaw == "never"
     )
     if raw_yaw == "always":
-        peaks = dataclasses.replace(peaks, boxes=_with_raw_footprint(peaks.boxes))
+        boxes = clip(_with_raw_footprint(peaks.boxes))
+        peaks = dataclasses.replace(peaks, boxes=boxes)
     return _compact(peaks, keep, max_detections)
 
 
@@ -133,17 +134,17 @@ def suppress(
 
     `normalize_yaw` compares boxes of their regressed size, whatever the length of the
     yaw vector.
+
+    Examples:
+        >>> boxes = jnp.array([[[0.0, 0, 0, 4, 2, 1, 0, 1], [0.5, 0, 0, 4, 2, 1, 0, 1]]])
+        >>> zeros, ones = jnp.zeros((1, 2), int), jnp.ones((1, 2), bool)
+        >>> peaks = Peaks(jnp.zeros((1, 2, 2), int), boxes, ones, zeros, ones, jnp.array([2]))
+        >>> jax.jit(suppress)(peaks, 0.3).tolist()
+        [[True, False]]
     """
     boxes = boxes7_from_8(peaks.boxes) if normalize_yaw else peaks.boxes
-
-    def one_frame(
-        boxes: jax.Array, is_valid: jax.Array, classes: jax.Array
-    ) -> jax.Array:
-        return rotated_nms(
-            boxes, is_valid, nms_iou, classes=classes if per_class else None
-        )
-
-    return jax.vmap(one_frame)(boxes, peaks.is_valid, peaks.classes)
+    classes = peaks.classes if per_class else None
+    return rotated_nms(boxes, peaks.is_valid, nms_iou, classes=classes)
 
 
 def find_peaks(
@@ -159,6 +160,16 @@ def find_peaks(
     """The strongest local maxima of the heatmaps with their boxes, before NMS.
 
     Args and errors are those of `decode`; `max_peaks` is P, cut to the number of bins.
+
+    Examples:
+        >>> grid = RadarGrid.reduced(
+        ...     num_doppler=4, num_range=16, num_elevation=4, num_azimuth=8)
+        >>> logits = jnp.full((1, 16, 8, 2), -9.0).at[0, 5, 3, 1].set(2.0)
+        >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
+        >>> jitted = jax.jit(find_peaks, static_argnames=("grid", "max_peaks"))
+        >>> peaks = jitted(maps, grid, max_peaks=4, score_threshold=0.3)
+        >>> peaks.cell[0, 0].tolist(), int(peaks.classes[0, 0]), int(peaks.num_found[0])
+        ([5, 3], 1, 1)
     """
     _check_shapes(maps, grid)
     if max_peaks < 1:
@@ -209,6 +220,11 @@ def boxes_at(
 
     Raises:
         AssertionError: Shapes are not these.
+
+    Examples:
+        >>> grid = RadarGrid.kradar()
+        >>> boxes_at(jnp.ones((1, 8)), jnp.array([[10, 53]]), grid, z0_m=0.5)[0, 2:4].tolist()
+        [1.5, 1.0]
     """
     chex.assert_shape(params, (*cell.shape[:-1], 8))
     chex.assert_axis_dimension(cell, -1, 2)
@@ -224,6 +240,11 @@ def _with_raw_footprint(boxes: jax.Array) -> jax.Array:
     """`[..., 8]` boxes, length and width multiplied by the length of the yaw vector."""
     norm = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
     return boxes.at[..., 3:5].multiply(norm)
+
+
+def _with_positive_sizes(boxes: jax.Array) -> jax.Array:
+    """`[..., 8]` boxes, sizes clipped from below."""
+    return boxes.at[..., 3:6].max(MIN_SIZE_M)
 
 
 def _max_3x3(values: jax.Array) -> jax.Array:
@@ -299,6 +320,15 @@ def _pad_rows(detections: Detections, count: int) -> Detections:
 def _flat_cells(values: jax.Array) -> jax.Array:
     """`[B, R, A, C]` -> `[B, R * A, C]`."""
     return values.reshape(values.shape[0], -1, values.shape[-1])
+
+
+def _check_options(max_detections: int, raw_yaw: str) -> None:
+    if max_detections < 1:
+        raise ValueError(f"max_detections must be at least 1, got {max_detections}")
+    if raw_yaw not in ("nms", "always", "never"):
+        raise UserError(
+            f'decode.raw_yaw is {raw_yaw!r}, expected "nms", "always" or "never"'
+        )
 
 
 def _check_shapes(maps: DetectionMaps, grid: RadarGrid) -> None:

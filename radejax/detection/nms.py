@@ -24,29 +24,28 @@ def rotated_nms(
             keep[j] = valid[j] and not any(keep[i] and iou[i, j] >= t for i < j)
 
     Args:
-        boxes: `[K, 7]` or `[K, 8]`, by descending score; the yaw vector of `[K, 8]`
-            scales the box, as in the released code (see `bev_iou`).
-        is_valid: `[K]` bool; False rows are neither kept nor suppress others.
+        boxes: `[..., K, 7]` or `[..., K, 8]`, by descending score; the yaw vector of
+            the latter scales the box, as in the released code (see `bev_iou`).
+        is_valid: `[..., K]` bool; False rows are neither kept nor suppress others.
         iou_threshold: Boxes overlapping this much or more are suppressed.
-        classes: `[K]` class indices; given, only boxes of one class suppress each
+        classes: `[..., K]` class indices; given, only boxes of one class suppress each
             other.
 
     Returns:
-        `[K]` bool, True where a box is kept.
+        `[..., K]` bool, True where a box is kept.
 
     Raises:
         AssertionError: The arrays have not one row per box.
 
     Examples:
         >>> boxes = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
-        >>> rotated_nms(boxes, jnp.array([True, True]), 0.3).tolist()
+        >>> jax.jit(rotated_nms)(boxes, jnp.array([True, True]), 0.3).tolist()
         [True, False]
     """
-    chex.assert_rank(boxes, 2)
     overlaps = bev_iou(boxes, boxes) >= iou_threshold
     if classes is not None:
-        chex.assert_shape(classes, boxes.shape[:1])
-        overlaps &= classes[:, None] == classes[None, :]
+        chex.assert_shape(classes, boxes.shape[:-1])
+        overlaps &= classes[..., :, None] == classes[..., None, :]
     return greedy_suppression(overlaps, is_valid)
 
 
@@ -60,17 +59,22 @@ def greedy_suppression(overlaps: jax.Array, is_valid: jax.Array) -> jax.Array:
     freed by the one before, a handful, never more than K.
 
     Args:
-        overlaps: `[K, K]` bool, True where a pair may not both be kept.
-        is_valid: `[K]` bool.
+        overlaps: `[..., K, K]` bool, True where a pair may not both be kept.
+        is_valid: `[..., K]` bool.
 
     Returns:
-        `[K]` bool, True where a row is kept.
+        `[..., K]` bool, True where a row is kept.
+
+    Examples:
+        >>> chain = jnp.eye(3, k=1, dtype=bool)  # 0 overlaps 1, 1 overlaps 2
+        >>> greedy_suppression(chain, jnp.ones(3, bool)).tolist()
+        [True, False, True]
     """
-    chex.assert_shape(overlaps, is_valid.shape * 2)
+    chex.assert_shape(overlaps, (*is_valid.shape, is_valid.shape[-1]))
     before = jnp.triu(overlaps, 1)  # [i, j]: i would suppress j
 
     def decide(keep: jax.Array) -> jax.Array:
-        return is_valid & ~jnp.any(before & keep[:, None], axis=0)
+        return is_valid & ~jnp.any(before & keep[..., :, None], axis=-2)
 
     def changed(state: tuple[jax.Array, jax.Array]) -> jax.Array:
         return jnp.any(state[0] != state[1])

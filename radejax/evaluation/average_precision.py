@@ -72,6 +72,7 @@ def evaluate(
         K-Radar evaluation: Paek et al., arXiv:2206.08171, and its issues 28, 36, 81.
 
     Examples:
+        >>> import numpy as np
         >>> box = np.array([[20.0, 0, 0, 4, 2, 1.5, 0]])
         >>> truth = {"frame": [0], "box": box, "cls": ["Sedan"]}
         >>> found = {**truth, "score": [0.9]}

@@ -13,13 +13,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import BOX_FIELDS, CLASSES, NARROW_ROI, WIDE_ROI
+from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS
+
+_MOST = 1e6  # metres and radians: far from where squares are no numbers any more
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not asked for are ignored."""
-
-ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
-"""Regions of interest: x, y, z bounds in metres, inclusive, for box centers (ego)."""
 
 Columns = Mapping[str, np.ndarray]
 """A table: frames, ground truth or predictions by the name of the column."""
@@ -58,6 +57,10 @@ def roi_bounds(roi: str | Sequence[float] | None) -> tuple[float, ...] | None:
 
     Raises:
         UserError: An unknown name, or not six increasing bounds.
+
+    Examples:
+        >>> roi_bounds([0, 72, -6.4, 6.4, -2, 6])
+        (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
     """
     if roi is None:
         return None
@@ -74,7 +77,13 @@ def roi_bounds(roi: str | Sequence[float] | None) -> tuple[float, ...] | None:
 
 
 def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
-    """`[N]` bool: box centers inside the region, bounds included."""
+    """`[N]` bool: box centers inside the region, bounds included.
+
+    Examples:
+        >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [20.0, 40, 0, 4, 2, 1.5, 0]])
+        >>> in_roi(cars, [0, 72, -6.4, 6.4, -2, 6]).tolist()
+        [True, False]
+    """
     bounds = roi_bounds(roi)
     if bounds is None:
         return np.ones(len(box), bool)
@@ -83,7 +92,12 @@ def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
 
 
 def roi_name(roi: str | Sequence[float] | None) -> str:
-    """A short name of a region for labels and file names."""
+    """A short name of a region for labels and file names.
+
+    Examples:
+        >>> roi_name("narrow"), roi_name(None), roi_name([0, 72, -6, 6, -2, 6])
+        ('narrow', 'none', '0,72,-6,6,-2,6')
+    """
     if roi is None:
         return "none"
     if isinstance(roi, str):
@@ -94,7 +108,12 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
 
 
 def frame_ids(frames: Columns) -> np.ndarray:
-    """`[F]` ids of a frame table, checked to be integers without repetition."""
+    """`[F]` ids of a frame table, checked to be integers without repetition.
+
+    Examples:
+        >>> frame_ids({"frame": np.array([7, 9])}).tolist()
+        [7, 9]
+    """
     if "frame" not in frames:
         raise UserError(f"frames need a column 'frame', found {sorted(frames)}")
     ids = _integers(frames["frame"], "frames")
@@ -113,12 +132,22 @@ def frame_ids(frames: Columns) -> np.ndarray:
 
 
 def are_simulated(frames: Columns | None) -> bool:
-    """Whether a frame table says that frames of it are simulated."""
+    """Whether a frame table says that frames of it are simulated.
+
+    Examples:
+        >>> are_simulated({"frame": np.array([7, 9])})
+        False
+    """
     return frames is not None and bool(np.any(frames.get("simulated", False)))
 
 
 def wanted_columns(scored: bool) -> tuple[str, ...]:
-    """Names of the columns of ground truth or, `scored`, of predictions."""
+    """Names of the columns of ground truth or, `scored`, of predictions.
+
+    Examples:
+        >>> wanted_columns(scored=False)
+        ('frame', 'box', 'cls')
+    """
     return ("frame", "box", "cls", "score")[: 4 if scored else 3]
 
 
@@ -131,6 +160,12 @@ def read_columns(
         UserError: A column is missing or has the wrong shape or type.
         DataError: A value no box may have, named by frame and row: not finite, a size
             that is not positive, a score outside [0, 1].
+
+    Examples:
+        >>> table = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> frame, box, cls, score = read_columns(table, name="ground truth", scored=False)
+        >>> frame.tolist(), box.shape, cls.tolist(), score.tolist()
+        ([0], (1, 7), ['Sedan'], [0.0])
     """
     missing = [column for column in wanted_columns(scored) if column not in table]
     if missing:
@@ -157,7 +192,7 @@ def read_columns(
                 f"{name}: column {column!r} has shape {values.shape}, expected ({num},)"
             )
     for bad, first, must in (
-        (~np.isfinite(box), 0, "is {}, expected a finite number"),
+        (~(np.abs(box) <= _MOST), 0, f"is {{}}, expected a number up to {_MOST:g}"),
         (box[:, 3:6] <= 0, 3, "is {:g} m, expected a size above 0"),
     ):
         if bad.any():
@@ -200,6 +235,11 @@ def class_indices(
 
     Raises:
         DataError: A class name that is neither asked for nor one of K-Radar's.
+
+    Examples:
+        >>> cls, frame = np.array(["Sedan", "Bicycle"]), np.array([0, 0])
+        >>> class_indices(cls, frame, ["Sedan"], name="ground truth").tolist()
+        [0, -1]
     """
     index_of = dict.fromkeys((*classes, *KNOWN_CLASSES), -1)
     index_of |= {name: i for i, name in enumerate(classes)}
@@ -219,6 +259,10 @@ def dense_frames(frame: np.ndarray, ids: np.ndarray, *, name: str) -> np.ndarray
 
     Raises:
         DataError: A frame that the table does not have.
+
+    Examples:
+        >>> dense_frames(np.array([9, 7, 7]), np.array([7, 9]), name="predictions").tolist()
+        [1, 0, 0]
     """
     order = np.argsort(ids, kind="stable")
     position = np.searchsorted(ids[order], frame)

@@ -9,12 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation import columns, matching, overlap, protocols
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT, Curve, Protocol
 from radejax.evaluation.result import SPACES, Result
+
+MOST_PAIRS = 1_000_000
+"""Of predictions and ground truths of a class in a frame; 100 and 20 are many."""
 
 # Scores [K], falling; frames [K]; how many true positives (or matches) each adds [K].
 Falling = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -70,6 +73,7 @@ class EvaluationSet:
         num_classes = len(self.classes)
         self.gt_group = self.gt.frame * num_classes + self.gt.cls
         self.pred_group = self.pred.frame * num_classes + self.pred.cls
+        self._check_number()
         self.pair_pred, self.pair_gt = overlap.candidate_pairs(
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
@@ -94,6 +98,24 @@ class EvaluationSet:
         row = np.flatnonzero(wanted & inside)
         row = row[np.lexsort((row, cls[row], dense[row]))]
         return columns.Objects(dense[row], box[row], cls[row], score[row], row)
+
+    def _check_number(self) -> None:
+        """`DataError` for more boxes of a class in a frame than can be compared."""
+        groups = self.frame.size * len(self.classes)
+        counts = [
+            np.bincount(group, minlength=groups)
+            for group in (self.gt_group, self.pred_group)
+        ]
+        pairs = counts[0] * counts[1]
+        if pairs.max(initial=0) > MOST_PAIRS:
+            group = int(pairs.argmax())
+            frame, cls = divmod(group, len(self.classes))
+            raise DataError(
+                f"frame {self.frame[frame]}: {counts[1][group]} predictions and "
+                f"{counts[0][group]} ground truths of {self.classes[cls]} are "
+                f"{pairs[group]:,} pairs, expected at most {MOST_PAIRS:,}: keep those "
+                "with the highest scores"
+            )
 
     # Shared work ---------------------------------------------------------------------
 

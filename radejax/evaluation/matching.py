@@ -56,6 +56,12 @@ def greedy(
 
     Returns:
         `[K]` positions of the chosen pairs.
+
+    Examples:
+        >>> claimant, target = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+        >>> chosen = greedy(claimant, target, np.array([0.4, 0.9, 0.3, 0.8]), 0 * target, 2)
+        >>> target[chosen].tolist()  # the second finds its best target taken
+        [1, 0]
     """
     chex.assert_equal_shape((claimant, target, preference, group))
     if claimant.size == 0:
@@ -123,6 +129,12 @@ def match_kradar(
         score: `[M]` scores of the predictions.
         gt_group: `[N]` group of every ground truth.
         threshold: A match needs an IoU above this.
+
+    Examples:
+        >>> pairs = Pairs(np.array([0, 1]), np.array([0, 0]), np.array([0.7, 0.8]))
+        >>> found = match_kradar(pairs, np.array([0.9, 0.5]), np.array([0]), 0.5)
+        >>> found.first_pred.tolist(), found.event_pred.tolist()
+        ([0], [0])
     """
     pairs = pairs.take(pairs.iou > threshold)
     preference = score[pairs.pred]
@@ -201,6 +213,11 @@ def match_best(pairs: Pairs, score: np.ndarray, threshold: float) -> np.ndarray:
         `[M]` matched ground truth or -1. The best ground truth is the one of largest IoU
         (the first on a tie), taken or not; of the predictions that want the same one,
         the highest score gets it (the first on a tie).
+
+    Examples:
+        >>> pairs = Pairs(np.array([0, 1]), np.array([0, 0]), np.array([0.7, 0.8]))
+        >>> match_best(pairs, np.array([0.9, 0.5]), 0.5).tolist()
+        [0, -1]
     """
     best = pairs.take(np.lexsort((pairs.gt, -pairs.iou, pairs.pred)))
     best = best.take(_is_new(best.pred) & (best.iou > threshold))
@@ -226,6 +243,11 @@ def match_free(
 
     Returns:
         `[M]` matched ground truth or -1.
+
+    Examples:
+        >>> pairs = Pairs(np.array([0, 1]), np.array([0, 0]), np.array([0.7, 0.8]))
+        >>> match_free(pairs, np.array([0.5, 0.9]), np.array([0, 0]), 1, 0.5).tolist()
+        [-1, 0]
     """
     pairs = pairs.take(pairs.iou > threshold)
     turn = np.empty(score.size, np.int64)

@@ -25,6 +25,12 @@ def candidate_pairs(
 
     Returns:
         Two `[P]` index arrays, ordered by a, then b.
+
+    Examples:
+        >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [60.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> a, b = candidate_pairs(np.zeros(2), np.zeros(2), cars, cars)
+        >>> a.tolist(), b.tolist()
+        ([0, 1], [0, 1])
     """
     chex.assert_shape([box_a, box_b], (None, 7))
     first = np.searchsorted(group_b, group_a, side="left")
@@ -49,7 +55,13 @@ def candidate_pairs(
 
 
 def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which range, and index, of everything in the ranges [first, first + count)."""
+    """Which range, and index, of everything in the ranges [first, first + count).
+
+    Examples:
+        >>> owner, index = ranges(np.array([5, 0]), np.array([2, 3]))
+        >>> owner.tolist(), index.tolist()
+        ([0, 0, 1, 1, 1], [5, 6, 0, 1, 2])
+    """
     owner = np.repeat(np.arange(count.size), count)
     before = np.cumsum(count) - count
     return owner, np.arange(owner.size) + (first - before)[owner]
@@ -67,6 +79,11 @@ def pair_iou(
 
     Returns:
         `[P]` BEV IoU and `[P]` 3D IoU, float64.
+
+    Examples:
+        >>> car, ahead = np.array([[0.0, 0, 0, 4, 2, 1, 0]]), np.array([[2.0, 0, 0, 4, 2, 1, 0]])
+        >>> [overlap.round(4).tolist() for overlap in pair_iou(car, ahead)]
+        [[0.3333], [0.3333]]
     """
     chex.assert_equal_shape((a, b))
     bev, iou_3d = np.zeros(len(a)), np.zeros(len(a))

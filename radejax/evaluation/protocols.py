@@ -98,6 +98,10 @@ def get_protocol(name: str) -> Protocol:
 
     Raises:
         UserError: No such protocol; the message lists them.
+
+    Examples:
+        >>> get_protocol("kradar_r40").name
+        'kradar_r40'
     """
     if name not in PROTOCOLS:
         raise UserError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
@@ -147,6 +151,10 @@ def score_thresholds(
 
     References:
         K-Radar, utils/kitti_eval/eval_revised.py: get_thresholds.
+
+    Examples:
+        >>> score_thresholds(np.array([0.9, 0.8, 0.6]), np.ones(3), 3).tolist()
+        [0.9, 0.8, 0.6]
     """
     ends = np.cumsum(weight)
     total = int(ends[-1]) if ends.size else 0
@@ -184,6 +192,12 @@ def kradar_curve(
             frames.
         num_gt: Number of ground truths.
         samples: All 41 precision samples, or every fourth (11).
+
+    Examples:
+        >>> both = np.array([0.9, 0.6]), np.ones(2)
+        >>> curve = kradar_curve(both, both, both, 2, "r40")
+        >>> round(curve.ap, 2), curve.recall.tolist()
+        (4.88, [0.5, 1.0])
     """
     thresholds = score_thresholds(*matched, num_gt)
     found = _sum_at_least(*events, thresholds)
@@ -219,6 +233,12 @@ def pooled_curve(
         weight: `[M]` weights of their frames.
         num_gt: Number of ground truths.
         curve: "voc11", "recall41", "coco101", "auc" (RADE-Net) or "exact".
+
+    Examples:
+        >>> score, is_tp = np.array([0.9, 0.8, 0.6]), np.array([True, False, True])
+        >>> round(pooled_curve(
+        ...     score=score, is_tp=is_tp, weight=np.ones(3), num_gt=2, curve="exact").ap, 2)
+        83.33
     """
     counts = weight > 0  # a frame left out must not leave a point at recall 0 either
     score, is_tp, weight = score[counts], is_tp[counts], weight[counts]

@@ -72,6 +72,11 @@ class Result:
 
 
 def mean_ap(results: Sequence[Result]) -> float:
-    """Mean AP over the classes that occur; NaN if none does."""
+    """Mean AP over the classes that occur; NaN if none does.
+
+    Examples:
+        >>> mean_ap([])
+        nan
+    """
     present = [result.ap for result in results if result.is_defined]
     return float(np.mean(present)) if present else float("nan")

@@ -18,7 +18,12 @@ _SIGN_WIDTH = (1.0, 1.0, -1.0, -1.0)
 
 
 def array_module(*values: Any) -> Any:
-    """NumPy where every value is NumPy's or Python's, else jax.numpy."""
+    """NumPy where every value is NumPy's or Python's, else jax.numpy.
+
+    Examples:
+        >>> array_module(np.ones(3), 2.0) is np, array_module(jnp.ones(3)) is jnp
+        (True, True)
+    """
     on_host = all(
         isinstance(v, np.ndarray | np.generic | float | int | list | tuple)
         for v in values
@@ -61,6 +66,10 @@ def boxes7_from_8(boxes: Any) -> Any:
 
     Raises:
         ValueError: The last axis is not 8 long.
+
+    Examples:
+        >>> boxes7_from_8(np.array([1.0, 2, 3, 4, 2, 1, 0, 5])).tolist()
+        [1.0, 2.0, 3.0, 4.0, 2.0, 1.0, 0.0]
     """
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 8)
@@ -83,6 +92,10 @@ def bev_corners(boxes: Any) -> Any:
 
     Returns:
         `[..., 4, 2]` x and y in metres.
+
+    Examples:
+        >>> bev_corners(np.array([10.0, 0, 0, 4, 2, 1.5, 0])).tolist()
+        [[12.0, 1.0], [8.0, 1.0], [8.0, -1.0], [12.0, -1.0]]
     """
     xp = array_module(boxes)
     boxes = xp.asarray(boxes)
@@ -105,6 +118,10 @@ def corners(boxes: Any) -> Any:
 
     Returns:
         `[..., 8, 3]` x, y, z in metres.
+
+    Examples:
+        >>> corners(np.array([10.0, 0, 0, 4, 2, 1.5, 0]))[[0, 4]].tolist()
+        [[12.0, 1.0, -0.75], [12.0, 1.0, 0.75]]
     """
     xp = array_module(boxes)
     boxes = xp.asarray(boxes)
@@ -129,6 +146,10 @@ def transform_boxes(boxes: Any, translation_m: Any, yaw_rad: float = 0.0) -> Any
 
     Raises:
         ValueError: The last axis is not 7 long.
+
+    Examples:
+        >>> transform_boxes(np.array([10.0, 0, 1, 4, 2, 1.5, 0]), [2.5, 1, -0.5]).tolist()
+        [12.5, 1.0, 0.5, 4.0, 2.0, 1.5, 0.0]
     """
     xp = array_module(boxes, translation_m)
     boxes = _checked(xp.asarray(boxes), 7)

@@ -24,7 +24,11 @@ ImageKind = Literal["raw", "rectified", "pinhole"]
 
 EGO_FROM_LIDAR_M = (-2.54, 0.3, 0.0)
 """Ego = LiDAR + this, as in every sequence's `calib_radar_lidar.txt`; dz as RADE-Net.
-K-Radar's loaders use dz = 0.7."""
+the loaders of K-Radar have it for boxes too, see `KRADAR_LIDAR_TO_RADAR_Z_M`."""
+
+KRADAR_LIDAR_TO_RADAR_Z_M = 0.7
+"""Metres by which K-Radar's radar is below its LiDAR, as in K-Radar's own loaders: what
+radar directions are projected with, whatever z boxes are counted from."""
 
 KRADAR_RECTIFIED = (520.08203125, 562.506958008, 597.921967403, 374.688782302)
 """fx, fy, cx, cy of the undistorted front image as K-Radar stores them. Each version of

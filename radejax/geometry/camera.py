@@ -58,6 +58,13 @@ def project(
 
     Raises:
         AssertionError: Points are not `[..., 3]`, or their first axes not the cameras'.
+
+    Examples:
+        >>> lens = np.array([100.0, 100, 320, 240])
+        >>> camera = Camera(np.eye(3, 4), lens, np.zeros(5), 9.0, np.array([640, 480]), True)
+        >>> pixels, depth = project(np.array([1.0, 0, 5]), camera)
+        >>> pixels.tolist(), float(depth)
+        ([340.0, 240.0], 5.0)
     """
     batch = np.shape(camera.max_radius)
     chex.assert_shape(points_ego, (*batch, ..., 3))
@@ -69,7 +76,13 @@ def project(
 
 
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
-    """A batch from single cameras, float32 as the accelerator computes."""
+    """A batch from single cameras, float32 as the accelerator computes.
+
+    Examples:
+        >>> one = Camera(np.eye(3, 4), np.ones(4), np.zeros(5), 9.0, np.ones(2), True)
+        >>> stack_cameras([one, one]).cam_from_ego.shape
+        (2, 3, 4)
+    """
 
     def stack(*leaves: Any) -> np.ndarray:
         stacked = np.stack(leaves)
@@ -79,7 +92,14 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
 
 
 def to_camera(points: Any, camera: Camera) -> Any:
-    """Points `[..., 3]` of the ego frame in the camera frame, metres."""
+    """Points `[..., 3]` of the ego frame in the camera frame, metres.
+
+    Examples:
+        >>> raised = np.column_stack([np.eye(3), [0, 0, 2.0]])
+        >>> one = Camera(raised, np.ones(4), np.zeros(5), 9.0, np.ones(2), True)
+        >>> to_camera(np.array([1.0, 0, 5]), one).tolist()
+        [1.0, 0.0, 7.0]
+    """
     xp = array_module(points, camera.cam_from_ego)
     rotation, shift = camera.cam_from_ego[..., :3], camera.cam_from_ego[..., 3]
     batch = shift.shape[:-1]
@@ -91,7 +111,14 @@ def to_camera(points: Any, camera: Camera) -> Any:
 
 
 def to_pixels(points_cam: Any, camera: Camera, depth_offset_m: float) -> Any:
-    """Pixels `[..., 2]` of points `[..., 3]` of the camera frame, see `project`."""
+    """Pixels `[..., 2]` of points `[..., 3]` of the camera frame, see `project`.
+
+    Examples:
+        >>> lens = np.array([100.0, 100, 320, 240])
+        >>> one = Camera(np.eye(3, 4), lens, np.zeros(5), 9.0, np.array([640, 480]), True)
+        >>> to_pixels(np.array([1.0, 0, 5]), one, 0.0).tolist()
+        [340.0, 240.0]
+    """
     xp = array_module(points_cam, camera.intrinsics)
     depth = points_cam[..., 2] + depth_offset_m
     depth = xp.where(depth == 0, 1e-12, depth)

@@ -49,7 +49,7 @@ def bev_iou(a: jax.Array, b: jax.Array) -> jax.Array:
     Examples:
         >>> car = jnp.array([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
         >>> moved = car.at[0, 0].set(2.0)
-        >>> round(float(bev_iou(car, moved)[0, 0]), 4)
+        >>> round(float(jax.jit(bev_iou)(car, moved)[0, 0]), 4)
         0.3333
     """
     return bev_iou_pairs(*_all_pairs(a, b))
@@ -60,17 +60,34 @@ def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
 
     Returns:
         `[..., N, M]` float32 in [0, 1].
+
+    Examples:
+        >>> car = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> round(float(jax.jit(iou_3d)(car, car.at[0, 2].set(0.75))[0, 0]), 4)
+        0.3333
     """
     return iou_3d_pairs(*_all_pairs(a, b))
 
 
 def bev_iou_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Bird's-eye-view IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`."""
+    """Bird's-eye-view IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`.
+
+    Examples:
+        >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]] * 3)
+        >>> jax.jit(bev_iou_pairs)(cars, cars).shape
+        (3,)
+    """
     return _bev_iou(jnp, _as_float32(a), _as_float32(b))
 
 
 def iou_3d_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Volume IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`."""
+    """Volume IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`.
+
+    Examples:
+        >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]] * 3)
+        >>> jax.jit(iou_3d_pairs)(cars, cars).shape
+        (3,)
+    """
     a, b = _as_float32(a), _as_float32(b)
     return _iou_3d(jnp, a, b)
 
@@ -90,6 +107,12 @@ def bev_intersection_np(
 
     Raises:
         ValueError: Shapes differ or are not `[P, 7]` or `[P, 8]`.
+
+    Examples:
+        >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> ahead = car + [3, 0, 0, 0, 0, 0, 0]
+        >>> bev_intersection_np(car, ahead).round(6).tolist()
+        [2.0]
     """
     return _by_chunks(
         lambda a, b: _intersection(np, _footprint(np, a), _footprint(np, b)),
@@ -102,12 +125,26 @@ def bev_intersection_np(
 def bev_iou_np(
     a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16
 ) -> np.ndarray:
-    """Bird's-eye-view IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`."""
+    """Bird's-eye-view IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`.
+
+    Examples:
+        >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> ahead = car + [2, 0, 0, 0, 0, 0, 0]
+        >>> bev_iou_np(car, ahead).round(4).tolist()
+        [0.3333]
+    """
     return _by_chunks(lambda a, b: _bev_iou(np, a, b), a, b, chunk_size)
 
 
 def iou_3d_np(a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16) -> np.ndarray:
-    """Volume IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`."""
+    """Volume IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`.
+
+    Examples:
+        >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> higher = car + [0, 0, 0.75, 0, 0, 0, 0]
+        >>> iou_3d_np(car, higher).round(4).tolist()
+        [0.3333]
+    """
     return _by_chunks(lambda a, b: _iou_3d(np, a, b), a, b, chunk_size)
 
 

@@ -47,8 +47,8 @@ class Detector:
         grid: Of the sensor.
         classes: Names in the order of the heatmap's channels.
         decode_options: Static keyword arguments of `radejax.detection.decode.decode`:
-            max_detections, threshold_inclusive, per_class_nms, z0_m, raw_yaw; and roi,
-            for calls and a detector that give none.
+            max_detections, threshold_inclusive, per_class_nms, z0_m, raw_yaw,
+            clip_sizes; and roi, for calls and a detector that give none.
         azimuth_mapping: "true", or "stretched" for official checkpoints.
         score_threshold: Default of calls.
         nms_iou: Default of calls.

@@ -1,6 +1,6 @@
-"""Models as folders that need nothing of this package: StableHLO, or Hugging Face's files.
+"""Models as folders without this package: StableHLO, ONNX, or Hugging Face's files.
 
-Both formats hold `config.json` and `model.safetensors`, which
+All formats hold `config.json` and `model.safetensors`, which
 `Detector.from_checkpoint` reads back.
 """
 
@@ -21,13 +21,13 @@ from ml_collections import ConfigDict
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.geometry.camera import Camera
-from radejax.inference import exported_loader, packed
+from radejax.inference import export_onnx, exported_loader, packed
 from radejax.inference.detector import Detector
 from radejax.inference.packed import BACKBONE
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
-FORMATS = ("stablehlo", "huggingface")
+FORMATS = ("stablehlo", "onnx", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
 
 CAMERA_SHAPES = {
@@ -48,6 +48,8 @@ def export(
     platforms: Sequence[str] = PLATFORMS,
     training_config: ConfigDict | None = None,
     with_backbone: bool = False,
+    batch_size: int = 1,
+    half: bool = False,
 ) -> dict[str, Any]:
     """Writes a folder with the model; existing files of the same names are replaced.
 
@@ -55,34 +57,58 @@ def export(
         detector: What to export, with its thresholds as defaults.
         folder: Made if missing.
         kind: "stablehlo": program, weights and `load.py`, which needs jax and numpy
-            alone; "huggingface": weights, config and model card.
-        platforms: That the program shall run on: of `KNOWN_PLATFORMS`; "gpu" is CUDA.
+            alone; "onnx": network, and network with decoding and NMS, for one batch
+            size; "huggingface": weights, config and model card.
+        platforms: That StableHLO shall run on: of `KNOWN_PLATFORMS`; "gpu" is CUDA.
         training_config: Kept in `config.json`.
         with_backbone: Keep the image transformer's weights, see `write_packed`.
+        batch_size: Frames of a call of the ONNX files.
+        half: Store float16; "huggingface" alone.
 
     Returns:
         "kind", "folder", "bytes" and "left_out".
 
     Raises:
-        UserError: An unknown kind or platform; or a program would need an image
-            backbone that is left out.
+        UserError: An unknown kind or platform; ONNX without jax2onnx; half
+            of a program, which takes float32 weights.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
+    if half and kind != "huggingface":
+        raise UserError("--half: a program takes float32; give --format huggingface")
     platforms = _checked_platforms(platforms)
     folder = pathlib.Path(folder)
+    programs: dict[str, bytes] = {}
     if kind == "stablehlo":
         program = stablehlo(detector, platforms, with_backbone=with_backbone)
+        programs = {PROGRAM_FILE: program}
+    elif kind == "onnx":
+        if detector.takes_camera and detector.model.vit is not None and with_backbone:
+            raise UserError(
+                "the image transformer does not convert to ONNX: leave --with-backbone, "
+                "and give the file embedded images (docs/deploy.md)"
+            )
+        variables, is_embedded = _exported_variables(detector, with_backbone)
+        shapes = _input_shapes(detector, batch_size, is_embedded)
+        programs = export_onnx.onnx_files(detector, variables, shapes)
     content = packed.write_packed(
-        folder, detector, training_config=training_config, with_backbone=with_backbone
+        folder,
+        detector,
+        training_config=training_config,
+        with_backbone=with_backbone,
+        half=half,
     )
-    if kind == "stablehlo":
-        with files.atomic_write(folder / PROGRAM_FILE) as file:
+    for name, program in programs.items():
+        with files.atomic_write(folder / name) as file:
             file.write(program)
+    if kind == "stablehlo":
         _copy_loader(folder)
-        files.write_text(folder / "README.md", _program_readme(detector, platforms))
+        text = _program_readme(detector, platforms)
+    elif kind == "onnx":
+        text = _onnx_readme(detector, batch_size)
     else:
-        files.write_text(folder / "README.md", _model_card(detector, content))
+        text = _model_card(detector, content, half)
+    files.write_text(folder / "README.md", text)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     return {
         "kind": kind,
@@ -116,12 +142,7 @@ def stablehlo(
     Raises:
         UserError: Weights that are not float32.
     """
-    variables = {name: dict(tree) for name, tree in detector.variables.items()}
-    is_embedded = detector.takes_camera and not (
-        with_backbone or detector.model.vit is None
-    )
-    if is_embedded:
-        variables["params"].pop(BACKBONE, None)
+    variables, is_embedded = _exported_variables(detector, with_backbone)
     flat = traverse_util.flatten_dict(variables, sep="/")
     if odd := sorted(name for name, x in flat.items() if x.dtype != jnp.float32):
         raise UserError(f"weights must be float32 to be exported; {odd[0]} is not")
@@ -141,22 +162,42 @@ def stablehlo(
 
     (batch,) = jax.export.symbolic_shape("b")
 
-    def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(shape, dtype)
-
-    inputs: tuple[Any, ...] = (array(batch, *detector.grid.projection_shape),)
-    if detector.takes_camera:
-        model = detector.model
-        image = array(batch, *model.image_size, 3, dtype=jnp.uint8)
-        if is_embedded:
-            image = array(batch, *model.feature_shape)
-        camera = {name: array(batch, *s) for name, s in CAMERA_SHAPES.items()}
-        inputs += image, camera | {"is_valid": array(batch, dtype=jnp.bool_)}
-    weights = {name: array(*x.shape) for name, x in flat.items()}
+    inputs = _input_shapes(detector, batch, is_embedded)
+    weights = {name: _array(*x.shape) for name, x in flat.items()}
     exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
-        weights, inputs, array(), array(), array(6)
+        weights, inputs, _array(), _array(), _array(6)
     )
     return bytes(exported.serialize())
+
+
+def _array(*shape: Any, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def _exported_variables(
+    detector: Detector, with_backbone: bool
+) -> tuple[dict[str, Any], bool]:
+    """What the file holds, and whether its images are embedded ones."""
+    variables = {name: dict(tree) for name, tree in detector.variables.items()}
+    is_embedded = detector.takes_camera and not (
+        with_backbone or detector.model.vit is None
+    )
+    if is_embedded:
+        variables["params"].pop(BACKBONE, None)
+    return variables, is_embedded
+
+
+def _input_shapes(detector: Detector, batch: Any, is_embedded: bool) -> tuple[Any, ...]:
+    """Of projections, and for a camera of images and the fields of `Camera`."""
+    projection = _array(batch, *detector.grid.projection_shape)
+    if not detector.takes_camera:
+        return (projection,)
+    model = detector.model
+    image = _array(batch, *model.image_size, 3, dtype=jnp.uint8)
+    if is_embedded:
+        image = _array(batch, *model.feature_shape)
+    camera = {name: _array(batch, *s) for name, s in CAMERA_SHAPES.items()}
+    return projection, image, camera | {"is_valid": _array(batch, dtype=jnp.bool_)}
 
 
 def _copy_loader(folder: pathlib.Path) -> None:
@@ -210,6 +251,34 @@ scale: `radejax.data.projection.project`. The sensor's axes are in `config.json`
 """
 
 
+def _onnx_readme(detector: Detector, batch_size: int) -> str:
+    shape = ", ".join(map(str, detector.grid.projection_shape))
+    camera = _camera_text(detector)
+    if camera:
+        camera += (
+            "Here each field is an input of its own: `camera_intrinsics` and so on.\n"
+        )
+    return f"""# A radar detector as ONNX files
+
+| file | from | to |
+|---|---|---|
+| `network.onnx` | `projection` | `heatmap_logits`, `box_params`: before decoding |
+| `detector.onnx` | `projection` and settings | detections, as below |
+
+```python
+import numpy as np, onnxruntime
+session = onnxruntime.InferenceSession("detector.onnx")
+everywhere = np.array([-1e9, 1e9] * 3, np.float32)   # x0, x1, y0, y1, z0, z1 in metres
+settings = {{"score_threshold": np.float32(0.3), "nms_iou": np.float32(0.3), "roi": everywhere}}
+boxes, scores, classes, is_valid, num_cut = session.run(
+    None, {{"projection": x, **settings}})   # x [{batch_size}, {shape}] float32
+```
+
+Rows, units and the projection are those of `docs/deploy.md` of radejax; `config.json` has
+grid, classes and thresholds. `radejax.Detector.from_checkpoint(folder)` reads this folder.
+{camera}"""
+
+
 def _camera_text(detector: Detector) -> str:
     if not detector.takes_camera:
         return ""
@@ -225,7 +294,14 @@ under `left_out`, and `camera` a dictionary of arrays: `cam_from_ego` [B, 3, 4],
 """
 
 
-def _model_card(detector: Detector, content: Mapping[str, Any]) -> str:
+def _model_card(detector: Detector, content: Mapping[str, Any], half: bool) -> str:
+    simulation = (content["training_config"] or {}).get("simulation") or {}
+    origin = (
+        "Before publishing, check the licence of the data that the weights were trained on\n"
+        "(K-Radar: CC BY-NC-ND)."
+    )
+    if simulation.get("scenes") == "procedural":
+        origin = "Trained on simulated data alone: it does not know real radar frames."
     name = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}[content["model"]["name"]]
     left_out = ""
     if content["left_out"]:
@@ -254,8 +330,7 @@ detector(projection).to_list()   # [B, {", ".join(map(str, detector.grid.project
 ```
 {left_out}
 `config.json` holds the model, the sensor's grid, the decoding thresholds and the training
-config; `model.safetensors` the weights, float32, by their names in Flax.
+config; `model.safetensors` the weights, float{16 if half else 32}, by their names in Flax.
 
-Before publishing, check the licence of the data that the weights were trained on (K-Radar:
-CC BY-NC-ND).
+{origin}
 """

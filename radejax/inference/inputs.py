@@ -15,12 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.structures import NARROW_ROI, WIDE_ROI
+from radejax.core.structures import ROIS
 from radejax.data.cameras import CameraOptions, no_camera
 from radejax.data.images import read_left_image
 from radejax.data.projection import MAX_LEVEL
 from radejax.data.tesseract import read_frame
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.calibration import (
+    KRADAR_LIDAR_TO_RADAR_Z_M,
+    CameraCalibration,
+)
 from radejax.geometry.camera import Camera, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -252,13 +255,17 @@ def _cameras(
 
 
 def _one_camera(camera: Any, options: CameraOptions) -> Camera:
+    z = options.lidar_to_radar_z_m
     if isinstance(camera, PathLike):
         camera = CameraCalibration.from_kradar(camera)
+        z = KRADAR_LIDAR_TO_RADAR_Z_M if z is None else z
     if isinstance(camera, CameraCalibration):
+        shift = camera.ego_from_lidar_m
         if options.ego_from_lidar_m is not None:
-            camera = dataclasses.replace(
-                camera, ego_from_lidar_m=np.asarray(options.ego_from_lidar_m)
-            )
+            shift = np.asarray(options.ego_from_lidar_m)
+        elif z is not None:
+            shift = np.array([*shift[:2], z])
+        camera = dataclasses.replace(camera, ego_from_lidar_m=shift)
         return camera.camera(options.projection)
     if isinstance(camera, Camera) and np.ndim(camera.max_radius) == 0:
         return camera
@@ -275,9 +282,8 @@ def _check_count(what: str, found: int, expected: int) -> None:
 
 def named_region(roi: Sequence[float] | str | None) -> Sequence[float] | None:
     """Limits of a region that may be named."""
-    named = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
-    if isinstance(roi, str) and roi in named:
-        return named[roi]
+    if isinstance(roi, str) and roi in ROIS:
+        return ROIS[roi]
     if roi is not None and (isinstance(roi, str) or len(roi) != 6):
         raise UserError(f"roi {roi!r}, expected narrow, wide or x0, x1, y0, y1, z0, z1")
     return roi

@@ -17,6 +17,7 @@ import flax.linen as nn
 from ml_collections import ConfigDict
 
 from radejax import models
+from radejax.core.config import renewed
 from radejax.core.errors import UserError
 from radejax.core.files import differences
 from radejax.data.cameras import CameraOptions
@@ -113,7 +114,9 @@ def load_torch(
         model, variables = dinorade_torch.load(
             path_or_state_dict, dinov3=image_backbone, **model_overrides
         )
-        settings["camera_options"] = CameraOptions("pinhole", OFFICIAL_OFFSET_M)
+        settings["camera_options"] = CameraOptions(
+            "pinhole", OFFICIAL_OFFSET_M, calibration="common"
+        )
     else:
         if image_backbone is not None:
             raise UserError("image_backbone is given, but the model is RADE-Net")
@@ -221,7 +224,7 @@ def _read_checkpoint(folder: pathlib.Path, step: Step) -> LoadedModel:
         if step == "best":
             step = checkpoints.best_step()
         state, info, step = checkpoints.restore_variables(step)
-    config = ConfigDict(info["config"], convert_dict=True)
+    config = ConfigDict(renewed(info["config"]), convert_dict=True)
     params = state["ema_params"] if state.get("ema_params") else state["params"]
     return LoadedModel(
         models.build(config.model),

@@ -14,7 +14,7 @@ import dataclasses
 import json
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 import numpy as np
@@ -25,15 +25,44 @@ from ml_collections import ConfigDict
 import radejax
 from radejax import models
 from radejax.core import files
+from radejax.core.archives import read_safetensors
+from radejax.core.config import renewed
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.interop.image_backbone import check_fits
 from radejax.models import dinorade_config, radenet
 from radejax.models.dinorade import IMAGE_BACKBONE as BACKBONE
 from radejax.models.vit import ViT
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 FORMAT = "radejax-1"
+
+
+_DECODE = {
+    "score_threshold": float,
+    "nms_iou": float,
+    "max_detections": int,
+    "threshold_inclusive?": bool,
+    "per_class_nms?": bool,
+    "pre_nms?": int | None,
+    "roi?": tuple[float, float, float, float, float, float]
+    | Literal["narrow", "wide"]
+    | None,
+    "z0_m?": float,
+    "raw_yaw?": Literal["nms", "always", "never"],
+    "clip_sizes?": bool,
+}
+_HINTS = {
+    "model": dict[str, Any],
+    "classes": tuple[str, ...],
+    "decode": _DECODE,
+    "azimuth_mapping": Literal["true", "stretched"],
+    "camera": dict[str, Any],
+    "grid": RadarGrid,
+    "training_config": dict[str, Any] | None,
+}
+"""What `config.json` holds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +100,7 @@ def write_packed(
     *,
     training_config: ConfigDict | None = None,
     with_backbone: bool = False,
+    half: bool = False,
 ) -> dict[str, Any]:
     """Writes `config.json` and `model.safetensors`.
 
@@ -80,6 +110,7 @@ def write_packed(
         training_config: Kept in `config.json` to be read.
         with_backbone: Keep the image transformer's weights. DINOv3's are for own
             machines and not to be passed on.
+        half: Store float16, to half the size; it is computed in float32 as ever.
 
     Returns:
         The content of `config.json`.
@@ -121,7 +152,7 @@ def write_packed(
         else json.loads(training_config.to_json()),
     }
     arrays = {
-        name: np.ascontiguousarray(value)
+        name: np.ascontiguousarray(value, np.float16 if half else None)
         for name, value in traverse_util.flatten_dict(variables, sep="/").items()
     }
     folder.mkdir(parents=True, exist_ok=True)
@@ -137,35 +168,49 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
     Raises:
         DataError: A file is damaged, or of another format.
     """
-    folder = pathlib.Path(folder)
-    content = files.read_json(folder / CONFIG_FILE)
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        found = content.get("format") if isinstance(content, dict) else None
+    path = pathlib.Path(folder) / CONFIG_FILE
+    files.read_json(path, {"format": Literal[FORMAT]})
+    content = files.read_json(path, _HINTS)
+    decode = content["decode"]
+    if unknown := sorted(set(decode) - {name.rstrip("?") for name in _DECODE}):
+        raise DataError(f"{path}: decode has unknown {unknown}")
+    shares = decode["score_threshold"], decode["nms_iou"]
+    if not all(0 <= x <= 1 for x in shares) or not 1 <= decode["max_detections"] <= 1e5:
         raise DataError(
-            f"{folder / CONFIG_FILE}: format is {found!r}, expected {FORMAT!r}"
+            f"{path}: decode has score_threshold {shares[0]}, nms_iou {shares[1]}, "
+            f"max_detections {decode['max_detections']}; expected the first two from 0 "
+            "to 1, the last from 1 to 100000"
         )
     try:
-        arrays = safetensors.numpy.load_file(folder / WEIGHTS_FILE)
-    except Exception as error:  # the library's own class is not exported
-        raise DataError(f"{folder / WEIGHTS_FILE} is damaged: {error}") from error
-    decode = dict(content["decode"])
-    camera = content["camera"]
-    if camera["ego_from_lidar_m"] is not None:
-        camera["ego_from_lidar_m"] = tuple(camera["ego_from_lidar_m"])
+        model = models.build(content["model"])
+        weights = path.with_name(WEIGHTS_FILE)
+        arrays = {
+            name: value.astype(np.float32)
+            for name, value in read_safetensors(weights).items()
+        }
+        variables = traverse_util.unflatten_dict(arrays, sep="/")
+        check_fits(model, variables, weights)
+    except UserError as error:
+        raise DataError(f"{path}: {error}") from None
+    if len(content["classes"]) != content["model"]["num_classes"]:
+        raise DataError(
+            f"{path}: {len(content['classes'])} classes, expected "
+            f"{content['model']['num_classes']}, as model.num_classes says"
+        )
     return LoadedModel(
-        models.build(content["model"]),
-        traverse_util.unflatten_dict(arrays, sep="/"),
-        RadarGrid.from_dict(content["grid"]),
+        model,
+        variables,
+        content["grid"],
         {
-            "classes": tuple(content["classes"]),
+            "classes": content["classes"],
             "azimuth_mapping": content["azimuth_mapping"],
             "score_threshold": decode.pop("score_threshold"),
             "nms_iou": decode.pop("nms_iou"),
             "decode_options": decode,
-            "camera_options": CameraOptions(**camera),
+            "camera_options": CameraOptions.of_fields(content["camera"], path),
         },
         content["training_config"]
-        and ConfigDict(content["training_config"], convert_dict=True),
+        and ConfigDict(renewed(content["training_config"]), convert_dict=True),
     )
 
 

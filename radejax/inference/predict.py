@@ -14,8 +14,8 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, Detections
 from radejax.data.cameras import CameraInputs
+from radejax.data.dataset import FrameSequence
 from radejax.data.frame_table import make_table
-from radejax.data.kradar import Frame
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.geometry.radar_grid import RadarGrid
@@ -99,7 +99,7 @@ class Predictor:
 def predict_dataset(
     detector: Predictor | Detector,
     records: RecordSource,
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     batch_size: int = 8,
     *,
     images: CameraInputs | None = None,

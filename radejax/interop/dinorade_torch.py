@@ -77,7 +77,7 @@ def load(
     except DataError as error:
         problems.append(str(error))
     if problems:
-        raise DataError("\n".join(problems))
+        raise DataError("; ".join(problems))
     if dinov3 is not None:
         vit, variables = dinov3_hf.load(dinov3)
         params["image_backbone"] = variables["params"]

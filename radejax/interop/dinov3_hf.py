@@ -6,7 +6,6 @@ yourself, and keep them out of checkpoints that are published.
 
 from __future__ import annotations
 
-import json
 import pathlib
 import re
 from collections.abc import Mapping
@@ -14,10 +13,10 @@ from typing import Any
 
 import jax
 import numpy as np
-import safetensors
-import safetensors.numpy
 
+from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import read_json
 from radejax.interop.state_dict import StateDictReader
 from radejax.models.vit import ViT
 
@@ -82,13 +81,10 @@ def load(
             f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 model folder"
             " as downloaded from Hugging Face"
         )
-    model = model_from_config(_read_config(folder / CONFIG_FILE), **model_overrides)
+    config = read_json(folder / CONFIG_FILE, dict[str, Any])
+    model = model_from_config(config, **model_overrides)
     path = folder / WEIGHTS_FILE
-    try:
-        tensors = safetensors.numpy.load_file(path)
-    except safetensors.SafetensorError as error:
-        raise DataError(f"{path}: damaged safetensors file ({error})") from error
-    return model, {"params": to_params(model, tensors, str(path))}
+    return model, {"params": to_params(model, read_safetensors(path), str(path))}
 
 
 def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
@@ -206,13 +202,3 @@ def _layer(reader: StateDictReader, model: ViT, prefix: str) -> dict[str, Any]:
     if model.gated_mlp:
         layer["gate"] = linear("mlp.gate_proj", channels, hidden, model.mlp_bias)
     return layer
-
-
-def _read_config(path: pathlib.Path) -> dict[str, Any]:
-    try:
-        config = json.loads(path.read_text())
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not a JSON file ({error})") from error
-    if not isinstance(config, dict):
-        raise DataError(f"{path}: expected a JSON object, got {type(config).__name__}")
-    return config

@@ -19,7 +19,7 @@ from radejax.core.errors import UserError
 from radejax.data.records.embeddings import embeddings_sha256
 from radejax.interop import dinov3_hf, resnet_torch
 from radejax.models import dinorade_config
-from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
+from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
 from radejax.models.vit import ViT
 
@@ -104,16 +104,21 @@ def _load_dinov3(path: PathLike, configured: ViT) -> Any:
     return variables["params"]
 
 
-def check_fits(model: DinoRade, variables: Mapping[str, Any], source: str) -> None:
+def check_fits(
+    model: nn.Module, variables: Mapping[str, Any], source: PathLike
+) -> None:
     """`UserError` unless variables are those of a model; the backbone may be missing."""
-    radar, bins = model.radar, model.radar.pad_multiple
-    channels = radar.doppler_bins + radar.elevation_bins
-    queries = (1, bins, bins, model.axes.num_elevation)
-    inputs = (
-        jnp.zeros((1, bins, bins, channels)),
-        jnp.zeros((1, *model.image_size, 3), jnp.uint8),
-        ReferencePoints(jnp.zeros((*queries, 2)), jnp.ones(queries, bool)),
-    )
+    radar = model.radar if models.has_camera(model) else model
+    bins, channels = radar.pad_multiple, radar.doppler_bins + radar.elevation_bins
+
+    def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, *shape), dtype)
+
+    inputs = [array(bins, bins, channels)]
+    if radar is not model:
+        queries = (bins, bins, model.axes.num_elevation)
+        points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
+        inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]
     wanted = jax.eval_shape(model.init, jax.random.key(0), *inputs)
 
     def shapes(tree: Any) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import flax
 import jax
 import numpy as np
 
+from radejax.core.errors import UserError
 from radejax.models.radenet import RadeNet
 
 Path = tuple[str, ...]
@@ -84,8 +85,25 @@ def head_names(kind: str) -> dict[str, str]:
     return names
 
 
+_KNOWN = {
+    "backbone": ("unet",),
+    "neck": ("dilated", "plain"),
+    "heads": ("expanded", "default"),
+}
+
+
 def torch_names(model: RadeNet) -> dict[Path, str]:
-    """Official name of every parameter of a model, by its path in our tree."""
+    """Official name of every parameter of a model, by its path in our tree.
+
+    Raises:
+        UserError: A part of the model is none of the released code's.
+    """
+    for part, known in _KNOWN.items():
+        if (kind := getattr(model, part)) not in known:
+            raise UserError(
+                f"{part} {kind!r} has no names in the released code, which has "
+                f"{', '.join(known)}"
+            )
     modules = {
         f"{ours}/{path}": f"{theirs}.{name}"
         for ours, theirs, names in (

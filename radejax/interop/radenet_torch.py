@@ -21,7 +21,7 @@ from radejax.interop.radenet_names import (
     torch_names,
     torch_shapes,
 )
-from radejax.interop.state_dict import read_state_dict, to_numpy
+from radejax.interop.state_dict import is_tensor, read_state_dict, shorten, to_numpy
 from radejax.models.radenet import FIELDS, RadeNet, from_config
 
 StateDict = Mapping[str, Any]
@@ -129,8 +129,8 @@ def _to_params(model: RadeNet, tensors: StateDict, source: str) -> dict[str, Any
     ]
     if problems:
         raise DataError(
-            f"{source} does not fit {_model_text(model)}; {len(problems)} problems:\n  "
-            + "\n  ".join(problems)
+            f"{source} does not fit {_model_text(model)}; {len(problems)} problems: "
+            + shorten(problems, "; ")
         )
     flat = {
         path: np.array(
@@ -175,7 +175,6 @@ def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
     heads = "expanded" if "head.heatmap_head.head.6.weight" in shapes else "default"
     last_head = f"head.heatmap_head.head.{9 if heads == 'expanded' else 3}."
     has_cbam = any(name.startswith("backbone.cbam_") for name in shapes)
-    is_dilated = any(name.startswith("neck.neck.0.conv1.") for name in shapes)
     shown = {
         "num_classes": _common_size(shapes, last_head, 0),
         "widths": widths,
@@ -183,7 +182,7 @@ def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
             shapes, f"backbone.decoder_block_{len(widths)}.", 0
         ),
         "cbam": "official" if has_cbam else None,
-        "neck": "dilated" if is_dilated else "plain",
+        "neck": _infer_neck(shapes),
         "heads": heads,
         "pad_multiple": 2 ** len(widths),
     }
@@ -196,6 +195,18 @@ def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
     defaults = {name: fields[name] for name in FIELDS}
     shown |= _infer_input(shapes, overrides)
     return {"name": "radenet"} | defaults | shown | overrides
+
+
+def _infer_neck(shapes: Mapping[str, Any]) -> str:
+    found = {n.split(".")[3] for n in shapes if n.startswith("neck.neck.0.")}
+    known = {"dilated": "conv1", "plain": "conv"}
+    kinds = [kind for kind, part in known.items() if part in found]
+    if not kinds and found:
+        raise DataError(
+            f"neck.neck.0 has {', '.join(sorted(found))}, expected conv1 (neck 'dilated') "
+            "or conv ('plain')"
+        )
+    return kinds[0] if kinds else "plain"
 
 
 _ENCODER = re.compile(r"backbone\.encoder_block_([0-9]{1,9})\.")
@@ -266,8 +277,8 @@ _PART = re.compile(r"(?:^|\.)((?:backbone|neck|head)\.)")
 def _state_dicts(content: Any, key: str) -> Any:
     if not isinstance(content, Mapping):
         return
-    tensors = {n: v for n, v in content.items() if hasattr(v, "shape")}
-    if any(isinstance(n, str) and _PART.search(n) for n in tensors):
+    tensors = {n: v for n, v in content.items() if is_tensor(n, v)}
+    if any(map(_PART.search, tensors)):
         yield key, tensors
         return
     for name, value in content.items():

@@ -9,12 +9,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
 
+from radejax.core.archives import read_npz, read_safetensors
 from radejax.core.errors import DataError
 from radejax.interop import torch_file
 
-_SHOWN = 20
+_SHOWN, _LONGEST = 20, 120
 
 
 class StateDictReader:
@@ -55,8 +55,9 @@ class StateDictReader:
             self._missing.append(name)
             return np.zeros(shape, np.float32)
         tensor = to_numpy(self._tensors[name])
-        if tensor.shape != tuple(shape):
-            found, expected = list(tensor.shape), list(shape)
+        if tensor.shape != tuple(shape) or not is_tensor(name, tensor):
+            kind = "" if is_tensor(name, tensor) else f" of {tensor.dtype}"
+            found, expected = f"{list(tensor.shape)}{kind}", list(shape)
             self._mis_shaped.append(f"{name} is {found}, expected {expected}")
             return np.zeros(shape, np.float32)
         return tensor.astype(np.float32)
@@ -126,7 +127,7 @@ class StateDictReader:
             "mis-shaped": self._mis_shaped,
         }
         parts = [
-            f"{len(names)} {kind}: {_shorten(names)}"
+            f"{len(names)} {kind}: {shorten(names)}"
             for kind, names in problems.items()
             if names
         ]
@@ -152,10 +153,9 @@ def read_state_dict(content_or_path: Any) -> tuple[Any, str]:
         return content_or_path, "state dict"
     path = pathlib.Path(content_or_path)
     if path.suffix == ".npz":
-        with np.load(path) as arrays:
-            return dict(arrays), str(path)
+        return read_npz(path), str(path)
     if path.suffix == ".safetensors":
-        return safetensors.numpy.load_file(path), str(path)
+        return read_safetensors(path), str(path)
     return torch_file.read(path), str(path)
 
 
@@ -169,6 +169,14 @@ def to_numpy(tensor: Any) -> np.ndarray:
     return np.asarray(tensor)
 
 
-def _shorten(names: list[str]) -> str:
-    text = ", ".join(sorted(names)[:_SHOWN])
-    return text + ", ..." * (len(names) > _SHOWN)
+def is_tensor(name: Any, value: Any) -> bool:
+    """Whether an entry of a file is a tensor of numbers with a name."""
+    dtype = getattr(value, "dtype", None)
+    is_number = getattr(dtype, "kind", "f") in "biufV"  # V: bfloat16; torch has none
+    return isinstance(name, str) and hasattr(value, "shape") and is_number
+
+
+def shorten(names: list[str], separator: str = ", ") -> str:
+    """The first names of a list, each cut to what a message can show."""
+    text = separator.join(name[:_LONGEST] for name in sorted(names)[:_SHOWN])
+    return text + f"{separator}..." * (len(names) > _SHOWN)

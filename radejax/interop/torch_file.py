@@ -11,11 +11,10 @@ pickles. bfloat16 becomes float32, which holds it exactly; NumPy has no such typ
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
+import os
 import pathlib
-import pickle
 import struct
 import zipfile
 from collections.abc import Mapping
@@ -23,77 +22,34 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from radejax.core.errors import DataError
+from radejax.core.archives import open_zip, read_member
+from radejax.core.errors import DataError, one_line
+from radejax.interop.torch_pickle import (
+    BFLOAT16,
+    STORAGE_DTYPES,
+    Storage,
+    Tensor,
+    Unpickler,
+)
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
 
-_BFLOAT16 = "bfloat16"
-
-_STORAGE_DTYPES = {
-    "DoubleStorage": np.float64,
-    "FloatStorage": np.float32,
-    "HalfStorage": np.float16,
-    "BFloat16Storage": _BFLOAT16,
-    "LongStorage": np.int64,
-    "IntStorage": np.int32,
-    "ShortStorage": np.int16,
-    "CharStorage": np.int8,
-    "ByteStorage": np.uint8,
-    "BoolStorage": np.bool_,
-    "ComplexFloatStorage": np.complex64,
-    "ComplexDoubleStorage": np.complex128,
-}
+_MAX_DEPTH, _MAX_VALUES = 64, 100_000
+_FACTOR, _MAX_PICKLE = 4, 1 << 20
+"""Bytes of the content for each byte of the file: storages may be shared; and of a
+pickle that is deflated."""
 
 
-class Opaque:
-    """What stands for an object of a class that is not read; it does nothing."""
+class _File:
+    """Reads no further than a file reaches: a length that is claimed takes no memory."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        del args, kwargs
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+        self.readline = file.readline
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Opaque:
-        del args, kwargs
-        return super().__new__(cls)
-
-    def __setstate__(self, state: Any) -> None:
-        del state
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        del key, value
-
-    def append(self, item: Any) -> None:
-        del item
-
-    def extend(self, items: Any) -> None:
-        del items
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@dataclasses.dataclass(eq=False)
-class _Storage:
-    dtype: Any
-    size: int
-    values: np.ndarray | None = None
-
-
-@dataclasses.dataclass(eq=False)
-class _Tensor:
-    """A view into a storage whose bytes may not have been read yet."""
-
-    storage: _Storage
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-
-class _Dict(dict):
-    """A dict that swallows attributes, as state dicts carry `_metadata`."""
-
-    def __setstate__(self, state: Any) -> None:
-        del state
+    def read(self, size: int) -> bytes:
+        return self._file.read(min(size, self._size - self._file.tell()))
 
 
 def read(path: str | pathlib.Path) -> Any:
@@ -116,15 +72,17 @@ def read(path: str | pathlib.Path) -> Any:
         file.seek(0)
         try:
             if start == b"PK\x03\x04":
-                return _resolve(_read_zip(file))
-            if start[:1] == b"\x80":
-                return _resolve(_read_legacy(file))
+                content = _read_zip(path)
+            elif start[:1] == b"\x80":
+                content = _read_legacy(_File(file))
+            else:
+                raise DataError(f"not a torch file (starts with {start!r})")
+            return _Resolver(os.path.getsize(path)).resolve(content)
         except DataError as error:
-            raise DataError(f"{path}: {error}") from None
+            raise DataError(f"{path}: {one_line(error)}") from None
         # What a damaged pickle or archive raises is not limited to one family.
         except Exception as error:
-            raise DataError(f"{path}: damaged torch file ({error})") from error
-    raise DataError(f"{path}: not a torch file (starts with {start!r})")
+            raise DataError(f"{path}: damaged torch file ({one_line(error)})") from None
 
 
 def write(path: str | pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -138,7 +96,7 @@ def write(path: str | pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
         ValueError: torch has no such type.
     """
     path = pathlib.Path(path)
-    names = {np.dtype(v): k for k, v in _STORAGE_DTYPES.items() if v != _BFLOAT16}
+    names = {np.dtype(v): k for k, v in STORAGE_DTYPES.items() if v != BFLOAT16}
     body = [b"\x80\x02}("]
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         root = path.stem or "archive"
@@ -158,77 +116,37 @@ def write(path: str | pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
 # Reading -----------------------------------------------------------------------------
 
 
-class _Unpickler(pickle.Unpickler):
-    """Unpickler that resolves names to nothing but what this module defines."""
+def _read_zip(path: pathlib.Path) -> Any:
+    budget = _FACTOR * os.path.getsize(path) + _MAX_PICKLE
 
-    def __init__(self, file: BinaryIO, storages: dict[str, _Storage]):
-        super().__init__(file, encoding="utf-8")
-        self._storages = storages
+    def read(name: str) -> bytes:
+        nonlocal budget
+        content = read_member(archive, name, max_bytes=budget)
+        budget -= len(content)
+        return content
 
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) in _BUILDERS:
-            return _BUILDERS[module, name]
-        if module in ("torch", "torch.storage") and name in _STORAGE_DTYPES:
-            return _STORAGE_DTYPES[name]
-        return type(name, (Opaque,), {})
-
-    def persistent_load(self, pid: Any) -> _Storage:
-        if not isinstance(pid, tuple) or len(pid) < 5 or pid[0] != "storage":
-            raise DataError(f"unknown persistent object {pid!r}")
-        _, dtype, key, _, size, *view = pid
-        if view and view[0] is not None:
-            raise DataError("views of storages (before torch 0.4) are not supported")
-        if dtype != _BFLOAT16 and dtype not in _STORAGE_DTYPES.values():
-            raise DataError(f"tensors of {dtype} are not supported")
-        return self._storages.setdefault(key, _Storage(dtype, size))
-
-
-def _rebuild_tensor(
-    storage: _Storage, offset: int, shape: tuple, strides: tuple, *rest: Any
-) -> _Tensor:
-    del rest  # requires_grad, hooks, metadata
-    return _Tensor(storage, offset, tuple(shape), tuple(strides))
-
-
-def _rebuild_parameter(data: _Tensor, *rest: Any) -> _Tensor:
-    del rest
-    return data
-
-
-_BUILDERS = {
-    ("torch._utils", "_rebuild_tensor"): _rebuild_tensor,
-    ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
-    ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
-    ("torch._utils", "_rebuild_parameter_with_state"): _rebuild_parameter,
-    ("torch", "Size"): tuple,
-    ("collections", "OrderedDict"): _Dict,
-    ("collections", "defaultdict"): lambda *args: _Dict(),
-}
-
-
-def _read_zip(file: BinaryIO) -> Any:
-    with zipfile.ZipFile(file) as archive:
+    with open_zip(path, "a torch file") as archive:
         names = set(archive.namelist())
         pickles = [n for n in names if n.endswith("/data.pkl") and n.count("/") == 1]
         if len(pickles) != 1:
             raise DataError("not a torch file (a zip archive without data.pkl)")
         root = pickles[0].removesuffix("data.pkl")
         order = "<"
-        if f"{root}byteorder" in names and archive.read(f"{root}byteorder") == b"big":
+        if f"{root}byteorder" in names and read(f"{root}byteorder") == b"big":
             order = ">"
-        storages: dict[str, _Storage] = {}
-        content = _Unpickler(io.BytesIO(archive.read(pickles[0])), storages).load()
+        storages: dict[str, Storage] = {}
+        content = Unpickler(io.BytesIO(read(pickles[0])), storages).load()
         for key, storage in storages.items():
-            data = archive.read(f"{root}data/{key}")
+            data = read(f"{root}data/{key}")
             storage.values = _decode(data, storage, order, key)
     return content
 
 
-def _read_legacy(file: BinaryIO) -> Any:
-    storages: dict[str, _Storage] = {}
+def _read_legacy(file: _File) -> Any:
+    storages: dict[str, Storage] = {}
 
     def load() -> Any:
-        return _Unpickler(file, storages).load()
+        return Unpickler(file, storages).load()
 
     if load() != _LEGACY_MAGIC:
         raise DataError("not a torch file (a pickle without torch's magic number)")
@@ -248,12 +166,12 @@ def _read_legacy(file: BinaryIO) -> Any:
     return content
 
 
-def _raw_dtype(storage: _Storage, order: str) -> np.dtype:
-    raw = np.uint16 if storage.dtype == _BFLOAT16 else storage.dtype
+def _raw_dtype(storage: Storage, order: str) -> np.dtype:
+    raw = np.uint16 if storage.dtype == BFLOAT16 else storage.dtype
     return np.dtype(raw).newbyteorder(order)
 
 
-def _decode(data: bytes, storage: _Storage, order: str, key: str) -> np.ndarray:
+def _decode(data: bytes, storage: Storage, order: str, key: str) -> np.ndarray:
     dtype = _raw_dtype(storage, order)
     if len(data) < storage.size * dtype.itemsize:
         raise DataError(
@@ -261,27 +179,50 @@ def _decode(data: bytes, storage: _Storage, order: str, key: str) -> np.ndarray:
             f"{storage.size * dtype.itemsize}"
         )
     values = np.frombuffer(data, dtype, storage.size)
-    if storage.dtype == _BFLOAT16:
+    if storage.dtype == BFLOAT16:
         # The upper half of a float32.
         return (values.astype(np.uint32) << 16).view(np.float32)
     return values.astype(dtype.newbyteorder("="), copy=False)
 
 
-def _resolve(value: Any) -> Any:
-    """Replaces tensors in nested containers by arrays."""
-    if isinstance(value, _Tensor):
-        return _view(value)
-    if isinstance(value, Mapping):
-        return {key: _resolve(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)([_resolve(item) for item in value])
-    return value
+class _Resolver:
+    """Replaces tensors in nested containers by arrays, within limits.
+
+    A pickle names the same container or storage many times at no cost; here each time
+    costs.
+    """
+
+    def __init__(self, file_size: int) -> None:
+        self._bytes = _FACTOR * file_size
+        self._values = _MAX_VALUES
+
+    def resolve(self, value: Any, depth: int = 0) -> Any:
+        """The value without tensors of torch."""
+        self._values -= 1
+        if depth > _MAX_DEPTH or self._values < 0:
+            raise DataError(
+                f"containers nested more than {_MAX_DEPTH} deep, or more than "
+                f"{_MAX_VALUES} values"
+            )
+        if isinstance(value, Tensor):
+            array = _view(value)
+            self._bytes -= array.nbytes
+            if self._bytes < 0:
+                raise DataError("its tensors have far more bytes than the file")
+            return array
+        if isinstance(value, Mapping):
+            return {k: self.resolve(item, depth + 1) for k, item in value.items()}
+        if isinstance(value, list | tuple):
+            return type(value)([self.resolve(item, depth + 1) for item in value])
+        return value
 
 
-def _view(tensor: _Tensor) -> np.ndarray:
+def _view(tensor: Tensor) -> np.ndarray:
     values, shape = tensor.storage.values, tensor.shape
     if values is None:
         raise DataError("a tensor has no values in the file")
+    if math.prod(shape) > values.size:
+        raise DataError(f"a tensor of shape {shape} of a storage of {values.size}")
     if math.prod(shape) == 0:
         return np.zeros(shape, values.dtype)
     last = tensor.offset + sum(

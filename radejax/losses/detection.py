@@ -1,14 +1,16 @@
-"""The training loss of both systems: focal + Gaussian Wasserstein + smooth L1."""
+"""The training loss of both systems: focal, Gaussian Wasserstein and smooth L1."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Literal, NamedTuple
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import boxes_at, find_peaks, suppress
 from radejax.detection.matching import match_boxes
@@ -16,10 +18,25 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import Sigma, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
-_LOSSES = ("focal", "gwd", "smooth_l1")
 Matching = Literal["center", "nms"]
 Pairs = tuple[jax.Array, jax.Array, jax.Array]
 """Predictions and their objects, `[B, N, 8]` each, and where they count, `[B, N]`."""
+
+
+BoxLoss = Callable[[jax.Array, jax.Array], jax.Array]
+BOX_LOSSES: dict[str, BoxLoss] = {
+    "smooth_l1": lambda predicted, wanted: jnp.mean(smooth_l1(predicted - wanted), -1)
+}
+"""Losses of predicted boxes and their objects, `[B, N, 8]` each, by name: `[B, N]`. The
+Gaussian Wasserstein distance, which has options, and the focal loss come on top."""
+
+Weights = Mapping[str, float | jax.Array]
+_WEIGHTS: Weights = MappingProxyType({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0})
+
+
+def loss_names() -> tuple[str, ...]:
+    """Parts that the loss may have: what `weights` may name."""
+    return ("focal", "gwd", *BOX_LOSSES)
 
 
 class AfterNms(NamedTuple):
@@ -53,17 +70,16 @@ def detection_loss(
     gwd_tau: float = 1.65,
     normalize_yaw: bool = False,
     matching: Matching = "center",
-    weights: Sequence[float] | jax.Array = (2.0, 1.0, 1.0),
+    weights: Weights = _WEIGHTS,
     normalize: bool = True,
     z0_m: float | jax.Array = 0.0,
     is_frame_valid: jax.Array | None = None,
     nms: AfterNms = AfterNms(),  # noqa: B008, immutable
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Weighted sum of the three losses over a batch, and its parts; in float32.
+    """Weighted sum of the losses that `weights` names, and its parts; in float32.
 
-    The regression losses are means over the matched boxes of a frame, then over all
-    frames; frames without any count as 0. All run over the whole batch, so that one
-    sharded over devices gives the same result.
+    Losses of boxes are means over the matched ones of a frame (0 without any), then over
+    all frames of the batch, sharded or not.
 
     Args:
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
@@ -71,13 +87,12 @@ def detection_loss(
         grid: The grid of the maps (padded where they are).
         sigma: Target shape, see `gaussian_heatmap`.
         sigma_cells: Standard deviation of targets in bins, for "fixed".
-        gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
-        gwd_tau: See `gwd_loss`.
+        gwd_transform, gwd_tau: See `gwd_loss`; "sqrt" in the paper, "none" as released.
         normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released:
             raw). Smooth L1 always sees it raw, which teaches the network its length.
-        matching: "center": box parameters at each object's own bin (as released); "nms":
-            each box that survives NMS with the object it overlaps most (the paper).
-        weights: Of focal, GWD and smooth L1.
+        matching: "center": boxes at each object's own bin (as released); "nms": those
+            that survive NMS with the object that they overlap most (the paper).
+        weights: Of some of `loss_names()`; a part without one is not computed.
         normalize: Divide each part by its own value, held constant: gradients of the
             parts have the ratio `weights`, the total is constant, parts of 0 add nothing.
         z0_m: Sensor height, added to the regressed z.
@@ -85,51 +100,53 @@ def detection_loss(
         nms: Which predicted boxes have an object, for "nms".
 
     Returns:
-        Scalar total, and scalars by name: raw `focal`, `gwd`, `smooth_l1`, their
-        `weighted_sum`, `num_objects`, `num_positive` (bins), `num_matched` (boxes).
+        Scalar total, and scalars by name: the raw parts, their `weighted_sum`,
+        `num_objects`, `num_positive` (bins), `num_matched` (boxes).
 
     Raises:
-        ValueError: Unknown option, or shapes of maps, batch and grid disagree.
+        UserError: Unknown option or part; or shapes of maps, batch and grid disagree.
 
     References:
         RADE-Net, equation (17).
+
+    Examples:
+        >>> maps = DetectionMaps(jnp.zeros((1, 256, 107, 2)), jnp.ones((1, 256, 107, 8)))
+        >>> car = jnp.array([[[20.0, 0, 0, 4, 2, 1.5, 0, 1]]])
+        >>> batch = Batch(None, car, jnp.array([[0]]), jnp.array([[True]]), frame=None)
+        >>> loss = jax.jit(detection_loss, static_argnames="grid")
+        >>> float(loss(maps, batch, RadarGrid.kradar())[0])
+        4.0
     """
+    check_weights(weights)
     _check(maps, batch, grid, matching)
     boxes, is_valid = _objects(batch, is_frame_valid)
-    target = gaussian_heatmap(
-        boxes,
-        batch.classes,
-        is_valid,
-        grid,
-        num_classes=maps.heatmap_logits.shape[-1],
-        sigma=sigma,
-        sigma_cells=sigma_cells,
-    )
-    focal = focal_loss(maps.heatmap_logits, target, is_frame_valid=is_frame_valid)
+    draw = partial(gaussian_heatmap, num_classes=maps.heatmap_logits.shape[-1])
+    shape: Any = {"sigma": sigma, "sigma_cells": sigma_cells}
+    target = draw(boxes, batch.classes, is_valid, grid, **shape)
     pair = _pairs_at_centers if matching == "center" else partial(_after_nms, nms)
     predicted, wanted, is_matched = pair(maps, boxes, is_valid, grid, z0_m)
-    for_gwd = _with_unit_yaw(predicted) if normalize_yaw else predicted
-    gwd = gwd_loss(for_gwd, wanted, gwd_tau, gwd_transform)
-    l1 = jnp.mean(smooth_l1(predicted - wanted), axis=-1)
-    parts = {
-        "focal": focal,
-        "gwd": _mean_of_frames(gwd, is_matched, is_frame_valid),
-        "smooth_l1": _mean_of_frames(l1, is_matched, is_frame_valid),
-    }
+    losses = BOX_LOSSES | {"gwd": partial(_gwd, gwd_tau, gwd_transform, normalize_yaw)}
+    parts = {}
+    for name in weights:
+        if name == "focal":
+            logits = maps.heatmap_logits
+            parts[name] = focal_loss(logits, target, is_frame_valid=is_frame_valid)
+            continue
+        values = losses[name](predicted, wanted)
+        parts[name] = _mean_of_frames(values, is_matched, is_frame_valid)
     total = _weighted_sum(parts, weights, normalize)
     parts["weighted_sum"] = _weighted_sum(parts, weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
-    for name, where in counted.items():
-        parts[f"num_{name}"] = jnp.sum(where, dtype=jnp.int32)
+    parts |= {f"num_{k}": jnp.sum(of, dtype=jnp.int32) for k, of in counted.items()}
     return total, parts
 
 
 def whole_batch_loss(
     parts: dict[str, jax.Array],
     num_bins: int | jax.Array,
-    weights: Sequence[float] = (2.0, 1.0, 1.0),
+    weights: Weights = _WEIGHTS,
     normalize: bool = True,
-) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+) -> tuple[dict[str, jax.Array], jax.Array, dict[str, jax.Array]]:
     """The loss of a batch from those of its equal parts, and how parts sum to it.
 
     A part divides by its own positive bins and loss values, the batch by those of all.
@@ -141,25 +158,30 @@ def whole_batch_loss(
         normalize: Likewise.
 
     Returns:
-        `[P, 3]` weights: the mean over the parts of their losses, so weighted and not
-        normalised, has the gradient of the batch. Then what `detection_loss` gives for
+        `[P]` weights by name: the mean over the parts of their losses, so weighted and
+        not normalised, has the gradient of the batch. Then what `detection_loss` gives for
         the batch: total and its parts.
+
+    Examples:
+        >>> parts = dict.fromkeys(("focal", "gwd", "smooth_l1"), jnp.array([1.0, 3.0]))
+        >>> parts["num_positive"] = jnp.array([1, 1])
+        >>> _, total, whole = whole_batch_loss(parts, 100)
+        >>> float(total), float(whole["focal"])
+        (4.0, 2.0)
     """
     positive = parts["num_positive"].astype(jnp.float32)
     of_part = jnp.where(positive > 0, positive, num_bins)
     mean = jnp.mean(positive)
     share = of_part / jnp.where(mean > 0, mean, num_bins)
-    shares = jnp.stack([share, jnp.ones_like(share), jnp.ones_like(share)], axis=-1)
-    losses = jnp.stack([parts[name] for name in _LOSSES], axis=-1)
-    values = jnp.mean(losses * shares, axis=0)
-    whole = dict(zip(_LOSSES, values, strict=True))
-    scale = jnp.asarray(weights, jnp.float32)
-    if normalize:
-        scale = scale / jnp.where(values > 0, values, 1.0)
+    shares = {k: share if k == "focal" else jnp.ones_like(share) for k in weights}
+    whole = {name: jnp.mean(parts[name] * shares[name]) for name in weights}
     total = _weighted_sum(whole, weights, normalize)
+    for name, weight in weights.items():
+        value = whole[name] if normalize else jnp.float32(0.0)
+        shares[name] *= weight / jnp.where(value > 0, value, 1.0)
     whole["weighted_sum"] = _weighted_sum(whole, weights, False)
     counts = {k: jnp.sum(v, axis=0) for k, v in parts.items() if k.startswith("num_")}
-    return shares * scale[None], total, whole | counts
+    return shares, total, whole | counts
 
 
 def _objects(
@@ -179,6 +201,10 @@ def smooth_l1(difference: jax.Array) -> jax.Array:
 
     `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
     loses the digits of small differences.
+
+    Examples:
+        >>> smooth_l1(jnp.array([0.5, 3.0])).tolist()
+        [0.125, 2.5]
     """
     size = jnp.abs(difference)
     return jnp.where(size < 1.0, 0.5 * size * size, size - 0.5)
@@ -238,6 +264,17 @@ def _neutral(predicted: jax.Array, wanted: jax.Array, is_matched: jax.Array) -> 
     return jnp.where(row, predicted, 1.0), jnp.where(row, wanted, 1.0), is_matched
 
 
+def _gwd(
+    tau: float,
+    transform: Transform,
+    normalize_yaw: bool,
+    predicted: jax.Array,
+    wanted: jax.Array,
+) -> jax.Array:
+    predicted = _with_unit_yaw(predicted) if normalize_yaw else predicted
+    return gwd_loss(predicted, wanted, tau, transform)
+
+
 def _with_unit_yaw(boxes: jax.Array) -> jax.Array:
     """Yaw vectors scaled to length 1; (0, 0) stays, with a finite gradient."""
     yaw = boxes[..., 6:8]
@@ -260,16 +297,26 @@ def _mean_of_frames(
 
 
 def _weighted_sum(
-    parts: dict[str, jax.Array], weights: Sequence[float] | jax.Array, normalize: bool
+    parts: Mapping[str, jax.Array], weights: Weights, normalize: bool
 ) -> jax.Array:
     total = jnp.zeros((), jnp.float32)
-    for weight, name in zip(weights, _LOSSES, strict=True):
+    for name, weight in weights.items():
         part = parts[name]
         if normalize:
             constant = jax.lax.stop_gradient(part)
             part = part / jnp.where(constant > 0, constant, 1.0)
         total = total + weight * part
     return total
+
+
+def check_weights(weights: Weights) -> None:
+    """`UserError` for weights of no part, or of one that there is not."""
+    unknown = [name for name in weights if name not in loss_names()]
+    if unknown or not weights:
+        raise UserError(
+            f"config.loss.weights has {unknown[0] if unknown else 'no part'!r}, expected "
+            f"some of {', '.join(loss_names())}"
+        )
 
 
 def _check(maps: DetectionMaps, batch: Batch, grid: RadarGrid, matching: str) -> None:

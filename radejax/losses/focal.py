@@ -118,6 +118,11 @@ def focal_loss(
 
     References:
         Law and Deng, CornerNet, arXiv:1808.01244, equation (1).
+
+    Examples:
+        >>> target = jnp.array([1.0, 0.0]).reshape(1, 1, 2, 1)
+        >>> round(float(focal_loss(jnp.zeros((1, 1, 2, 1)), target)), 4)  # log(2) / 2
+        0.3466
     """
     chex.assert_equal_shape([logits, target])
     if is_frame_valid is not None:
@@ -142,6 +147,11 @@ def focal_loss_per_bin(
 
     log p and log(1 - p) are taken from the logits: log(1 - sigmoid(x)) rounds to 0 or
     -inf in float32 where log_sigmoid(-x) is accurate.
+
+    Examples:
+        >>> loss = focal_loss_per_bin(jnp.zeros(3), jnp.array([1.0, 0.0, 0.5]))
+        >>> [round(value, 4) for value in loss.tolist()]
+        [0.1733, 0.1733, 0.0108]
     """
     logits = logits.astype(jnp.float32)
     # Unlike jnp.clip, full gradient on the bounds themselves, as the released clamp.

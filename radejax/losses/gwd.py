@@ -98,6 +98,12 @@ def gwd_loss(
 
     References:
         RADE-Net, section on the Gaussian Wasserstein distance loss.
+
+    Examples:
+        >>> car = jnp.array([10.0, 2.0, 0.0, 4.0, 2.0, 1.5, 0.0, 1.0])
+        >>> loss = jax.jit(gwd_loss)
+        >>> round(float(loss(car, car)), 4), round(float(loss(car, car.at[0].add(3))), 4)
+        (0.3939, 0.7849)
     """
     distance = gwd(a, b, root=root)
     if transform == "sqrt":
@@ -115,7 +121,12 @@ def gwd_loss(
 
 
 def gaussian_root(boxes: jax.Array) -> jax.Array:
-    """Square root S of the covariance of boxes: `[..., 8]` -> `[..., 2, 2]`."""
+    """Square root S of the covariance of boxes: `[..., 8]` -> `[..., 2, 2]`.
+
+    Examples:
+        >>> gaussian_root(jnp.array([0.0, 0, 0, 4, 2, 1.5, 0, 1])).tolist()
+        [[2.0, 0.0], [0.0, 1.0]]
+    """
     xx, xy, yy = _root_entries(boxes)
     return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
 
@@ -220,6 +231,10 @@ def trace_of_root_2x2(xx: jax.Array, xy: jax.Array, yy: jax.Array) -> jax.Array:
 
     Returns:
         `[...]` sum of the roots of the eigenvalues.
+
+    Examples:
+        >>> round(float(trace_of_root_2x2(*jnp.array([4.0, 0.0, 9.0]))), 4)
+        5.0
     """
     roots, _, _ = _roots_and_axes(xx, xy, yy)
     return roots[0] + roots[1]

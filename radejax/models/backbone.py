@@ -125,3 +125,7 @@ class Backbone(nn.Module):
                 name="stem",
             )(x)
         return Conv(width, dtype=self.dtype, name="start")(x)
+
+
+BACKBONES: dict[str, type[Backbone]] = {"unet": Backbone}
+"""What `config.model.backbone` may name."""

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from radejax.models.convolution import product
 from radejax.models.layers import Conv, Dense, uniform_fan_in
 
 # Which of the four taps even and odd outputs see, ordered along the input.
@@ -53,7 +54,7 @@ class TransposedConv(nn.Module):
             ],
             -1,
         )
-        y = x @ kernel.astype(self.dtype)
+        y = product(x, kernel.astype(self.dtype))
         y = y.reshape(b, height + 1, width + 1, 2, 2, self.features)
         rows = [
             jnp.stack(

@@ -46,9 +46,19 @@ def conv2d(x: jax.Array, kernel: jax.Array, dilation: int = 1) -> jax.Array:
     return _conv2d(x, kernel, dilation)
 
 
+def product(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """`[..., C]` times `[C, C']` as one product of two matrices.
+
+    The same as `x @ kernel`, whose gradients XLA computes 1.5 to 4 times slower on a CPU
+    where x has more axes.
+    """
+    flat = x.reshape(-1, x.shape[-1]) @ kernel
+    return flat.reshape(*x.shape[:-1], kernel.shape[-1])
+
+
 def _conv2d(x: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:
     if kernel.shape[:2] == (1, 1):
-        return x @ kernel[0, 0]
+        return product(x, kernel[0, 0])
     padding = dilation * (kernel.shape[0] // 2)
     return jax.lax.conv_general_dilated(
         x,

@@ -179,7 +179,7 @@ class DeformableAttention(nn.Module):
             query_weights,
             offsets.bias.reshape(heads, points, 2),
             logits.bias.reshape(heads, points),
-            chunk_size=self.chunk_size or _default_chunk(),
+            chunk_size=self.chunk_size,
         )  # [B, N, heads, D]
         # The projection is linear: once per bin, its bias as often as the mean counts.
         out = self.output_proj.product(out.reshape(b, n, -1))
@@ -199,8 +199,3 @@ class DeformableAttention(nn.Module):
             grid, (self.num_heads, self.num_levels, self.num_points, 2)
         )
         return jnp.asarray(grid.reshape(shape), dtype)
-
-
-def _default_chunk() -> int:
-    # A CPU wants the sampled rows in cache, an accelerator few, large steps.
-    return 448 if jax.default_backend() == "cpu" else 8192

@@ -12,7 +12,7 @@ pixel is at half a pixel, and samples outside the map read zero.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import chex
@@ -21,6 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 Sizes = Sequence[tuple[int, int]]
+
+_CHUNK_SIZES = {"cpu": 448, "default": 8192}
+"""Bins at a time: a CPU wants the sampled rows in cache, an accelerator few large steps."""
 
 
 def deformable_attention(
@@ -56,7 +59,6 @@ def deformable_attention(
             f"maps of sizes {tuple(sizes)} have {starts[-1]} pixels, value has "
             f"{value.shape[1]}"
         )
-    chunk_size = min(chunk_size, queries)
 
     def flat(x: jax.Array) -> jax.Array:  # [B heads, queries or pixels, ...]
         x = jnp.moveaxis(x, 2, 1)
@@ -113,7 +115,7 @@ def lifted_attention(
         query_weights: `[B or 1, N, E]` weights of the mean.
         offset_bias: `[heads, P, 2]`.
         logit_bias: `[heads, P]`.
-        chunk_size: Bins at a time.
+        chunk_size: Bins at a time; 0 chooses by the platform that it is compiled for.
 
     Returns:
         `[B, N, heads, D]`.
@@ -129,7 +131,6 @@ def lifted_attention(
     chex.assert_shape(query_weights, (None, *scale.shape[1:]))
     chex.assert_shape(offset_bias, (heads, points, 2))
     chex.assert_shape(logit_bias, (heads, points))
-    chunk_size = min(chunk_size, bins)
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
     by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
 
@@ -170,9 +171,28 @@ def lifted_attention(
 # place; transposing the loop would allocate and add a whole map per chunk.
 
 
+# The chunk is chosen in there too, where nothing is differentiated: a program lowered for
+# another platform than the tracing machine's gets that platform's.
+
+
+def _by_chunk(function: Callable[..., Any], chunk_size: int, *arrays: Any) -> Any:
+    """`function(chunk_size, *arrays)`; a chunk size of 0 is the platform's."""
+    if chunk_size:
+        return function(chunk_size, *arrays)
+    by_platform = {
+        platform: functools.partial(function, size)
+        for platform, size in _CHUNK_SIZES.items()
+    }
+    return jax.lax.platform_dependent(*arrays, **by_platform)
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _lifted_head(chunk_size: int, value: jax.Array, *arrays: jax.Array) -> jax.Array:
     """`[N, D]` of one head: value `[H, W, D]`, the rest as in `lifted_attention`."""
+    return _by_chunk(_head_forward, chunk_size, value, *arrays)
+
+
+def _head_forward(chunk_size: int, value: jax.Array, *arrays: jax.Array) -> jax.Array:
     *per_bin, offset_bias, logit_bias = arrays
     pixels = value.reshape(-1, value.shape[-1])
 
@@ -189,6 +209,10 @@ def _lifted_head_forward(chunk_size: int, *arrays: jax.Array) -> tuple[jax.Array
 
 
 def _lifted_head_backward(chunk_size: int, saved: Any, grad: jax.Array) -> tuple:
+    return _by_chunk(_head_backward, chunk_size, grad, *saved)
+
+
+def _head_backward(chunk_size: int, grad: jax.Array, *saved: jax.Array) -> tuple:
     value, *per_bin, offset_bias, logit_bias = saved
     size, bins = value.shape[:2], per_bin[0].shape[0]
     pixels = value.reshape(-1, value.shape[-1])
@@ -317,6 +341,7 @@ def _pad_axis(x: jax.Array, axis: int, multiple: int) -> jax.Array:
 
 
 def _to_chunks(arrays: Sequence[jax.Array], size: int) -> list[jax.Array]:
-    """`[N, ...]` -> `[chunks, size, ...]`, padded with zeros."""
+    """`[N, ...]` -> `[chunks, size, ...]`, padded with zeros; one chunk if N is less."""
+    size = min(size, len(arrays[0]))
     padded = (_pad_axis(x, 0, size) for x in arrays)
     return [x.reshape(-1, size, *x.shape[1:]) for x in padded]

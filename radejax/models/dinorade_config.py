@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal, get_type_hints
 
 from radejax.core.errors import UserError
 from radejax.models import radenet
@@ -40,13 +40,20 @@ AXES_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
 FIELDS = (*radenet.FIELDS, "image", "fusion", "axes")
 """Fields of a model config beside `name`."""
 
-_CHOICES = {
-    "image.kind": ("vit", "resnet50"),
-    "image.attention": ("auto", "blocked", "xla", "cudnn"),
-    "fusion.weighting": ("mlp", "cnn", "off"),
-    "fusion.gate": ("channel", "bin"),
-    "fusion.invalid": ("drop", "official"),
+_VIT, _FUSION, _AXES = map(get_type_hints, (ViT, Fusion, LiftingAxes))
+_IMAGE = {
+    "kind": Literal["vit", "resnet50"],
+    "size": tuple[int, int],
+    "freeze": bool,
+    "standardize": bool,
+    "resnet_width": int,
 }
+HINTS = radenet.HINTS | {
+    "image": {name: (_VIT | _IMAGE)[name] for name in IMAGE_FIELDS},
+    "fusion": {name: _FUSION[name] for name in FUSION_FIELDS},
+    "axes": {name: _AXES[name] for name in AXES_FIELDS},
+}
+"""What the fields may be."""
 
 
 def from_config(config: Mapping[str, Any]) -> DinoRade:
@@ -59,19 +66,14 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
     Raises:
         UserError: A key is missing or unknown, or a value is not possible.
     """
-    fields = {key: config[key] for key in config if key != "name"}
+    # Models of before the field have that backbone.
+    fields = {"backbone": "unet"} | {k: config[k] for k in config if k != "name"}
     radenet.check_keys(fields, FIELDS, "model")
     sections = {"image": IMAGE_FIELDS, "fusion": FUSION_FIELDS, "axes": AXES_FIELDS}
-    image, fusion, axes = (
-        dict(_section(fields, name, keys)) for name, keys in sections.items()
-    )
-    for key, choices in _CHOICES.items():
-        section, name = key.split(".")
-        if fields[section][name] not in choices:
-            raise UserError(
-                f"config.model.{key} is {fields[section][name]!r}, expected one of "
-                f"{choices}"
-            )
+    for name, keys in sections.items():
+        fields[name] = dict(_section(fields, name, keys))
+    fields = radenet.check_values(fields, HINTS)
+    image, fusion, axes = (fields[name] for name in sections)
     if image["kind"] == "resnet50" and not image["freeze"]:
         raise UserError(
             "config.model.image.freeze is False, but the ResNet's first stages have "
@@ -83,10 +85,10 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
         vit=_vit(image) if image["kind"] == "vit" else None,
         fusion=fusion,
         axes=LiftingAxes(
-            **{k: tuple(float(v) for v in axes[k]) for k in AXES_FIELDS},
+            **{k: tuple(map(float, axes[k])) for k in AXES_FIELDS},
             num_elevation=fusion["num_elevation"],
         ),
-        image_size=tuple(image["size"]),
+        image_size=image["size"],
         freeze=image["freeze"],
         resnet_width=image["resnet_width"],
         standardize_image=image["standardize"],
@@ -113,6 +115,17 @@ def _vit(image: Mapping[str, Any]) -> ViT:
 
 
 def _check_sizes(model: DinoRade) -> None:
+    sizes = {f"fusion.{k}": v for k, v in model.fusion.items() if _FUSION[k] is int}
+    sizes |= {"image.resnet_width": model.resnet_width}
+    if model.vit is not None:
+        names = (name for name in IMAGE_FIELDS if _VIT.get(name) is int)
+        sizes |= {f"image.{name}": getattr(model.vit, name) for name in names}
+    for name, size in sizes.items():
+        least = int(name not in ("fusion.chunk_size", "image.num_registers"))
+        if not least <= size <= 1 << 16:
+            raise UserError(
+                f"config.model.{name} is {size}, expected {least} to {1 << 16}"
+            )
     stride = STRIDE if model.vit is None else model.vit.patch_size
     if any(n < stride or n % stride for n in model.image_size):
         raise UserError(

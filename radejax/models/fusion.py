@@ -23,7 +23,7 @@ from radejax.models.lifting import (
     WeightingNetwork,
     query_weights,
 )
-from radejax.models.neck import Neck
+from radejax.models.neck import DilatedNeck
 
 GateKind = Literal["channel", "bin"]
 
@@ -125,8 +125,8 @@ class Fusion(nn.Module):
         self.sow("intermediates", "camera_share", share.mean(-1))
         return dropout(share * seen + (1 - share) * radar)
 
-    def _neck(self, name: str) -> Neck:
-        return Neck("dilated", self.num_groups, self.dtype, self.remat, name=name)
+    def _neck(self, name: str) -> DilatedNeck:
+        return DilatedNeck(self.num_groups, self.dtype, self.remat, name=name)
 
     def _camera_share(self, radar: jax.Array, seen: jax.Array) -> jax.Array:
         """Weight of the camera, `[B, R, A, C or 1]`."""

@@ -9,7 +9,8 @@ References:
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -18,20 +19,14 @@ import jax.numpy as jnp
 from radejax.core.structures import DetectionMaps
 from radejax.models.layers import Conv, ConvGNSiLU
 
-HeadKind = Literal["expanded", "default"]
-
 NUM_BOX_PARAMS = 8
 
 
 class Head(nn.Module):
-    """`ConvGNSiLU` blocks, then a 1x1 convolution in float32.
-
-    "expanded": three blocks of the input's width. "default": one block of half the
-    input's width and at most 64 channels.
+    """What every head has: `[B, R, A, C]` -> `[B, R, A, features]`, float32.
 
     Attributes:
         features: Output channels.
-        kind: "expanded" or "default".
         num_groups: Groups of the normalisations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
@@ -39,16 +34,13 @@ class Head(nn.Module):
     """
 
     features: int
-    kind: HeadKind = "expanded"
     num_groups: int = 32
     dtype: Any = jnp.float32
     remat: bool = False
     initial_bias: float = 0.0
 
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        width = x.shape[-1]
-        widths = (width,) * 3 if self.kind == "expanded" else (min(64, width // 2),)
+    def convolve(self, x: jax.Array, widths: Sequence[int]) -> jax.Array:
+        """`ConvGNSiLU` of these widths, then a 1x1 convolution in float32."""
         block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
         for i, width in enumerate(widths, 1):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"conv_{i}")(x)
@@ -56,12 +48,32 @@ class Head(nn.Module):
         return out(x)
 
 
+class ExpandedHead(Head):
+    """Three blocks of the input's width."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return self.convolve(x, (x.shape[-1],) * 3)
+
+
+class DefaultHead(Head):
+    """One block of half the input's width and at most 64 channels."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return self.convolve(x, (min(64, x.shape[-1] // 2),))
+
+
+HEADS: dict[str, type[Head]] = {"expanded": ExpandedHead, "default": DefaultHead}
+"""What `config.model.heads` may name."""
+
+
 class Heads(nn.Module):
     """Features `[B, R, A, C]` -> `DetectionMaps`, float32.
 
     Attributes:
         num_classes: Channels of the heatmap.
-        kind: "expanded" or "default", see `Head`.
+        kind: Of `HEADS`.
         num_groups: Groups of the normalisations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
@@ -70,7 +82,7 @@ class Heads(nn.Module):
     """
 
     num_classes: int
-    kind: HeadKind = "expanded"
+    kind: str = "expanded"
     num_groups: int = 32
     dtype: Any = jnp.float32
     remat: bool = False
@@ -79,9 +91,8 @@ class Heads(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> DetectionMaps:
         def head(features: int, bias: float, name: str) -> Head:
-            return Head(
+            return HEADS[self.kind](
                 features,
-                self.kind,
                 self.num_groups,
                 self.dtype,
                 self.remat,

@@ -15,7 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from radejax.models.convolution import conv2d
+from radejax.models.convolution import conv2d, product
 
 Initializer = Callable[..., jax.Array]
 
@@ -82,7 +82,7 @@ class Dense(nn.Module):
         init = uniform_fan_in(x.shape[-1])
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         bias = self.param("bias", init, (self.features,)).astype(self.dtype)
-        y = x.astype(self.dtype) @ kernel.astype(self.dtype)
+        y = product(x.astype(self.dtype), kernel.astype(self.dtype))
         return y + jnp.expand_dims(bias, range(y.ndim - 1))
 
 
@@ -107,10 +107,11 @@ class Upsample(nn.Module):
         init = uniform_fan_in(4 * self.features)
         kernel = self.param("kernel", init, (2, 2, c, self.features))
         bias = self.param("bias", init, (self.features,)).astype(self.dtype)
-        y = jnp.einsum(
-            "brac,klcd->brkald", x.astype(self.dtype), kernel.astype(self.dtype)
-        )  # [B, R, 2, A, 2, C']
-        return y.reshape(b, 2 * r, 2 * a, -1) + jnp.expand_dims(bias, (0, 1, 2))
+        # Channels stay innermost: einsum's own order would turn the whole map around.
+        matrix = kernel.astype(self.dtype).transpose(2, 0, 1, 3).reshape(c, -1)
+        y = product(x.astype(self.dtype), matrix).reshape(b, r, a, 2, -1)
+        y = y.swapaxes(2, 3).reshape(b, 2 * r, 2 * a, -1)
+        return y + jnp.expand_dims(bias, (0, 1, 2))
 
 
 def max_pool(x: jax.Array) -> jax.Array:

@@ -6,15 +6,13 @@ References:
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from radejax.models.layers import Conv, ConvGNSiLU, GroupNorm
-
-NeckKind = Literal["dilated", "plain"]
 
 
 class DilatedResidual(nn.Module):
@@ -46,31 +44,40 @@ class DilatedResidual(nn.Module):
 
 
 class Neck(nn.Module):
-    """Three blocks that keep shape and width, `[B, R, A, C]` -> `[B, R, A, C]`.
+    """What every neck has; it keeps shape and width, `[B, R, A, C]` -> `[B, R, A, C]`.
 
     Attributes:
-        kind: "dilated" for `DilatedResidual` of dilation 1, 2, 3; "plain" for
-            three `ConvGNSiLU`.
         num_groups: Groups of the normalisations.
         dtype: Dtype of the computation and the output.
         remat: Recompute blocks in the backward pass instead of storing them.
     """
 
-    kind: NeckKind = "dilated"
     num_groups: int = 32
     dtype: Any = jnp.float32
     remat: bool = False
 
+
+class DilatedNeck(Neck):
+    """Three `DilatedResidual`, of dilation 1, 2 and 3."""
+
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        wrap = nn.remat if self.remat else lambda module: module
-        residual, plain = wrap(DilatedResidual), wrap(ConvGNSiLU)
-        features = x.shape[-1]
+        block = nn.remat(DilatedResidual) if self.remat else DilatedResidual
         for i in (1, 2, 3):
-            name = f"block_{i}"
-            if self.kind == "dilated":
-                block = residual(i, self.num_groups, dtype=self.dtype, name=name)
-            else:
-                block = plain(features, self.num_groups, dtype=self.dtype, name=name)
-            x = block(x)
+            x = block(i, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
         return x
+
+
+class PlainNeck(Neck):
+    """Three `ConvGNSiLU`."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        block, width = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU, x.shape[-1]
+        for i in (1, 2, 3):
+            x = block(width, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
+        return x
+
+
+NECKS: dict[str, type[Neck]] = {"dilated": DilatedNeck, "plain": PlainNeck}
+"""What `config.model.neck` may name."""

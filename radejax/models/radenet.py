@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Literal, get_type_hints
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from radejax.core.errors import UserError
+from radejax.core import schema
+from radejax.core.errors import DataError, UserError
 from radejax.core.structures import DetectionMaps
-from radejax.models.backbone import Backbone
+from radejax.models.backbone import BACKBONES
 from radejax.models.cbam import CBAMKind
-from radejax.models.heads import HeadKind, Heads
-from radejax.models.neck import Neck, NeckKind
+from radejax.models.heads import HEADS, Heads
+from radejax.models.neck import NECKS
 
 DTYPES = ("float32", "bfloat16")
 
@@ -44,8 +45,7 @@ class RadeNet(nn.Module):
         num_groups: Groups of every normalisation; must divide every width.
         cbam: "official", "paper" or None; see `radejax.models.cbam.CBAM`.
         input_stem: Encode Doppler and elevation apart first.
-        neck: "dilated" or "plain".
-        heads: "expanded" or "default".
+        backbone, neck, heads: Of `BACKBONES`, `NECKS` and `HEADS`.
         pad_multiple: Multiple of 2 ** len(widths).
         crop_output: Cut the maps back to the projection's bins.
         dtype: "float32" or "bfloat16", of the computation; outputs are float32.
@@ -61,8 +61,9 @@ class RadeNet(nn.Module):
     num_groups: int = 32
     cbam: CBAMKind | None = "official"
     input_stem: bool = False
-    neck: NeckKind = "dilated"
-    heads: HeadKind = "expanded"
+    backbone: str = "unet"
+    neck: str = "dilated"
+    heads: str = "expanded"
     pad_multiple: int = 8
     crop_output: bool = False
     dtype: str = "float32"
@@ -90,6 +91,7 @@ class RadeNet(nn.Module):
 
 def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
     """What makes backbone, neck and heads, which DinoRADE has as well."""
+    check_choices(radar)
     stage = nn.remat if radar.remat == "full" else lambda module: module
     shared = {
         "num_groups": radar.num_groups,
@@ -97,7 +99,7 @@ def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
         "remat": radar.remat != "none",
     }
     backbone = functools.partial(
-        stage(Backbone),
+        stage(BACKBONES[radar.backbone]),
         doppler_bins=radar.doppler_bins,
         widths=radar.widths,
         decoder_width=radar.decoder_width,
@@ -105,7 +107,7 @@ def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
         input_stem=radar.input_stem,
         **shared,
     )
-    neck = functools.partial(stage(Neck), kind=radar.neck, **shared)
+    neck = functools.partial(stage(NECKS[radar.neck]), **shared)
     heads = functools.partial(
         stage(Heads),
         num_classes=radar.num_classes,
@@ -114,6 +116,15 @@ def radar_parts(radar: RadeNet) -> tuple[Callable[..., nn.Module], ...]:
         **shared,
     )
     return backbone, neck, heads
+
+
+def check_choices(radar: RadeNet) -> None:
+    """`UserError` for a choice by name that there is not; names those that there are."""
+    for field, choices in _CHOICES.items():
+        if (found := getattr(radar, field)) not in choices:
+            raise UserError(
+                f"config.model.{field} is {found!r}, expected one of {tuple(choices)}"
+            )
 
 
 def padded_input(projection: jax.Array, radar: RadeNet) -> jax.Array:
@@ -161,13 +172,22 @@ def own_fields(
 FIELDS = own_fields(RadeNet)
 """Fields of a model config beside `name`."""
 
-_CHOICES = {
-    "cbam": ("official", "paper", "off", None),
-    "neck": ("dilated", "plain"),
-    "heads": ("expanded", "default"),
+_CHOICES: dict[str, Collection[Any]] = {
+    "cbam": ("official", "paper", None),
+    "backbone": BACKBONES,
+    "neck": NECKS,
+    "heads": HEADS,
     "dtype": DTYPES,
-    "remat": (*REMAT, False, True),  # as configs of earlier versions say it
+    "remat": REMAT,
 }
+HINTS = {k: hint for k, hint in get_type_hints(RadeNet).items() if k in FIELDS} | {
+    "cbam": Literal["official", "paper", "off"] | None,
+    "dtype": Literal[DTYPES],
+    "remat": Literal[REMAT] | bool,  # True and False in earlier versions
+}
+"""What the fields may be."""
+
+_MOST = 1 << 16  # channels, groups, classes
 
 
 def from_config(config: Mapping[str, Any]) -> RadeNet:
@@ -179,19 +199,16 @@ def from_config(config: Mapping[str, Any]) -> RadeNet:
     Raises:
         UserError: A key is missing or unknown, or a value is not possible.
     """
-    fields = {key: config[key] for key in config if key != "name"}
+    # Models of before the field have that backbone.
+    fields = {"backbone": "unet"} | {k: config[k] for k in config if k != "name"}
     check_keys(fields, FIELDS, "model")
-    for key, choices in _CHOICES.items():
-        if fields[key] not in choices:
-            raise UserError(
-                f"config.model.{key} is {fields[key]!r}, expected one of {choices}"
-            )
-    fields["widths"] = tuple(fields["widths"])
+    fields = check_values(fields, HINTS)
     if fields["cbam"] == "off":
         fields["cbam"] = None
     if isinstance(fields["remat"], bool):
-        fields["remat"] = "blocks" if fields["remat"] else "none"
+        fields["remat"] = "blocks" if fields["remat"] else "none"  # of 0.1
     model = RadeNet(**fields)
+    check_choices(model)
     _check_sizes(model)
     return model
 
@@ -211,14 +228,28 @@ def check_keys(
         )
 
 
+def check_values(fields: Mapping[str, Any], hints: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of `config.model`; `UserError` for one that is of another type."""
+    try:
+        return schema.check(fields, dict(hints), "", "config.model")
+    except DataError as error:
+        raise UserError(str(error)) from None
+
+
 def _check_sizes(model: RadeNet) -> None:
+    names = ("num_classes", "doppler_bins", "elevation_bins", "num_groups")
+    for name in names:
+        if not 1 <= getattr(model, name) <= _MOST:
+            raise UserError(
+                f"config.model.{name} is {getattr(model, name)}, expected 1 to {_MOST}"
+            )
     if not 0.0 < model.heatmap_prior < 1.0:
         raise UserError(
             f"config.model.heatmap_prior is {model.heatmap_prior}, expected a "
             "probability between 0 and 1"
         )
     stride = 2 ** len(model.widths)
-    if model.pad_multiple < 1 or model.pad_multiple % stride:
+    if not 1 <= model.pad_multiple <= _MOST or model.pad_multiple % stride:
         raise UserError(
             f"config.model.pad_multiple is {model.pad_multiple}; {len(model.widths)} "
             f"levels need a multiple of {stride}"
@@ -230,8 +261,8 @@ def _check_sizes(model: RadeNet) -> None:
     if model.input_stem:
         widths["widths[0] / 2 (input stem)"] = model.widths[0] // 2
     for name, width in widths.items():
-        if width < 1 or width % model.num_groups:
+        if not 1 <= width <= _MOST or width % model.num_groups:
             raise UserError(
                 f"config.model: {name} = {width} is not a multiple of "
-                f"num_groups = {model.num_groups}"
+                f"num_groups = {model.num_groups} up to {_MOST}"
             )

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from ml_collections import ConfigDict
@@ -15,7 +15,7 @@ from radejax.core.errors import UserError
 from radejax.data.kradar.labels import AVAILABILITY_FLAGS, LABEL_CLASSES, VERSIONS
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.runs.validation import check_best_metric
+from radejax.losses.detection import loss_names
 from radejax.simulation.config import SimulationConfig
 
 
@@ -97,6 +97,15 @@ def _where(rule: Rule, text: str, fits: Callable[[Any], bool]) -> Rule:
     return Rule(f"{rule.expected}; {text}", lambda v: rule.holds(v) and fits(v))
 
 
+def _are_weights(value: Any) -> bool:
+    """By name; or of focal, GWD and smooth L1 in a row, as in earlier versions."""
+    if isinstance(value, Mapping):
+        is_known, value = set(value) <= set(loss_names()), tuple(value.values())
+    else:
+        is_known = _several(_NOT_NEGATIVE, 3).holds(value)
+    return is_known and all(map(_NOT_NEGATIVE.holds, value)) and any(value)
+
+
 _BOOL = Rule("True or False", _is_bool)
 _TEXT = Rule("text", lambda value: isinstance(value, str))
 _MAPPING = Rule("a mapping of fields", lambda value: isinstance(value, Mapping))
@@ -127,7 +136,8 @@ RULES: dict[str, Rule] = {
         lambda value: value in ((), []) or _several(_SEED, distinct=True).holds(value),
     ),
     "profile": _TEXT,
-    # The model: what its parts need of each other is told when it is built.
+    # The model: which parts there are, and what they need of each other, is told when
+    # it is built.
     "model.name": _one_of("radenet", "dinorade"),
     "model.num_classes": _COUNT,
     "model.doppler_bins": _COUNT,
@@ -137,8 +147,9 @@ RULES: dict[str, Rule] = {
     "model.num_groups": _COUNT,
     "model.cbam": _one_of("official", "paper", "off", None),
     "model.input_stem": _BOOL,
-    "model.neck": _one_of("dilated", "plain"),
-    "model.heads": _one_of("expanded", "default"),
+    "model.backbone": _TEXT,
+    "model.neck": _TEXT,
+    "model.heads": _TEXT,
     "model.pad_multiple": _COUNT,
     "model.crop_output": _BOOL,
     "model.dtype": _one_of("float32", "bfloat16"),
@@ -178,7 +189,10 @@ RULES: dict[str, Rule] = {
     "loss.gwd_tau": _POSITIVE,
     "loss.normalize_yaw": _BOOL,
     "loss.matching": _one_of("center", "nms"),
-    "loss.weights": _where(_several(_NOT_NEGATIVE, 3), "not all 0", any),
+    "loss.weights": Rule(
+        f"numbers of at least 0, not all 0, by names of {', '.join(loss_names())}",
+        lambda value: _are_weights(value),
+    ),
     "loss.normalize": _BOOL,
     "loss.z0_m": _number(),
     "decode.max_detections": _COUNT,
@@ -188,6 +202,7 @@ RULES: dict[str, Rule] = {
     "decode.per_class_nms": _BOOL,
     "decode.roi": _or_none(_several(_number(), 6)),
     "decode.raw_yaw": _one_of("nms", "always", "never"),
+    "decode.clip_sizes": _BOOL,
     "train.batch_size": _COUNT,
     "train.num_epochs": _COUNT,
     "train.learning_rate": _POSITIVE,
@@ -205,8 +220,10 @@ RULES: dict[str, Rule] = {
     "train.evaluate_every_epochs": _COUNT_OR_0,
     "train.best_metric": _TEXT,
     "train.max_skipped_steps": _COUNT_OR_0,
+    "data.format": _TEXT,
     "data.label_version": _VERSION,
     "data.visibility": _or_none(_several(_one_of(*AVAILABILITY_FLAGS), distinct=True)),
+    "data.count_disabled": _BOOL,
     "data.sequences": _some(_COUNT),
     "data.weather": _some(_one_of(*WEATHERS)),
     "data.validation": _HELD_OUT,
@@ -221,17 +238,24 @@ RULES: dict[str, Rule] = {
     "data.label_permutation_seed": _or_none(_COUNT_OR_0),
     "data.camera.projection": _one_of("raw", "rectified", "pinhole"),
     "data.camera.ego_from_lidar_m": _or_none(_several(_number(), 3)),
+    "data.camera.lidar_to_radar_z_m": _or_none(_number()),
+    "data.camera.calibration": _one_of("sequence", "common"),
     "data.camera.resize": _BOOL,
     "data.camera.allow_missing": _BOOL,
-    "evaluation.roi": _where(
-        _several(_number(), 6),
-        "x0 < x1, y0 < y1, z0 < z1",
-        lambda value: all(a < b for a, b in zip(value[::2], value[1::2], strict=True)),
+    "evaluation.roi": _or_none(
+        _where(
+            _several(_number(), 6),
+            "x0 < x1, y0 < y1, z0 < z1",
+            lambda value: all(
+                a < b for a, b in zip(value[::2], value[1::2], strict=True)
+            ),
+        )
     ),
     "evaluation.protocols": _several(_one_of(*PROTOCOLS), distinct=True),
     "evaluation.skip_empty": _one_of("protocol", "class", "frame", "none"),
     "evaluation.iou_thresholds": _several(_BELOW_ONE, distinct=True),
     "evaluation.score_threshold": _SHARE,
+    "evaluation.min_score": _SHARE,
     "evaluation.bootstrap": _COUNT_OR_0,
     "evaluation.batch_size": _COUNT,
     "evaluation.num_pictures": _COUNT_OR_0,
@@ -282,38 +306,61 @@ def check(config: ConfigDict) -> None:
             first one, what it is and what is expected.
     """
     values = config.to_dict()
-    fields = dict(_fields(values))
+    found = dict(field_values(values))
     sections = {"", *_SECTIONS}
-    if fields.get("model.name") != "radenet":
+    if found.get("model.name") != "radenet":
         sections |= set(_CAMERA_SECTIONS)
     if "simulation" in values:
         sections.add("simulation")
     known = [name for name in RULES if name.rpartition(".")[0] in sections]
-    for name, value in fields.items():
+    for name, value in found.items():
         if any(rule.startswith(f"{name}.") for rule in known):
             raise UserError(f"config.{name} is {value!r}, expected a section of fields")
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean config.{near[0]}?" if near else ""
-            raise UserError(f"config.{name} is not a field of this config{hint}")
-        if not RULES[name].holds(value):
-            raise UserError(
-                f"config.{name} is {value!r}, expected {RULES[name].expected}"
-            )
+        check_name(name, known)
+        check_field(name, value)
     for name in known:
-        if name not in fields:
+        if name not in found:
             raise UserError(
                 f"config.{name} is missing, expected {RULES[name].expected}"
             )
     _check_together(config, values)
 
 
-def _fields(values: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def check_name(name: str, known: Collection[str]) -> None:
+    """`UserError` with the nearest name for a field that is not among those known."""
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean config.{near[0]}?" if near else ""
+        raise UserError(f"config.{name} is not a field of this config{hint}")
+
+
+def check_field(name: str, value: Any) -> None:
+    """`UserError` for an impossible value of a field that there is, by its dotted name."""
+    if not RULES[name].holds(value):
+        raise UserError(f"config.{name} is {value!r}, expected {RULES[name].expected}")
+
+
+def check_best_metric(name: str, iou_thresholds: Sequence[float]) -> None:
+    """`UserError` for a metric that validations at these thresholds do not compute."""
+    spaces = ("bev", "3d")
+    known = [
+        f"map_{space}_iou{100 * i:.4g}" for space in spaces for i in iou_thresholds
+    ]
+    if name not in known:
+        raise UserError(
+            f"train.best_metric is {name!r}; with these evaluation.iou_thresholds it "
+            f"can be one of {', '.join(known)}"
+        )
+
+
+def field_values(
+    values: Mapping[str, Any], path: str = ""
+) -> Iterator[tuple[str, Any]]:
     """Name with dots and value of every field; an empty section counts as one."""
     for key, value in values.items():
         name = f"{path}{key}"
         if isinstance(value, Mapping) and value and name not in RULES:
-            yield from _fields(value, f"{name}.")
+            yield from field_values(value, f"{name}.")
         else:
             yield name, value
 

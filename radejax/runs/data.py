@@ -26,9 +26,8 @@ from radejax.data.cameras import (
     check_embeddable,
     require_images,
 )
+from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.frame_table import make_table
-from radejax.data.kradar import Frame, KRadar
-from radejax.data.kradar.folders import read_grid
 from radejax.data.kradar.splits import held_out
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
@@ -66,7 +65,7 @@ class Data:
     """
 
     paths: DataPaths
-    frames: KRadar
+    frames: LabelledFrames
     classes: tuple[str, ...]
     options: ConfigDict
     camera: CameraOptions | None
@@ -102,14 +101,16 @@ class Data:
                 "embeddings are given, but config.model.name is "
                 f"{config.model.name!r}, which has no camera"
             )
-        frames = KRadar(
+        frames = data_set(config.data.get("format", "kradar"))(
             paths.roots,
             paths.labels,
             version=config.data.label_version,
             visibility=config.data.visibility,
             classes=config.classes,
             camera_calibration=paths.camera_calibration,
-            # Runs of before are without these two fields.
+            common_camera=camera is not None and camera.calibration == "common",
+            # Runs of before are without these fields.
+            count_disabled=config.data.get("count_disabled", False),
             sequence_numbers=config.data.get("sequences") or None,
             weather=config.data.get("weather") or None,
         )
@@ -143,10 +144,10 @@ class Data:
         return RecordSource(self.paths.records, grid=self.grid)
 
     @functools.cached_property
-    def _splits(self) -> dict[str | None, KRadar]:
+    def _splits(self) -> dict[str | None, LabelledFrames]:
         return {}
 
-    def split(self, name: str | None) -> KRadar:
+    def split(self, name: str | None) -> LabelledFrames:
         """Frames of "train", "validation", "test" or a split file; all for None.
 
         Without those that were left out when they were projected, which are counted.
@@ -166,7 +167,7 @@ class Data:
             self._splits[name] = frames
         return self._splits[name]
 
-    def _part_of_train(self, name: str) -> KRadar:
+    def _part_of_train(self, name: str) -> LabelledFrames:
         """What the train split leaves to train on, or what is held out of it."""
         frames = self.frames.of_split("train")
         # Runs of before are without these two fields.
@@ -192,7 +193,7 @@ class Data:
         """By which the best checkpoint is chosen: "validation", "test" without one."""
         return "validation" if self.options.get("validation") else "test"
 
-    def images(self, frames: Sequence[Frame]) -> CameraInputs | None:
+    def images(self, frames: FrameSequence) -> CameraInputs | None:
         """Images and cameras of frames; None for a model without a camera.
 
         Raises:
@@ -203,7 +204,7 @@ class Data:
         return camera_inputs(frames, self.image_size, self.camera, self.features)
 
     def training_batches(
-        self, frames: Sequence[Frame], train: ConfigDict, seed: int
+        self, frames: FrameSequence, train: ConfigDict, seed: int
     ) -> grain.DatasetIterator[Batch]:
         """An endless, shuffled, checkpointable iterator over batches of this process.
 
@@ -232,13 +233,10 @@ class Data:
             gain_db=options.gain_db,
             gain_slope_db=options.gain_slope_db,
         )
-        loading = LoaderOptions(
-            batch_size=train.batch_size // jax.process_count(),
-            seed=seed,
-            num_threads=options.num_threads,
-            num_workers=options.num_workers,
-        )
-        return make_loader(table, loading, augment=augment)
+        loading = {name: options[name] for name in ("num_threads", "num_workers")}
+        batch_size = train.batch_size // jax.process_count()
+        loader = LoaderOptions(batch_size=batch_size, seed=seed, **loading)
+        return make_loader(table, loader, augment=augment)
 
 
 def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
@@ -256,13 +254,12 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
             backbone; no space left.
         FileNotFoundError: A folder that was named is not there.
     """
-    if sources.camera_calibration is not None:  # simulating takes long
-        check_folders([sources.camera_calibration])
+    check_folders(filter(None, [sources.camera_calibration]))  # simulating takes long
     simulation = config.get("simulation")
     if not sources.data and simulation is None:
         raise UserError(
             "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
-            "config that simulates them, such as configs/quickstart.py"
+            "config that simulates them, such as quickstart"
         )
     if simulation is not None:
         root = _simulated_root(simulation, sources.data)
@@ -280,8 +277,7 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     if count := len(data.split("train")):  # projecting takes long
         check_enough(count, config.train.batch_size)
     data.project()
-    lost = len(data.frames) - len(data.split(None))
-    if lost:
+    if lost := len(data.frames) - len(data.split(None)):
         _log.warning(
             f"{lost} of {len(data.frames)} frames were left out when they were projected; "
             f"manifest.json in {data.paths.records} says why"
@@ -321,24 +317,20 @@ def data_of_run(
         FileNotFoundError: A folder is not there.
     """
     config, own = loaded.config, loaded.run.get("data")
-    paths = own = own and DataPaths.from_dict(own)
-    if other is not None:
-        paths = other.paths(own)
+    own = own and DataPaths.from_dict(own)
+    paths = own if other is None else other.paths(own)
     if paths is None:
         raise UserError(
             f"{workdir}: trained on frames that were never written, there is no "
             "split to evaluate on; give --data ROOT, or use `radejax detect`"
         )
     if other is not None:
+        config = config.copy_and_resolve_references()
         if other.label_version is not None:
-            config = config.copy_and_resolve_references()
             config.data.label_version = other.label_version
-        grid = read_grid(list(map(pathlib.Path, paths.roots)))
-        if grid != loaded.grid:
-            raise UserError(
-                f"{', '.join(paths.roots)}: the radar has {describe_grid(grid)}, "
-                f"{workdir} was trained on {describe_grid(loaded.grid)}"
-            )
+        if other.sequences or other.weather or own is None or paths.roots != own.roots:
+            part = {"sequences": other.sequences, "weather": other.weather}
+            config.data.update({name: tuple(of) for name, of in part.items()})
         is_blind = models.has_camera(loaded.model) and (
             IMAGE_BACKBONE not in loaded.variables["params"]
         )
@@ -347,7 +339,13 @@ def data_of_run(
                 f"{workdir} is without the weights of its image backbone: give "
                 "--image_backbone FOLDER, or --embeddings FOLDER of these images"
             )
-    return config, Data.open(config, loaded.model, paths, grid=loaded.grid)
+    data = Data.open(config, loaded.model, paths, grid=loaded.grid)
+    if other is not None and data.frames.grid != loaded.grid:
+        raise UserError(
+            f"{', '.join(paths.roots)}: the radar has {describe_grid(data.frames.grid)}, "
+            f"{workdir} was trained on {describe_grid(loaded.grid)}"
+        )
+    return config, data
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -15,15 +15,17 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
+from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
-from radejax.data.kradar import Frame, KRadar
+from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.evaluation.files.load import tables_from_frames
+from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report.measure import Options, rare_classes
 from radejax.evaluation.report.report import Report, write_report
 from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.runs import pictures
+from radejax.runs import check_config, pictures
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.sources import Sources
 from radejax.training import processes
@@ -41,45 +43,38 @@ def evaluate(
     out: pathlib.Path | None = None,
     split: str = "test",
     exchange_images: int | None = None,
-    num_pictures: int | None = None,
     step: int | None = None,
     remark: str = "",
+    **options: Any,
 ) -> Report | None:
     """Detects on a split as the config says, on all devices, and writes the report.
 
     Args:
-        config: Of the run.
-        model: What `config.model` describes.
-        variables: Of the model.
+        config, workdir: Of the run.
+        model, variables: What `config.model` describes.
         data: To evaluate on.
-        workdir: Of the run.
         out: Folder of the results; `evaluation` in the work folder if None.
         split: "test", "validation", "train", "all" or a split file.
         exchange_images: Seed; see `evaluate_run`.
-        num_pictures: Frames drawn; as the config says if None.
         step: Of the variables, for `source.json`.
         remark: Behind the name of the run in the report.
+        **options: Of the report's `Options`, in place of the config's.
 
     Returns:
-        The report that was written; None on all processes but the first, which return
-        when it is there.
+        The report that was written; None on all processes but the first.
 
     Raises:
-        UserError: There are no frames of the split, or images to exchange.
+        UserError: No frames of the split, or images to exchange.
     """
     frames, seen = _frames(data, split, exchange_images)
-    out = workdir / "evaluation" if out is None else out
     predictor = make_predictor(config, model, data)
     predictor.update(variables)
-    batch_size, images = config.evaluation.batch_size, data.images(seen)
-    predictions = predict_dataset(
-        predictor, data.records, seen, batch_size, images=images
-    )
+    size, images = config.evaluation.batch_size, data.images(seen)
+    predictions = predict_dataset(predictor, data.records, seen, size, images=images)
 
-    def report() -> Report:
-        out.mkdir(parents=True, exist_ok=True)
-        source = source_of(data, split, exchange_images)
-        files.write_json(out / "source.json", {"step": step, **source})
+    def write(folder: pathlib.Path) -> Report:
+        source = {"step": step, **source_of(data, split, exchange_images)}
+        files.write_json(folder / "source.json", source)
         drawer = pictures.FrameDrawer(
             data.records,
             frames,
@@ -88,23 +83,34 @@ def evaluate(
             score_threshold=config.decode.score_threshold,
         )
         ground_truth, table = tables_from_frames(frames, split)
-        report = write_report(
+        made = write_report(
             ground_truth,
             predictions,
             table,
-            out,
+            folder,
             report_options(config, f"{workdir.name}{remark}"),
             rare=_rare_classes(config, data),
             bootstrap=config.evaluation.bootstrap,
             left_out_before=frames.summary().counts,
             draw_frame=drawer,
+            **options,
         )
-        _log.info("step %s, split %s\n%s", step, split, report.text)
+        _log.info("step %s, split %s\n%s", step, split, made.text)
         if models.has_camera(model):
-            pictures.draw_camera_share(model, variables, data, frames, out)
-        count = config.evaluation.num_pictures if num_pictures is None else num_pictures
-        _draw(drawer, count, workdir, out, is_simulated=frames.is_simulated)
-        return report
+            pictures.draw_camera_share(model, variables, data, frames, folder)
+        if drawer.draw_spread(folder / "pictures", config.evaluation.num_pictures):
+            drawer.draw_scenes(folder / "scenes.png")
+        pictures.draw_curves(
+            workdir, folder / "training.png", is_simulated=frames.is_simulated
+        )
+        return made
+
+    def report() -> Report:
+        place = out or workdir / "evaluation"
+        with files.swapped_in(place) as folder:
+            made = write(folder)
+        placed = [place / path.relative_to(folder) for path in made.files]
+        return dataclasses.replace(made, files=placed)
 
     return processes.main_only(report)
 
@@ -115,33 +121,16 @@ def _rare_classes(config: ConfigDict, data: Data) -> tuple[tuple[str, str], ...]
     return rare_classes(objects, table, config.classes, config.evaluation.roi)
 
 
-def _draw(
-    drawer: pictures.FrameDrawer,
-    count: int,
-    workdir: pathlib.Path,
-    out: pathlib.Path,
-    *,
-    is_simulated: bool,
-) -> None:
-    """Frames of a split, one of each weather, and the losses of the run."""
-    drawn = drawer.draw_spread(out / "pictures", count)
-    if drawn:
-        drawer.draw_scenes(out / "scenes.png")
-    if (workdir / "metrics.jsonl").exists():
-        pictures.draw_curves(workdir, out / "training.png", is_simulated=is_simulated)
-    _log.info("drew %d frames in %s", len(drawn), out / "pictures")
-
-
 def evaluate_run(
     workdir: PathLike,
     *,
     step: Step = None,
     split: str = "test",
     out: PathLike | None = None,
-    num_pictures: int | None = None,
     image_backbone: PathLike | None = None,
     exchange_images: int | None = None,
     other: Sources | None = None,
+    **changes: Any,
 ) -> Report | None:
     """Evaluates a run's checkpoint as its config says, on all devices.
 
@@ -151,12 +140,14 @@ def evaluate_run(
         split: "test", "validation", "train", "all" or a split file.
         out: Folder of the results; `evaluation` in the work folder if None,
             `evaluation_<name>` for other data, and with `_validation` for that split.
-        num_pictures: Frames drawn; as the config says if None.
         image_backbone: Weights of a frozen backbone, see `inference.open.load`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
             control of what a radar-camera model knows from the images. `out` then ends
             in `_exchanged`.
         other: Other data than the run's own; projected if they are not yet.
+        **changes: Fields of `config.evaluation` in place of the run's, and `classes`,
+            some of the run's, `run` and `invalid_sizes` of the report's `Options`. A
+            `score_threshold` or `skip_empty` that is given here holds for `exact` too.
 
     Returns:
         The report that was written; None on all processes but the first.
@@ -164,11 +155,18 @@ def evaluate_run(
     Raises:
         UserError: There are no frames of the split, or images to exchange; the run has
             no data and none are given; other data do not fit the run, or `out` has
-            results on others.
+            results on others. Or a change that is impossible.
     """
     loaded = load(workdir, step=step, image_backbone=image_backbone)
     workdir = pathlib.Path(workdir).absolute()
-    config, data = data_of_run(loaded, workdir, other)
+    if loaded.config is None:
+        raise UserError(
+            f"{workdir} has no config of a run: give a work folder of train.py"
+        )
+    config, options = _changed(loaded.config, changes)
+    config, data = data_of_run(
+        dataclasses.replace(loaded, config=config), workdir, other
+    )
     name = "evaluation" if other is None else f"evaluation_{other.name}"
     name += "_validation" if split == "validation" else ""
     name += "" if exchange_images is None else "_exchanged"
@@ -195,10 +193,35 @@ def evaluate_run(
         out=pathlib.Path(out or workdir / name),
         split=split,
         exchange_images=exchange_images,
-        num_pictures=num_pictures,
         step=loaded.step,
         remark=remark,
+        **options,
     )
+
+
+def _changed(
+    config: ConfigDict, changes: Mapping[str, Any]
+) -> tuple[ConfigDict, dict[str, Any]]:
+    """The config of a run with changes of its `evaluation`, and those of `Options`.
+
+    Fields that are younger than the run stand at their default.
+    """
+    values = base_config().evaluation.to_dict()
+    options = {name: v for name, v in changes.items() if name not in values}
+    values |= config.evaluation.to_dict()
+    for name in changes.keys() - options.keys():
+        check_config.check_field(f"evaluation.{name}", changes[name])
+        values[name] = changes[name]
+    if unknown := sorted(set(options.get("classes", ())) - set(config.classes)):
+        raise UserError(
+            f"classes has {unknown[0]!r}, expected some of the run's: "
+            f"{', '.join(config.classes)}"
+        )
+    if changes.keys() & {"score_threshold", "skip_empty"}:
+        options["uncut"] = ()
+    config = config.copy_and_resolve_references()
+    config.evaluation = ConfigDict(values)
+    return config, options
 
 
 def source_of(
@@ -209,6 +232,8 @@ def source_of(
         "split": split,
         "exchange_images": exchange_images,
         "label_version": data.options.label_version,
+        "sequences": list(data.options.get("sequences") or ()),
+        "weather": list(data.options.get("weather") or ()),
         "simulated": data.frames.is_simulated,
         **dataclasses.asdict(data.paths),
         "roots": list(data.paths.roots),  # as JSON has them
@@ -219,17 +244,17 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     """`UserError` if a folder has results on other data than these."""
     if not (out / "source.json").exists():
         return
-    names = ("roots", "labels", "label_version", "split")
+    names = ("roots", "labels", "label_version", "split", "sequences", "weather")
     found, wanted = (
-        {name: values.get(name) for name in names}
-        for values in (files.read_json(out / "source.json"), source)
+        {name: values.get(name) or None for name in names}
+        for values in (files.read_json(out / "source.json", dict[str, Any]), source)
     )
     files.require_same(found, wanted, f"{out} has other results", mend="give --out")
 
 
 def _frames(
     data: Data, split: str, exchange_images: int | None
-) -> tuple[KRadar, Sequence[Frame]]:
+) -> tuple[LabelledFrames, FrameSequence]:
     """Frames of a split, and the same as the model is to see them."""
     frames = data.split(None if split == "all" else split)
     if not len(frames):
@@ -239,12 +264,12 @@ def _frames(
     if data.camera is None:
         raise UserError(
             "config.model.name is 'radenet', which has no camera; expected 'dinorade', "
-            "for example configs/dinorade.py"
+            "for example --config dinorade"
         )
     return frames, with_images_exchanged(frames, exchange_images)
 
 
-def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
+def with_images_exchanged(frames: FrameSequence, seed: int) -> list[LabelledFrame]:
     """The frames, each with the image and calibration of another one.
 
     Raises:
@@ -256,8 +281,9 @@ def with_images_exchanged(frames: Sequence[Frame], seed: int) -> list[Frame]:
     order = np.random.default_rng(seed).permutation(given)
     exchanged = list(frames)
     for own, other in zip(order, np.roll(order, 1), strict=True):
+        frame: Any = frames[own]
         exchanged[own] = dataclasses.replace(
-            frames[own],
+            frame,
             camera_path=frames[other].camera_path,
             camera_calibration_path=frames[other].camera_calibration_path,
         )
@@ -270,16 +296,21 @@ def make_predictor(
     data: Data,
     mesh: jax.sharding.Mesh | None = None,
 ) -> Predictor:
-    """Predictor with the score threshold of evaluations, still without variables."""
-    threshold = config.evaluation.score_threshold
+    """Predictor of all that evaluations keep, still without variables."""
     return Predictor(
         model,
         data.records.grid,
         classes=config.classes,
-        decode={**config.decode, "score_threshold": threshold},
+        decode={**config.decode, "score_threshold": _lowest_score(config)},
         azimuth_mapping=config.data.azimuth_mapping,
         mesh=mesh,
     )
+
+
+def _lowest_score(config: ConfigDict) -> float:
+    """Score from which on predictions are kept."""
+    options = config.evaluation
+    return min(options.min_score, options.score_threshold)
 
 
 def report_options(config: ConfigDict, name: str) -> Options:
@@ -290,8 +321,10 @@ def report_options(config: ConfigDict, name: str) -> Options:
         classes=tuple(config.classes),
         protocols=tuple(options.protocols),
         iou_thresholds=tuple(options.iou_thresholds),
-        roi=tuple(options.roi),
+        roi=options.roi and tuple(options.roi),
         score_threshold=options.score_threshold,
+        uncut=(RECOMMENDED,),
+        min_score=_lowest_score(config),
         skip_empty=None if options.skip_empty == "none" else options.skip_empty,
         label_version=config.data.label_version,
         invalid_sizes="false_positive",

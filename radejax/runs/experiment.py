@@ -6,7 +6,6 @@ import hashlib
 import logging
 import pathlib
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -14,8 +13,9 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
+from radejax.core.config import renewed
 from radejax.core.errors import UserError
-from radejax.data.kradar import Frame
+from radejax.data.dataset import FrameSequence
 from radejax.inference.open import PathLike, StartingWeights, starting_weights
 from radejax.losses.detection import AfterNms
 from radejax.runs import check_config
@@ -33,11 +33,11 @@ _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {folder}:
   evaluation/      metrics.json, metrics.csv, tables, pictures
   checkpoints/     the trained model
   metrics.jsonl    losses by step (tensorboard --logdir {folder})
-Evaluate again:    python evaluate.py --workdir {folder}
+Evaluate again:    radejax evaluate --workdir {folder}
 {best}Boxes for a folder of frames:
                    radejax detect --workdir {folder} --out boxes FOLDER"""
 
-_BEST = """Best on the way:   python evaluate.py --workdir {folder} --checkpoint best
+_BEST = """Best on the way:   radejax evaluate --workdir {folder} --checkpoint best
                    chosen on the {split} split: {word}
 """
 _MAY_BE_REPORTED = {
@@ -73,14 +73,15 @@ def run(
     """
     started = time.perf_counter()
     check_config.check(config)
-    folder = default_workdir(workdir, name)
-    model = models.build(config.model)  # what cannot be built fails first
+    config = ConfigDict(renewed(config.to_dict()))
     sharding.check_batch_size(
         config.train.batch_size,
         sharding.make_mesh(),
         "config.train.batch_size",
         config.train.num_accumulate,
     )
+    model = models.build(config.model)  # what cannot be built fails first
+    folder = default_workdir(workdir, name)
     with claimed(folder, config):
         weights = starting_weights(
             model, init_from, sources.image_backbone, sources.embeddings
@@ -175,10 +176,10 @@ def loss_options(config: ConfigDict) -> dict[str, Any]:
         nms_iou=decode.nms_iou,
         per_class=decode.per_class_nms,
     )
-    return {**config.loss, "nms": nms}
+    return {**config.loss.to_dict(), "nms": nms}
 
 
-def _what_stays(frames: Sequence[Frame], weights: StartingWeights) -> dict[str, Any]:
+def _what_stays(frames: FrameSequence, weights: StartingWeights) -> dict[str, Any]:
     """What a checkpoint does not hold and a run must not change on its way.
 
     Folders may move, therefore frames are compared by their keys and the frozen

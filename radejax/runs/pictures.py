@@ -12,12 +12,14 @@ import flax.linen as nn
 import jax
 import numpy as np
 
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import decode, model_inputs
 from radejax.data.frame_table import make_table
 from radejax.data.images import front_view
-from radejax.data.kradar import Frame
+from radejax.data.kradar.sequences import WEATHERS
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource, record_positions
+from radejax.losses.detection import loss_names
 from radejax.runs.data import Data
 from radejax.visualize import bev, curves
 from radejax.visualize.camera_share import average_by_group, write_camera_share
@@ -32,7 +34,7 @@ class FrameDrawer:
         records: Projections.
         frames: The data set.
         predictions: Columns as `predict_dataset` returns.
-        roi: Region of the evaluation, x, y, z from and to in metres.
+        roi: Region of the evaluation, x, y, z from and to in metres, or None.
         score_threshold: Predictions from here on are drawn, as a detector in use would
             show them.
     """
@@ -40,17 +42,17 @@ class FrameDrawer:
     def __init__(
         self,
         records: RecordSource,
-        frames: Sequence[Frame],
+        frames: FrameSequence,
         predictions: Mapping[str, np.ndarray],
         *,
-        roi: Sequence[float],
+        roi: Sequence[float] | None,
         score_threshold: float,
     ) -> None:
         self._records = records
         self._frames = frames
         self._positions = record_positions(records, frames)
         self._predictions = predictions
-        self._roi = tuple(roi)
+        self._roi = roi
         self._score_threshold = score_threshold
 
     def __call__(self, index: int, path: str | os.PathLike) -> None:
@@ -78,6 +80,7 @@ class FrameDrawer:
             ground_truth=(frame.boxes, list(frame.classes)),
             predictions=(columns["box"], columns["score"], list(columns["cls"])),
             roi=self._roi,
+            score_threshold=self._score_threshold,
             image=image,
             camera=camera,
             title=f"{frame.weather} ({frame.key}){_simulated(frame.is_simulated)}",
@@ -93,7 +96,7 @@ class FrameDrawer:
             best = fullest.setdefault(frame.weather, i)
             if len(frame.boxes) > len(self._frames[best].boxes):
                 fullest[frame.weather] = i
-        scenes = [self._scene(i) for i in fullest.values()]
+        scenes = [self._scene(fullest[w]) for w in sorted(fullest, key=_place)]
         figure = draw_scenes(scenes)
         bev.save_figure(figure, path)
 
@@ -112,6 +115,11 @@ class FrameDrawer:
         return paths
 
 
+def _place(weather: str) -> int:
+    """Of a weather in every table; unknown ones come last."""
+    return WEATHERS.index(weather) if weather in WEATHERS else len(WEATHERS)
+
+
 def _simulated(is_simulated: bool) -> str:
     """The end of a title."""
     return ", simulated" if is_simulated else ""
@@ -120,9 +128,13 @@ def _simulated(is_simulated: bool) -> str:
 def draw_curves(
     workdir: pathlib.Path, path: pathlib.Path, *, is_simulated: bool = False
 ) -> None:
-    """Draws the losses of a run over its steps into a picture file."""
+    """Draws the losses of a run, if it has any, over its steps into a picture file."""
+    if not (workdir / "metrics.jsonl").exists():
+        return
     title = f"{workdir.name}{_simulated(is_simulated)}"
-    figure = curves.draw_training(workdir / "metrics.jsonl", title=title)
+    series = curves.read_metrics(workdir / "metrics.jsonl")
+    parts = [name for name in loss_names() if name in series]
+    figure = curves.draw_training(series, keys=parts, title=title)
     bev.save_figure(figure, path)
 
 
@@ -130,7 +142,7 @@ def draw_camera_share(
     model: nn.Module,
     variables: Mapping[str, Any],
     data: Data,
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     out: pathlib.Path,
 ) -> None:
     """Writes `camera_share.json` and `camera_share.png`, see `camera_share`."""
@@ -143,9 +155,9 @@ def camera_share(
     model: nn.Module,
     variables: Mapping[str, Any],
     data: Data,
-    frames: Sequence[Frame],
+    frames: FrameSequence,
     *,
-    group: Callable[[Frame], str] = lambda frame: frame.weather,
+    group: Callable[[LabelledFrame], str] = lambda frame: frame.weather,
     max_frames: int = 256,
     batch_size: int = 8,
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import logging
 import pathlib
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from ml_collections import ConfigDict
 from tabulate import tabulate
 
 from radejax.core import files
+from radejax.core.errors import DataError
 from radejax.runs import check_config
 from radejax.runs.experiment import run
 from radejax.runs.workdir import PathLike, default_workdir
@@ -72,13 +74,15 @@ def run_seeds(
 
 def read_aps(path: pathlib.Path) -> dict[tuple[str, ...], float]:
     """APs of a report's metrics.csv by protocol, condition, class, space and IoU."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {
-        tuple(row[key] for key in _KEYS): float(row["ap"] or "nan")
-        for row in rows
-        if int(row["num_gt"])
-    }
+    try:
+        rows = list(csv.DictReader(io.StringIO(files.read_text(path), newline="")))
+        return {
+            tuple(row[key] for key in _KEYS): float(row["ap"] or "nan")
+            for row in rows
+            if float(row["num_gt"])
+        }
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
+        raise DataError(f"{path}: no metrics of a report ({error!r:.200})") from None
 
 
 def summarize(tables: dict[int, dict[tuple[str, ...], float]]) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from radejax.core.errors import UserError
@@ -24,6 +24,7 @@ class Sources:
         data: K-Radar folders. Without any a config may say what to simulate.
         labels: Label revision, see `KRadar`; the sequences' own if None.
         label_version: Its version, in place of the config's.
+        sequences: Only these, and only of this `weather`, in place of the config's.
         records: Folder of projected frames, beside the first of `data` if None.
         camera_calibration: Folder of camera calibrations, the data's own if None.
         embeddings: Folder of `radejax embed`, in place of images.
@@ -33,6 +34,8 @@ class Sources:
     data: Sequence[str] = ()
     labels: str | None = None
     label_version: str | None = None
+    sequences: Sequence[int] = ()
+    weather: Sequence[str] = ()
     records: str | None = None
     camera_calibration: str | None = None
     embeddings: str | None = None
@@ -69,10 +72,11 @@ class Sources:
 
     @property
     def name(self) -> str:
-        """What tells results on them from others: names of the folder and labels."""
+        """What tells results on them from others: folder, labels, sequences, weather."""
         parts = [pathlib.Path(path).resolve().name for path in self.data[:1]]
         if self.labels is not None:
             parts.append(pathlib.Path(self.labels).resolve().stem)
+        parts += ["-".join(map(str, part)) for part in (self.sequences, self.weather)]
         return "_".join(filter(None, parts)) or "other"
 
 
@@ -102,7 +106,7 @@ class DataPaths:
         return cls(**{**fields, "roots": tuple(fields["roots"])})
 
 
-def check_folders(paths: Sequence[str]) -> None:
+def check_folders(paths: Iterable[str]) -> None:
     """`FileNotFoundError` for a folder that is not there."""
     for path in paths:
         if not pathlib.Path(path).is_dir():

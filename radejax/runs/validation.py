@@ -6,7 +6,7 @@ import functools
 import math
 import pathlib
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -21,6 +21,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
 from radejax.inference.predict import predict_dataset
+from radejax.runs.check_config import check_best_metric
 from radejax.runs.data import Data
 from radejax.runs.evaluate import make_predictor, report_options
 from radejax.runs.pictures import FrameDrawer
@@ -150,25 +151,3 @@ class Validation:
                     pixels = np.asarray(image.convert("RGB"))
                 pictures[f"validation/{path.stem}"] = pixels
         return pictures
-
-
-def check_best_metric(name: str, iou_thresholds: Sequence[float]) -> None:
-    """Refuses a `train.best_metric` that validations do not compute.
-
-    Args:
-        name: Such as "map_3d_iou30".
-        iou_thresholds: Of `config.evaluation`.
-
-    Raises:
-        UserError: Names those that there are.
-    """
-    known = [
-        f"map_{space}_iou{100 * iou:.4g}"
-        for space in ("bev", "3d")
-        for iou in iou_thresholds
-    ]
-    if name not in known:
-        raise UserError(
-            f"train.best_metric is {name!r}; with these evaluation.iou_thresholds it "
-            f"can be one of {', '.join(known)}"
-        )

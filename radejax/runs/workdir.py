@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import pathlib
@@ -26,7 +27,8 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax.core import files
-from radejax.core.config import base_config
+from radejax.core.config import renewed
+from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.sources import DataPaths, saved_path
 from radejax.simulation.config import default_config
@@ -69,9 +71,11 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     path = workdir / "config.json"
     if processes.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
-    defaults = json.loads(base_config().to_json())
-    if "simulation" in config:  # of which earlier versions have fewer fields
-        defaults["simulation"] = default_config()
+    before: dict[str, Any] = {}  # of what earlier versions have fewer fields
+    if "camera" in config.data:
+        before["data"] = {"camera": BEFORE}
+    if "simulation" in config:
+        before["simulation"] = default_config()
     files.claim(
         path,
         json.loads(config.to_json()) | {"profile": "", "seeds": []},
@@ -79,7 +83,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("watch",),
-        defaults=defaults,
+        renewed=functools.partial(renewed, before=before),
     )
 
 
@@ -92,7 +96,8 @@ def run_info(
     """
     init_from = saved_path(init_from)
     if init_from is None and (workdir / "run.json").exists():
-        init_from = files.read_json(workdir / "run.json").get("init_from")
+        saved = files.read_json(workdir / "run.json", {"init_from?": str | None})
+        init_from = saved.get("init_from")
     return {
         "data": dataclasses.asdict(paths),
         "init_from": init_from,

@@ -105,7 +105,7 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
         "a data set of another simulation config",
         ignore=("finished",),
     )
-    return bool(files.read_json(marker)["finished"])
+    return files.read_json(marker, {"finished": bool})["finished"]
 
 
 def _marker(config: SimulationConfig) -> dict[str, Any]:

@@ -115,7 +115,6 @@ class SequenceSimulator:
         self,
         given: RadarInput,
         output: tensor.Output = "projection",
-        rows_per_step: int = 1,
     ) -> np.ndarray:
         """The radar frame of an input; see `tensor.simulate`.
 
@@ -129,7 +128,6 @@ class SequenceSimulator:
                 grid=self.grid,
                 parameters=self.parameters,
                 output="rows" if output == "tesseract" else output,
-                rows_per_step=rows_per_step,
             )
         )
         if output == "tesseract":

@@ -44,7 +44,9 @@ _NO_NEWS = (
 
 
 def _is_worth_telling(record: logging.LogRecord) -> bool:
-    """False for orbax's warnings of what is meant to be."""
+    """False for orbax's warnings of what is meant to be, and of what we say ourselves."""
+    if record.exc_info and record.exc_info[1] and files.is_no_space(record.exc_info[1]):
+        return False  # with the traceback of each of its threads
     return not any(text in str(record.msg) for text in _NO_NEWS)
 
 

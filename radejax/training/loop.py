@@ -93,6 +93,7 @@ def train(
             processes.stop_on_signal(mesh) as stop,
         ):
             step, metrics, is_stopped, is_cut = start, None, stop(), False
+            told = int(state.num_skipped)
             while step < num_steps and not is_stopped:
                 with logs.timing("data", behind=metrics):
                     batch = next(loader)
@@ -106,7 +107,7 @@ def train(
                 logs.tick(step, metrics)
                 if _is_due(step, options.log_every_steps, num_steps):
                     logs.log(step, metrics, epoch=step / plan.steps_per_epoch)
-                    _check_skipped(state, plan)
+                    told = _check_skipped(state, plan, told)
                 scores, every = None, options.evaluate_every_epochs
                 if evaluate and _is_due(step, every * plan.steps_per_epoch, num_steps):
                     scores = _evaluate(evaluate, state, step, stop, logs)
@@ -116,7 +117,7 @@ def train(
                 # Save ----------------------------------------------------------------
                 is_due = _is_due(step, options.checkpoint_every_steps, num_steps)
                 if is_due or is_stopped or scores is not None:
-                    _check_skipped(state, plan)
+                    told = _check_skipped(state, plan, told)
                     found, kept = (
                         scores and scores.with_best(),
                         state.replace(frozen={}),
@@ -149,15 +150,29 @@ def _evaluate(
     return scores
 
 
-def _check_skipped(state: TrainState, plan: Plan) -> None:
-    """`DataError` where too many steps in a row had no finite loss and gradient."""
+def _check_skipped(state: TrainState, plan: Plan, told: int) -> int:
+    """Tells of steps without a finite loss and gradient beyond those `told` of.
+
+    Returns:
+        How many there were so far.
+
+    Raises:
+        DataError: Too many were in a row.
+    """
     in_row, limit = int(state.most_skipped_in_row), plan.options.max_skipped_steps
-    if in_row > limit:
+    if (skipped := int(state.num_skipped)) > told or in_row > limit:
         frames = np.asarray(state.skipped_frames).tolist()
         if plan.frame_names is not None:
             frames = [plan.frame_names[i] for i in frames]
-        raise DataError(
-            f"loss or gradient was not finite in {in_row} steps in a row (limit "
-            f"train.max_skipped_steps={limit}); frames of the last batch: "
-            + ", ".join(map(str, frames))
+        last = f"frames of the last batch: {', '.join(map(str, frames))}"
+        if in_row > limit:
+            raise DataError(
+                f"loss or gradient was not finite in {in_row} steps in a row (limit "
+                f"train.max_skipped_steps={limit}); {last}"
+            )
+        _log.warning(
+            "%d steps so far were skipped, as their loss or gradient was not finite; %s",
+            skipped,
+            last,
         )
+    return skipped

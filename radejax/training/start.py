@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import dataclasses
 import logging
-import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ import jax
 import numpy as np
 import optax
 
-from radejax.core.errors import UserError
+from radejax.core.files import require_same
 from radejax.core.structures import Batch
 from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
@@ -163,7 +162,13 @@ def restore(
     # Frozen parameters are not in a checkpoint: they come from where they came from.
     saved = abstract_state(abstract, placement).replace(frozen={})
     state, info, step = checkpoints.restore(saved, loader) or (None, {}, 0)
-    _check_same(info.get("same", {}), plan.info.get("same", {}), checkpoints.folder)
+    found, given = info.get("same", {}), plan.info.get("same", {})
+    require_same(
+        found,
+        {name: given.get(name) for name in found},
+        f"the run in {checkpoints.folder.parent} was trained with something else",
+        mend="give the same, or another --workdir",
+    )
     if state is not None:
         _log.info("continuing from step %d of %d", step, plan.num_steps)
         if not abstract.frozen:
@@ -177,22 +182,6 @@ def restore(
         compiler_options={"xla_backend_optimization_level": 1} if is_cpu else {},
     )(init)
     return drawn if state is None else state.replace(frozen=drawn.frozen), step
-
-
-def _check_same(
-    found: Mapping[str, Any], given: Mapping[str, Any], checkpoints: pathlib.Path
-) -> None:
-    """`UserError` where a run would continue with other data or frozen weights."""
-    differing = [
-        f"{name}: {found[name]} there, {given.get(name)} now"
-        for name in found
-        if found[name] != given.get(name)
-    ]
-    if differing:
-        raise UserError(
-            f"the run in {checkpoints.parent} was trained with something else: "
-            f"{'; '.join(differing)}. Give the same, or another --workdir"
-        )
 
 
 def compile_step(

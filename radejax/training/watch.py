@@ -22,7 +22,8 @@ from tensorboardX import summary
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
+from radejax.losses.detection import loss_names
 from radejax.training import processes
 from radejax.training.checkpoints import BEST
 from radejax.training.clock import StepClock, seconds_since_start
@@ -31,8 +32,6 @@ _log = logging.getLogger(__name__)
 
 Values = Mapping[str, float]
 Pictures = Mapping[str, np.ndarray]
-
-_ON_THE_BAR = ("focal", "gwd", "smooth_l1")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +118,7 @@ class Watch:
         with self.timing("compute"):  # the metrics have to be waited for
             values = {k: float(np.asarray(v)) for k, v in metrics.items()}
         speed = self._speed(step)
-        text = [f"{k} {v:.4g}" for k, v in values.items() if k in _ON_THE_BAR]
+        text = [f"{k} {v:.4g}" for k, v in values.items() if k in loss_names()]
         if speed:
             text.append(f"{speed['frames_per_s']:.1f} frames/s")
             text.append(f"wait {speed['data_wait_share']:.0%}")
@@ -165,13 +164,15 @@ class _Jsonl:
             self._drop_after(start_step)
 
     def _drop_after(self, step: int) -> None:
-        kept = []
-        for line in self._path.read_text().splitlines():
+        kept, lines = [], files.read_text(self._path).splitlines()
+        for number, line in enumerate(lines, 1):
+            where = f"{self._path}, line {number}"
             try:
-                if json.loads(line)["step"] <= step:
+                if files.parse_json(line, {"step": float}, where)["step"] <= step:
                     kept.append(line + "\n")
-            except json.JSONDecodeError:  # the line a killed run was writing
-                break
+            except DataError:
+                if number < len(lines):  # not the one a killed run was writing
+                    raise
         files.write_text(self._path, "".join(kept))
 
     def write(self, step: int, values: Values, _: Pictures) -> None:

@@ -34,7 +34,12 @@ from radejax.visualize.maps import (
     legend_handles,
     roi_m,
 )
-from radejax.visualize.projections import bin_edges, color_label, range_azimuth
+from radejax.visualize.projections import (
+    bin_edges,
+    color_label,
+    range_azimuth,
+    to_polar,
+)
 
 __all__ = [
     "Scene",
@@ -128,8 +133,8 @@ def draw_polar(
     if scene.roi is not None:
         x0, x1, y0, y1 = roi_m(scene.roi)
         box = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 0, x1 - x0, y1 - y0, 0, 0]])
-        draw_roi(ax, _to_polar(footprints(box, 200)[0]))
-    draw_objects(ax, scene.sets, _to_polar, show_labels=show_labels)
+        draw_roi(ax, to_polar(footprints(box, 200)[0]))
+    draw_objects(ax, scene.sets, to_polar, show_labels=show_labels)
     _explain(ax, scene, show_legend)
     return ax
 
@@ -179,17 +184,12 @@ def draw_frame(
         loc="lower center",
         bbox_to_anchor=(0.765, polar_place[1] + polar_place[3] + 0.01),
         ncols=3,
+        fontsize=8,  # counts, threshold and the region's name fit
         frameon=False,
     )
     if scene.title:
         figure.suptitle(scene.title)
     return figure
-
-
-def _to_polar(points: np.ndarray) -> np.ndarray:
-    """Azimuth in degrees and range of ground positions `[..., 2]`."""
-    x, y = points[..., 0], points[..., 1]
-    return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
 def draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:

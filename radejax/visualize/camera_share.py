@@ -92,7 +92,7 @@ def draw_camera_share(
             interpolation="nearest",
         )
         number = "" if counts is None else f", {counts[name]} frames"
-        mean = f"mean {mean_share(share, grid):.2f}" if share.any() else "not in view"
+        mean = f"mean {mean_share(share, grid):.3f}" if share.any() else "not in view"
         ax.set_title(f"{name}\n{mean}{number}", fontsize=8)
         ax.tick_params(labelbottom=True, labelsize=8)
     for ax in axes.flat[len(maps) :]:

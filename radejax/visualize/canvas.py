@@ -35,7 +35,10 @@ COLOR_MAP = LinearSegmentedColormap.from_list(
 ROI_COLOR = "black"
 # Okabe and Ito's palette: told apart under every common colour blindness.
 CLASS_COLORS = ("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#CC79A7")
-SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+SERIES_COLORS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
+    *("#000000", "#8A6D00"),  # black of theirs, and a yellow that paper shows
+)
 
 
 Side = Literal["left", "right", "above"]
@@ -188,6 +191,7 @@ class Scene:
         camera: Calibration of the image: draws the boxes on it; or None.
         title: Such as sequence, frame and weather.
         class_names: Names of class indices, see `as_objects`.
+        score_threshold: Of the predictions shown, for the legend, or None.
         zoom: x and y in metres of the place that `scenes` magnifies, or None.
         track_ids: One hashable id per ground truth box, None for a box without trail; for
             recordings; or None.
@@ -203,6 +207,7 @@ class Scene:
     camera: CameraCalibration | None = None
     title: str = ""
     class_names: Sequence[str] | None = None
+    score_threshold: float | None = None
     zoom: tuple[float, float] | None = None
     track_ids: Any = None
     time_s: float | None = None

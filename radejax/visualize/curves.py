@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,10 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.visualize.canvas import SERIES_COLORS, new_figure
 
-LOSS_KEYS = ("focal", "gwd", "smooth_l1")
 _LINE_STYLES = ("-", "--", "-.", ":")
 _AXIS_LABELS = {
     "frames_per_s": "frames per second",
@@ -25,7 +24,7 @@ _AXIS_LABELS = {
 
 
 def draw_precision_recall(
-    curves: Mapping[str, tuple[Any, Any]] | Iterable[Any],
+    curves: Mapping[str, tuple[Any, Any] | None] | Iterable[Any],
     *,
     ax: Axes | None = None,
     title: str | None = None,
@@ -35,7 +34,8 @@ def draw_precision_recall(
     Lines differ in colour and in dash pattern.
 
     Args:
-        curves: Name to `(recall [K], precision [K])`, both in [0, 1]; or results of
+        curves: Name to `(recall [K], precision [K])`, both in [0, 1], or to None, which
+            keeps the looks of the others the same from panel to panel; or results of
             `evaluation.average_precision.evaluate`, which are named by class and AP.
             Results of classes without any object are left out.
         ax: Where to draw; a new figure by default.
@@ -49,7 +49,10 @@ def draw_precision_recall(
         curves, name = _named_curves(curves)
         title = title or name
     ax = new_figure(5.2, 4.6, layout="constrained").add_subplot() if ax is None else ax
-    for i, (label, (recall, precision)) in enumerate(curves.items()):
+    for i, (label, curve) in enumerate(curves.items()):
+        if curve is None:
+            continue
+        recall, precision = curve
         recall, precision = np.asarray(recall, float), np.asarray(precision, float)
         if recall.ndim != 1 or recall.shape != precision.shape:
             raise UserError(
@@ -68,7 +71,15 @@ def draw_precision_recall(
     ax.title.set_fontsize(9)
     ax.grid(alpha=0.3)
     if curves:
-        ax.legend(fontsize=8, loc="lower left")
+        # Below the axes, where it covers no curve.
+        columns = 1 if len(curves) < 4 else 2
+        ax.legend(
+            fontsize=7,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.16),
+            ncols=columns,
+            frameon=False,
+        )
     return ax
 
 
@@ -104,20 +115,18 @@ def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndar
     if not path.is_file():
         raise FileNotFoundError(f"no metrics of a run at {path}")
     series: dict[str, list[tuple[float, float]]] = {}
-    lines = path.read_text(encoding="utf-8").split("\n")
+    lines = files.read_text(path).split("\n")
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
         try:
-            record = json.loads(line)
-            step = float(record.pop("step"))
-        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            where = f"{path}, line {number}"
+            record = files.parse_json(line, {"step": float}, where)
+        except DataError:
             if number == len(lines):
                 break
-            raise DataError(
-                f"{path}, line {number}: expected a JSON object with a step, got "
-                f"{line[:60]!r}"
-            ) from error
+            raise
+        step = float(record.pop("step"))
         for name, value in record.items():
             if isinstance(value, int | float):
                 series.setdefault(name, []).append((step, float(value)))
@@ -135,7 +144,7 @@ def draw_training(
 
     Args:
         metrics: Path of `metrics.jsonl`, or name to `(step [N], value [N])`.
-        keys: Names to show; by default the loss parts that are there.
+        keys: Names to show; by default the weighted sum of the losses where it is there.
         smoothing: Share of the run over which the bold line averages.
         title: Title of the figure.
 
@@ -143,7 +152,7 @@ def draw_training(
         UserError: A key is not in the metrics; lists those that are.
     """
     series = metrics if isinstance(metrics, Mapping) else read_metrics(metrics)
-    keys = keys or [k for k in LOSS_KEYS if k in series] or sorted(series)[:3]
+    keys = keys or [k for k in ("weighted_sum",) if k in series] or sorted(series)[:3]
     unknown = [key for key in keys if key not in series]
     if unknown or not keys:
         raise UserError(

@@ -15,6 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
 from radejax.core.errors import UserError
+from radejax.core.structures import ROIS
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.canvas import (
     COLOR_MAP,
@@ -223,14 +224,16 @@ def legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
     handles = []
     for style, objects in scene.sets:
         count = f" ({len(objects.boxes)})" if show_counts else ""
+        if objects.scores is not None and scene.score_threshold is not None:
+            count += f", score from {scene.score_threshold:g}"
         width, label = style.map_width, style.name + count
         line = Line2D([], [], color=style.color, lw=width, label=label)
         line.set_path_effects(halo(width + 1.4))
         handles.append(line)
     if scene.roi is not None:
-        handles.append(
-            Line2D([], [], color=ROI_COLOR, lw=1.4, ls="--", label="region of interest")
-        )
+        named = [name for name, roi in ROIS.items() if roi == tuple(scene.roi)]
+        label = f"{named[0]} region" if named else "region of interest"
+        handles.append(Line2D([], [], color=ROI_COLOR, lw=1.4, ls="--", label=label))
     return handles
 
 

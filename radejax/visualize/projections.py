@@ -12,11 +12,21 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from radejax.core.errors import UserError
+from radejax.geometry.boxes import corners
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize.canvas import color_limits_of, draw_tiles, new_figure
+from radejax.visualize.canvas import (
+    GROUND_TRUTH,
+    as_objects,
+    color_limits_of,
+    draw_tiles,
+    footprints,
+    halo,
+    new_figure,
+)
 
 Channels = Literal["all", "doppler", "elevation"]
 Reduce = Literal["max", "mean"]
@@ -182,8 +192,12 @@ def draw_slices(
     range_idx: int | None = None,
     azimuth_idx: int | None = None,
     units: Units = "normalized",
+    ground_truth: Any = None,
 ) -> Figure:
     """Figure of the three slices side by side, on one colour scale.
+
+    Boxes are outlined where both axes are known. Labels have no Doppler: there a bar at
+    the left edge spans the ranges of each box.
 
     Args:
         projection: `[R, A, D+E]` normalised log power.
@@ -191,6 +205,7 @@ def draw_slices(
         range_idx: Range bin of the azimuth-elevation slice; None: maximum.
         azimuth_idx: Azimuth bin of the range-Doppler slice; None: maximum.
         units: "normalized" or "db".
+        ground_truth: Boxes to draw, anything that `canvas.as_objects` takes, or None.
     """
     figure = new_figure(14.0, 4.2, layout="constrained")
     axes = figure.subplots(1, 3)
@@ -210,7 +225,49 @@ def draw_slices(
             color_limits=limits,
             ax=ax,
         )
+    boxes = as_objects(ground_truth, what="ground_truth").boxes
+    left, right = axes[1].get_xlim()
+    left += 0.02 * (right - left)
+    width = 0.7 * GROUND_TRUTH.map_width  # most boxes are a few bins
+    for ax, lines in zip(axes, _outlines(boxes, left), strict=True):
+        ax.add_collection(
+            LineCollection(
+                lines,
+                colors=GROUND_TRUTH.color,
+                linewidths=width,
+                path_effects=halo(width + 1.2),
+            ),
+            autolim=False,
+        )
     return figure
+
+
+def _outlines(boxes: np.ndarray, left: float) -> tuple[list[np.ndarray], ...]:
+    """Lines of boxes `[N, 7]` in the three slices, each `[P, 2]`.
+
+    Args:
+        boxes: In the ego frame.
+        left: Doppler at which a box's bar stands.
+    """
+    azimuth_range = [to_polar(outline) for outline in footprints(boxes, 8)]
+    bars, azimuth_elevation = [], []
+    for outline, points in zip(azimuth_range, corners(boxes), strict=True):
+        ground = to_polar(points[:, :2])
+        height = np.rad2deg(np.arctan2(points[:, 2], ground[:, 1]))
+        seen = np.stack([ground[:, 0], height], -1)
+        (x0, y0), (x1, y1) = seen.min(0), seen.max(0)
+        azimuth_elevation.append(
+            np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        )
+        ranges = outline[:, 1]
+        bars.append(np.array([[left, ranges.min()], [left, ranges.max()]]))
+    return azimuth_range, bars, azimuth_elevation
+
+
+def to_polar(points: np.ndarray) -> np.ndarray:
+    """Azimuth in degrees, right positive, and range of ground positions `[..., 2]`."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
 def _slice_or_max(

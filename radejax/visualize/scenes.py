@@ -27,6 +27,7 @@ ZOOM_COLOR = "#E69F00"
 
 _COLOR_PERCENTILES = (20.0, 99.5)
 _FOOT_IN = 0.8  # legend and colour bar
+_COLUMN_IN, _ROW_IN = 4.9, 8.0  # large enough for scores of crowded scenes
 
 
 def draw_scenes(
@@ -46,24 +47,24 @@ def draw_scenes(
         raise UserError("no scenes to draw")
     columns = min(columns, len(scenes))
     rows = -(-len(scenes) // columns)
-    width, height = 3.9 * columns, 6.4 * rows + _FOOT_IN
+    width, height = _COLUMN_IN * columns, _ROW_IN * rows + _FOOT_IN
     figure = new_figure(width, height)
     limits = _common_limits(scenes)
     options = {"color_limits": limits, "show_legend": False, "show_colorbar": False}
     for index, scene in enumerate(scenes):
         row, column = divmod(index, columns)
         left = (column + 0.14) / columns
-        bottom = 1.0 - (6.4 * (row + 1) + 0.05) / height
+        bottom = 1.0 - (_ROW_IN * (row + 1) + 0.05) / height
 
         def place(y: float, h: float, x: float = left, base: float = bottom) -> tuple:
             return x, base + y / height, 0.83 / columns, h / height
 
         above = None
         if scene.image is not None:
-            above = figure.add_axes(place(4.25, 1.85))
+            above = figure.add_axes(place(5.55, 2.15))
             # Labels are readable on the map; here they would hide the image.
             bev.draw_view(above, scene, show_labels=False)
-        below = figure.add_axes(place(0.55, 3.6))
+        below = figure.add_axes(place(0.55, 4.9))
         bev.draw_bev(dataclasses.replace(scene, title=""), ax=below, **options)
         if column:
             below.set_ylabel("")

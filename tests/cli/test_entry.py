@@ -1,11 +1,7 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
-import json
-import os
-import pathlib
 import socket
-import subprocess
 import sys
 
 import jax
@@ -43,12 +39,24 @@ from radejax.geometry.calibration import CalibrationError, CalibrationFileError
             2,
             "error: Is a directory: /tmp\n",
         ),
+        (
+            OSError(errno.EROFS, "Read-only file system", "/cdrom/records"),
+            2,
+            "error: Read-only file system: /cdrom/records; name another place (--out, "
+            "--workdir, --records, --data)\n",
+        ),
+        (KeyboardInterrupt(), 130, "error: interrupted\n"),
+        (
+            KeyboardInterrupt("second SIGINT"),
+            130,
+            "error: interrupted (second SIGINT)\n",
+        ),
         (OSError(errno.ENOSPC, "No space left on device"), 1, None),
         (DiskFullError("no space left"), 1, "error: no space left\n"),
     ],
 )
 def test_user_errors_end_in_one_line(
-    error: Exception, code: int, text: str | None, capsys: pytest.CaptureFixture
+    error: BaseException, code: int, text: str | None, capsys: pytest.CaptureFixture
 ) -> None:
     with pytest.raises(SystemExit) as ended, entry.exit_codes():
         raise error
@@ -56,6 +64,20 @@ def test_user_errors_end_in_one_line(
     written = capsys.readouterr().err
     assert written.count("\n") == 1
     assert text is None or written == text
+
+
+def test_closed_standard_error_says_nothing_and_keeps_the_exit_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def work() -> None:
+        sys.stderr.write("progress")
+        raise UserError("wrong")
+
+    monkeypatch.setattr(sys, "stderr", None)  # as Python has it for 2>&-
+    with pytest.raises(SystemExit) as ended, entry.exit_codes():
+        work()
+    assert ended.value.code == entry.WRONG_USE
+    sys.stderr.close()
 
 
 def test_defects_keep_their_traceback() -> None:
@@ -68,9 +90,6 @@ def test_defects_keep_their_traceback() -> None:
 def test_debug_lets_the_traceback_through() -> None:
     with pytest.raises(UserError), entry.exit_codes(debug=True):
         raise UserError("wrong")
-
-
-REPOSITORY = pathlib.Path(__file__).resolve().parents[2]
 
 
 def test_a_coordinator_that_is_not_reached_is_one_line(
@@ -98,53 +117,5 @@ def test_a_port_that_is_taken_is_one_line() -> None:
         entry.join_processes("1234", 2, 0)
 
 
-def test_processes_without_a_coordinator_are_wrong_use(tmp_path: pathlib.Path) -> None:
-    command = [sys.executable, "train.py", "--config=configs/quickstart.py:short"]
-    command += [f"--workdir={tmp_path / 'run'}", "--num_processes=2", "--process_id=1"]
-    ended = subprocess.run(
-        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120
-    )
-    assert ended.returncode == entry.WRONG_USE
-    assert "--num_processes and --process_id together" in ended.stderr
-    assert not (tmp_path / "run").exists()
-
-
 def test_words_are_repeated_or_with_commas() -> None:
     assert entry.words(["a, b", "c", ""]) == ("a", "b", "c")
-
-
-def test_a_second_folder_without_its_flag_is_wrong_use(tmp_path: pathlib.Path) -> None:
-    command = [sys.executable, "train.py", "--config=configs/quickstart.py:short"]
-    command += [f"--workdir={tmp_path / 'run'}", "--data", "disk1", "disk2"]
-    ended = subprocess.run(
-        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=120
-    )
-    assert ended.returncode == entry.WRONG_USE
-    assert ended.stderr == (
-        "error: unexpected arguments: disk2; several folders are --data A,B or "
-        "--data A --data B\n"
-    )
-    assert not (tmp_path / "run").exists()
-
-
-def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
-    command = [sys.executable, "train.py", "--config=configs/radenet.py"]
-    command += [f"--data={tmp_path}", f"--workdir={tmp_path / 'run'}"]
-    for words, message in (
-        (["--sequences=1,x"], "error: --sequences: 'x' is no number, expected 1,5,58"),
-        (["--weather=fog", "--weather=mist"], "config.data.weather is ('fog', 'mist')"),
-        (["--sequences=1,58", "--weather=fog", "--weather=rain"], "no sequence"),
-    ):
-        ended = subprocess.run(
-            [*command, *words],
-            cwd=REPOSITORY,
-            capture_output=True,
-            text=True,
-            timeout=120,
-            env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        )
-        assert ended.returncode == entry.WRONG_USE
-        assert message in ended.stderr
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert config["data"]["sequences"] == [1, 58]
-    assert config["data"]["weather"] == ["fog", "rain"]

@@ -116,10 +116,11 @@ def test_evaluate_takes_flags_as_its_script_does(
 ) -> None:
     from radejax.runs import evaluate
 
-    seen = []
+    seen, scoring = [], []
 
     def evaluate_run(workdir: str, **options: object) -> SimpleNamespace:
-        seen.append((workdir, options["step"], options["other"]))
+        seen.append((workdir, options.pop("step"), options.pop("other")))
+        scoring.append(options)
         return SimpleNamespace(metrics={}, files=[pathlib.Path("there/metrics.json")])
 
     monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
@@ -130,11 +131,22 @@ def test_evaluate_takes_flags_as_its_script_does(
     assert (other.data, other.label_version) == (("a", "b", "c"), "v1.0")
     _run("evaluate", "--workdir=run", "--split=train")
     assert seen[1] == ("run", None, None)
+    flags = "--roi=0,50,-5,5,-2,6 --min_score=0.01 --iou=0.5 --classes Sedan --name n"
+    _run("evaluate", "--workdir=run", *flags.split(), "--protocols=exact,auc")
+    given = {k: v for k, v in scoring[2].items() if k not in scoring[1]}
+    assert given == {
+        "roi": (0.0, 50.0, -5.0, 5.0, -2.0, 6.0),
+        "min_score": 0.01,
+        "iou_thresholds": (0.5,),
+        "classes": ("Sedan",),
+        "protocols": ("exact", "auc"),
+        "run": "n",
+    }
     wrong = _run("evaluate", "--workdir", "run", "--data=", "--debug")
     assert "names no folder" in str(wrong.exception)
     assert isinstance(wrong.exception, UserError)
     for flags, message in (
-        (("--workdir", "run", "--roi=wide"), "--roi: config.evaluation of the run"),
+        (("--workdir", "run", "--frames=x"), "--frames: only without --workdir"),
         (("--predictions", "x", "--step=3"), "--checkpoint: only with --workdir"),
         (("--predictions", "x", "y", "z"), "unexpected arguments: y z"),
         (("--compare", "a", "b", "--bootstrap=0"), "a comparison needs resamples"),

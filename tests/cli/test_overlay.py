@@ -9,6 +9,7 @@ from PIL import Image
 
 from radejax.cli.overlay import overlay
 from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.visualize import bev
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +42,7 @@ def test_the_first_frame_of_a_sequence_is_drawn(
         ("first", "expected sequence/radar_lidar"),
         ("1/00000_00000", "no frame 00000_00000 in sequence 1; there are"),
         ("7", "no labels of sequences [7]"),
+        ("", "expected sequence/radar_lidar"),
     ],
 )
 def test_a_frame_that_is_not_there_is_named(
@@ -63,3 +65,38 @@ def test_slices_and_a_sequence_in_motion(
     assert '"frames": 1' in done.output
     with Image.open(tmp_path / "all.gif") as picture:
         assert picture.format == "GIF"
+
+
+def test_a_part_of_the_data_is_drawn(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    weather = (root / "1" / "description.txt").read_text().strip().split(",")[2]
+    done = _run("", root, "--weather", weather, "--out", tmp_path / "part.png")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "part.png").is_file()
+    other = "rain" if weather == "fog" else "fog"
+    done = _run("", root, "--sequences", 1, "--weather", other)
+    assert done.exit_code == 2
+    assert "no frames of these sequences and weathers" in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), "narrow region"),
+        (("--roi", "wide"), "wide region"),
+        (("--roi=none",), None),
+    ],
+)
+def test_the_region_is_that_of_the_evaluation_and_named(
+    arguments: tuple[str, ...],
+    expected: str | None,
+    root: pathlib.Path,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = []
+    monkeypatch.setattr(bev, "save_figure", lambda figure, _: drawn.append(figure))
+    assert _run("1", root, "--out", tmp_path / "a.png", *arguments).exit_code == 0
+    texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert texts[1:] == ([expected] if expected else [])

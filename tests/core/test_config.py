@@ -1,5 +1,6 @@
 """Configs: words, presets, the rows of the papers' tables; every one can be built."""
 
+import json
 import pathlib
 from typing import Any
 
@@ -7,7 +8,15 @@ import jax
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config, config_name, load_module, parse_words
+from radejax.core.config import (
+    base_config,
+    config_file,
+    config_name,
+    load_config,
+    load_module,
+    parse_words,
+    renewed,
+)
 from radejax.core.errors import UserError
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -83,3 +92,37 @@ def test_words_that_do_not_go_together_are_refused() -> None:
 def test_names_of_runs() -> None:
     assert config_name("configs/quickstart.py") == "quickstart"
     assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
+
+
+def test_a_config_of_before_is_brought_to_the_present_form() -> None:
+    now = json.loads(base_config().to_json())
+    before = json.loads(base_config().to_json())
+    before["loss"]["weights"] = [2.0, 1.0, 0.5]
+    del before["data"]["sequences"], before["seed"]
+    now["loss"]["weights"]["smooth_l1"] = 0.5
+    assert renewed(before) == renewed(now) == now
+
+
+def test_a_config_file_of_before_lists_the_weights_of_losses() -> None:
+    config = base_config()
+    config.loss.weights = (2.0, 1.0, 0.5)
+    by_name = renewed(config.to_dict())["loss"]["weights"]
+    assert by_name == {"focal": 2.0, "gwd": 1.0, "smooth_l1": 0.5}
+
+
+def test_configs_that_come_along_are_those_of_the_repository() -> None:
+    for path in CONFIGS.glob("*.py"):
+        found = config_file(path.stem)
+        assert "radejax" in found.parent.parent.name
+        assert found.samefile(path)
+    assert load_config("radenet:sedan").classes == ("Sedan",)
+
+
+def test_a_file_that_is_no_config_is_named(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "mine.py").write_text("x = 1\n")
+    with pytest.raises(UserError, match=r"mine\.py has no function get_config"):
+        load_config(f"{tmp_path / 'mine.py'}:word")
+    with pytest.raises(
+        UserError, match=r"no such config file: .*mine; give a \.py file"
+    ):
+        load_config(str(tmp_path / "mine"))

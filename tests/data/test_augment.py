@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.data.augment import (
@@ -14,6 +15,7 @@ from radejax.data.augment import (
     mirror_camera,
 )
 from radejax.data.encoding import decode, encode
+from radejax.data.images import read_left_image
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import project
 from radejax.geometry.radar_grid import RadarGrid
@@ -108,6 +110,30 @@ def test_image_is_mirrored_with_its_camera():
     assert after["camera"].intrinsics[2] == 1280 - 600
     assert before["camera"].intrinsics[2] == 600
     assert mirror(sample(boxes))["image"] is None
+
+
+def test_a_point_has_its_colour_in_the_resized_and_the_mirrored_image(tmp_path):
+    """Read as the model samples: pixel i has its center at i + 1/2."""
+    ramp = np.broadcast_to(
+        2 * np.arange(128, dtype=np.uint8)[None, :, None], (64, 128, 3)
+    )
+    Image.fromarray(ramp).save(tmp_path / "a.png")
+    calibration = dataclasses.replace(
+        CAMERA, intrinsics=(60.0, 60.0, 55.0, 30.0), width=128, height=64
+    )
+    points = np.array([[20.0, 3.0, 0.0], [30.0, -8.5, 0.0], [15.0, 2.25, 1.0]])
+    colours = []
+    for scale in (1, 2):
+        width, height = 128 // scale, 64 // scale
+        image = read_left_image(tmp_path / "a.png", (height, width), resize=True)
+        camera = calibration.resized(width, height).camera()
+        before = {**sample(np.zeros((1, 8))), "image": image, "camera": camera}
+        for frame, sign in ((before, 1), (mirror(before), -1)):
+            (pixels, _) = project(points * (1, sign, 1), frame["camera"])
+            row = frame["image"][0, :, 0].astype(float)
+            colours.append(np.interp(pixels[:, 0] - 0.5, np.arange(width), row))
+    for found in colours[1:]:
+        np.testing.assert_allclose(found, colours[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint8])

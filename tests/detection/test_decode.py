@@ -21,12 +21,21 @@ CASES = ("padded_wide_roi", "padded_no_roi", "unpadded_wide_roi", "unpadded_no_r
 GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimuth=12)
 C = 3
 SIZES = ("grid", "max_detections", "pre_nms", "per_class_nms")
-FLAGS = ("threshold_inclusive", "raw_yaw")
+FLAGS = ("threshold_inclusive", "raw_yaw", "clip_sizes")
 
-decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
-find_peaks = jax.jit(
+_decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
+_find_peaks = jax.jit(
     D.find_peaks, static_argnames=("grid", "max_peaks", "threshold_inclusive")
 )
+
+
+def decode(*args, **options):
+    """Results in NumPy: JAX compiles every slice of another size."""
+    return jax.device_get(_decode(*args, **options))
+
+
+def find_peaks(*args, **options):
+    return jax.device_get(_find_peaks(*args, **options))
 
 
 def logit(p):
@@ -217,13 +226,13 @@ def test_encoded_boxes_come_back():
         heading = [np.sin(box[6]), np.cos(box[6])]
         params[0, i, j] = [*offset, box[2] - 0.7, *box[3:6], *heading]
     found = decode(
-        maps_of(logits, params), GRID, max_detections=12, score_threshold=0.3, z0_m=0.7
+        maps_of(logits, params), GRID, max_detections=16, score_threshold=0.3, z0_m=0.7
     )
     np.testing.assert_allclose(found.boxes[0, :6], boxes, atol=2e-5)
-    np.testing.assert_array_equal(found.classes[0], [*classes] + [-1] * 6)
+    np.testing.assert_array_equal(found.classes[0], [*classes] + [-1] * 10)
     np.testing.assert_array_equal(found.scores[0, 6:], 0)
     np.testing.assert_array_equal(found.boxes[0, 6:], 0)
-    assert found.is_valid[0].tolist() == [True] * 6 + [False] * 6
+    assert found.is_valid[0].tolist() == [True] * 6 + [False] * 10
 
 
 def test_what_k_cuts_off_is_counted():
@@ -276,7 +285,7 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     assert 3 < inside.sum() < 10
     roi = np.array([0, 90, -30, 30, 0, 0.0])
     found = decode(
-        maps_of(logits, params), GRID, max_detections=12, score_threshold=0.3, roi=roi
+        maps_of(logits, params), GRID, max_detections=16, score_threshold=0.3, roi=roi
     )
     np.testing.assert_allclose(found.boxes[0, : inside.sum(), 0], x[inside], rtol=1e-6)
     # Peaks outside do not take the place of peaks inside.
@@ -292,7 +301,7 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     above = decode(
         maps_of(logits, params),
         GRID,
-        max_detections=12,
+        max_detections=16,
         score_threshold=0.3,
         roi=roi,
         z0_m=0.1,
@@ -339,7 +348,7 @@ def test_official_preset_decodes_as_released(case):
     options = dict(config) | {"max_detections": 48}
     if not want["wide_roi"]:
         options["roi"] = None
-    found = D.decode(maps, grid, **options)
+    found = decode(maps, grid, **options)
     for frame in range(3):
         kept = want[f"boxes_before_nms_{frame}"][want[f"kept_{frame}"]]
         norm = np.hypot(kept[:, 6], kept[:, 7])[:, None]
@@ -365,7 +374,7 @@ def test_our_evaluator_takes_the_raw_footprint_as_the_released_one(shared):
 
 def test_thresholds_and_region_are_traced_values():
     logits, params, _, _ = scattered(num=10)
-    count = decode._cache_size()
+    count = _decode._cache_size()
     for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5), (0.5, 0.1)):
         roi = np.array([0.0, 100 * threshold, -50, 50, -1, 1])
         found = decode(
@@ -379,15 +388,15 @@ def test_thresholds_and_region_are_traced_values():
         valid = np.asarray(found.is_valid[0])
         assert (np.asarray(found.scores[0])[valid] > threshold).all()
         assert (np.asarray(found.boxes[0])[valid, 0] <= 100 * threshold).all()
-    assert decode._cache_size() == count + 1
+    assert _decode._cache_size() == count + 1
 
 
 def test_frames_of_a_batch_do_not_mix():
     scenes = [scattered(num=n, seed=n)[:2] for n in (0, 3, 9)]
     batch = maps_of(*(np.concatenate(x) for x in zip(*scenes, strict=True)))
-    together = decode(batch, GRID, max_detections=12, score_threshold=0.3)
+    together = decode(batch, GRID, max_detections=16, score_threshold=0.3)
     for i, scene in enumerate(scenes):
-        alone = decode(maps_of(*scene), GRID, max_detections=12, score_threshold=0.3)
+        alone = decode(maps_of(*scene), GRID, max_detections=16, score_threshold=0.3)
         for found, wanted in zip(
             jax.tree.leaves(together), jax.tree.leaves(alone), strict=True
         ):
@@ -398,14 +407,14 @@ def test_frames_of_a_batch_do_not_mix():
 def test_bfloat16_maps_and_saturated_or_missing_numbers():
     logits, params, _, _ = scattered()
     low = jax.tree.map(lambda x: x.astype(jnp.bfloat16), maps_of(logits, params))
-    found = decode(low, GRID, max_detections=8, score_threshold=0.3)
+    found = decode(low, GRID, max_detections=16, score_threshold=0.3)
     assert found.boxes.dtype == found.scores.dtype == jnp.float32
     assert int(found.is_valid.sum()) == 6
     for value in (np.inf, 100.0, np.nan, -np.inf):
         flat = decode(
             maps_of(np.full_like(logits, value), params),
             GRID,
-            max_detections=8,
+            max_detections=16,
             score_threshold=0.3,
         )
         assert np.isfinite(flat.boxes).all()
@@ -426,3 +435,31 @@ def test_wrong_shapes_are_refused():
         run(maps_of(logits, params), GRID, pre_nms=0)
     with pytest.raises(ValueError, match=r"roi must be \[6\]"):
         run(maps_of(logits, params), GRID, roi=np.zeros(4))
+
+
+@pytest.mark.parametrize("raw_yaw", ["nms", "always"])
+def test_a_size_is_never_negative(raw_yaw):
+    logits = jnp.full((2, 20, 12, C), -9.0)
+    logits = logits.at[0, [5, 15], [3, 9], 1].set(2.0).at[1, 5, 3, 0].set(2.0)
+    params = (
+        jnp.ones((2, 20, 12, 8))
+        .at[0, 5, 3]
+        .set(jnp.array([0, 0, 0, -0.2, 1.5, 0, 0, 0]))
+    )
+
+    def run(**options):
+        settings = {"max_detections": 4, "score_threshold": 0.3, "raw_yaw": raw_yaw}
+        maps = DetectionMaps(logits, params)
+        return decode(maps, grid=GRID, **settings, **options)
+
+    found, released = run(), run(clip_sizes=False)
+    least = np.float32(0.01)
+    width = 1.5 if raw_yaw == "nms" else least  # the yaw vector's length is 0
+    np.testing.assert_array_equal(found.boxes[0, 0, 3:6], [least, width, least])
+    assert found.num_clipped.tolist() == [1, 0]
+    np.testing.assert_array_equal(found.boxes[0, 1], released.boxes[0, 1])
+    assert float(released.boxes[0, 0, 3]) == (
+        np.float32(-0.2) if raw_yaw == "nms" else 0.0
+    )
+    assert load_config("configs/radenet.py:official").decode.clip_sizes is False
+    assert load_config("configs/radenet.py").decode.clip_sizes is True

@@ -39,7 +39,7 @@ def test_chain_by_hand():
     boxes = np.zeros((4, 7), np.float32)
     boxes[:, 0] = [0, 2, 4, 30]
     boxes[:, 3:6] = 4
-    keep = rotated_nms(boxes, jnp.array([True, True, True, False]), 0.3)
+    keep = nms(boxes, jnp.array([True, True, True, False]), 0.3)
     assert keep.tolist() == [True, False, True, False]
 
 
@@ -48,21 +48,20 @@ def test_threshold_is_inclusive():
     boxes[:, 3:6] = [3.0, 2, 1]
     boxes[1, 0] = 1.5  # half of each: IoU 1/3, exact in these numbers up to rounding
     valid = jnp.ones(2, bool)
-    iou = np.float32(jax.jit(lambda b: rotated_nms(b, valid, 0.0))(boxes)[1])
-    assert iou == 0  # suppressed at threshold 0, even
-    assert rotated_nms(boxes, valid, 1 / 3 - 1e-5).tolist() == [True, False]
-    assert rotated_nms(boxes, valid, 1 / 3 + 1e-5).tolist() == [True, True]
+    assert nms(boxes, valid, 0.0).tolist() == [True, False]
+    assert nms(boxes, valid, 1 / 3 - 1e-5).tolist() == [True, False]
+    assert nms(boxes, valid, 1 / 3 + 1e-5).tolist() == [True, True]
     same = boxes.copy()
     same[1] = same[0]
-    assert rotated_nms(same, valid, 1.0).tolist() == [True, False]
+    assert nms(same, valid, 1.0).tolist() == [True, False]
 
 
 def test_only_boxes_of_one_class_where_classes_are_given():
     boxes = np.zeros((3, 7), np.float32)
     boxes[:, 3:6] = 4
     valid, classes = jnp.ones(3, bool), jnp.array([0, 1, 0])
-    assert rotated_nms(boxes, valid, 0.3).tolist() == [True, False, False]
-    keep = rotated_nms(boxes, valid, 0.3, classes=classes)
+    assert nms(boxes, valid, 0.3).tolist() == [True, False, False]
+    keep = nms(boxes, valid, 0.3, classes=classes)
     assert keep.tolist() == [True, True, False]
 
 

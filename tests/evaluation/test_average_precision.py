@@ -611,6 +611,18 @@ def test_bad_rows_are_named():
     raises("frame 8, row 1: no such frame among the 2 frames", frame=put(1, 8))
 
 
+def test_far_too_many_boxes_of_a_frame_are_refused_at_once():
+    truth = truth_of(*((7, car(), "Sedan") for _ in range(2000)))
+    found = found_of(*((7, car(), "Sedan", 0.5) for _ in range(20000)))
+    message = (
+        "frame 7: 20000 predictions and 2000 ground truths of Sedan are 40,000,000"
+    )
+    with pytest.raises(DataError, match=message):
+        evaluate(truth, found)
+    half = {name: column[:500] for name, column in found.items()}  # 10**6 pairs are not
+    assert EvaluationSet(truth, half).pair_gt.size == 1_000_000
+
+
 def test_ground_truth_and_frames_are_checked_too():
     truth, found = truth_of((0, car(), "Sedan")), found_of()
     with pytest.raises(DataError, match="frame 3 occurs twice, in rows"):

@@ -7,10 +7,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
+from radejax.evaluation.files.load import Source
+from radejax.evaluation.files.load import load as load_tables
+from radejax.evaluation.files.predictions import write_table
 from radejax.inference import packed
 from radejax.inference.detect_files import (
+    chosen_frames,
     detect_files,
     find_frames,
     front_images,
@@ -52,10 +57,21 @@ def test_every_frame_is_found_once_and_its_projection_preferred(
 def test_names_of_results_are_unique_among_sequences(root: pathlib.Path) -> None:
     names = [output_name(path) for path in find_frames([root])]
     assert sorted(names) == [
-        "5_tesseract_00033",
-        "5_tesseract_00034",
-        "6_tesseract_00033",
+        "5_00033",
+        "5_00034",
+        "6_00033",
     ]
+
+
+def test_a_part_of_the_frames(root: pathlib.Path) -> None:
+    for sequence, weather in (("5", "fog"), ("6", "rain")):
+        (root / sequence / "description.txt").write_text(f"urban,day,{weather}\n")
+    every = find_frames([root])
+    assert chosen_frames(every) == every
+    assert [output_name(p) for p in chosen_frames(every, (6, 9))] == ["6_00033"]
+    assert len(chosen_frames(every, weather=("fog",))) == 2
+    with pytest.raises(UserError, match="no frames of 5, rain in these folders"):
+        chosen_frames(every, (5,), ("rain",))
 
 
 def test_nothing_found_and_nothing_there(tmp_path: pathlib.Path) -> None:
@@ -83,13 +99,35 @@ def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
     out = tmp_path / "out"
     count = detect_files(tmp_path / "packed", [tmp_path / "data"], out, batch_size=2)
     expected = detector(frames).to_list()
+    assert count.pop("clipped") == detector(frames).num_clipped.sum()
     assert count == {"frames": 3, "boxes": sum(map(len, expected))}
     for i, boxes in enumerate(expected):
-        found = json.loads((out / f"7_tesseract_{i:05}.json").read_text())
+        found = json.loads((out / f"7_{i:05}.json").read_text())
         assert [b["cls"] for b in found] == [b["cls"] for b in boxes]
         assert [b["x"] for b in found] == pytest.approx(
             [b["x"] for b in boxes], abs=1e-5
         )
+        assert all(b["frame"] == f"7/{i:05}" for b in found)
+    model, data, text = tmp_path / "packed", [tmp_path / "data"], tmp_path / "k"
+    detect_files(model, data, text, batch_size=2, file_format="kitti")
+    # Either is scored against labels whose frames have the key of both sensors.
+    table = {
+        "frame": [4, 5],
+        "sequence": [7, 7],
+        "name": ["00002_00011", "00001_00010"],
+    }
+    truth = {k: v[:0] for k, v in detector(frames).to_columns().items()}
+    write_table(tmp_path / "truth.json", truth)
+    files.write_json(tmp_path / "frames.json", table)
+    paths = {k: str(tmp_path / f"{k}.json") for k in ("frames", "truth")}
+    source = Source(ground_truth=paths["truth"], frames=paths["frames"])
+    _, found, *_ = load_tables(out, source, detector.classes)
+    counts = np.bincount(found["frame"], minlength=6).tolist()
+    assert counts == [0, 0, 0, 0, len(expected[2]), len(expected[1])]
+    _, kitti, *_ = load_tables(tmp_path / "k", source, detector.classes)
+    order, kitti_order = np.argsort(found["score"]), np.argsort(kitti["score"])
+    for name in ("frame", "box", "cls"):
+        np.testing.assert_array_equal(found[name][order], kitti[name][kitti_order])
     with pytest.raises(
         UserError, match=r"step best of .*packed, which holds one model"
     ):
@@ -101,7 +139,7 @@ def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:
         path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
         path.parent.mkdir(parents=True)
         path.touch()
-    with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* 5_tesseract_00033.json"):
+    with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* 5_00033.json"):
         detect_files(tmp_path, [tmp_path / "a", tmp_path / "b"], tmp_path / "out")
 
 

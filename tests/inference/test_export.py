@@ -143,13 +143,55 @@ def test_huggingface_files_name_what_is_left_out(tmp_path: pathlib.Path) -> None
         "config.json",
         "model.safetensors",
     }
-    with pytest.raises(UserError, match="format is 'onnx'"):
+    with pytest.raises(UserError, match="format is 'tflite'"):
+        export.export(small.detector(), tmp_path, kind="tflite")
+
+
+def test_onnx_without_its_library_says_what_to_install(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "jax2onnx", None)
+    with pytest.raises(
+        UserError, match=r'needs jax2onnx: pip install "radejax\[onnx\]"'
+    ):
         export.export(small.detector(), tmp_path, kind="onnx")
-
-
-def test_names_of_platforms(tmp_path: pathlib.Path) -> None:
-    checked = export._checked_platforms
-    assert checked(["gpu", "cpu", " cuda"]) == ("cuda", "cpu")
-    with pytest.raises(UserError, match="platform is 'foo', expected some of cpu"):
-        export.export(small.detector(), tmp_path, platforms=("cpu", "foo"))
+    with pytest.raises(UserError, match="image transformer does not convert"):
+        export.export(
+            small.detector("camera"), tmp_path, kind="onnx", with_backbone=True
+        )
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["radar", "camera"])
+def test_onnx_files_give_the_same_boxes(kind: str, tmp_path: pathlib.Path) -> None:
+    pytest.importorskip("jax2onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    detector, count = small.detector(kind), 2
+    arguments: list[Any] = [small.projections(count)]
+    inputs = {"projection": arguments[0]}
+    if kind == "camera":
+        camera = stack_cameras([small.calibration().camera()] * count)
+        image = small.images(count)
+        image = detector.model.apply(detector.variables, image, method="embed")
+        arguments += [np.asarray(image), camera]
+        inputs |= {"image": arguments[1]}
+        inputs |= {f"camera_{name}": array for name, array in vars(camera).items()}
+    export.export(detector, tmp_path, kind="onnx", batch_size=count)
+
+    def run(file: str, feed: dict[str, Any]) -> dict[str, Any]:
+        session = runtime.InferenceSession(tmp_path / file)
+        names = [output.name for output in session.get_outputs()]
+        return dict(zip(names, session.run(None, feed), strict=True))
+
+    for score, roi in ((0.1, (-99, 99) * 3), (0.5, (0, 20, -5, 5, -9, 9))):
+        settings = {"score_threshold": score, "nms_iou": 0.3, "roi": roi}
+        feed = {name: np.asarray(value, np.float32) for name, value in settings.items()}
+        found = run("detector.onnx", inputs | feed)
+        expected = detector(*arguments, **settings)
+        _check({f"{name}_": x for name, x in found.items()}, "", expected)
+    maps = jax.jit(lambda v, *x: detector.model.apply(v, *x, train=False))(
+        detector.variables, *arguments
+    )
+    for name, values in run("network.onnx", inputs).items():
+        np.testing.assert_allclose(values, getattr(maps, name), atol=1e-4)

@@ -157,3 +157,26 @@ def test_the_shift_and_projection_of_a_config_are_used() -> None:
     assert not camera.distortion.any()
     expected = -calibration.rotation @ np.array([-2.08, -0.13, 0.9])
     np.testing.assert_allclose(camera.cam_from_ego[0, :, 3], expected, atol=1e-6)
+
+
+def test_the_height_of_the_radar_is_the_models_or_kradars(
+    tmp_path: pathlib.Path,
+) -> None:
+    path = tmp_path / "cam_front0.yml"
+    path.write_text(small.calibration().to_kradar_text())
+    model = small.detector("camera").model
+
+    def shift(camera: Any, **options: Any) -> Any:
+        _, camera, _ = prepare(
+            small.images(1), camera, 1, model, CameraOptions(**options)
+        )
+        return -small.calibration().rotation.T @ camera.cam_from_ego[0, :, 3]
+
+    own = small.calibration(ego_from_lidar_m=(1.0, 2.0, 3.0))
+    for camera, options, expected in (
+        (str(path), {}, (-2.54, 0.3, 0.7)),
+        (str(path), {"lidar_to_radar_z_m": 0.0}, (-2.54, 0.3, 0.0)),
+        (own, {}, (1, 2, 3)),
+        (own, {"lidar_to_radar_z_m": 0.5}, (1, 2, 0.5)),
+    ):
+        np.testing.assert_allclose(shift(camera, **options), expected, atol=1e-6)

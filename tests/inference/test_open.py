@@ -3,6 +3,7 @@
 import json
 import pathlib
 
+import grain
 import jax
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from radejax.inference import open as opening
 from radejax.inference import packed
 from radejax.interop import radenet_torch
 from radejax.interop.image_backbone import weights_sha256
+from radejax.runs import workdir
+from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
 
@@ -62,6 +65,31 @@ def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> N
         UserError, match=r"do not fit: config\.model\.heatmap_prior is .* 0\.25 here"
     ):
         opening.starting_weights(other, init_from=tmp_path)
+
+
+def test_classes_reordered_in_a_work_folder_change_nothing_or_are_refused(
+    tmp_path: pathlib.Path,
+) -> None:
+    """A checkpoint has its own config; a training compares its config with the folder's."""
+    config, grid = small.radar_config(), small.small_grid()
+    info = workdir.checkpoint_info(config, grid, {}, {})
+    state = {"params": small.detector().variables["params"]}
+    positions = iter(grain.MapDataset.range(9).to_iter_dataset())
+    with (
+        workdir.claimed(tmp_path, config),
+        Checkpoints(tmp_path / "checkpoints") as saved,
+    ):
+        saved.save(1, state, positions, info=info)
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    content["classes"].reverse()
+    path.write_text(json.dumps(content))
+    assert opening.load(tmp_path).settings["classes"] == tuple(config.classes)
+    with (
+        pytest.raises(UserError, match="a run with another config: config"),
+        workdir.claimed(tmp_path, config),
+    ):
+        pass
 
 
 def test_without_anything_to_start_from_all_is_drawn() -> None:

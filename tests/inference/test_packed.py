@@ -8,10 +8,10 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
-from ml_collections import ConfigDict
 
 from radejax import Detector, UserError, models
-from radejax.core.config import load_module
+from radejax.cli.demo import MODEL
+from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
@@ -27,9 +27,9 @@ def _equal(a: Any, b: Any) -> None:
 
 def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> None:
     detector = small.detector(nms_iou=0.2, azimuth_mapping="stretched")
-    content = packed.write_packed(
-        tmp_path, detector, training_config=ConfigDict({"seed": 3})
-    )
+    config = base_config()
+    config.seed = 3
+    content = packed.write_packed(tmp_path, detector, training_config=config)
     assert content["left_out"] == []
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "config.json",
@@ -40,7 +40,43 @@ def test_a_packed_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> No
     assert loaded.classes == detector.classes
     assert (loaded.nms_iou, loaded.score_threshold) == (0.2, 0.1)
     _equal(loaded(small.projections(3)), detector(small.projections(3)))
-    assert load(tmp_path).config.to_dict() == {"seed": 3}
+    assert load(tmp_path).config.to_json() == config.to_json()
+    # A neck that this version does not have is not taken for another.
+    content["model"]["neck"] = "strips"
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"neck is 'strips', expected .*dilated.*plain"):
+        load(tmp_path)
+
+
+def test_a_model_stored_in_half_is_half_and_computes_in_float32(
+    tmp_path: pathlib.Path,
+) -> None:
+    detector = small.detector()
+    for half in (False, True):
+        packed.write_packed(tmp_path / str(half), detector, half=half)
+    sizes = [
+        (tmp_path / n / packed.WEIGHTS_FILE).stat().st_size for n in ("False", "True")
+    ]
+    assert sizes[1] < 0.6 * sizes[0]
+    found = packed.read_packed(tmp_path / "True").variables
+
+    def same(ours: Any, theirs: Any) -> None:
+        assert ours.dtype == np.float32
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-7)
+
+    jax.tree.map(same, found, dict(detector.variables))
+
+
+def test_the_demo_comes_with_a_small_model_of_simulated_data() -> None:
+    files = list(MODEL.iterdir())
+    assert sum(path.stat().st_size for path in files) < 4e6
+    loaded = packed.read_packed(MODEL)
+    card = (MODEL / "README.md").read_text()
+    assert "float16" in card
+    assert "simulated data alone" in card
+    assert "CC BY" not in card
+    assert loaded.config.simulation.scenes == "procedural"  # nothing of K-Radar in it
+    assert loaded.grid.projection_shape == (64, 56, 25)
 
 
 @pytest.mark.slow
@@ -89,7 +125,9 @@ def test_damaged_and_absent_folders_are_named(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-8])
-    with pytest.raises(DataError, match=r"model.safetensors is damaged"):
+    with pytest.raises(
+        DataError, match=r"model.safetensors: damaged, not a safetensors"
+    ):
         Detector.from_checkpoint(tmp_path)
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"format": "other"}))
@@ -115,3 +153,26 @@ def test_grid_survives_json_exactly(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
     assert load(tmp_path).grid == small.small_grid()
     assert RadarGrid.kradar() != small.small_grid()
+
+
+def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> None:
+    packed.write_packed(tmp_path, small.detector())
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    model, decode = content["model"], content["decode"]
+    for change, message in (
+        ({"classes": ["Sedan"]}, "1 classes, expected 5, as model.num_classes"),
+        ({"decode": {**decode, "nms_iou": 2}}, r"nms_iou 2, .*from 0 to 1"),
+        ({"decode": {**decode, "nms": 1}}, r"decode has unknown \['nms'\]"),
+        ({"camera": {"projection": "x"}}, "camera.projection is 'x', expected one of"),
+        (
+            {"model": {**model, "widths": 8}},
+            "config.model.widths is 8, expected a list",
+        ),
+        ({"model": {**model, "num_groups": 0}}, "num_groups is 0, expected 1 to"),
+        ({"model": {**model, "decoder_width": 16}}, "do not fit config.model"),
+        ({"grid": {}}, "grid lacks range_m"),
+    ):
+        path.write_text(json.dumps(content | change))
+        with pytest.raises(DataError, match=rf"config\.json: .*{message}"):
+            packed.read_packed(tmp_path)

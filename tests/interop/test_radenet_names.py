@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from radejax.core.errors import UserError
 from radejax.interop.radenet_names import (
     from_torch_layout,
     to_torch_layout,
@@ -29,6 +30,12 @@ def test_names_and_shapes_are_the_official_ones(variant, shared):
     )
     expected = {e["name"]: tuple(e["shape"]) for e in listing["tensors"]}
     assert torch_shapes(RadeNet(5, **VARIANTS[variant])) == expected
+
+
+@pytest.mark.parametrize("part", ["backbone", "neck", "heads"])
+def test_parts_that_were_never_released_have_no_names(part):
+    with pytest.raises(UserError, match=rf"{part} 'wide' has no names in the released"):
+        torch_names(RadeNet(5, **{part: "wide"}))
 
 
 def test_names_by_hand():

@@ -176,6 +176,15 @@ def test_something_else_is_refused(content, error, message):
         radenet_torch.load(content)
 
 
+def test_a_neck_of_other_names_is_not_taken_for_a_known_one(small_state):
+    other = {
+        n.replace("neck.neck.0.conv", "neck.neck.0.strip"): v
+        for n, v in small_state.items()
+    }
+    with pytest.raises(DataError, match=r"neck.neck.0 has .*strip.*'dilated'.*'plain'"):
+        radenet_torch.load(other, **OVERRIDES)
+
+
 def test_overrides_are_checked(small_state):
     with pytest.raises(UserError, match=r"unknown model fields \['width'\]"):
         radenet_torch.load(small_state, width=3)

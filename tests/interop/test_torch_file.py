@@ -2,13 +2,14 @@
 
 import io
 import pickle
+import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
 
 from radejax.core.errors import DataError
-from radejax.interop import torch_file
+from radejax.interop import torch_file, torch_pickle
 
 
 def check_equal(actual, expected):
@@ -106,7 +107,7 @@ def test_runs_no_code(tmp_path):
     pickled = pickle.dumps({"a": Attack(str(witness)), "b": 1}, protocol=2)
     zip_with(tmp_path / "x.pth", pickled)
     content = torch_file.read(tmp_path / "x.pth")
-    assert isinstance(content["a"], torch_file.Opaque)
+    assert isinstance(content["a"], torch_pickle.Opaque)
     assert content["b"] == 1
     assert not witness.exists()
 
@@ -145,7 +146,7 @@ def test_tensor_pickle_is_right_when_its_numbers_are(tmp_path):
     [
         ({"offset": 1}, "reaches outside its storage"),
         ({"strides": (-1, 1)}, "reaches outside its storage"),
-        ({"shape": (2, 30)}, "reaches outside its storage"),
+        ({"shape": (2, 30)}, r"shape \(2, 30\) of a storage of 6"),
         ({"size": 7}, "has 24 bytes, expected 28"),
         ({"dtype": "QInt8Storage"}, "not supported"),
     ],
@@ -190,3 +191,71 @@ def test_cut_files_are_refused(shared, tmp_path, cut):
         (tmp_path / "x.pth").write_bytes(data[:cut])
         with pytest.raises(DataError, match=r"x\.pth"):
             torch_file.read(tmp_path / "x.pth")
+
+
+def zeros(size=6):
+    return np.zeros(size, np.float32).tobytes()
+
+
+def opcodes(*parts):
+    return b"\x80\x02" + b"".join(parts) + b"."
+
+
+NESTED = b"]" + b"".join(  # each list has the one before it twice
+    b"q" + bytes([i]) + b"0](h" + bytes([i]) + b"h" + bytes([i]) + b"e"
+    for i in range(60)
+)
+DEEP = b"]" * 5000 + b"a" * 4999
+
+
+@pytest.mark.parametrize(
+    ("pickled", "message"),
+    [
+        (tensor_pickle(6, 0, (1000, 1000, 600), (0, 0, 0)), "of a storage of 6"),
+        (opcodes(b"]r\x00\x00\x00\x08"), None),  # a place in the memo, 2**27
+        (opcodes(NESTED), "nested more than 64 deep, or more than 100000 values"),
+        (opcodes(DEEP), "nested more than 64 deep"),
+        (opcodes(b"\x8d", (2**40).to_bytes(8, "little"), b"x"), "damaged torch file"),
+        (tensor_pickle(-1), "a storage has -1 values"),
+    ],
+    ids=["stride", "memo", "shared", "deep", "length", "size"],
+)
+def test_claims_take_no_memory_and_no_time(tmp_path, pickled, message):
+    path = tmp_path / "x.pth"
+    zip_with(path, pickled, **{"0": zeros()})
+    tracemalloc.start()
+    if message is None:
+        assert torch_file.read(path) == []
+    else:
+        with pytest.raises(DataError, match=f"x.pth: .*{message}"):
+            torch_file.read(path)
+    assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    tracemalloc.stop()
+
+
+def test_one_storage_in_many_tensors_is_limited(tmp_path):
+    one = tensor_pickle(1000, 0, (1000,), (1,))[2:-1]
+    body = b"(" + one * 50 + b"l."
+    zip_with(tmp_path / "x.pth", b"\x80\x02" + body, **{"0": zeros(1000)})
+    with pytest.raises(DataError, match="far more bytes than the file"):
+        torch_file.read(tmp_path / "x.pth")
+
+
+def test_deflated_members_are_limited(tmp_path):
+    path = tmp_path / "x.pth"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x/data.pkl", tensor_pickle())
+        archive.writestr("x/data/0", bytes(1 << 24))
+    with pytest.raises(DataError, match="x/data/0: claims 16777216 bytes, expected"):
+        torch_file.read(path)
+
+
+def test_a_pickle_cannot_change_what_it_calls(tmp_path):
+    name = b"ctorch._utils\n_rebuild_tensor_v2\n"
+    state = b"N}X\x0c\x00\x00\x00__defaults__K\x01\x85s\x86b"  # (None, {...}), BUILD
+    zip_with(tmp_path / "x.pth", b"\x80\x02" + name + state + b".")
+    torch_file.read(tmp_path / "x.pth")
+    assert torch_pickle._rebuild_tensor.__defaults__ is None
+    write_and_read = tmp_path / "y.pth"
+    torch_file.write(write_and_read, ARRAYS)
+    assert torch_file.read(write_and_read).keys() == ARRAYS.keys()

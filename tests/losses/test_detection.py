@@ -6,9 +6,16 @@ import numpy as np
 import optax
 import pytest
 
+from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import AfterNms, detection_loss, smooth_l1
+from radejax.losses.detection import (
+    BOX_LOSSES,
+    AfterNms,
+    detection_loss,
+    smooth_l1,
+    whole_batch_loss,
+)
 from radejax.losses.focal import gaussian_heatmap
 from radejax.losses.gwd import gwd_loss
 
@@ -185,9 +192,10 @@ def small_scene(rng, counts=(0, 1, 3), rows=4):
 
 
 @partial(jax.jit, static_argnames="options")
-def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
+def _loss_and_grad(maps, batch, is_frame_valid, numbers, weights, options):
     def loss(maps):
         z0_m, score_threshold, nms_iou = numbers
+        given = {} if weights is None else {"weights": weights}
         return detection_loss(
             maps,
             batch,
@@ -196,19 +204,20 @@ def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
             z0_m=z0_m,
             nms=AfterNms(score_threshold=score_threshold, nms_iou=nms_iou),
             **dict(options),
+            **given,
         )
 
     return jax.value_and_grad(loss, has_aux=True)(maps)
 
 
-def loss_and_grad(maps, batch, is_frame_valid=None, **options):
+def loss_and_grad(maps, batch, is_frame_valid=None, weights=None, **options):
     """Compiled once per shape and set of options, not once per test."""
     defaults = {"z0_m": 0.0, "score_threshold": 0.3, "nms_iou": 0.3}
     numbers = tuple(options.pop(name, value) for name, value in defaults.items())
     if is_frame_valid is None:
         is_frame_valid = jnp.ones(len(batch.boxes), bool)
     return _loss_and_grad(
-        maps, batch, is_frame_valid, numbers, tuple(sorted(options.items()))
+        maps, batch, is_frame_valid, numbers, weights, tuple(sorted(options.items()))
     )
 
 
@@ -248,7 +257,7 @@ def test_parts_weigh_as_asked_whatever_their_size():
     (total, parts), grad = loss_and_grad(maps, batch)
     assert float(total) == pytest.approx(4)
     sizes = [float(parts[p]) for p in PARTS]
-    weights = tuple(np.array([2, 1, 1]) / sizes)
+    weights = dict(zip(PARTS, np.array([2, 1, 1]) / sizes, strict=True))
     (plain, parts), plain_grad = loss_and_grad(
         maps, batch, weights=weights, normalize=False
     )
@@ -258,6 +267,42 @@ def test_parts_weigh_as_asked_whatever_their_size():
         jax.tree.leaves(grad), jax.tree.leaves(plain_grad), strict=True
     ):
         np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_another_part_is_a_function_and_a_weight(monkeypatch):
+    monkeypatch.setitem(
+        BOX_LOSSES, "height", lambda p, w: jnp.abs(p[..., 2] - w[..., 2])
+    )
+    maps, batch = small_scene(np.random.default_rng(1))
+    weights = {"focal": 2.0, "height": 3.0}
+    (total, parts), _ = loss_and_grad(maps, batch, weights=weights, normalize=False)
+    assert set(parts) >= set(weights)
+    assert not {"gwd", "smooth_l1"} & set(parts)  # without a weight, not computed
+    boxes = np.asarray(batch.boxes)
+    heights = [
+        np.mean(
+            [
+                abs(maps.box_params[b, *GRID.nearest_cell(*box[:2]), 2] - box[2])
+                for box in boxes[b][batch.is_valid[b]]
+            ]
+            or 0
+        )
+        for b in range(len(boxes))
+    ]
+    np.testing.assert_allclose(parts["height"], np.mean(heights), rtol=1e-5)
+    np.testing.assert_allclose(total, 2 * parts["focal"] + 3 * parts["height"], 1e-5)
+    # A batch in parts weighs it likewise.
+    of_parts = jax.tree.map(lambda x: jnp.stack([x, x]), parts)
+    shares, again, _ = whole_batch_loss(of_parts, 9, weights, normalize=False)
+    np.testing.assert_allclose(again, total, rtol=1e-6)
+    assert {name: float(v[0]) for name, v in shares.items()} == weights
+
+
+@pytest.mark.parametrize("weights", [{"focal": 1.0, "giou": 1.0}, {}])
+def test_an_unknown_part_is_named_with_those_that_there_are(weights):
+    maps, batch = small_scene(np.random.default_rng(1))
+    with pytest.raises(UserError, match=r"weights has '(giou|no part)', expected some"):
+        detection_loss(maps, batch, GRID, weights=weights)
 
 
 @pytest.mark.parametrize("matching", ["center", "nms"])
@@ -458,3 +503,56 @@ def test_wrong_shapes_are_refused():
         detection_loss(maps, batch, STRETCHED)
     with pytest.raises(ValueError, match=r"must be \[3, N, 8\] .* got \(3, 4, 7\)"):
         detection_loss(maps, batch.replace(boxes=batch.boxes[..., :7]), GRID)
+
+
+@pytest.mark.slow  # full-size maps and their NMS: half a minute
+def test_matching_after_nms_begins_where_boxes_have_a_size():
+    """The paper's matching trains maps themselves, from boxes of different sizes.
+
+    Until a box overlaps an object the heatmap alone has a gradient; boxes of negative
+    extents overlap none, so that their training does not begin at all.
+    """
+    grid = RadarGrid.kradar()
+    boxes = np.zeros((1, 4, 8), np.float32)
+    boxes[0, :, :2] = [(12.0, 3.0), (25.0, -8.0), (40.0, 0.0), (55.0, 20.0)]
+    boxes[0, :, 3:] = (4.4, 1.9, 1.6, 0.0, 1.0)
+    batch = batch_of(boxes, np.zeros((1, 4), np.int32), np.ones((1, 4), bool))
+    optimizer = optax.adam(0.03)
+
+    @jax.jit
+    def step(maps, state):
+        def loss(maps):
+            return detection_loss(maps, batch, grid, matching="nms")
+
+        (_, parts), grads = jax.value_and_grad(loss, has_aux=True)(maps)
+        updates, state = optimizer.update(grads, state)
+        norms = [optax.global_norm(g) for g in (grads.heatmap_logits, grads.box_params)]
+        return optax.apply_updates(maps, updates), state, parts, norms
+
+    def train(extent):
+        rng = np.random.default_rng(0)
+        logits = np.full((1, 256, 107, 5), -1.0, np.float32)  # 0.27, below 0.3
+        params = rng.normal(extent, 0.05, (1, 256, 107, 8)).astype(np.float32)
+        maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
+        state, rows = optimizer.init(maps), []
+        for _ in range(40):
+            maps, state, parts, norms = step(maps, state)
+            names = ("num_matched", "gwd", "smooth_l1")
+            rows.append([*(float(parts[n]) for n in names), *map(float, norms)])
+        return np.array(rows).T
+
+    matched, gwd, l1, heat, regression = train(extent=0.3)
+    before = np.flatnonzero(matched)[0]
+    assert 2 < before < 15
+    assert (regression[:before] == 0).all()
+    assert (gwd[:before] == 0).all()
+    assert (heat > 0).all()
+    assert (regression[before:] > 0).all()
+    assert matched[-1] == 4
+    whole = np.flatnonzero(matched == 4)
+    assert l1[whole[-1]] < 0.8 * l1[whole[0]]
+    matched, gwd, _, heat, regression = train(extent=-0.3)
+    assert not matched.any()
+    assert not gwd.any()
+    assert not regression.any()
+    assert (heat > 0).all()

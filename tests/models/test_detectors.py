@@ -1,8 +1,14 @@
 """Tests of `radejax.models.detectors`."""
 
+import jax
+import pytest
+
 from radejax import models
 from radejax.core.config import base_config
+from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
+
+from .. import small_models as small
 
 GRID = RadarGrid.reduced(num_doppler=2, num_range=13, num_elevation=2, num_azimuth=11)
 
@@ -17,3 +23,43 @@ def test_map_grid_follows_padding_and_cropping() -> None:
     assert stretched.num_azimuth == 11
     assert stretched.azimuth_step_rad < GRID.azimuth_step_rad
     assert not models.has_camera(model)
+
+
+CHOICES = {
+    "name": "radenet",
+    "backbone": "unet",
+    "neck": "dilated",
+    "heads": "expanded",
+    "cbam": "official",
+    "dtype": "bfloat16",
+    "remat": "blocks",
+    "image.kind": "resnet50",
+    "image.attention": "blocked",
+    "fusion.weighting": "mlp",
+    "fusion.gate": "bin",
+    "fusion.invalid": "official",
+}
+
+
+@pytest.mark.parametrize("field", CHOICES)
+def test_an_unknown_name_is_refused_with_those_that_there_are(field: str) -> None:
+    config = small.camera_config().model.to_dict()
+    section, _, name = field.rpartition(".")
+    (config[section] if section else config)[name] = "wide"
+    words = rf"config.model.{field} is 'wide'.*'{CHOICES[field]}'"
+    with pytest.raises(UserError, match=words):
+        models.build(config)
+
+
+def test_a_model_made_by_hand_is_checked_when_it_is_called() -> None:
+    model = models.build(small.radar_config().model).clone(neck="wide")
+    projection = jax.ShapeDtypeStruct((1, 16, 16, 5), "float32")
+    with pytest.raises(UserError, match=r"model.neck is 'wide', expected .*'plain'"):
+        jax.eval_shape(model.init, jax.random.key(0), projection)
+
+
+def test_a_model_of_before_its_backbone_had_a_name_is_built() -> None:
+    config = small.radar_config().model.to_dict()
+    now = models.build(config)
+    del config["backbone"]
+    assert models.build(config) == now

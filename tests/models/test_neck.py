@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.models.neck import DilatedResidual, Neck
+from radejax.models.neck import NECKS, DilatedResidual
 
 NAMES = {
     "conv_1/conv": "conv1.conv",
@@ -25,7 +25,7 @@ def test_dilated_residual_equals_official(dilation, module_case, run_like_torch)
 def reach(kind):
     """Bins around the center that a change of the center reaches through the convs."""
     x = jax.random.normal(jax.random.key(1), (1, 41, 41, 8))
-    module = Neck(kind, 8)
+    module = NECKS[kind](8)
     params = module.init(jax.random.key(0), x)
     # The norms pass a little of every change to all bins: count where far more arrives.
     y = module.apply(params, x)
@@ -42,7 +42,7 @@ def test_dilated_neck_sees_farther():
 def test_kinds_have_their_blocks():
     def blocks(kind):
         x = jnp.zeros((1, 8, 8, 16))
-        return Neck(kind, 8).init(jax.random.key(0), x)["params"]
+        return NECKS[kind](8).init(jax.random.key(0), x)["params"]
 
     assert set(blocks("plain")["block_3"]) == {"conv", "norm"}
     assert set(blocks("dilated")["block_3"]) == {"conv_1", "conv_2", "norm"}

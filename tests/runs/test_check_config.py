@@ -52,6 +52,9 @@ WRONG = [
     ("loss.weights", (1.0, 1.0)),
     ("loss.weights", (1.0, 1.0, "1")),
     ("loss.weights", (0.0, 0.0, 0.0)),
+    ("loss.weights", {"focal": 1.0, "giou": 1.0}),
+    ("loss.weights", {"focal": -1.0}),
+    ("loss.weights", {}),
     ("loss.z0_m", INF),
     ("decode.max_detections", 0),
     ("decode.nms_iou", NAN),
@@ -163,6 +166,11 @@ def test_fields_that_are_missing_or_unknown() -> None:
     del config["loss"]
     with pytest.raises(UserError, match=r"config.loss.sigma is missing"):
         check(config)
+
+
+def test_weights_of_losses_have_names_or_are_in_a_row() -> None:
+    for weights in ({"focal": 1, "gwd": 0.0}, (2.0, 1.0, 1.0), [2, 1, 0]):
+        check(_with("loss.weights", weights))
 
 
 def test_what_one_field_asks_of_another() -> None:

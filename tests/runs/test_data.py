@@ -1,7 +1,10 @@
 """Data folders of a run: found, checked, projected once."""
 
+import dataclasses
 import hashlib
 import pathlib
+import shutil
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +15,12 @@ from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
-from radejax.runs.data import Data, _simulated_root, open_data
+from radejax.runs.data import (
+    Data,
+    _simulated_root,
+    data_of_run,
+    open_data,
+)
 from radejax.runs.sources import DataPaths, Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 
@@ -107,6 +115,8 @@ def test_results_on_other_data_are_named_by_folder_and_labels(
     assert Sources(data=("/a/b", "/c"), labels="/x/v1.zip").name == "b_v1"
     assert Sources(labels="/x/v1.zip").name == "v1"
     assert Sources(label_version="v1.1").name == "other"
+    part = {"sequences": (1, 58), "weather": ("fog",)}
+    assert Sources(data=("/a/b",), **part).name == "b_1-58_fog"
 
 
 def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
@@ -133,6 +143,22 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     part = open_data(config, model, sources)  # the same records
     assert {frame.sequence for frame in part.frames} == {1, 3}
     assert len(part.split(None)) == 3
+
+    # Of a run: its own part, another one, and all of other folders.
+    shutil.copytree(root, tmp_path / "copy")
+    run = {"data": dataclasses.asdict(data.paths)}
+    loaded = SimpleNamespace(config=config, run=run, model=model, grid=frames.grid)
+    loaded.variables = {"params": {}}
+    for other, expected in (
+        (None, {1, 3}),
+        (Sources(label_version="v2.1"), {1, 3}),
+        (Sources(sequences=(2,)), {2}),
+        (Sources(data=(str(tmp_path / "copy"),)), {1, 2, 3}),
+        (Sources(data=(str(tmp_path / "copy"),), sequences=(3,)), {3}),
+    ):
+        _, chosen = data_of_run(loaded, tmp_path, other)
+        assert {frame.sequence for frame in chosen.frames} == expected
+    assert tuple(config.data.sequences) == (1, 3)
     del config.data["sequences"], config.data["weather"]  # as runs of before
     assert len(open_data(config, model, sources).frames) == 6
     _check_validation(config, model, sources, caplog)

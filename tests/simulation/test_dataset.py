@@ -13,8 +13,10 @@ import pytest
 from PIL import Image
 
 from radejax.core.errors import UserError
+from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar, read_labels
 from radejax.simulation import dataset
+from radejax.simulation.camera.renderer import stereo_calibration
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 
@@ -77,6 +79,14 @@ class TestTree:
         assert normalised.min() >= 0.0
         assert normalised.max() <= 1.0
         assert 0.45 < np.median(normalised) < 0.6  # the noise floor
+
+    def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
+        cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras
+        shift = small_config()["lidar_to_radar_m"]
+        drawn = stereo_calibration(shift, 64, 36)[0].camera()
+        np.testing.assert_allclose(
+            cameras[0].cam_from_ego, drawn.cam_from_ego, atol=1e-12
+        )
 
     def test_file_numbers_agree_with_the_header(self, tree):
         for frame in KRadar(tree):

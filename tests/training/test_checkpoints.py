@@ -149,7 +149,7 @@ def small_disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
 # written; TensorStore then reports each of them to a loop that is closed.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_is_one_clear_error_and_earlier_checkpoints_stay(
-    small_disk: pathlib.Path,
+    small_disk: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     # Random bits do not compress: 1 MiB a checkpoint.
     values = np.random.default_rng(0).random((8, 2**15), np.float32)
@@ -167,6 +167,7 @@ def test_a_full_disk_is_one_clear_error_and_earlier_checkpoints_stay(
 
     with pytest.raises(DiskFullError, match=r"no space left for a checkpoint .*intact"):
         fill()
+    assert not [record for record in caplog.records if record.exc_info]
     whole = sharding.replicated(sharding.make_mesh(1))
     with Checkpoints(folder) as intact:
         wanted = abstract_state(state(1), {"w": whole, "step": whole})

@@ -171,7 +171,7 @@ def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
     losses = _losses(workdir)
     with pytest.raises(
         UserError,
-        match=r"something else: sha256 of their keys: ab there, cd now\. Give",
+        match=r"something else: sha256 of their keys is 'ab' there and 'cd' here; give",
     ):
         run(workdir, info={"same": same | {"sha256 of their keys": "cd"}})
     assert _losses(workdir) == losses
@@ -260,7 +260,7 @@ def test_a_run_continues_on_another_number_of_devices(
 
 
 def test_steps_without_finite_loss_end_the_run_and_name_the_frames(
-    run: Any, tiny: Tiny, workdir: pathlib.Path
+    run: Any, tiny: Tiny, workdir: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Poisoned(Stopping):
         def __next__(self) -> Any:
@@ -284,6 +284,8 @@ def test_steps_without_finite_loss_end_the_run_and_name_the_frames(
         DataError, match=r"3 steps in a row .*batch: 7/frame\d+, 7/frame\d+, "
     ):
         run(workdir, Poisoned(tiny.loader(), 99, lambda: None), frame_names=names)
+    assert "1 steps so far were skipped, as their loss" in caplog.text
+    assert "frames of the last batch: 7/frame" in caplog.text
 
 
 def test_evaluation_on_the_way_is_logged_and_the_best_kept(

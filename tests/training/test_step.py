@@ -1,5 +1,7 @@
 """One step: what it changes, what it leaves, and that devices do not matter."""
 
+import math
+import re
 from typing import Any
 
 import chex
@@ -146,10 +148,32 @@ def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> Non
     )
     on_mesh = jax.device_put((state, RNG), (placement, sharding.replicated(mesh)))
     batch = sharding.put_batch(_batch(tiny, 8), mesh)
+    program = sharded.lower(on_mesh[0], batch, on_mesh[1]).compile()
+    if parameters == "replicated":
+        _check_traffic(program.as_text(), state)
     with jax.transfer_guard("disallow"):
-        actual, metrics = sharded(on_mesh[0], batch, on_mesh[1])
+        actual, metrics = program(on_mesh[0], batch, on_mesh[1])
     chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-4, atol=1e-5)
     chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
+
+
+def _check_traffic(text: str, state: Any) -> None:
+    """Every gradient is summed over the devices once, and no part of a batch is gathered.
+
+    On a CPU each array is summed by itself; on GPU and TPU XLA joins them.
+    """
+    kinds = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
+    found = re.findall(rf"= (.*?) ({kinds})(?:-start)?\(", text)
+    moved = {kind: [] for kind in kinds.split("|")}
+    for result, kind in found:
+        for shape in re.findall(r"\w+\[([\d,]*)\]", result):
+            moved[kind].append(math.prod(map(int, filter(None, shape.split(",")))))
+    num_parameters = sum(x.size for x in jax.tree.leaves(state.params))
+    # Beside the gradients: sums of losses and counts, a number or a class's each.
+    assert 0 <= sum(moved.pop("all-reduce")) - num_parameters <= 100, found
+    # The state keeps the numbers of the frames of a step that was skipped.
+    assert sum(moved.pop("all-gather")) <= state.skipped_frames.size, found
+    assert not any(moved.values()), found
 
 
 def test_parts_of_a_batch_stay_on_their_devices(tiny: Tiny) -> None:

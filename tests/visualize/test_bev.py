@@ -1,3 +1,4 @@
+import dataclasses
 import threading
 import time
 
@@ -54,7 +55,7 @@ def test_polar_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
     ax = bev.draw_polar(Scene(projection, GRID), show_legend=False)
     x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
-    outline = bev._to_polar(np.array([x, y]))
+    outline = bev.to_polar(np.array([x, y]))
     tile = brightest_tile(ax.figure, ax)
     np.testing.assert_allclose(tile, ax.transData.transform(outline), atol=1.0)
 
@@ -88,7 +89,7 @@ def test_boxes_are_drawn_where_they_are():
     texts = {t.get_text() for t in ax.texts}
     assert texts == {"Sedan", "Bus or Truck 0.88"}
     legend = [t.get_text() for t in ax.get_legend().get_texts()]
-    assert legend == ["ground truth (1)", "prediction (1)", "region of interest"]
+    assert legend == ["ground truth (1)", "prediction (1)", "wide region"]
 
 
 def test_roi_is_a_dashed_rectangle():
@@ -227,3 +228,11 @@ def test_footprint_of_a_turned_box():
     np.testing.assert_allclose(
         outline, [[0, 4], [0, 0], [2, 0], [2, 4], [0, 4]], atol=1e-12
     )
+
+
+def test_the_legend_names_region_and_threshold() -> None:
+    found = (np.array([[20.0, 0, 0, 4, 2, 1.5, 0]]), [0.9], ["Sedan"])
+    scene = Scene(blob_at(3, 3), GRID, predictions=found, roi=ROI)
+    scene = dataclasses.replace(scene, score_threshold=0.3)
+    legend = [t.get_text() for t in bev.draw_bev(scene).get_legend().get_texts()]
+    assert legend == ["prediction (1), score from 0.3", "wide region"]

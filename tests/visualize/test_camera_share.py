@@ -27,8 +27,8 @@ def test_panels_are_named_and_share_one_scale_without_what_is_not_in_view(grid):
     figure = draw_camera_share(maps, grid, counts={"all": 3, "fog": 1})
     panels = [ax for ax in figure.axes if ax.get_images()]
     assert [ax.get_title() for ax in panels] == [
-        "all\nmean 0.50, 3 frames",
-        "fog\nmean 0.20, 1 frames",
+        "all\nmean 0.500, 3 frames",
+        "fog\nmean 0.200, 1 frames",
     ]
     for ax in panels:
         picture = ax.get_images()[0]

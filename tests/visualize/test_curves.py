@@ -3,6 +3,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from radejax.core.errors import DataError, UserError
 from radejax.visualize import curves
@@ -104,3 +105,15 @@ def test_calibration_without_detections_and_with_bad_ones():
         curves.calibration_bins([1.5], [True])
     with pytest.raises(UserError, match="one length"):
         curves.calibration_bins([0.5], [True, False])
+
+
+def test_the_legend_covers_no_curve_and_colours_differ() -> None:
+    conditions = {f"{i}, AP 50.0": ([0, 1], [1, 0]) for i in range(8)}
+    ax = curves.draw_precision_recall(conditions)
+    assert len({line.get_color() for line in ax.lines}) == 8
+    canvas = FigureCanvasAgg(ax.figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    legend = ax.get_legend().get_window_extent(renderer)
+    assert legend.y1 < ax.get_window_extent(renderer).y0
+    assert legend.y0 > 0  # on the picture

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
@@ -74,3 +75,21 @@ def test_slice_bounds_are_the_axes():
 def test_wrong_use_is_named(call, message):
     with pytest.raises(UserError, match=message):
         call()
+
+
+def test_boxes_are_outlined_in_all_slices() -> None:
+    box = np.array([[20.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]])
+    figure = projections.draw_slices(PROJECTION, GRID, ground_truth=(box, ["Sedan"]))
+    lines = [ax.findobj(LineCollection)[-1].get_segments()[0] for ax in figure.axes[:3]]
+    side = np.rad2deg(np.arctan2(1.0, 18.0))  # of the near corners
+    far = np.hypot(22.0, 1.0)
+    np.testing.assert_allclose(lines[0].max(0), [side, far], rtol=1e-6)
+    np.testing.assert_allclose(lines[0].min(0), [-side, 18.0], atol=0.1)
+    left, right = figure.axes[1].get_xlim()
+    left += 0.02 * (right - left)
+    np.testing.assert_allclose(lines[1].max(0), [left, far], rtol=1e-6)
+    top = np.rad2deg(np.arctan2(2.0, np.hypot(18.0, 1.0)))
+    np.testing.assert_allclose(lines[2].min(0), [-side, 0.0], atol=1e-6)
+    np.testing.assert_allclose(lines[2].max(0), [side, top], rtol=1e-6)
+    without = projections.draw_slices(PROJECTION, GRID).axes[0]
+    assert not [c for c in without.findobj(LineCollection) if len(c.get_segments())]

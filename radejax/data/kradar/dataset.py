@@ -60,12 +60,14 @@ class KRadar(Sequence[Frame]):
             None: from each sequence's calibration file, else (-2.54, 0.3).
         z_offset_m: Metres to add to LiDAR z: 0 in the papers, 0.7 in K-Radar's code.
         visibility: Availability flags to keep, None for all.
+        count_disabled: Lines of v1.x labels without a `*` count too, as released.
         classes: Classes to keep.
         field_of_view: Keep only boxes whose center is in the field of view.
         sequence_numbers: Only these sequences; None for all. Sequences that have labels
             and no folder in the roots are left out and counted, if any has one.
         weather: Only sequences of these weathers; None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
+        common_camera: `common/cam_front0.yml` for all sequences, as released.
 
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
@@ -94,11 +96,13 @@ class KRadar(Sequence[Frame]):
         radar_from_lidar: tuple[float, float] | None = None,
         z_offset_m: float = 0.0,
         visibility: Sequence[str] | None = ("R",),
+        count_disabled: bool = False,
         classes: Sequence[str] = CLASSES,
         field_of_view: bool = True,
         sequence_numbers: Iterable[int] | None = None,
         weather: Iterable[str] | None = None,
         camera_calibration: PathLike | None = None,
+        common_camera: bool = False,
     ) -> None:
         self.version = normalise_version(version)
         self.strict = strict
@@ -113,10 +117,13 @@ class KRadar(Sequence[Frame]):
         if labels is not None:
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
         self.is_simulated = folders.are_simulated(self.split_folders)
+        self._lidar_to_radar_z_m = folders.read_lidar_to_radar_z(self.split_folders)
         self._sequence_numbers = sequence_numbers and tuple(sequence_numbers)
         self._offset = (radar_from_lidar, float(z_offset_m))
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
+        self._common_camera = common_camera
         self._visibility, self._field_of_view = visibility, field_of_view
+        self._count_disabled = count_disabled
         self._parsed: dict[Key, _Parsed] = {}
         self._read(split)
 
@@ -171,12 +178,16 @@ class KRadar(Sequence[Frame]):
 
     def _open_labels(self, labels: PathLike | None) -> folders.LabelSource:
         """The label source; `UserError` when there is nothing in it."""
+        if not self.folders:
+            meant = folders.nearby_roots(self.roots)
+            if meant or labels is None:
+                hint = f"; try {', '.join(map(str, meant))}" if meant else ""
+                raise UserError(
+                    "no sequence folders (1, 2, ...) in "
+                    f"{', '.join(map(str, self.roots))}{hint}"
+                )
         if labels is not None:
             return folders.labels_from(pathlib.Path(labels))
-        if not self.folders:
-            raise UserError(
-                f"no sequence folders (1, 2, ...) in {', '.join(map(str, self.roots))}"
-            )
         source = folders.own_labels(self.folders, self.version)
         if not source.files:
             raise UserError(
@@ -215,6 +226,7 @@ class KRadar(Sequence[Frame]):
                 radar_from_lidar=self._offset[0],
                 z_offset_m=self._offset[1],
                 camera_folders=self._camera_folders,
+                common_camera=self._common_camera,
             )
             for number in sorted({number for number, _ in keys})
         }
@@ -249,7 +261,11 @@ class KRadar(Sequence[Frame]):
                     if isinstance(content, DataError):
                         raise content
                     file = parse_label_file(
-                        content, self.version, where=where, problems=problems
+                        content,
+                        self.version,
+                        where=where,
+                        problems=problems,
+                        count_disabled=self._count_disabled,
                     )
                 except DataError as error:
                     file, problems = None, [Problem("label file", where, str(error))]
@@ -353,6 +369,7 @@ class KRadar(Sequence[Frame]):
             camera,
             info.camera_calibration_path,
             self.is_simulated,
+            self._lidar_to_radar_z_m,
         )
 
 

@@ -19,6 +19,7 @@ from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_json
 from radejax.data.kradar.labels import MAX_LABEL_BYTES, read_label_bytes
+from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 
 SIMULATION_MARKER = "simulation.json"
@@ -30,6 +31,8 @@ _OWN_LABEL_FOLDERS = {
     "v2.0": ("info_label_v2_0", "info_label_v2", "info_label"),
     "v2.1": ("info_label_v2_1", "info_label"),
 }
+# As labels have it; isdecimal is also true of the digits of other scripts.
+_IS_SEQUENCE = re.compile(r"[0-9]{1,6}")
 _SEQUENCE_NAME = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
 _LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
 
@@ -75,8 +78,7 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
         if not root.is_dir():
             raise FileNotFoundError(f"{root}: no such folder, expected a K-Radar root")
         for folder in sorted(root.iterdir()):
-            # As labels have it; isdecimal is also true of the digits of other scripts.
-            if re.fullmatch(r"[0-9]{1,6}", folder.name) and folder.is_dir():
+            if _IS_SEQUENCE.fullmatch(folder.name) and folder.is_dir():
                 same = found.setdefault(int(folder.name), [])
                 if same and same[-1].parent == root:
                     raise DataError(
@@ -85,6 +87,19 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
                     )
                 same.append(folder)
     return {number: SequenceFolder(found[number]) for number in sorted(found)}
+
+
+def nearby_roots(roots: Sequence[pathlib.Path]) -> list[pathlib.Path]:
+    """Up to three roots that may be meant by a sequence's folder or a root's parent."""
+    found = []
+    for root in (pathlib.Path(os.path.abspath(root)) for root in roots):
+        inside = sorted(root.iterdir())
+        has_radar = any(p.name.startswith(("radar_", "info_label")) for p in inside)
+        if _IS_SEQUENCE.fullmatch(root.name) and has_radar:
+            found.append(root.parent)
+        folders = [p for p in inside if p.is_dir() and os.access(p, os.R_OK)]
+        found += [path for path in folders if find_sequences([path])]
+    return found[:3]
 
 
 class LabelSource:
@@ -217,9 +232,14 @@ def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | 
 
 
 def find_camera_calibration(
-    folders: Sequence[pathlib.Path], sequence: int
+    folders: Sequence[pathlib.Path], sequence: int, *, common_only: bool = False
 ) -> tuple[pathlib.Path | None, bool]:
     """Calibration of the left front camera: of the sequence, else the common one.
+
+    Args:
+        folders: Where it is looked for.
+        sequence: Number of the sequence.
+        common_only: The common one even where the sequence has its own.
 
     Returns:
         The file, None where there is none, and whether it is the sequence's own.
@@ -227,7 +247,7 @@ def find_camera_calibration(
     own = f"seq_{sequence:02d}/cam_1.yml"
     of_sequence = (f"calib_seq_v2/{own}", own)
     common = ("common/cam_front0.yml", "cam_front0.yml")
-    for names, is_own in ((of_sequence, True), (common, False)):
+    for names, is_own in ((of_sequence, True), (common, False))[common_only:]:
         for folder in folders:
             for name in names:
                 if (folder / name).is_file():
@@ -240,6 +260,33 @@ def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
     return any((folder / SIMULATION_MARKER).is_file() for folder in folders)
 
 
+def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
+    """Metres from LiDAR up to radar as the sensors stand, not as boxes are counted.
+
+    What a simulated data set says of its set-up, else K-Radar's own; its calibration
+    files say nothing of z.
+
+    Raises:
+        DataError: A simulation's file is malformed, or two of them differ.
+    """
+    found: dict[pathlib.Path, float] = {}
+    for path in (folder / SIMULATION_MARKER for folder in folders):
+        if path.is_file():
+            try:
+                shift = read_json(path).get("config", {}).get("lidar_to_radar_m")
+                found[path] = KRADAR_LIDAR_TO_RADAR_Z_M if shift is None else shift[2]
+            except (AttributeError, IndexError, TypeError, KeyError):
+                raise DataError(
+                    f"{path}: config.lidar_to_radar_m is not three numbers"
+                ) from None
+    if len(set(found.values())) > 1:
+        raise DataError(
+            f"different heights of radar over LiDAR in {', '.join(map(str, found))}; data "
+            "sets of different sensors cannot be read as one"
+        )
+    return float(next(iter(found.values()), KRADAR_LIDAR_TO_RADAR_Z_M))
+
+
 def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
     """Sensor axes of a data set: `radar_grid.json` in a root, else K-Radar's.
 
@@ -250,11 +297,7 @@ def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
     for root in roots:
         path = root / "radar_grid.json"
         if path.is_file():
-            content = read_json(path)
-            try:
-                found[path] = RadarGrid.from_dict(content)
-            except (ValueError, KeyError, TypeError) as error:
-                raise DataError(f"{path}: no radar grid: {error!r}") from None
+            found[path] = read_json(path, RadarGrid)
     if len(set(found.values())) > 1:
         raise DataError(
             f"different sensor axes in {', '.join(map(str, found))}; data sets of "

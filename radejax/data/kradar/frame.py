@@ -8,6 +8,9 @@ import pathlib
 import numpy as np
 
 from radejax.data.kradar.labels import Label, LabelHeader
+from radejax.data.tesseract import read_frame
+from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M, CameraCalibration
+from radejax.geometry.radar_grid import RadarGrid
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +33,8 @@ class Frame:
         camera_path: Front image (stereo pair), None where it is missing.
         camera_calibration_path: Calibration of the left front camera, or None.
         is_simulated: Nothing of it was measured.
+        lidar_to_radar_z_m: By which the radar itself is above the LiDAR, whatever z
+            was added to the boxes.
     """
 
     sequence: int
@@ -48,8 +53,37 @@ class Frame:
     camera_path: pathlib.Path | None
     camera_calibration_path: pathlib.Path | None
     is_simulated: bool = False
+    lidar_to_radar_z_m: float = KRADAR_LIDAR_TO_RADAR_Z_M
 
     @property
     def key(self) -> str:
         """Name that is unique in a data set: `"1/00033_00001"`."""
         return f"{self.sequence}/{self.name}"
+
+    @property
+    def radar_path(self) -> pathlib.Path | None:
+        """File of the radar: the tesseract, or without one the official projection."""
+        return self.tesseract_path or self.projection_path
+
+    def read_projection(
+        self, grid: RadarGrid, timings: dict[str, float] | None = None
+    ) -> np.ndarray:
+        """`[R, A, D+E]` float32 projection; see `tesseract.read_frame`.
+
+        Raises:
+            FileNotFoundError: There is no file of the radar.
+            DataError: It is damaged, or of another shape than the grid.
+        """
+        if self.radar_path is None:
+            raise FileNotFoundError("no tesseract in any root")
+        return read_frame(self.radar_path, grid, timings)
+
+    def read_calibration(
+        self, ego_from_lidar_m: tuple[float, ...] | None = None
+    ) -> CameraCalibration:
+        """Of the camera, with the frame's own offset or another; see `from_kradar`."""
+        assert self.camera_calibration_path is not None  # for those who look first
+        return CameraCalibration.from_kradar(
+            self.camera_calibration_path,
+            ego_from_lidar_m=ego_from_lidar_m or self.radar_from_lidar_m,
+        )

@@ -126,7 +126,13 @@ class Problem:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LabelFile:
-    """All of one label file; `num_disabled` counts v1.x lines without a `*`."""
+    """All of one label file.
+
+    Attributes:
+        header: Its first line.
+        labels: Its objects.
+        num_disabled: v1.x lines without a `*` that are no objects of these.
+    """
 
     header: LabelHeader
     labels: list[Label]
@@ -204,8 +210,12 @@ def parse_label_file(
     *,
     where: str = "<labels>",
     problems: list[Problem] | None = None,
+    count_disabled: bool = False,
 ) -> LabelFile:
     """Like `read_label_file` for the content of a file; `where` names it in errors.
+
+    With `count_disabled` v1.x lines without a `*` are objects like others where they
+    have the fields of one, as the released code reads them.
 
     A damaged header or an undecodable file raises even with `problems`: nothing in
     such a file can be trusted.
@@ -224,8 +234,10 @@ def parse_label_file(
         if not line or line.isspace():
             continue
         if version.startswith("v1") and not line.lstrip().startswith("*"):
-            num_disabled += 1
-            continue
+            line = "*," + line.partition(",")[2]
+            if not (count_disabled and _LINES[version].fullmatch(line)):
+                num_disabled += 1
+                continue
         try:
             labels.append(_parse_object(line, version, f"{where}:{number}"))
         except DataError as error:

@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from radejax.core.errors import DataError
+from radejax.core.files import read_text
 from radejax.data.kradar import folders
 from radejax.data.kradar.findings import Findings
 from radejax.data.kradar.folders import SequenceFolder
@@ -157,6 +158,7 @@ def read_sequence_info(
     radar_from_lidar: tuple[float, float] | None,
     z_offset_m: float,
     camera_folders: Sequence[pathlib.Path],
+    common_camera: bool = False,
 ) -> SequenceInfo:
     """Reads what is in the folders of a sequence and fills in what is not.
 
@@ -167,12 +169,15 @@ def read_sequence_info(
         radar_from_lidar: Offset that replaces the calibration file's.
         z_offset_m: Metres to add to LiDAR z.
         camera_folders: Where camera calibrations are looked for.
+        common_camera: One calibration for all sequences, as the released code does.
     """
     if radar_from_lidar is None:
         x, y = _read_offset(number, folder, findings)
     else:
         x, y = map(float, radar_from_lidar)
-    camera, is_own = folders.find_camera_calibration(camera_folders, number)
+    camera, is_own = folders.find_camera_calibration(
+        camera_folders, number, common_only=common_camera
+    )
     if camera is None:
         findings.counts["sequences without camera calibration"] += 1
     elif not is_own:
@@ -220,9 +225,16 @@ def _read_conditions(
     path = None if folder is None else folder.find(".", "description.txt")
     if path is not None:
         try:
-            return read_description(path)
+            conditions = read_description(path)
         except DataError as error:
             findings.report("description", str(path), str(error))
+        else:
+            if conditions.weather not in (*WEATHERS, "unknown"):
+                findings.notes.append(
+                    f"{path}: weather {conditions.weather!r} is none of K-Radar's: "
+                    f"{', '.join(WEATHERS)}"
+                )
+            return conditions
     findings.counts["sequences with built-in conditions"] += 1
     return KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
 
@@ -273,9 +285,4 @@ def split_by_rule(names: Iterable[str], split: str) -> list[str]:
 
 def _read_lines(path: str | os.PathLike) -> list[str]:
     """Lines of a small text file; `DataError` if it is none."""
-    try:
-        return pathlib.Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise DataError(f"{path}:1: not a UTF-8 text file") from None
-    except IsADirectoryError:
-        raise DataError(f"{path}: is a folder, expected a text file") from None
+    return read_text(path).splitlines()

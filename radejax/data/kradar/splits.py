@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import logging
 import os
 import pathlib
 from collections.abc import Collection, Iterable, Sequence
@@ -13,6 +14,8 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import folders, sequences
 from radejax.data.kradar.findings import Findings
 from radejax.data.kradar.folders import LabelSource
+
+_log = logging.getLogger(__name__)
 
 Key = tuple[int, str]
 """Sequence number and frame name."""
@@ -65,6 +68,7 @@ def select_frames(
     if split is None:
         return keys
     entries = read_split_entries(split, near, keys, findings)
+    _report_overlap(near, findings)
     for sequence, name in sorted(entries - set(keys)):
         if sequence in wanted:
             findings.report(
@@ -76,6 +80,22 @@ def select_frames(
         elif sequence_numbers is None:
             findings.counts["split entries of sequences that are not here"] += 1
     return [key for key in keys if key in entries]
+
+
+def _report_overlap(near: Sequence[pathlib.Path], findings: Findings) -> None:
+    """Reports, and warns of, frames that the files of both splits name."""
+    paths = [folders.find_split_file(split, near) for split in ("train", "test")]
+    if None in paths:
+        return
+    train, test = (set(sequences.read_split(path)) for path in paths if path)
+    if both := sorted(train & test):
+        key = f"{both[0][0]}/{both[0][1]}"
+        message = (
+            f"{len(both)} frames are in both {paths[0]} and {paths[1]}, first {key}: what "
+            "is evaluated on them was trained on them"
+        )
+        findings.report("split", key, message)
+        _log.warning(message)
 
 
 def check_weather(names: Iterable[str]) -> tuple[str, ...]:

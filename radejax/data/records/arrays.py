@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import bisect
+import collections
 import itertools
+import math
 import os
 import pathlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,31 +17,38 @@ import numpy as np
 from radejax.core.errors import DataError
 from radejax.core.files import read_json
 from radejax.data.records.files import (
+    MEND,
     READER_OPTIONS,
     RecordFile,
-    damage_named,
     sha256,
+    unshuffled,
 )
 
 MANIFEST = "manifest.json"
 
 
-def read_manifest_json(folder: pathlib.Path, kind: tuple[str, int]) -> dict[str, Any]:
-    """What `manifest.json` of a folder says, of a format and version.
+def read_manifest_json(
+    folder: pathlib.Path, kind: tuple[str, int], hint: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What `manifest.json` of a folder says, of a format up to a version.
+
+    Args:
+        folder: Of records.
+        kind: Format and version.
+        hint: What it must hold beside these and its `files`, see `schema.check`.
 
     Raises:
         DataError: It is damaged or of another format or version.
     """
     path = folder / MANIFEST
-    with damage_named(path):
-        content = read_json(path)
-        found = content["format"], content["version"]
-        if found != kind:
-            raise DataError(
-                f"{path}: {found[0]} version {found[1]}, this radejax reads {kind[0]} "
-                f"version {kind[1]}"
-            )
-        return content
+    content = read_json(path, {"format": str, "version": int}, mend=MEND)
+    found = content["format"], content["version"]
+    if found[0] != kind[0] or not 1 <= found[1] <= kind[1]:
+        raise DataError(
+            f"{path}: {found[0][:80]} version {found[1]}, this radejax reads {kind[0]} "
+            f"up to version {kind[1]}"
+        )
+    return read_json(path, {**hint, "files": list[RecordFile]}, mend=MEND)
 
 
 class ArrayRecords(Sequence[Any]):
@@ -50,6 +59,7 @@ class ArrayRecords(Sequence[Any]):
         files: What its manifest says about them.
         shape: Of every array.
         dtype: Of every array.
+        compressed: Their bytes are shuffled, see `files.shuffled`.
         verify: Compare the checksums of all files (reads them whole). Their sizes and
             record counts are always checked.
 
@@ -64,11 +74,18 @@ class ArrayRecords(Sequence[Any]):
         shape: tuple[int, ...],
         dtype: np.dtype,
         *,
+        compressed: bool = False,
         verify: bool = False,
     ) -> None:
-        self.folder = pathlib.Path(folder)
+        self.folder, self._compressed = pathlib.Path(folder), compressed
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
         self.frames = list(itertools.chain.from_iterable(f.frames for f in files))
+        if len(set(self.frames)) < len(self.frames):
+            counts = collections.Counter(self.frames)
+            raise DataError(
+                f"{self.folder / MANIFEST}: frame {counts.most_common(1)[0][0][:80]} is "
+                "there twice"
+            )
         self._files = list(files)
         self._ends = list(itertools.accumulate(len(f.frames) for f in files))
         self._open()
@@ -97,9 +114,10 @@ class ArrayRecords(Sequence[Any]):
             content = self._reader(number).read([position])[0]
         except Exception as error:  # the reader raises several types
             raise self._damaged(number, position, str(error)) from None
-        if len(content) != self.dtype.itemsize * int(np.prod(self.shape)):
+        if len(content) != self.dtype.itemsize * math.prod(self.shape):
             raise self._damaged(number, position, f"{len(content)} bytes")
-        return np.frombuffer(content, self.dtype).reshape(self.shape)
+        decode = unshuffled if self._compressed else np.frombuffer
+        return decode(content, self.dtype).reshape(self.shape)
 
     def index_of(self) -> dict[str, int]:
         """Record index by frame key."""

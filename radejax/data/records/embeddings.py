@@ -10,13 +10,12 @@ import json
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from radejax.core.files import read_json, require_same
 from radejax.data.records.arrays import MANIFEST, ArrayRecords, read_manifest_json
-from radejax.data.records.files import RecordFile, damage_named
 
 FORMAT = "radejax-embeddings"
 FORMAT_VERSION = 1
@@ -44,10 +43,15 @@ def open_embeddings(
         raise FileNotFoundError(
             f"{folder}: no {MANIFEST}; expected a folder that `radejax embed` finished"
         )
-    manifest = read_manifest_json(folder, (FORMAT, FORMAT_VERSION))
-    with damage_named(folder / MANIFEST):
-        entries = [RecordFile.from_dict(f) for f in manifest["files"]]
-        shape, dtype = tuple(manifest["shape"]), np.dtype(manifest["dtype"])
+    manifest = read_manifest_json(
+        folder,
+        (FORMAT, FORMAT_VERSION),
+        {
+            "image": dict[str, Any],
+            "shape": tuple[int, int, int],
+            "dtype": Literal["float32", "float16"],
+        },
+    )
     if image_config is not None:
         wanted = relevant_fields(image_config)
         require_same(
@@ -57,12 +61,14 @@ def open_embeddings(
             mend="embed the images anew",
             name="config.model.image",
         )
-    return ArrayRecords(folder, entries, shape, dtype)
+    dtype = np.dtype(manifest["dtype"])
+    return ArrayRecords(folder, manifest["files"], manifest["shape"], dtype)
 
 
 def embeddings_sha256(folder: str | os.PathLike) -> str:
     """Checksum of the weights that embeddings were made with."""
-    return read_json(pathlib.Path(folder) / MANIFEST)["weights_sha256"]
+    path = pathlib.Path(folder) / MANIFEST
+    return read_json(path, {"weights_sha256": str})["weights_sha256"]
 
 
 def relevant_fields(image_config: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,23 +15,23 @@ import math
 import multiprocessing
 import os
 import pathlib
+import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from tqdm import tqdm
 
 from radejax.core.errors import DataError, UserError
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import check_encoding, encode, num_clipped
-from radejax.data.kradar import Frame, KRadar
 from radejax.data.records import files
-from radejax.data.records.plan import claim_folder, dtype_there
+from radejax.data.records.plan import claim_folder, encoding_there
 from radejax.data.records.projections import (
     Manifest,
     write_manifest,
 )
-from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.geometry.radar_grid import RadarGrid
 
 _SMALL_JOB_CELLS = 3e9  # some 50 of K-Radar's tesseracts, a few seconds
@@ -78,28 +78,24 @@ class ProjectionReport:
         return "\n".join(lines)
 
 
-_Source = tuple[str, pathlib.Path | None, pathlib.Path | None]
-"""Key, tesseract and released projection of a frame."""
-
-
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """One file of records: picklable, without boxes and labels."""
+    """One file of records, to be pickled; `kind` is the manifest as yet without files."""
 
     folder: pathlib.Path
     name: str
-    frames: list[_Source]
-    grid: RadarGrid
-    encoding: str
+    frames: list[LabelledFrame]
+    kind: Manifest
     skip_bad: bool
 
 
 def project_dataset(
-    frames: KRadar | Sequence[Frame],
+    frames: FrameSequence,
     out_dir: str | os.PathLike,
     *,
     grid: RadarGrid | None = None,
     dtype: str | None = None,
+    compress: bool | None = None,
     shard: str | tuple[int, int] = (0, 1),
     num_workers: int | None = None,
     frames_per_file: int = 64,
@@ -116,6 +112,8 @@ def project_dataset(
         grid: Sensor axes; None takes those of `frames`.
         dtype: Type of the records: "float16", "uint8" or "float32"; None: of those that
             are there, else "float16".
+        compress: Byte-shuffled zstd: a third of the bytes, read in more time; None: as
+            what is there, else not.
         shard: `(i, n)` or `"i/n"`, i from 0: this run does every n-th file.
         num_workers: Processes; 0: this one; None: one a core, or for a job that is done
             before they have started, this one.
@@ -139,15 +137,16 @@ def project_dataset(
         raise UserError("a plain list of frames has no grid: give grid=")
     index, count = parse_shard(shard)
     out_dir = pathlib.Path(out_dir)
-    dtype = check_encoding(dtype or dtype_there(out_dir))
-    sources = [(f.key, f.tesseract_path, f.projection_path) for f in frames]
+    kind = _empty_manifest(out_dir, grid, dtype, compress)
+    sources = list(frames)
     if not sources:
         raise UserError("no frames to project")
     if frames_per_file < 1:
         raise UserError(f"frames_per_file must be at least 1, got {frames_per_file}")
-    keys = "\n".join(key for key, *_ in sources)
+    keys = "\n".join(frame.key for frame in sources)
     plan = {
-        "dtype": dtype,
+        "dtype": kind.encoding,
+        "compress": kind.compressed,
         "num_frames": len(sources),
         "frames_per_file": frames_per_file,
         "frames_sha256": hashlib.sha256(keys.encode()).hexdigest(),
@@ -160,18 +159,26 @@ def project_dataset(
     starts = range(0, len(sources), frames_per_file)
     names = [files.file_name(i, len(starts), what) for i in range(len(starts))]
     tasks = [
-        _Task(out_dir, name, sources[i : i + frames_per_file], grid, dtype, skip_bad)
+        _Task(out_dir, name, sources[i : i + frames_per_file], kind, skip_bad)
         for name, i in zip(names, starts, strict=True)
     ][index::count]
     report.num_frames += sum(len(task.frames) for task in tasks)
     keep = skip_bad or not retry_skipped
     todo = [task for task in tasks if not _count_finished(task, report, keep)]
     _run(todo, report, num_workers, progress)
-    report.is_complete = not names or _finish(
-        out_dir, names, grid, dtype, sources, earlier
-    )
+    report.is_complete = not names or _finish(out_dir, names, kind, sources, earlier)
     report.seconds = time.perf_counter() - began
     return report
+
+
+def _empty_manifest(
+    folder: pathlib.Path, grid: RadarGrid, dtype: str | None, compress: bool | None
+) -> Manifest:
+    """Grid and encoding of what is written; None: as what is there."""
+    there = encoding_there(folder)
+    if compress is None:
+        compress = there["compress"]
+    return Manifest(grid, check_encoding(dtype or there["dtype"]), {}, [], compress)
 
 
 def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
@@ -187,14 +194,14 @@ def parse_shard(shard: str | tuple[int, int]) -> tuple[int, int]:
 
 
 def _count_earlier(
-    sources: list[_Source], earlier: Manifest, report: ProjectionReport
-) -> list[_Source]:
+    frames: list[LabelledFrame], earlier: Manifest, report: ProjectionReport
+) -> list[LabelledFrame]:
     """The frames of which a finished job has nothing; the others are counted."""
     recorded, skipped = set(earlier.frames), earlier.skipped
-    report.skipped = {key: skipped[key] for key, *_ in sources if key in skipped}
-    report.num_found = sum(key in recorded for key, *_ in sources)
+    report.skipped = {f.key: skipped[f.key] for f in frames if f.key in skipped}
+    report.num_found = sum(frame.key in recorded for frame in frames)
     report.num_frames = report.num_found + len(report.skipped)
-    return [s for s in sources if s[0] not in recorded and s[0] not in skipped]
+    return [f for f in frames if f.key not in recorded and f.key not in skipped]
 
 
 def _count_finished(task: _Task, report: ProjectionReport, keep_skipped: bool) -> bool:
@@ -221,7 +228,7 @@ def _run(
     bar = tqdm(total=total, unit="frame", desc="project", disable=not progress)
     if num_workers is None:
         cells = sum(
-            len(task.frames) * math.prod(task.grid.shape_drea) for task in tasks
+            len(task.frames) * math.prod(task.kind.grid.shape_drea) for task in tasks
         )
         num_workers = (os.cpu_count() or 1) if cells > _SMALL_JOB_CELLS else 0
     reading = working = 0.0
@@ -249,10 +256,16 @@ def _run_in_processes(tasks: list[_Task], num_workers: int, bar: tqdm) -> Iterat
         initargs=(done, stop),
     )
     with pool:
-        pending = {
-            pool.submit(_project_in_worker, task, slot)
-            for slot, task in enumerate(tasks)
-        }
+        # Ctrl-C is for this process: those that start now inherit the mask, and `stop`
+        # tells them.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            pending = {
+                pool.submit(_project_in_worker, task, slot)
+                for slot, task in enumerate(tasks)
+            }
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             while pending:
                 finished, pending = concurrent.futures.wait(
@@ -310,11 +323,12 @@ def _project_task(
     """Projects one file of records; returns its manifest, reading and working time."""
     began = time.perf_counter()
     timings = {"reading": 0.0}
-    with files.RecordFileWriter(task.folder, task.name) as writer:
-        for source in task.frames:
-            key = source[0]
+    grid, encoding, compress = task.kind.grid, task.kind.encoding, task.kind.compressed
+    with files.RecordFileWriter(task.folder, task.name, compress=compress) as writer:
+        for frame in task.frames:
+            key = frame.key
             try:
-                projection = _projection(source, task.grid, timings)
+                projection = frame.read_projection(grid, timings)
             except (DataError, FileNotFoundError, OSError) as error:
                 if not task.skip_bad:
                     raise DataError(
@@ -323,48 +337,35 @@ def _project_task(
                     ) from None
                 writer.skipped[key] = str(error)
             else:
-                writer.num_clipped += num_clipped(projection, task.encoding)
-                writer.write(key, encode(projection, task.encoding))
+                writer.num_clipped += num_clipped(projection, encoding)
+                writer.write(key, encode(projection, encoding))
             count_frame(1)
         entry = writer.commit()
     return entry, timings["reading"], time.perf_counter() - began
 
 
-def _projection(source: _Source, grid: RadarGrid, timings: dict[str, float]) -> Any:
-    """The projection of one frame, from its tesseract or, without one, from `.npy`."""
-    _, tesseract, npy = source
-    if tesseract is not None:
-        return project_file(tesseract, shape_drea=grid.shape_drea, timings=timings)
-    if npy is not None:
-        return read_projection_npy(npy, projection_shape=grid.projection_shape)
-    raise FileNotFoundError("no tesseract in any root")
-
-
 def _finish(
     out_dir: pathlib.Path,
     names: list[str],
-    grid: RadarGrid,
-    dtype: str,
-    sources: list[_Source],
+    kind: Manifest,
+    frames: list[LabelledFrame],
     earlier: Manifest | None,
 ) -> bool:
     """Writes the manifest of the folder, after an earlier one's, if every file is there."""
     entries = [files.read_manifest_of(out_dir, name) for name in names]
     if any(entry is None for entry in entries):
         return False
+    paths = [frame.radar_path for frame in frames if frame.radar_path is not None]
+    num_released = sum(path.suffix == ".npy" for path in paths)
     described = {
-        "tesseracts": sum(tesseract is not None for _, tesseract, _ in sources),
-        "released_projections": sum(
-            tesseract is None and npy is not None for _, tesseract, npy in sources
-        ),
-        "folders": sorted(
-            {str(p.parents[2]) for _, *paths in sources for p in paths if p}
-        ),
+        "tesseracts": len(paths) - num_released,
+        "released_projections": num_released,
+        "folders": sorted({str([path, *path.parents][:4][-1]) for path in paths}),
     }
     if earlier is not None:
-        for name, value in earlier.sources.items():
-            described[name] += value
+        for name, value in described.items():
+            described[name] = value + earlier.sources.get(name, type(value)())
         described["folders"] = sorted(set(described["folders"]))
         entries = [*earlier.files, *entries]
-    write_manifest(out_dir, Manifest(grid, dtype, described, entries))
+    write_manifest(out_dir, dataclasses.replace(kind, sources=described, files=entries))
     return True

@@ -6,17 +6,24 @@ import pathlib
 from typing import Any
 
 from radejax.core import files
+from radejax.data.encoding import Encoding
 from radejax.data.records.arrays import MANIFEST
+from radejax.data.records.files import MEND
 from radejax.data.records.projections import Manifest, read_manifest
 
 PLAN = "plan.json"
 _WHAT = "projections"
 
 
-def dtype_there(folder: pathlib.Path) -> str:
-    """Type of the records of a folder; the usual one where there are none yet."""
+_USUAL = {"dtype": "float16", "compress": False}
+
+
+def encoding_there(folder: pathlib.Path) -> dict[str, Any]:
+    """How a folder stores records, "dtype" and "compress"; as usual where none are yet."""
     path = folder / PLAN
-    return files.read_json(path)["dtype"] if path.is_file() else "float16"
+    hint = {"dtype": Encoding, "compress?": bool}
+    found = files.read_json(path, hint, mend=MEND) if path.is_file() else {}
+    return _USUAL | found
 
 
 def claim_folder(
@@ -39,7 +46,7 @@ def claim_folder(
         DataError: Its plan or manifest is damaged.
     """
     path, is_done = folder / PLAN, (folder / MANIFEST).exists()
-    is_same = path.exists() and files.read_json(path) == plan
+    is_same = path.exists() and _renewed(files.read_json(path)) == plan
     is_begun = is_done or any(
         path.name.lstrip(".").startswith(_WHAT) for path in folder.glob("*")
     )
@@ -52,7 +59,13 @@ def claim_folder(
         mend="choose another folder, delete that one, or finish it with the frames that "
         "it was begun with: a finished one serves all label revisions",
         ignore=("num_frames", "frames_sha256", "frames_per_file") if is_done else (),
+        renewed=_renewed,
     )
     if is_same or not is_done:
         return None, _WHAT
     return read_manifest(folder), f"{_WHAT}-{plan['frames_sha256'][:8]}"
+
+
+def _renewed(plan: Any) -> dict[str, Any]:
+    """A plan of before records could be compressed."""
+    return {"compress": False, **plan}

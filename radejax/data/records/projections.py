@@ -12,21 +12,21 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from radejax.core.errors import UserError
 from radejax.core.files import write_text
-from radejax.data.encoding import MAX_ERROR_DB, check_encoding
-from radejax.data.kradar.frame import Frame
+from radejax.data.dataset import FrameSequence
+from radejax.data.encoding import MAX_ERROR_DB, Encoding
 from radejax.data.records.arrays import MANIFEST, ArrayRecords, read_manifest_json
-from radejax.data.records.files import RecordFile, damage_named
+from radejax.data.records.files import RecordFile
 from radejax.geometry.radar_grid import RadarGrid
 
 FORMAT = "radejax-projections"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""The newest that is read. Records that are not compressed are version 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,12 +38,14 @@ class Manifest:
         encoding: "float16", "uint8" or "float32".
         sources: Where the projections come from.
         files: Files of records; record i of the folder is the i-th of their frames.
+        compressed: Records are byte-shuffled and compressed, see `files.shuffled`.
     """
 
     grid: RadarGrid
     encoding: str
     sources: dict[str, Any]
     files: list[RecordFile]
+    compressed: bool = False
 
     @property
     def frames(self) -> list[str]:
@@ -59,10 +61,11 @@ class Manifest:
         """Plain values, for JSON."""
         return {
             "format": FORMAT,
-            "version": FORMAT_VERSION,
+            "version": 2 if self.compressed else 1,
             "grid": self.grid.to_dict(),
             "encoding": {
                 "dtype": self.encoding,
+                "compressed": self.compressed,
                 "max_error_db": MAX_ERROR_DB[self.encoding],
                 "num_clipped": sum(f.num_clipped for f in self.files),
             },
@@ -99,14 +102,24 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
         raise FileNotFoundError(
             f"{folder}: no {MANIFEST}{hint if folder.is_dir() else ''}"
         )
-    fields = read_manifest_json(folder, (FORMAT, FORMAT_VERSION))
-    with damage_named(path):
-        return Manifest(
-            RadarGrid.from_dict(fields["grid"]),
-            check_encoding(fields["encoding"]["dtype"]),
-            fields["sources"],
-            [RecordFile.from_dict(entry) for entry in fields["files"]],
-        )
+    hint = {
+        "grid": RadarGrid,
+        "encoding": {"dtype": Encoding, "compressed?": bool},
+        "sources": {
+            "tesseracts?": int,
+            "released_projections?": int,
+            "folders?": list[str],
+        },
+    }
+    fields = read_manifest_json(folder, (FORMAT, FORMAT_VERSION), hint)
+    encoding = fields["encoding"]
+    return Manifest(
+        fields["grid"],
+        encoding["dtype"],
+        fields["sources"],
+        fields["files"],
+        encoding.get("compressed", False),
+    )
 
 
 def skipped_frames(folder: str | os.PathLike) -> dict[str, str]:
@@ -153,6 +166,7 @@ class RecordSource(ArrayRecords):
             self.manifest.files,
             self.grid.projection_shape,
             np.dtype(self.manifest.encoding),
+            compressed=self.manifest.compressed,
             verify=verify,
         )
 
@@ -160,7 +174,7 @@ class RecordSource(ArrayRecords):
         return {"projection": self.read(int(index)), "frame": int(index)}
 
 
-def record_positions(records: RecordSource, frames: Sequence[Frame]) -> list[int]:
+def record_positions(records: RecordSource, frames: FrameSequence) -> list[int]:
     """Index of the record of every frame.
 
     Raises:

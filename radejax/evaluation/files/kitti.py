@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 import pathlib
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -26,7 +27,8 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
-from radejax.evaluation.columns import Columns
+from radejax.evaluation.columns import Columns, dense_frames, frame_ids
+from radejax.evaluation.files.predictions import find_frames
 
 CLASS_KEYS = {
     "Sedan": "sed",
@@ -60,8 +62,9 @@ def write_kitti(
 
     Args:
         folder: Where; a folder named after the score cut is made in it.
-        ground_truth: Columns as in `average_precision.evaluate`, already reduced to the
-            classes, region and field of view that shall count.
+        ground_truth: Columns as in `average_precision.evaluate`, or with frames by key as
+            in a report's files, already reduced to the classes, region and field of view
+            that shall count.
         predictions: The same with scores.
         frames: Frame table; the position of a frame is the number of its file.
         score_threshold: Only predictions above it are written.
@@ -72,16 +75,21 @@ def write_kitti(
         tools do.
 
     Raises:
-        UserError: A class K-Radar has no key for.
+        UserError: A class K-Radar has no key for, or no frame with ground truth.
+        DataError: A frame that the table does not have.
     """
+    ids = frame_ids(frames)
+    ground_truth = _with_ids(ground_truth, frames, "ground truth")
+    predictions = _with_ids(predictions, frames, "predictions")
+    if not len(ground_truth["frame"]):
+        raise UserError("no frame has ground truth: K-Radar's tools write none of them")
     root = pathlib.Path(folder) / f"{float(score_threshold)}"
     above = np.flatnonzero(np.asarray(predictions["score"]) > score_threshold)
     truth = _lines(ground_truth, range(len(ground_truth["cls"])), scored=False)
     found = _lines(predictions, above, scored=True)
     kinds = [kind for kind in conditions if kind in frames]
-    ids = np.asarray(frames["frame"]).tolist()
     listed: dict[pathlib.Path, list[str]] = {root / "all": []}
-    for position, frame in enumerate(ids):
+    for position, frame in enumerate(ids.tolist()):
         if frame not in truth:
             continue
         tags = {kind: str(np.asarray(frames[kind])[position]) for kind in kinds}
@@ -100,6 +108,13 @@ def write_kitti(
         part.mkdir(parents=True, exist_ok=True)
         files.write_text(part / "val.txt", "".join(f"{name}\n" for name in names))
     return len(listed[root / "all"])
+
+
+def _with_ids(table: Columns, frames: Columns, name: str) -> Columns:
+    """The table with frames by id, all of which the frame table has."""
+    ids = frame_ids(frames)
+    found = find_frames(table["frame"], frames, where=name)
+    return {**table, "frame": ids[dense_frames(found, ids, name=name)]}
 
 
 def prediction_texts(
@@ -203,13 +218,12 @@ def _read_folder(
     """Numbers of the files in a folder, if there is one, and columns of all lines."""
     numbers, rows = [], []
     for path in sorted(folder.glob("*.txt")) if folder else ():
-        if not path.stem.isdigit():
+        if not re.fullmatch("[0-9]{1,9}", path.stem):
             raise DataError(
                 f"{path}: expected a file named by its number, as 000012.txt"
             )
         numbers.append(int(path.stem))
-        text = path.read_text(encoding="utf-8")
-        for number, line in enumerate(text.splitlines(), 1):
+        for number, line in enumerate(files.read_text(path).splitlines(), 1):
             if row := _read_line(line, scored, f"{path}: line {number}"):
                 rows.append((numbers[-1], *row))
     columns = {
@@ -245,7 +259,7 @@ def _frame_table(numbers: list[int], desc: pathlib.Path | None) -> Columns:
     tags = []
     for number in numbers:
         path = desc / f"{number:06d}.txt"
-        words = path.read_text(encoding="utf-8").split() if path.is_file() else []
+        words = files.read_text(path).split() if path.is_file() else []
         tags.append(words if len(words) == 3 else ["unknown"] * 3)
     columns = np.array(tags, dtype=str).reshape(-1, 3).T
     return ids | dict(zip(DESCRIPTION, columns, strict=True))

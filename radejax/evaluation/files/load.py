@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core import files, schema
+from radejax.core.errors import DataError, UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import are_simulated
 from radejax.evaluation.columns import Columns
@@ -31,6 +31,10 @@ class Source:
         split: "train", "test", a split file, or None for every frame.
         ground_truth: File of ground truth instead, with `frames`.
         frames: JSON file of the frame table (columns) for `ground_truth`.
+        sequences: Only frames of these; all if empty.
+        weather: Likewise.
+        z_offset_m: Added to the z of predictions.
+        yaw_degrees: Yaws of predictions are degrees.
     """
 
     data: tuple[str, ...] = ()
@@ -39,6 +43,18 @@ class Source:
     split: str | None = "test"
     ground_truth: str | None = None
     frames: str | None = None
+    sequences: tuple[int, ...] = ()
+    weather: tuple[str, ...] = ()
+    z_offset_m: float = 0.0
+    yaw_degrees: bool = False
+
+    def corrected(self, found: Columns) -> Columns:
+        """Predictions in metres and radians of the radar frame."""
+        box = np.array(found["box"], np.float64).reshape(-1, 7)
+        box[:, 2] += self.z_offset_m
+        if self.yaw_degrees:
+            box[:, 6] = np.deg2rad(box[:, 6])
+        return {**found, "box": box}
 
 
 def load(
@@ -47,23 +63,53 @@ def load(
     """Ground truth, predictions, frame table and counts of what loading left out.
 
     Args:
-        path: Predictions: a .npz, .json or .csv file, a folder in KITTI's layout, or the
-            folder of an earlier report.
+        path: Predictions: a .npz, .json or .csv file, the folder of `radejax detect`, one
+            in KITTI's layout, or that of an earlier report.
         source: Ground truth; a KITTI folder and a report bring their own.
         classes: Classes to load from labels.
 
     Raises:
-        UserError: No ground truth anywhere.
+        UserError: No ground truth anywhere, or no frame of the part that is asked for.
         FileNotFoundError: Names what is missing.
         DataError: Malformed content.
     """
-    path = pathlib.Path(path)
+    truth, found, frames, left_out = _load(pathlib.Path(path), source, classes)
+    found = source.corrected(found)
+    for column, wanted in (("sequence", source.sequences), ("weather", source.weather)):
+        if not wanted:
+            continue
+        if column not in frames:
+            raise UserError(
+                f"the frames do not say their {column}: give --data or --labels"
+            )
+        values = np.asarray(frames[column]).astype(str)
+        chosen = np.isin(values, [str(value) for value in wanted])
+        if not chosen.any():
+            raise UserError(
+                f"no frames of {column} {', '.join(map(str, wanted))}; there are "
+                f"{', '.join(np.unique(values))}"
+            )
+        frames = {name: np.asarray(v)[chosen] for name, v in frames.items()}
+        truth, found = (_of_frames(table, frames["frame"]) for table in (truth, found))
+    return truth, found, frames, left_out
+
+
+def _of_frames(table: Columns, ids: np.ndarray) -> Columns:
+    rows = np.isin(table["frame"], ids)
+    return {name: np.asarray(column)[rows] for name, column in table.items()}
+
+
+def _load(
+    path: pathlib.Path, source: Source, classes: Sequence[str]
+) -> tuple[Columns, Columns, Columns, dict[str, int]]:
+    """As `load`, of all frames."""
     if (path / "predictions.npz").is_file():
         frames = _frames_of_report(path)
         truth = predictions.read_table(path / "ground_truth.npz", frames, scored=False)
         found = predictions.read_table(path / "predictions.npz", frames)
         return truth, found, frames, {}
     frames, left_out = None, {}
+    is_boxes = any(path.glob("*.json")) and not (path / "preds").is_dir()
     if source.ground_truth:
         frames = _read_frames(source.frames) if source.frames else None
         truth = predictions.read_table(source.ground_truth, frames, scored=False)
@@ -77,28 +123,58 @@ def load(
         )
         truth, frames = tables_from_frames(data, source.split or "all")
         left_out = {f"labels: {what}": int(n) for what, n in data.counts.items()}
-    elif path.is_dir():
+    elif path.is_dir() and not is_boxes:
         return (*kitti.read_kitti(path), left_out)
     else:
         raise UserError(
             f"{path} holds predictions only: say where the ground truth is, with --data,"
             " --labels or --ground_truth"
         )
-    is_kitti = path.is_dir()
-    found = (
-        kitti.read_kitti(path)[1] if is_kitti else predictions.read_table(path, frames)
-    )
+    if path.is_dir() and not is_boxes:
+        found = kitti.read_kitti(path)[1]
+        if frames is not None and (path / "frames.json").is_file():
+            found = _of_detect(path, found, frames)
+    else:
+        found = predictions.read_table(path, frames)
     if frames is None:
         frames = {"frame": np.union1d(truth["frame"], found["frame"])}
     return truth, found, frames, left_out
 
 
+def stored_from(path: PathLike) -> float:
+    """Score from which on predictions were stored, as the report of a run says; or 0.
+
+    Runs of before `evaluation.min_score` stored what their score cut left.
+    """
+    path = pathlib.Path(path)
+    if not (path / "source.json").is_file() or not (path / "metrics.json").is_file():
+        return 0.0
+    options = files.read_json(path / "metrics.json")["options"]
+    return float(options.get("min_score", options["score_threshold"]))
+
+
 def _read_frames(path: PathLike) -> Columns:
     """A frame table written by `report.write_report`."""
-    content = files.read_json(path)
-    if not isinstance(content, dict) or "frame" not in content:
-        raise UserError(f"{path}: expected an object of columns with 'frame'")
-    return {name: np.asarray(column) for name, column in content.items()}
+    column = list[int] | list[str] | list[bool] | list[float]
+    columns = files.read_json(path, dict[str, column])
+    hint = {"frame": list[int], "name?": list[str], "sequence?": list[int]}
+    columns = schema.check(columns, hint, str(path))
+    for name, column in columns.items():
+        if len(column) != len(columns["frame"]):
+            raise DataError(
+                f"{path}: column {name!r} has {len(column)} entries for "
+                f"{len(columns['frame'])} frames"
+            )
+    return {name: np.asarray(column) for name, column in columns.items()}
+
+
+def _of_detect(folder: pathlib.Path, found: Columns, frames: Columns) -> Columns:
+    """KITTI's files of `radejax detect`, whose list says which frame has which number."""
+    names = _read_frames(folder / "frames.json")["name"]
+    named = {**found, "frame": names[found["frame"]]}
+    named = predictions.of_known_frames(named, frames)
+    ids = predictions.find_frames(named["frame"], frames, where=str(folder))
+    return {**named, "frame": ids}
 
 
 def _frames_of_report(path: pathlib.Path) -> Columns:
@@ -106,7 +182,9 @@ def _frames_of_report(path: pathlib.Path) -> Columns:
     frames = dict(_read_frames(path / "frames.json"))
     source = path / "source.json"
     if "simulated" not in frames and source.is_file():
-        roots = map(pathlib.Path, files.read_json(source)["roots"])
+        roots = map(
+            pathlib.Path, files.read_json(source, {"roots": list[str]})["roots"]
+        )
         frames["simulated"] = np.full(frames["frame"].size, are_simulated([*roots]))
     return frames
 

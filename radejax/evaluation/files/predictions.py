@@ -11,16 +11,19 @@ import csv
 import io
 import json
 import pathlib
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from radejax.core import files
+from radejax.core import files, schema
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS
 from radejax.evaluation.columns import Columns, wanted_columns
+
+_SCORED = wanted_columns(scored=True)
 
 
 def frame_keys(frames: Columns) -> list[str]:
@@ -37,6 +40,13 @@ def frame_keys(frames: Columns) -> list[str]:
     ]
 
 
+def _known_frames(frames: Columns) -> dict[str, int]:
+    """Ids by key, and by the half of it that a radar file tells: "sequence/radar"."""
+    ids = np.asarray(frames["frame"]).tolist()
+    keys = dict(zip(frame_keys(frames), ids, strict=True))
+    return {key.rpartition("_")[0]: frame for key, frame in keys.items()} | keys
+
+
 def _strip(name: str) -> str:
     return name.removesuffix(".txt")
 
@@ -47,7 +57,8 @@ def read_table(
     """Reads predictions (or, not `scored`, ground truth) from .npz, .json or .csv.
 
     Args:
-        path: The file.
+        path: The file; or the folder of `radejax detect`, a .json a frame, of which
+            frames that the table does not have are left.
         frames: Frame table to look frames up in; None leaves integer ids as they are.
         scored: Whether a score is expected.
 
@@ -61,6 +72,11 @@ def read_table(
             message names the file and the row.
     """
     path = pathlib.Path(path)
+    if path.is_dir():
+        columns = _read_folder(path)
+        if frames is not None:
+            columns = of_known_frames(columns, frames)
+        return _checked(columns, frames, path, _SCORED)
     if not path.is_file():
         raise FileNotFoundError(2, "no such file", str(path))
     readers = {".npz": _read_npz, ".json": _read_json, ".csv": _read_csv}
@@ -70,7 +86,13 @@ def read_table(
             " and folders in KITTI's layout"
         )
     columns = readers[path.suffix](path)
-    wanted = wanted_columns(scored)
+    return _checked(columns, frames, path, wanted_columns(scored))
+
+
+def _checked(
+    columns: Columns, frames: Columns | None, path: pathlib.Path, wanted: Sequence[str]
+) -> Columns:
+    """The wanted columns, frames by id."""
     missing = [name for name in wanted if name not in columns]
     if missing:
         raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
@@ -84,7 +106,7 @@ def read_table(
 def find_frames(
     named: np.ndarray | Sequence[Any], frames: Columns | None, *, where: str
 ) -> np.ndarray:
-    """Ids of frames that are named by id or by key.
+    """Ids of frames that are named by id, key or "sequence/radar", half of a key.
 
     Raises:
         DataError: A frame that the table does not have, or names without a table.
@@ -94,20 +116,48 @@ def find_frames(
         return np.zeros(0, np.int64)
     if named.dtype.kind in "iu":
         return named.astype(np.int64)
-    text = [_strip(str(name)) for name in named.tolist()]
-    if all(name.lstrip("-").isdigit() for name in text):
-        return np.array([int(name) for name in text], np.int64)
-    if frames is None:
+    # Rows of a frame are neighbours, and a million of them are looked up once a frame.
+    first = np.flatnonzero(np.append(True, named[1:] != named[:-1]))
+    text = [_strip(str(name)) for name in named[first].tolist()]
+    if all(re.fullmatch("-?[0-9]{1,18}", name) for name in text):
+        found = [int(name) for name in text]
+    elif frames is None:
         raise DataError(f"{where}: frames are named ({text[0]!r}), but none are known")
-    ids = np.asarray(frames["frame"]).tolist()
-    known = dict(zip(frame_keys(frames), ids, strict=True))
-    for row, name in enumerate(text):
-        if name not in known:
-            raise DataError(
-                f"{where}: row {row}: no frame {name!r} among the {len(known)} frames"
-                f" that are evaluated (such as {next(iter(known), '-')!r})"
-            )
-    return np.array([known[name] for name in text], np.int64)
+    else:
+        known = _known_frames(frames)
+        for row, name in zip(first.tolist(), text, strict=True):
+            if name not in known:
+                count, such = len(frames["frame"]), next(iter(frame_keys(frames)), "-")
+                raise DataError(
+                    f"{where}: row {row}: no frame {name!r} among the {count} frames"
+                    f" that are evaluated (such as {such!r})"
+                )
+        found = [known[name] for name in text]
+    return np.repeat(np.array(found, np.int64), np.diff(first, append=named.size))
+
+
+def _read_folder(folder: pathlib.Path) -> Columns:
+    """All files of `radejax detect`."""
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise UserError(f"{folder} has no predictions: no .json files")
+    tables = [table for table in map(_read_json, paths) if table["frame"].size]
+    if lacking := [name for table in tables for name in _SCORED if name not in table]:
+        raise DataError(f"{folder}: lacks {lacking[0]!r}")
+    none = np.zeros(0)
+    return {
+        name: np.concatenate([table[name] for table in tables]) if tables else none
+        for name in _SCORED
+    }
+
+
+def of_known_frames(columns: Columns, frames: Columns) -> Columns:
+    """Rows of frames that the table has; all if there is none, for `find_frames`."""
+    known = _known_frames(frames)
+    is_known = [_strip(str(name)) in known for name in columns["frame"].tolist()]
+    if not any(is_known):
+        return columns
+    return {name: column[np.array(is_known)] for name, column in columns.items()}
 
 
 def _read_npz(path: pathlib.Path) -> Columns:
@@ -123,15 +173,18 @@ def _read_json(path: pathlib.Path) -> Columns:
         columns = content
     else:
         columns = _columns_of_records(_records(content, path), path)
-    types = {"frame": None, "cls": None, "box": np.float64, "score": np.float64}
-    try:
-        return {
-            name: np.asarray(columns[name], dtype)
-            for name, dtype in types.items()
-            if name in columns
-        }
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{path}: a box or score is not a number: {error}") from error
+    columns = schema.check(columns, _JSON, str(path))
+    names = [name.removesuffix("?") for name in _JSON]
+    return {name: np.asarray(columns[name]) for name in names if name in columns}
+
+
+_JSON = {
+    "frame?": list[int] | list[str],
+    "cls?": list[str],
+    "box?": list[tuple[float, float, float, float, float, float, float]],
+    "score?": list[float],
+}
+"""Columns; which of them must be there `read_table` knows."""
 
 
 def _records(content: Any, path: pathlib.Path) -> Iterator[dict]:
@@ -172,18 +225,24 @@ def _columns_of_records(records: Iterator[dict], path: pathlib.Path) -> dict[str
 
 
 def _read_csv(path: pathlib.Path) -> Columns:
-    with open(path, encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
+    reader = csv.DictReader(
+        io.StringIO(files.read_text(path), newline=""), skipinitialspace=True
+    )
+    frame, cls, values = [], [], []
+    try:
         header = reader.fieldnames or []
         missing = [n for n in ("frame", "cls", *BOX_FIELDS) if n not in header]
         if missing:
-            raise DataError(f"{path}: line 1: lacks columns {missing}; found {header}")
+            raise DataError(
+                f"{path}: line 1: lacks columns {missing}; found {str(header)[:200]}"
+            )
         numbers = [n for n in (*BOX_FIELDS, "score") if n in header]
-        frame, cls, values = [], [], []
         for line in reader:
             frame.append(line["frame"])
             cls.append(line["cls"])
             values.append([_number(line[n], n, path, reader.line_num) for n in numbers])
+    except csv.Error as error:
+        raise DataError(f"{path}: line {reader.line_num}: {error}") from None
     table = np.array(values, np.float64).reshape(-1, len(numbers))
     columns = {"frame": np.array(frame), "cls": np.array(cls, str), "box": table[:, :7]}
     if "score" in numbers:
@@ -196,7 +255,7 @@ def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float
         return float(text)
     except (TypeError, ValueError):
         raise DataError(
-            f"{path}: line {line}: {name} is {text!r}, expected a number"
+            f"{path}: line {line}: {name} is {text!r:.80}, expected a number"
         ) from None
 
 

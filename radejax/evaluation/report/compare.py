@@ -10,10 +10,13 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import PathLike, Source, load
+from radejax.evaluation.files.load import PathLike, Source, load, stored_from
 from radejax.evaluation.report import bootstrap, paper_tables, tables
 from radejax.evaluation.report.measure import Options, measure, repair_sizes
 from radejax.evaluation.report.report import Report, plain, write_report
+
+LOW_SCORE = 0.1
+"""Where predictions are stored from here on, AP without a cut is nearly the whole."""
 
 
 def evaluate_files(
@@ -21,8 +24,17 @@ def evaluate_files(
 ) -> Report:
     """Evaluates predictions in files and writes the report. See `load` for errors."""
     truth, found, frames, left_out = load(path, source, options.classes)
+    warnings, low = options.warnings, stored_from(path)
+    if low > max(LOW_SCORE, options.score_threshold):
+        warnings += (
+            f"{path} has predictions from score {low:g} on only, and every number is of "
+            "these; evaluate --workdir again stores lower ones",
+        )
     options = dataclasses.replace(
-        options, left_out_before={**left_out, **options.left_out_before}
+        options,
+        left_out_before={**left_out, **options.left_out_before},
+        min_score=max(low, options.min_score),
+        warnings=warnings,
     )
     return write_report(truth, found, frames, out_dir, options)
 
@@ -52,6 +64,9 @@ def compare_files(
     """
     if len(paths) < 2:
         raise UserError("a comparison needs at least two runs")
+    # What one run has not stored must not count for another one.
+    cut = max(options.score_threshold, *map(stored_from, paths))
+    options = dataclasses.replace(options, score_threshold=cut)
     first, *others = [_load_run(path, source, options) for path in paths]
     named = [p for p in ("exact", "kradar_r40") if p in options.protocols]
     parts, rows = [], []

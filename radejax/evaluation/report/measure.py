@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES, RARE_SHARE
+from radejax.core.structures import CLASSES, MIN_SIZE_M, RARE_SHARE
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation import protocols
 from radejax.evaluation.columns import Columns, are_simulated, in_roi
@@ -45,6 +45,8 @@ class Options:
         protocols: Names of protocols.
         score_threshold: Score cut of all APs.
         skip_empty: Frame rule; "protocol" takes each protocol's own.
+        uncut: Protocols without the score cut and with their own frame rule.
+        min_score: Predictions were stored from here on: nothing is cut below it.
         roi: Region of interest for both sides.
         label_version: Label revision of the ground truth.
         operating_score: Precision, recall, confusion and worst frames are of predictions
@@ -57,6 +59,7 @@ class Options:
             not positive overlap nothing but still count.
         rare: Classes and conditions, from `rare_classes`, whose APs are marked.
         left_out_before: Counts of what loading left out already, to be printed.
+        warnings: What loading has to say of the numbers, to be printed.
         draw_frame: Called with (frame id, path of a picture to write) for each of the
             worst frames, or None.
     """
@@ -67,6 +70,8 @@ class Options:
     protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
     score_threshold: float = 0.0
     skip_empty: str | None = PROTOCOL_DEFAULT
+    uncut: tuple[str, ...] = ()
+    min_score: float = 0.0
     roi: str | Sequence[float] | None = "narrow"
     label_version: str | None = None
     operating_score: float = 0.3
@@ -77,6 +82,7 @@ class Options:
     invalid_sizes: str = "error"
     rare: tuple[tuple[str, str], ...] = ()
     left_out_before: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
     draw_frame: Callable[[int, Any], None] | None = None
 
     @property
@@ -91,6 +97,15 @@ class Options:
         usual = ("exact", "kradar_r40", "coco101")
         chosen = tuple(name for name in usual if name in self.protocols)
         return chosen or self.protocols[:1]
+
+    def cut(self, protocol: str) -> float:
+        """Score that predictions need more than."""
+        own = 0.0 if protocol in self.uncut else self.score_threshold
+        return max(own, self.min_score)
+
+    def frame_rule(self, protocol: str) -> str | None:
+        """As `skip_empty`."""
+        return PROTOCOL_DEFAULT if protocol in self.uncut else self.skip_empty
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a report, without callbacks."""
@@ -203,8 +218,8 @@ def measure(
         results = data.results(
             protocol,
             iou_thresholds=options.iou_thresholds,
-            skip_empty=options.skip_empty,
-            score_threshold=options.score_threshold,
+            skip_empty=options.frame_rule(protocol),
+            score_threshold=options.cut(protocol),
             weights=mask,
             curves=False,
         )
@@ -265,7 +280,10 @@ def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
     """What the numbers do not see, and why, in words and counts."""
     counts = {**options.left_out_before, **data.left_out}
     low = data.pred.score <= options.score_threshold
-    counts[f"predictions: score not above {options.score_threshold:g}"] = int(low.sum())
+    but = f" (counted by {', '.join(options.uncut)})" if options.uncut else ""
+    counts[f"predictions: score not above {options.score_threshold:g}{but}"] = int(
+        low.sum()
+    )
     empty = data.gt_count.sum(axis=1) == 0
     counts["frames: without ground truth (left out by skip=frame)"] = int(empty.sum())
     counts["predictions: in frames without ground truth (left out by skip=frame)"] = (
@@ -276,6 +294,12 @@ def left_out(data: EvaluationSet, options: Options) -> dict[str, int]:
         (other & ~low).sum()
     )
     return counts
+
+
+def num_clipped(predictions: Columns) -> int:
+    """Predictions with a size that decoding clipped, see `decode(clip_sizes=True)`."""
+    sizes = np.asarray(predictions["box"], np.float64).reshape(-1, 7)[:, 3:6]
+    return int(((sizes > 0) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1).sum())
 
 
 def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:

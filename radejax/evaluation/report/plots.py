@@ -47,12 +47,13 @@ def draw(
                 RECOMMENDED,
                 iou_thresholds=iou,
                 spaces=space,
-                score_threshold=options.score_threshold,
+                score_threshold=options.cut(RECOMMENDED),
                 weights=mask,
             )
             for name, mask in masks.items()
         }
-        figure = _precision_recall(results, f"{space}, IoU {iou:g}{kind}")
+        terms = f"{RECOMMENDED}, {space}, IoU {iou:g}{kind}"
+        figure = _precision_recall(results, terms)
         path = out_dir / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
         written.append(save_figure(figure, path, dpi=110))
     match = breakdown.matched_objects(data, "3d", iou)
@@ -61,22 +62,25 @@ def draw(
 
 
 def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Any:
-    """Figure with one panel per class, one curve per condition."""
+    """Figure with one panel per class that has objects, one curve per condition."""
     from radejax.visualize.canvas import new_figure
     from radejax.visualize.curves import draw_precision_recall
 
-    panels = list(zip(*results.values(), strict=True))  # results of a class each
+    classes = list(zip(*results.values(), strict=True))  # results of a class each
+    seen = [panel for panel in classes if any(result.is_defined for result in panel)]
+    panels = seen or classes[:1]
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
-    figure = new_figure(4.6 * columns, 4.0 * rows, layout="constrained")
+    figure = new_figure(4.6 * columns, 4.8 * rows, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for axis in axes[len(panels) :]:
         axis.set_axis_off()
     for axis, panel in zip(axes, panels, strict=False):
         lines = {
             f"{name}, AP {result.ap:.1f}": (result.recall, result.precision)
-            for name, result in zip(results, panel, strict=True)
             if result.is_defined
+            else None
+            for name, result in zip(results, panel, strict=True)
         }
         draw_precision_recall(lines, ax=axis, title=f"{panel[0].cls}, {terms}")
     return figure

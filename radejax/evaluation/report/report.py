@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from radejax.core import files
+from radejax.core.structures import MIN_SIZE_M
 from radejax.evaluation import protocols
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -22,6 +23,7 @@ from radejax.evaluation.report import (
     breakdown,
     measure,
     paper_tables,
+    plausible,
     plots,
     tables,
 )
@@ -54,14 +56,15 @@ def write_report(
     options: Options | None = None,
     **changes: Any,
 ) -> Report:
-    """Evaluates a run in every protocol and writes its report.
+    """Evaluates a run in the protocols asked for, and `exact`, and writes its report.
 
     Args:
         ground_truth: Columns as in `average_precision.evaluate`.
         predictions: The same with scores.
         frames: Frame table: frame `[F]` ids, and as far as known name, sequence,
             weather, environment and time.
-        out_dir: Folder of the report; made if missing, files in it are replaced.
+        out_dir: Folder of the report; made if missing, files in it are replaced when all
+            are written.
         options: What to compute.
         **changes: Fields of `Options` given by name.
 
@@ -70,6 +73,10 @@ def write_report(
         DataError: A bad row, named by table, frame and row.
     """
     options = dataclasses.replace(options or Options(), **changes)
+    if protocols.RECOMMENDED not in options.protocols:
+        with_own = (*options.protocols, protocols.RECOMMENDED)
+        options = dataclasses.replace(options, protocols=with_own)
+    clipped = measure.num_clipped(predictions)
     predictions, repaired = measure.repair_sizes(predictions, options.invalid_sizes)
     data = EvaluationSet(
         ground_truth,
@@ -83,34 +90,48 @@ def write_report(
     intervals = why_no_intervals(frames, options)
     if intervals is None:
         rows = with_intervals(data, frames, rows, options)
-    metrics = collect(data, frames, rows, options)
+    metrics = collect(data, predictions, frames, rows, options)
     metrics["intervals"] = intervals or f"{options.bootstrap} resamples of sequences"
     metrics["left_out"]["predictions: size not positive, kept as false positives"] = (
         repaired
     )
+    metrics["left_out"][f"predictions: size clipped to {MIN_SIZE_M} m, kept"] = clipped
     text = console_text(metrics, rows, options)
-    found_tables = all_tables(rows, metrics, options)
-    out_dir = pathlib.Path(out_dir)
-    out_dir.mkdir(parents=True, exist_ok=True)
+    inputs = {"predictions.npz": predictions, "ground_truth.npz": ground_truth}
+    with files.swapped_in(out_dir) as folder:
+        _write(folder, metrics, rows, frames, inputs, text, options)
+        _draw(data, frames, metrics, folder, options)
+        written = [path for path in folder.rglob("*") if path.is_file()]
+        names = [path.relative_to(folder) for path in sorted(written)]
+    return Report(text, metrics, rows, [pathlib.Path(out_dir) / name for name in names])
+
+
+def _write(
+    folder: pathlib.Path,
+    metrics: Mapping[str, Any],
+    rows: list[Measured],
+    frames: Columns,
+    inputs: Mapping[str, Columns],
+    text: str,
+    options: Options,
+) -> None:
+    """The files that are no pictures."""
+    built = all_tables(rows, metrics, options)
     # The inputs stay with the report, so that two reports can be compared later.
     columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
-    files.write_json(out_dir / "metrics.json", plain(metrics))
-    files.write_json(out_dir / "frames.json", columns)
+    files.write_json(folder / "metrics.json", plain(metrics))
+    files.write_json(folder / "frames.json", columns)
     texts = {
         "metrics.csv": csv_text(rows),
         "report.txt": text,
-        "tables.md": "\n".join(table.render("markdown") for table in found_tables),
-        "tables.tex": "\n".join(table.render("latex") for table in found_tables),
+        "tables.md": "\n".join(table.render("markdown") for table in built),
+        "tables.tex": "% \\usepackage{booktabs,adjustbox}\n"
+        + "\n".join(table.render("latex") for table in built),
     }
     for name, content in texts.items():
-        files.write_text(out_dir / name, content)
-    inputs = {"predictions.npz": predictions, "ground_truth.npz": ground_truth}
+        files.write_text(folder / name, content)
     for name, table in inputs.items():
-        write_table(out_dir / name, table, frames if "name" in frames else None)
-    names = ("metrics.json", "frames.json", *texts, *inputs)
-    written = [out_dir / name for name in names]
-    written += _draw(data, frames, metrics, out_dir, options)
-    return Report(text, metrics, rows, written)
+        write_table(folder / name, table, frames if "name" in frames else None)
 
 
 def why_no_intervals(frames: Columns, options: Options) -> str | None:
@@ -139,8 +160,8 @@ def with_intervals(
             resamples=options.bootstrap,
             seed=options.seed,
             masks=weathers if name in main else {},
-            skip_empty=options.skip_empty,
-            score_threshold=options.score_threshold,
+            skip_empty=options.frame_rule(name),
+            score_threshold=options.cut(name),
         )
     result = []
     for row in rows:
@@ -150,7 +171,11 @@ def with_intervals(
 
 
 def collect(
-    data: EvaluationSet, frames: Columns, rows: list[Measured], options: Options
+    data: EvaluationSet,
+    predictions: Columns,
+    frames: Columns,
+    rows: list[Measured],
+    options: Options,
 ) -> dict[str, Any]:
     """Everything of metrics.json, as plain values (NaN where nothing is defined)."""
     iou, cut = options.iou_thresholds[0], options.operating_score
@@ -169,6 +194,7 @@ def collect(
         "num_ground_truth": len(data.gt),
         "num_predictions": len(data.pred),
         "left_out": measure.left_out(data, options),
+        "warnings": [*options.warnings, *plausible.warnings(predictions, data)],
         "protocols": {
             name: protocols.PROTOCOLS[name].summary for name in options.protocols
         },
@@ -247,7 +273,9 @@ def console_text(
     parts = [
         f"{options.run}: {metrics['num_frames']} {kind}frames, "
         f"{metrics['num_ground_truth']}"
-        f" objects, {metrics['num_predictions']} predictions\n",
+        f" objects, {metrics['num_predictions']} predictions, score above "
+        f"{options.min_score:g}\n",
+        *(f"WARNING: {line}\n" for line in metrics["warnings"]),
         *(built_table.render() for built_table in _labelled(built, metrics)),
         f"Intervals: {metrics['intervals']}\n",
         "Left out, or kept with a remark:",
@@ -283,17 +311,16 @@ def _draw(
     data: EvaluationSet,
     frames: Columns,
     metrics: Mapping[str, Any],
-    out_dir: pathlib.Path,
+    folder: pathlib.Path,
     options: Options,
-) -> list[pathlib.Path]:
+) -> None:
     """Curves, and pictures of the worst frames if somebody can draw them."""
-    written = []
     if options.plots:
-        written += plots.draw(data, frames, options, out_dir)
+        plots.draw(data, frames, options, folder)
     if options.draw_frame is not None:
-        folder = out_dir / "worst_frames"
-        folder.mkdir(exist_ok=True)
-        for rank, entry in enumerate(metrics["worst_frames"]):
-            written.append(folder / f"{rank:02d}_frame_{entry['frame']}.png")
-            options.draw_frame(entry["frame"], written[-1])
-    return written
+        (folder / "worst_frames").mkdir()
+        for entry in metrics["worst_frames"]:
+            name = f"frame_{entry['frame']}"
+            if {"name", "sequence"} <= set(entry):
+                name = f"{entry['sequence']:02d}_{entry['name']}"
+            options.draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")

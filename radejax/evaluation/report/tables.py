@@ -59,8 +59,15 @@ class Table:
             self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         if style == "latex":
-            below = "".join(f"% {note}\n" for note in self.notes)
-            return f"% {self.title}\n{body}\n{below}"
+            lines = [
+                "\\begin{table}[t]",
+                f"\\centering\\footnotesize\n\\caption{{{_latex(self.title)}}}",
+                f"\\begin{{adjustbox}}{{max width=\\columnwidth}}\n{body}",
+                "\\end{adjustbox}",
+                *(f"\\par {_latex(note)}" for note in self.notes),
+                "\\end{table}\n",
+            ]
+            return "\n".join(lines)
         title = f"**{self.title}**" if style == "markdown" else self.title
         below = "".join(f"\n{note}\n" for note in self.notes)
         return f"{title}\n\n{body}\n{below}"
@@ -68,6 +75,13 @@ class Table:
     def of_simulated(self) -> Table:
         """The same, saying that its numbers are of simulated data."""
         return dataclasses.replace(self, title=f"Simulated data: {self.title}")
+
+
+def _latex(text: str) -> str:
+    """Text with what LaTeX takes for commands, and in its old fonts for other signs."""
+    signs = {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    signs |= {"\\": "\\textbackslash{}", ">": "$>$", "<": "$<$", "~": "$\\sim$"}
+    return "".join(signs.get(sign, sign) for sign in text)
 
 
 def index(rows: Sequence[Measured]) -> dict[Key, Measured]:

@@ -155,7 +155,7 @@ def simulate(
     grid: RadarGrid,
     parameters: RadarParameters = RadarParameters(),
     output: Output = "projection",
-    rows_per_step: int = 1,
+    rows_per_step: int = 0,
 ) -> jax.Array:
     """One radar frame, jitted; map it over frames with `jax.vmap`.
 
@@ -170,8 +170,8 @@ def simulate(
             made, `[R, E, D, A]` (turning 260 MB around takes time), "projection" for
             `[R, A, D+E]` normalised projections: the numbers that
             `radejax.data.projection.project` makes of the tesseract.
-        rows_per_step: Range rows at a time: 1 on CPU, 64 or more on accelerators.
-            Does not change the numbers, only memory and speed.
+        rows_per_step: Range rows at a time; 0: 1 on CPUs, 64 on accelerators. Does not
+            change the numbers, only memory and speed.
 
     Returns:
         float32 array as `output` says.
@@ -204,8 +204,16 @@ def simulate(
         return _project_row(power) if output == "projection" else power
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
-    one_by_one = rows_per_step == 1  # without a batch's axis
-    result = lax.map(row, rows, batch_size=None if one_by_one else rows_per_step)
+
+    def by_rows(count: int, *rows: Any) -> jax.Array:
+        # One by one is without a batch's axis.
+        return lax.map(row, rows, batch_size=None if count == 1 else count)
+
+    if rows_per_step:
+        result = by_rows(rows_per_step, *rows)
+    else:
+        one, many = (functools.partial(by_rows, count) for count in (1, 64))
+        result = lax.platform_dependent(*rows, cpu=one, default=many)
     return jnp.transpose(result, TESSERACT_OF_ROWS) if output == "tesseract" else result
 
 

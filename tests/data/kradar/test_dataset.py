@@ -86,6 +86,18 @@ def test_filters_can_be_changed(tmp_path):
     np.testing.assert_allclose(shifted[0].boxes[:, :3], [[7.0, 0.0, 0.5]])
 
 
+def test_lines_without_a_star_count_where_they_are_to(tmp_path):
+    write_frame(tmp_path, [sedan(10, 0), sedan(20, 0)], "v1.1")
+    path = tmp_path / f"1/info_label/{NAME}.txt"
+    path.write_text(path.read_text().replace("\n*,", "\n#,", 1))
+    kept = KRadar(tmp_path, version="v1.1")
+    assert (kept.class_counts()["Sedan"], len(kept)) == (1, 1)
+    assert kept.counts["disabled objects (no leading *)"] == 1
+    released = KRadar(tmp_path, version="v1.1", count_disabled=True)
+    assert released.class_counts()["Sedan"] == 2
+    assert not released.counts["disabled objects (no leading *)"]
+
+
 def test_frame_knows_its_files(kradar_root):
     data = KRadar(kradar_root, split="train", camera_calibration=kradar_root)
     assert len(data) == 8

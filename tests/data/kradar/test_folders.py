@@ -38,6 +38,19 @@ def test_sequence_spread_over_roots(tmp_path):
         folders.find_sequences([tmp_path / "c"])
 
 
+def test_a_sequence_or_a_parent_as_root_is_answered_with_the_root(tmp_path):
+    touch(tmp_path / "disk/kradar/7/info_label/00004_00001.txt")
+    touch(tmp_path / "disk/other/readme.txt")
+    meant = rf"in {tmp_path}/\S+; try {tmp_path}/disk/kradar$"
+    for wrong in ("disk/kradar/7", "disk"):
+        with pytest.raises(UserError, match=meant):
+            KRadar(tmp_path / wrong)
+        with pytest.raises(UserError, match=meant):
+            KRadar(tmp_path / wrong, tmp_path / "labels.zip")
+    with pytest.raises(UserError, match=r"other$"):
+        KRadar(tmp_path / "disk/other")
+
+
 @pytest.mark.parametrize(
     ("version", "folder"),
     [("v1.0", "info_label"), ("v2.0", "info_label_v2"), ("v2.1", "info_label")],
@@ -162,7 +175,24 @@ def test_split_files_and_camera_calibration_are_found(tmp_path):
     own = touch(tmp_path / "c/calib_seq_v2/seq_03/cam_1.yml")
     assert folders.find_camera_calibration([tmp_path / "c"], 3) == (own, True)
     assert folders.find_camera_calibration([tmp_path / "c"], 4) == (common, False)
+    found = folders.find_camera_calibration([tmp_path / "c"], 3, common_only=True)
+    assert found == (common, False)
     assert folders.find_camera_calibration([tmp_path / "d"], 4) == (None, False)
+
+
+def test_height_of_the_radar_is_kradars_or_the_simulations(tmp_path):
+    a, b = tmp_path / "a", tmp_path / "b"
+    touch(a / "1/x")
+    assert folders.read_lidar_to_radar_z([a]) == 0.7
+    touch(b / "simulation.json", '{"config": {"lidar_to_radar_m": [-2.54, 0.3, 0.2]}}')
+    assert folders.read_lidar_to_radar_z([a, b]) == 0.2
+    touch(a / "simulation.json", "{}")
+    assert folders.read_lidar_to_radar_z([a]) == 0.7
+    with pytest.raises(DataError, match="different heights of radar over LiDAR in"):
+        folders.read_lidar_to_radar_z([a, b])
+    touch(b / "simulation.json", '{"config": {"lidar_to_radar_m": [1]}}')
+    with pytest.raises(DataError, match=r"lidar_to_radar_m is not three numbers"):
+        folders.read_lidar_to_radar_z([b])
 
 
 def test_grid_of_the_roots(tmp_path):
@@ -175,5 +205,5 @@ def test_grid_of_the_roots(tmp_path):
     with pytest.raises(DataError, match="different sensor axes"):
         folders.read_grid([a, b])
     touch(b / "radar_grid.json", '{"range_m": 3}')
-    with pytest.raises(DataError, match=r"radar_grid\.json: no radar grid"):
+    with pytest.raises(DataError, match=r"radar_grid\.json: it lacks azimuth_rad"):
         folders.read_grid([b])

@@ -79,6 +79,10 @@ def test_disabled_objects_are_skipped_and_counted(version):
     line = LINES[version]
     file = parse(f"{HEADER}\n#{line[1:]}\n{line}\n", version)
     assert (len(file.labels), file.num_disabled) == (1, 1)
+    text = f"{HEADER}\n#{line[1:]}\n{line}\n# no, object\n"
+    file = parse(text, version, count_disabled=True)
+    assert (len(file.labels), file.num_disabled) == (2, 1)
+    assert file.labels[0] == file.labels[1]
 
 
 @pytest.mark.parametrize(

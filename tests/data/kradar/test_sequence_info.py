@@ -42,6 +42,15 @@ def test_own_files_come_first(read, tmp_path):
     assert not findings.counts
 
 
+def test_a_misspelt_weather_is_reported(read, tmp_path):
+    for weather, count in (("fog", 0), ("fogg", 1)):
+        write.write_description(tmp_path / "description.txt", "urban", "day", weather)
+        info, findings = read()
+        assert info.conditions.weather == weather
+        assert len(findings.notes) == count
+    assert "weather 'fogg' is none of K-Radar's: normal, " in findings.notes[0]
+
+
 def test_what_is_not_there_is_filled_in_and_counted(read):
     info, findings = read(number=38)
     assert info.radar_from_lidar_m == (-2.54, 0.3, 0.7)

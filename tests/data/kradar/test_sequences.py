@@ -68,7 +68,7 @@ def test_malformed_files_name_file_and_line(tmp_path, read, text, message):
 )
 def test_binary_files_are_data_errors(tmp_path, read):
     (tmp_path / "f.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match=r"f\.txt:1: not a UTF-8"):
+    with pytest.raises(DataError, match=r"f\.txt:1: byte 0xff is not UTF-8"):
         read(tmp_path / "f.txt")
 
 

@@ -42,6 +42,19 @@ def test_rule_and_file(tmp_path):
     assert select(tmp_path, split=own)[0] == KEYS[8:]
 
 
+def test_a_frame_in_both_splits_is_told(tmp_path, caplog):
+    write.write_splits(tmp_path / "split", KEYS[:4], KEYS[4:])
+    assert not select(tmp_path, split="test")[1].problems
+    assert not caplog.text
+    write.write_splits(tmp_path / "split", KEYS[:4], KEYS[3:])
+    keys, findings = select(tmp_path, split="train")
+    assert keys == KEYS[:4]
+    assert findings.summary().problem_counts() == {"split": 1}
+    assert "1 frames are in both" in caplog.text
+    assert "first 1/00003_00003: what is evaluated" in caplog.text
+    assert select(tmp_path)[0] == KEYS  # all frames, as `data check` reads them
+
+
 def test_errors(tmp_path):
     with pytest.raises(UserError, match="'val' is neither"):
         select(tmp_path, split="val")

@@ -113,6 +113,34 @@ def test_resumes_after_a_kill(root, tmp_path):
         np.testing.assert_array_equal(records[i]["projection"], wanted)
 
 
+@pytest.mark.slow
+def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
+    out = tmp_path / "out"
+    blocked = root / "2/radar_tesseract/tesseract_00005.mat"
+    blocked.unlink()
+    os.mkfifo(blocked)  # the worker waits there until it is opened below
+    # Started in the background, Ctrl-C would be ignored by all of them.
+    command = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    )
+    command += "from radejax.cli.main import main; main(prog_name='radejax')"
+    job = subprocess.Popen(
+        [sys.executable, "-c", command, "project", root, "--out", out, "--workers=1"],
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    with blocked.open("wb"):  # returns when the worker reads
+        os.killpg(job.pid, signal.SIGINT)
+        time.sleep(1.0)
+        assert job.poll() is None  # waits for its worker
+    _, errors = job.communicate(timeout=120)
+    assert job.returncode == 130
+    assert errors.rstrip().splitlines()[-1] == "error: interrupted"
+    assert "Traceback" not in errors
+
+
 def wait_until(condition, seconds=120.0):
     end = time.monotonic() + seconds
     while not condition():
@@ -176,6 +204,41 @@ def test_eight_bits_state_what_they_lose(kradar_root, tmp_path):
     encoding = json.loads((tmp_path / "manifest.json").read_text())["encoding"]
     assert error_db <= encoding["max_error_db"] * 1.001
     assert encoding["num_clipped"] == 0
+
+
+@pytest.mark.parametrize("dtype", ["float16", "uint8", "float32"])
+def test_compressed_records_are_the_same(kradar_root, tmp_path, dtype):
+    data, plain, small = KRadar(kradar_root), tmp_path / "plain", tmp_path / "small"
+    run(data, plain, dtype=dtype)
+    run(data[:8], small, grid=data.grid, dtype=dtype, compress=True)
+    assert run(data, small).num_projected == 4  # as what is there
+    wanted, found = RecordSource(plain), RecordSource(small, verify=True)
+    assert (wanted.manifest.compressed, found.manifest.compressed) == (False, True)
+    for i in range(12):
+        x = found[i]["projection"]
+        assert (x.dtype, x.shape) == (np.dtype(dtype), data.grid.projection_shape)
+        np.testing.assert_array_equal(x, wanted[i]["projection"])
+    # Earlier versions read what is not compressed and refuse what is.
+    versions = [
+        json.loads((x / "manifest.json").read_text())["version"] for x in (small, plain)
+    ]
+    assert versions == [2, 1]
+
+
+def test_records_of_a_folder_are_compressed_or_not(kradar_root, tmp_path):
+    data = KRadar(kradar_root)
+    run(data, tmp_path, shard="0/2", compress=True)
+    with pytest.raises(UserError, match="compress is True there and False here"):
+        run(data, tmp_path, compress=False)
+    assert run(data, tmp_path).is_complete
+    other = tmp_path / "other"
+    run(data, other, shard="0/2")
+    plan = json.loads((other / "plan.json").read_text())
+    del plan["compress"]  # as versions before wrote it
+    (other / "plan.json").write_text(json.dumps(plan))
+    with pytest.raises(UserError, match="compress is False there and True here"):
+        run(data, other, compress=True)
+    assert run(data, other).is_complete
 
 
 def test_a_folder_keeps_to_its_plan(kradar_root, tmp_path):

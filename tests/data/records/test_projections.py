@@ -134,14 +134,26 @@ def test_a_flipped_byte_is_found(copy):
     records[11]
 
 
+FILE = {"name": "x", "frames": ["1/a"], "skipped": {}, "num_bytes": 1, "sha256": ""}
+FILE |= {"num_clipped": 0}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, r"radejax-projections version 2, this .* reads .* version 1"),
+        ({"version": 3}, r"radejax-projections version 3, this .* up to version 2"),
         ({"format": "x"}, r"x version 1, this radejax reads radejax-projections"),
-        ({"grid": {}}, r"damaged manifest"),
-        ({"files": [{}]}, r"damaged manifest"),
-        ({"encoding": {"dtype": "int4"}}, r"damaged manifest"),
+        ({"grid": {}}, r"grid lacks range_m"),
+        ({"files": [{}]}, r"files\[0\] lacks name, frames.*; delete it"),
+        (
+            {"files": [FILE | {"name": "../x"}]},
+            r"files\[0\]: '../x' is no name of a file",
+        ),
+        ({"files": [FILE, FILE | {"name": "y"}]}, r"frame 1/a is there twice"),
+        (
+            {"encoding": {"dtype": "int4"}},
+            r"encoding\.dtype is 'int4', expected one of",
+        ),
     ],
 )
 def test_other_versions_and_damaged_manifests(copy, change, message):

@@ -3,7 +3,7 @@ import pytest
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation.average_precision import evaluate
-from radejax.evaluation.files import kitti
+from radejax.evaluation.files import kitti, predictions
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -115,3 +115,22 @@ def test_errors(tmp_path, scene):
     path.rename(path.with_name("first.txt"))
     with pytest.raises(DataError, match="named by its number"):
         kitti.read_kitti(tmp_path / "0.0")
+
+
+def test_a_reports_own_files_are_written(tmp_path, scene):
+    truth, found, frames = scene
+    for name, table in (("truth", truth), ("found", found)):
+        predictions.write_table(tmp_path / f"{name}.npz", table, frames)
+    by_key = [dict(np.load(tmp_path / f"{name}.npz")) for name in ("truth", "found")]
+    assert by_key[0]["frame"].dtype.kind == "U"
+    count = kitti.write_kitti(tmp_path / "by_key", *by_key, frames)
+    assert count == kitti.write_kitti(tmp_path / "by_id", truth, found, frames) > 1
+    for path in (tmp_path / "by_id").rglob("*.txt"):
+        other = tmp_path / "by_key" / path.relative_to(tmp_path / "by_id")
+        assert path.read_text() == other.read_text()
+    wrong = {**truth, "frame": truth["frame"] + 10**6}
+    with pytest.raises(DataError, match=r"ground truth: frame 10000.*no such frame"):
+        kitti.write_kitti(tmp_path / "wrong", wrong, found, frames)
+    none = {name: column[:0] for name, column in truth.items()}
+    with pytest.raises(UserError, match="no frame has ground truth"):
+        kitti.write_kitti(tmp_path / "none", none, found, frames)

@@ -1,9 +1,10 @@
+import dataclasses
 import types
 
 import numpy as np
 import pytest
 
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.evaluation.files import load, predictions
 from radejax.evaluation.files.load import Source
 
@@ -15,7 +16,12 @@ def test_ground_truth_has_to_come_from_somewhere(stored):
     with pytest.raises(FileNotFoundError, match=r"none\.json"):
         load.load(folder / "none.json", source, ("Sedan",))
     (folder / "frames.json").write_text("[]")
-    with pytest.raises(UserError, match="expected an object of columns"):
+    with pytest.raises(
+        DataError, match=r"frames\.json: it is \[\], expected an object"
+    ):
+        load.load(folder / "found.json", source, ("Sedan",))
+    (folder / "frames.json").write_text('{"frame": [1, 2], "name": ["a"]}')
+    with pytest.raises(DataError, match="column 'name' has 1 entries for 2 frames"):
         load.load(folder / "found.json", source, ("Sedan",))
 
 
@@ -27,6 +33,22 @@ def test_ground_truth_by_id_without_a_frame_table(random_scene, tmp_path):
     _, _, frames, _ = load.load(tmp_path / "found.npz", source, ("Sedan",))
     both = np.union1d(truth["frame"], found["frame"])
     np.testing.assert_array_equal(frames["frame"], both)
+
+
+def test_a_part_of_the_frames(stored, random_scene):
+    folder, source = stored
+    _, _, whole, _ = load.load(folder / "found.json", source, ("Sedan",))
+    part = dataclasses.replace(source, weather=("fog", "rain"))
+    truth, found, frames, _ = load.load(folder / "found.json", part, ("Sedan",))
+    chosen = whole["frame"][np.isin(whole["weather"], ("fog", "rain"))]
+    assert 0 < chosen.size < whole["frame"].size
+    np.testing.assert_array_equal(frames["frame"], chosen)
+    for table in (truth, found):
+        assert set(table["frame"]) <= set(chosen.tolist())
+        assert len(table["box"]) == len(table["frame"]) > 0
+    none = dataclasses.replace(source, sequences=(77,))
+    with pytest.raises(UserError, match="no frames of sequence 77; there are "):
+        load.load(folder / "found.json", none, ("Sedan",))
 
 
 def test_labels_of_kradar(shared, tmp_path):

@@ -113,7 +113,11 @@ def test_wrong_files_are_named(tmp_path):
     one = '{"frame": 0, "cls": "Sedan", "box": [1,2,3,4,5,6,7]'
     raises("a.json", f'[{one}, "score": 1}}, {one}}}]', "row 1: lacks 'score'")
     raises("a.json", f"[{one}}}]", r"lacks \['score'\]")
-    raises("a.json", f'[{one}, "score": "high"}}]', "not a number")
+    raises(
+        "a.json",
+        f'[{one}, "score": "high"}}]',
+        r"score\[0\] is 'high', expected a finite",
+    )
     raises("a.csv", "frame,cls,x\n", "line 1: lacks columns \\['y', 'z'")
     raises("a.csv", header + "0,Sedan,1,2,3,4,5,6,x,1\n", "line 2: yaw is 'x'")
     raises("a.csv", header + "0,Sedan,1,2\n", "line 2: z is None")

@@ -1,18 +1,18 @@
-import os
-import pathlib
-import subprocess
-import sys
+import dataclasses
+import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from radejax.cli.evaluate import evaluate
 from radejax.core.errors import UserError
 from radejax.evaluation.files import kitti, predictions
 from radejax.evaluation.files.load import Source
 from radejax.evaluation.report import compare as commands
+from radejax.evaluation.report import report
 from radejax.evaluation.report.measure import Options
 
-ROOT = pathlib.Path(__file__).resolve().parents[3]
 OPTIONS = Options(roi=None, plots=False, protocols=("exact", "kradar_r40"))
 
 
@@ -88,6 +88,33 @@ def test_comparison_of_two_reports(stored, scene):
         commands.compare_files([folder / "few"], None, Source(), OPTIONS)
 
 
+def test_predictions_that_were_stored_cut_say_so(stored, scene):
+    folder, _ = stored
+    truth, found, frames = scene
+    kept = {k: v[found["score"] > 0.3] for k, v in found.items()}
+    for name, table, min_score in (("old", kept, 0.3), ("new", found, 0.05)):
+        options = dataclasses.replace(
+            OPTIONS, score_threshold=0.3, uncut=("exact",), min_score=min_score
+        )
+        made = report.write_report(truth, table, frames, folder / name, options)
+        cuts = {r.result.protocol: r.result.score_threshold for r in made.rows}
+        assert cuts == {"exact": min_score, "kradar_r40": 0.3}
+        (folder / name / "source.json").write_text('{"roots": []}')
+    path = folder / "old" / "metrics.json"
+    content = json.loads(path.read_text())
+    del content["options"]["min_score"]  # as runs of before wrote it
+    path.write_text(json.dumps(content))
+    old = commands.evaluate_files(folder / "old", folder / "a", Source(), OPTIONS)
+    assert "has predictions from score 0.3 on only" in old.metrics["warnings"][0]
+    assert "WARNING: " in old.text
+    assert "/exact/score>0.3/" in old.metrics["ap"][0]["name"]
+    new = commands.evaluate_files(folder / "new", folder / "b", Source(), OPTIONS)
+    assert new.metrics["warnings"] == []
+    runs = [folder / "old", folder / "new"]
+    _, rows = commands.compare_files(runs, None, Source(), OPTIONS, resamples=10)
+    assert {row.difference for row in rows} == {0.0}  # both above what one has stored
+
+
 def test_frames_without_sequences_cannot_be_compared(scene, tmp_path):
     kitti.write_kitti(tmp_path / "kitti", *scene)
     with pytest.raises(UserError, match="the frames do not say"):
@@ -96,15 +123,8 @@ def test_frames_without_sequences_cannot_be_compared(scene, tmp_path):
         )
 
 
-def run(*arguments, **settings):
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg"}
-    return subprocess.run(
-        [sys.executable, str(ROOT / "evaluate.py"), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=environment,
-        **settings,
-    )
+def run(*arguments):
+    return CliRunner().invoke(evaluate, [str(argument) for argument in arguments])
 
 
 def test_command_line(stored):
@@ -115,14 +135,14 @@ def test_command_line(stored):
         "--protocols", "exact,kradar_r40", "--iou", "0.3", "--classes", "Sedan",
         "--bootstrap", "10",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert "AP 3D / BEV at IoU 0.3, exact" in done.stdout
     assert (folder / "out" / "metrics.json").is_file()
     compared = run(
         "--compare", folder / "out", folder / "out", "--bootstrap", 20,
         "--roi", "none", "--classes", "Sedan",
     )  # fmt: skip
-    assert compared.returncode == 0, compared.stderr
+    assert compared.exit_code == 0, compared.stderr
     assert "B - A" in compared.stdout
 
 
@@ -137,7 +157,7 @@ def test_command_line(stored):
 )
 def test_wrong_use_is_one_line_and_exit_code_2(arguments, message):
     done = run(*arguments)
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
@@ -147,5 +167,5 @@ def test_bad_content_is_one_line_and_exit_code_1(tmp_path):
     done = run(
         "--predictions", tmp_path / "p.csv", "--ground_truth", tmp_path / "p.csv"
     )
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert "lacks columns" in done.stderr

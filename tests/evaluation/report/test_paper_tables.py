@@ -163,7 +163,9 @@ def test_simulated_frames_have_no_published_row_anywhere(random_scene, tmp_path)
     for text in (*texts.values(), made.text):
         assert not re.search("RADE-Net|DinoRADE, Table|RTNH", text.split("recall")[0])
         assert "Table" not in text
-    titles = re.findall(r"^(?:\*\*|% )(.*)$", "\n".join(texts.values()), re.MULTILINE)
+    titles = re.findall(
+        r"^(?:\*\*|\\caption{)(.*)$", "\n".join(texts.values()), re.MULTILINE
+    )
     assert titles
     assert all(title.startswith("Simulated data: ") for title in titles)
     assert all(row["name"].endswith("/simulated") for row in made.metrics["ap"])

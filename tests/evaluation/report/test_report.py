@@ -1,19 +1,23 @@
 import csv
+import errno
 import json
 import math
+import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, DiskFullError, UserError
 from radejax.evaluation.average_precision import evaluate
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.report import measure, paper_tables, report, tables
+from radejax.evaluation.report import measure, paper_tables, plots, report, tables
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.published import published_rows
+from radejax.visualize.canvas import SERIES_COLORS
 
 TERMS = {"roi": None, "plots": False}
 
@@ -132,7 +136,14 @@ def test_tables_stand_beside_the_published_rows(written):
     for cell in ("85.4", "77.42", "64.06", "RADE-Net, Table II", "DinoRADE, Table 1"):
         assert cell in text
     latex = (out / "tables.tex").read_text()
-    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") > 5
+    count = latex.count(r"\begin{tabular}")
+    assert count > 5
+    for part in (r"\end{tabular}", r"\toprule", r"\begin{table}[t]", r"\caption{"):
+        assert latex.count(part) == count
+    assert latex.count(r"\begin{adjustbox}{max width=\columnwidth}") == count
+    captions = [line for line in latex.splitlines() if line.startswith(r"\caption{")]
+    assert any(r"kradar\_r40, score$>$0, skip=frame" in line for line in captions)
+    assert not any(re.search(r"[^\\$][_&%><]", line[9:]) for line in captions)
 
 
 def test_differences_are_ours_minus_theirs(written):
@@ -183,6 +194,7 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
     truth, found, frames = scene
     broken = {**found, "box": found["box"].copy()}
     broken["box"][5, 3] = -0.2
+    broken["box"][[6, 7], [4, 5]] = np.float32(0.01)  # as decoding clips them
     with pytest.raises(DataError, match=r"row 5: l of the box is -0.2 m"):
         report.write_report(truth, broken, frames, tmp_path, **TERMS)
     assert not list(tmp_path.iterdir())
@@ -197,11 +209,39 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
     )
     what = "predictions: size not positive, kept as false positives"
     assert made.metrics["left_out"][what] == 1
+    assert made.metrics["left_out"]["predictions: size clipped to 0.01 m, kept"] == 2
     whole = evaluate(truth, found, protocol="exact", frames=frames)
     row = made.rows[0].result
     assert row.num_det == whole[0].num_det
     with pytest.raises(UserError, match='"error" or "false_positive"'):
         measure.repair_sizes(found, "drop")
+
+
+def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
+    out, terms = tmp_path / "out", {"protocols": ("exact",), **TERMS}
+
+    def draw(frame, path):
+        path.write_text(f"first, {frame}")
+
+    report.write_report(*scene, out, draw_frame=draw, worst_frames=4, **terms)
+    (out / "notes.txt").write_text("mine")
+
+    def content():
+        return {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+
+    before = content()
+
+    def fill(frame, path):
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    with pytest.raises(DiskFullError, match="no space left on the disk of"):
+        report.write_report(*scene, out, draw_frame=fill, run="second", **terms)
+    assert content() == before
+    made = report.write_report(*scene, out, draw_frame=draw, worst_frames=2, **terms)
+    after = content()
+    assert set(made.files) == set(after) - {out / "notes.txt"}
+    assert len(list((out / "worst_frames").iterdir())) == 2  # of this evaluation alone
 
 
 def test_conditions_are_in_the_papers_order():
@@ -252,3 +292,37 @@ def test_matplotlib_waits_until_something_is_drawn():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert b"radejax.evaluation.report.report" in done.stdout
     assert b"matplotlib" not in done.stdout
+
+
+def test_panels_of_curves_say_the_protocol_and_none_is_blank():
+    def result(cls, is_defined):
+        line = np.array([0.0, 1.0])
+        values = {"cls": cls, "ap": 50.0, "is_defined": is_defined}
+        return SimpleNamespace(**values, recall=line, precision=line)
+
+    everywhere = [result("Sedan", True), result("Bicycle", True), result("Bus", False)]
+    in_fog = [result("Sedan", False), result("Bicycle", False), result("Bus", False)]
+    rain = [result("Sedan", True), *in_fog[1:]]
+    results = {"all": everywhere, "fog": in_fog, "rain": rain}
+    figure = plots._precision_recall(results, "exact, bev, IoU 0.3")
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles == ["Sedan, exact, bev, IoU 0.3", "Bicycle, exact, bev, IoU 0.3"]
+    names = [[line.get_label()[:4] for line in ax.lines] for ax in figure.axes]
+    assert names == [["all,", "rain"], ["all,"]]
+    # Fog has a colour of its own where it is not drawn: rain's is the third.
+    assert figure.axes[0].lines[1].get_color() == SERIES_COLORS[2]
+
+
+def test_worst_frames_are_named_like_other_pictures(scene, tmp_path):
+    truth, found, frames = scene
+    ids = np.asarray(frames["frame"])
+    names = {"name": np.array([f"{i:05d}_00001" for i in ids]), "sequence": ids + 3}
+    report.write_report(
+        truth, found, {**frames, **names}, tmp_path, worst_frames=2,
+        draw_frame=lambda frame, path: path.write_text(str(frame)), **TERMS
+    )  # fmt: skip
+    drawn = sorted((tmp_path / "worst_frames").iterdir())
+    assert len(drawn) == 2
+    for path in drawn:
+        frame = int(path.read_text())
+        assert path.name == f"{frame + 3:02d}_{frame:05d}_00001.png"

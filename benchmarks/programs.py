@@ -1,0 +1,277 @@
+"""What the programs for GPU and TPU hold, lowered here and not run, beside rooflines.
+
+    python benchmarks/programs.py             # full size, bfloat16; a minute, no accelerator
+
+Every program is lowered by `jax.export` for a platform that need not be there. `facts`
+reads its text: types, host callbacks, convolutions, transposes, loops. `work` counts the
+operations and bytes of matrix products, convolutions and gathers, loops and the chosen
+branches of `platform_dependent` included, which XLA's own analysis counts once or not at
+all; everything between them is elementwise or a reduction and fuses into its neighbours.
+The time on a device is at least the sum, over these, of the greater of operations over
+peak and bytes over bandwidth.
+"""
+
+import argparse
+import collections
+import functools
+import math
+import pathlib
+import re
+import sys
+
+import jax
+import jax.export
+import jax.numpy as jnp
+from tabulate import tabulate
+
+from radejax import models
+from radejax.core.config import load_config
+from radejax.core.structures import Batch
+from radejax.geometry.camera import Camera
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.export import CAMERA_SHAPES
+from radejax.inference.program import detect
+from radejax.simulation.radar import tensor
+from radejax.training.state import create_state, make_optimizer
+from radejax.training.step import make_train_step
+
+CONFIGS = pathlib.Path(__file__).parents[1] / "configs"
+
+# Dense peaks: bfloat16 and TF32 in FLOP/s, memory in byte/s, from NVIDIA's data sheets of
+# H100 SXM, H200 SXM and A100 SXM 80 GB; of AGX Orin 64 GB from its technical brief, where
+# 170 sparse INT8 TOP/s of the GPU are 42.5 dense in 16 bits and 21.25 in TF32.
+DEVICES = {
+    "H100": (989e12, 494e12, 3.35e12),
+    "H200": (989e12, 494e12, 4.8e12),
+    "A100": (312e12, 156e12, 2.039e12),
+    "Orin": (42.5e12, 21.25e12, 0.2048e12),
+}
+
+
+# Programs ----------------------------------------------------------------------------
+
+
+def shape_of(*shape, dtype=jnp.float32):
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def batch_of(model, grid, size, max_objects=16):
+    """Shapes of a batch for training."""
+    rows = size, max_objects
+    image = camera = None
+    if models.has_camera(model):
+        image = shape_of(size, *model.image_size, 3, dtype=jnp.uint8)
+        fields = {name: shape_of(size, *s) for name, s in CAMERA_SHAPES.items()}
+        camera = Camera(**fields, is_valid=shape_of(size, dtype=jnp.bool_))
+    return Batch(
+        projection=shape_of(size, *grid.projection_shape, dtype=jnp.float16),
+        boxes=shape_of(*rows, 8),
+        classes=shape_of(*rows, dtype=jnp.int32),
+        is_valid=shape_of(*rows, dtype=jnp.bool_),
+        frame=shape_of(size, dtype=jnp.int32),
+        image=image,
+        camera=camera,
+    )
+
+
+def detector(config, grid, size):
+    """The function from projections to detections, and the shapes of its arguments."""
+    model = models.build(config.model)
+    batch = batch_of(model, grid, size)
+    inputs = [x for x in (batch.projection, batch.image, batch.camera) if x is not None]
+    variables = jax.eval_shape(model.init, jax.random.key(0), *inputs)
+    map_grid = models.map_grid(grid, model, "true")
+    options = {"max_detections": 100, "score_threshold": 0.3, "nms_iou": 0.3}
+    return functools.partial(detect, model, map_grid, options), (variables, *inputs)
+
+
+def train_step(config, grid, size):
+    """One step of training, and the shapes of its arguments."""
+    model = models.build(config.model)
+    _, (variables, *_) = detector(config, grid, size)
+    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.01)
+    create = functools.partial(
+        create_state,
+        optimizer=optimizer,
+        batch_size=size,
+        use_ema=False,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
+    map_grid = models.map_grid(grid, model, "true")
+    step = make_train_step(model, optimizer, map_grid, loss=dict(config.loss))
+    rng = jax.eval_shape(lambda: jax.random.key(0))
+    state = jax.eval_shape(create, variables)
+    return step, (state, batch_of(model, grid, size), rng)
+
+
+def simulator(grid, num_scatterers=1024):
+    """One simulated frame, fused to its projection, and the shapes of its arguments."""
+    points = [shape_of(num_scatterers)] * 4
+    scatterers = tensor.Scatterers(*points, amplitude=shape_of(num_scatterers, 2))
+    noise = shape_of(grid.num_range, grid.num_doppler)
+    function = functools.partial(tensor.simulate, grid=grid)
+    return function, (scatterers, noise, shape_of(2, dtype=jnp.uint32))
+
+
+def text_of(function, arguments, platform):
+    """The StableHLO text of a program for a platform."""
+    exported = jax.export.export(jax.jit(function), platforms=(platform,))(*arguments)
+    return exported.mlir_module()
+
+
+# What the text shows -----------------------------------------------------------------
+
+
+def facts(text):
+    """What can be read off a program's text.
+
+    Returns:
+        "ops" by name; "types" of elements; "calls" to code outside of the program;
+        "convolutions" by type of result; "turned": shapes of the arrays of four axes and
+        more whose innermost axis a transpose moves; "branches": greatest number of
+        branches that hold more than a constant in one `case`.
+    """
+    lines = text.splitlines()
+    turned = []
+    for line in lines:
+        found = re.search(
+            r"stablehlo.transpose .* dims = \[([\d, ]+)\] : \(tensor<(\S+)>\)", line
+        )
+        if found:
+            order = [int(axis) for axis in found[1].split(",")]
+            if len(order) >= 4 and order[-1] != len(order) - 1:
+                turned.append(found[2])
+    convolutions = [
+        re.findall(r"-> tensor<(?:\d+x)*(\w+)>", line)[-1]
+        for line in lines
+        if "stablehlo.convolution" in line
+    ]
+    return {
+        "ops": collections.Counter(re.findall(r"(?:stablehlo|chlo)\.(\w+)", text)),
+        "types": set(re.findall(r"tensor<(?:\d+x)*([a-z]\w*)>", text)),
+        "calls": collections.Counter(re.findall(r"custom_call @(\w+)", text)),
+        "convolutions": collections.Counter(convolutions),
+        "turned": turned,
+    }
+
+
+# Operations and bytes ----------------------------------------------------------------
+
+
+def work(function, arguments, platform):
+    """FLOPs and bytes of all products, convolutions, gathers and scatters.
+
+    Returns:
+        List of (name, dtype, FLOPs, bytes, times), `times` for what is in a loop of known
+        length; loops until a condition holds (NMS) count once.
+    """
+    jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
+    return list(_work(jaxpr, platform, 1))
+
+
+def _work(jaxpr, platform, times):
+    chosen = {}  # the branch that a platform's index names
+    for eqn in jaxpr.eqns:
+        name = eqn.primitive.name
+        if name == "platform_index":
+            names = eqn.params["platforms"]
+            here = [i for i, n in enumerate(names) if n is None or platform in n]
+            chosen[eqn.outvars[0]] = here[0]
+        elif name in ("dot_general", "conv_general_dilated", "gather", "scatter-add"):
+            moved = sum(_bytes(v.aval) for v in (*eqn.invars, *eqn.outvars))
+            if name == "gather":  # what is not asked for is not read
+                moved = 2 * _bytes(eqn.outvars[0].aval)
+            yield name, eqn.invars[0].aval.dtype.name, _flops(eqn), moved, times
+        elif name == "cond":
+            index = chosen.get(eqn.invars[0], -1)
+            yield from _work(eqn.params["branches"][index].jaxpr, platform, times)
+        else:
+            length = eqn.params["length"] if name == "scan" else 1
+            for inner in jax.core.jaxprs_in_params(eqn.params):
+                yield from _work(inner, platform, times * length)
+
+
+def _bytes(aval):
+    return aval.size * aval.dtype.itemsize
+
+
+def _flops(eqn):
+    left, right = (v.aval.shape for v in eqn.invars[:2])
+    out = math.prod(eqn.outvars[0].aval.shape)
+    if eqn.primitive.name == "dot_general":
+        (contracted, _), _ = eqn.params["dimension_numbers"]
+        return 2 * out * math.prod(left[axis] for axis in contracted)
+    if eqn.primitive.name == "conv_general_dilated":
+        numbers = eqn.params["dimension_numbers"]
+        return 2 * out * math.prod(right) // right[numbers.rhs_spec[0]]
+    return 0
+
+
+def least_seconds(found, device):
+    """Seconds that a device needs at least, see the top."""
+    bfloat16, tf32, bandwidth = DEVICES[device]
+    total = 0.0
+    for _, dtype, flops, moved, times in found:
+        peak = bfloat16 if dtype in ("bfloat16", "float16") else tf32
+        total += times * max(flops / peak, moved / bandwidth)
+    return total
+
+
+# Table ---------------------------------------------------------------------------------
+
+
+def full_size(size, dtype="bfloat16"):
+    """Name -> function, arguments and frames of every program at full size."""
+    grid = RadarGrid.kradar()
+    programs = {"simulator": (*simulator(grid), 1)}
+    for name, path in (("RADE-Net", "radenet.py"), ("DinoRADE", "dinorade.py")):
+        config = load_config(str(CONFIGS / path))
+        config.model.dtype = dtype
+        programs[f"{name}, detector"] = (*detector(config, grid, size), size)
+        programs[f"{name}, training step"] = (*train_step(config, grid, size), size)
+    return programs
+
+
+HEAVY = (
+    "convolution", "dot_general", "gather", "scatter", "sort", "while", "constant",
+    "return", "case",
+)  # fmt: skip
+
+
+def rows(size):
+    """One row a program: what is in it, and the least milliseconds a frame."""
+    for name, (function, arguments, frames) in full_size(size).items():
+        sys.stderr.write(f"{name}\n")
+        found = work(function, arguments, "cuda")
+        shown = facts(text_of(function, arguments, "cuda"))
+        ops = shown["ops"]
+        yield {
+            "program": name,
+            "batch": frames,
+            "gflop_a_frame": sum(f * t for _, _, f, _, t in found) / frames / 1e9,
+            "mib_a_frame": sum(b * t for _, _, _, b, t in found) / frames / 2**20,
+            "convolutions": ops["convolution"],
+            "products": ops["dot_general"],
+            "loops": ops["while"],
+            "fusable": sum(ops.values()) - sum(ops[x] for x in HEAVY),
+            "turned": len(shown["turned"]),
+            "least_ms_a_frame": {
+                device: 1e3 * least_seconds(found, device) / frames
+                for device in DEVICES
+            },
+        }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--batch", type=int, default=8)
+    table = [
+        {k: v for k, v in row.items() if k != "least_ms_a_frame"}
+        | {f"{name}, ms": ms for name, ms in row["least_ms_a_frame"].items()}
+        for row in rows(parser.parse_args().batch)
+    ]
+    print(tabulate(table, headers="keys", floatfmt=".3g"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""`radejax train` and `train.py`: from data to metrics, by a config and its fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from radejax.cli import entry, options
+
+_PREFIX = "--config."
+
+
+class _Command(options.Command):
+    """Also takes any field of the config: `--config.train.batch_size=4`.
+
+    The last one counts where a field is given twice, and `--config.watch.wandb` alone is
+    true. Other options that do not exist name the field that was meant.
+    """
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Click's words; fields and their texts go to `ctx.meta["fields"]`."""
+        fields = ctx.meta["fields"] = {}
+        words, left = [], list(args)
+        while left:
+            word = left.pop(0)
+            if not word.startswith(_PREFIX):
+                words.append(word)
+                continue
+            name, is_set, text = word.removeprefix(_PREFIX).partition("=")
+            if not is_set:
+                is_value = bool(left) and not left[0].startswith("--")
+                text = left.pop(0) if is_value else "true"
+            fields[name] = text
+        try:
+            return super().parse_args(ctx, words)
+        except click.NoSuchOption as error:
+            from radejax.runs.override import fields_like
+
+            meant = fields_like(error.option_name.lstrip("-").replace("-", "_"))
+            if not meant:
+                raise
+            flags = " or ".join(_PREFIX + name for name in meant)
+            raise click.UsageError(
+                f"no such option {error.option_name}; did you mean {flags}?", ctx
+            ) from None
+
+
+@click.command(cls=_Command)
+@click.argument("others", nargs=-1, metavar="")
+@click.option(
+    "--config",
+    required=True,
+    metavar="NAME[:WORDS]",
+    help="One that comes along, such as radenet:official, or a file.py[:WORDS].",
+)
+@click.option(
+    "--workdir", help="Folder of the run; runs/<name of the config> by default."
+)
+@click.option(
+    "--data",
+    multiple=True,
+    callback=options.split_words,
+    metavar="A,B,...",
+    help="Roots of K-Radar. Without it, configs with a `simulation` section simulate "
+    "one under data/.",
+)
+@click.option("--labels", help="Folder or zip of a label revision; the sequences' own.")
+@options.sequences
+@options.weather
+@click.option("--records", help="Projected frames; made beside the data if missing.")
+@click.option(
+    "--init-from", help="Weights to start: official .pth, or another workdir."
+)
+@click.option("--embeddings", help="Folder of `radejax embed`, in place of images.")
+@click.option(
+    "--image-backbone",
+    help="Its weights: a DINOv3 folder from Hugging Face, or torchvision's ResNet-50 "
+    "file.",
+)
+@click.option(
+    "--camera-calibration",
+    help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
+    "repository); the roots' own by default.",
+)
+@click.option(
+    "--distributed",
+    is_flag=True,
+    help="One of several processes, as Slurm starts them.",
+)
+@click.option("--coordinator", help="host:port of process 0, where no cluster tells.")
+@click.option("--num-processes", type=int, help="Likewise.")
+@click.option("--process-id", type=int, help="Likewise, from 0.")
+@click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
+@click.pass_context
+def train(
+    ctx: click.Context,
+    *,
+    others: tuple[str, ...],
+    config: str,
+    workdir: str | None,
+    sequence_numbers: tuple[int, ...] | None,
+    weather: tuple[str, ...] | None,
+    init_from: str | None,
+    distributed: bool,
+    coordinator: str | None,
+    num_processes: int | None,
+    process_id: int | None,
+    debug: bool,
+    as_json: bool,
+    **sources: Any,
+) -> None:
+    """Train a detector, then evaluate it.
+
+    Any field of the config can be set: --config.train.batch_size=4. Run the same
+    command again to continue where an earlier start ended. On several hosts start it
+    once on each, with --distributed (docs/training.md, examples/slurm.sh).
+
+    Example: radejax train --config quickstart
+
+    Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
+    """
+    from radejax.core.config import config_name, load_config
+    from radejax.runs import experiment, seeds
+    from radejax.runs.override import override
+    from radejax.runs.sources import Sources
+
+    entry.check_leftovers(others)
+    settings = load_config(config)
+    override(settings, ctx.meta["fields"])
+    if sequence_numbers is not None:
+        settings.data.sequences = sequence_numbers
+    if weather is not None:
+        settings.data.weather = weather
+    entry.set_up_jax()
+    place = coordinator, num_processes, process_id
+    if distributed or place != (None,) * 3:
+        entry.join_processes(*place)
+    run = seeds.run_seeds if settings.seeds else experiment.run
+    folder = run(
+        settings,
+        name=config_name(config),
+        sources=Sources(**sources),
+        workdir=workdir,
+        init_from=init_from,
+    )
+    options.echo_result(as_json, {"workdir": str(folder)}, "")

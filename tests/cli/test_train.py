@@ -1,0 +1,134 @@
+"""`radejax train`, the door that train.py is too: configs by name, fields, messages."""
+
+import json
+import pathlib
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from radejax.cli import entry
+from radejax.cli.main import main
+from radejax.cli.train import train
+
+
+def _train(*arguments: str) -> Result:
+    return CliRunner().invoke(train, list(arguments), prog_name="train")
+
+
+def test_the_script_is_the_command() -> None:
+    text = pathlib.Path(__file__).parents[2].joinpath("train.py").read_text()
+    assert "from radejax.cli.train import train" in text
+    assert main.commands["train"] is train
+
+
+def test_a_second_folder_without_its_flag_is_wrong_use(tmp_path: pathlib.Path) -> None:
+    run = tmp_path / "run"
+    ended = _train("--config=quickstart", f"--workdir={run}", "--data", "one", "two")
+    assert ended.exit_code == entry.WRONG_USE
+    assert ended.stderr == (
+        "error: unexpected arguments: two; several folders are --data A,B or "
+        "--data A --data B\n"
+    )
+    assert not run.exists()
+
+
+def test_processes_without_a_coordinator_are_wrong_use(tmp_path: pathlib.Path) -> None:
+    run = tmp_path / "run"
+    place = ["--num_processes=2", "--process-id=1"]
+    ended = _train("--config=quickstart:short", f"--workdir={run}", *place)
+    assert ended.exit_code == entry.WRONG_USE
+    assert "--num_processes and --process_id together" in ended.stderr
+    assert not run.exists()
+
+
+def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
+    run = tmp_path / "run"
+    arguments = ["--config=radenet", "--config.train.batch_size=8"]
+    arguments += [f"--data={tmp_path}", f"--workdir={run}"]
+    for words, message in (
+        (["--sequences=1,x"], "'x' is no number, expected 1,5,58"),
+        (["--weather=fog", "--weather=mist"], "config.data.weather is ('fog', 'mist')"),
+        (["--sequences=1,58", "--weather=fog", "--weather=rain"], "no sequence"),
+    ):
+        ended = _train(*arguments, *words)
+        assert ended.exit_code == entry.WRONG_USE
+        assert message in ended.stderr
+    config = json.loads((run / "config.json").read_text())
+    assert config["data"]["sequences"] == [1, 58]
+    assert config["data"]["weather"] == ["fog", "rain"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--batch_size=4"],
+            "no such option --batch-size; did you mean --config.train.batch_size or "
+            "--config.evaluation.batch_size?",
+        ),
+        (["--train.batchsize=4"], "did you mean --config.train.batch_size?"),
+        (["--learning-rat", "1"], "did you mean --config.train.learning_rate?"),
+        (["--wordkir=a"], "No such option '--wordkir'"),
+        (
+            ["--config.loss.sigma=foo"],
+            "error: config.loss.sigma is 'foo', expected one of 'fixed', 'adaptive'",
+        ),
+        (
+            ["--config.evaluation.roi=(0,1)"],
+            "error: config.evaluation.roi is '(0,1)', expected a tuple of 6, each a number",
+        ),
+        (["--config.train.seed", "1"], "error: config.train.seed is not a field"),
+        (
+            ["--config=nope"],
+            "error: no such config file: nope; give a .py file, or one of",
+        ),
+        (["--config=configs_of_mine/radenet.py"], "did you mean radenet?"),
+        (["--config=radenet:big"], "unknown config argument 'big'; available:"),
+    ],
+)
+def test_near_misses_are_answered(arguments: list[str], message: str) -> None:
+    ended = _train("--config=radenet", *arguments)
+    assert ended.exit_code == entry.WRONG_USE
+    assert message in ended.stderr
+    assert "Traceback" not in ended.output
+
+
+def test_fields_are_read_in_every_spelling() -> None:
+    context = click.Context(train, **train.context_settings)
+    words = [
+        "--config=radenet",
+        "--config.seed=1",
+        "--config.seed",
+        "2",
+        "--init_from=a",
+    ]
+    train.parse_args(context, [*words, "--config.watch.wandb", "--weather=fog"])
+    fields = context.meta["fields"]
+    assert fields == {"seed": "2", "watch.wandb": "true"}
+    assert context.params["init_from"] == "a"
+
+
+def _commands(group: click.Group) -> list[click.Command]:
+    """All commands, those of groups inside of it too."""
+    found: list[click.Command] = []
+    for command in group.commands.values():
+        found += _commands(command) if isinstance(command, click.Group) else [command]
+    return found
+
+
+@pytest.mark.parametrize("command", _commands(main), ids=lambda command: command.name)
+def test_options_are_understood_with_hyphens_and_underscores(
+    command: click.Command,
+) -> None:
+    context = click.Context(command, **command.context_settings)
+    parser = command.make_parser(context)
+    names = [name for option in command.params for name in option.opts if "--" in name]
+    assert names
+    for name in names:
+        option = next(option for option in command.params if name in option.opts)
+        words = [] if getattr(option, "is_flag", False) else ["1"]
+        word = name[2:]
+        for spelled in (word.replace("_", "-"), word.replace("-", "_")):
+            given, _, _ = parser.parse_args([f"--{spelled}", *words])
+            assert option.name in given

@@ -1,0 +1,60 @@
+"""Examples in docstrings run, and every public function of the pure rooms has one."""
+
+import ast
+import doctest
+import importlib
+import pathlib
+from collections.abc import Iterator
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PURE = ("geometry", "losses", "detection", "evaluation")
+"""Rooms of functions from arrays to arrays; what is in folders below reads or writes."""
+
+Documented = ast.FunctionDef | ast.ClassDef
+
+
+def _documented(node: ast.AST, prefix: str) -> Iterator[tuple[str, Documented]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, Documented):
+            name = f"{prefix}.{child.name}"
+            yield name, child
+            yield from _documented(child, name)
+
+
+NODES = {
+    name: (module, node)
+    for path in sorted((ROOT / "radejax").rglob("*.py"))
+    for module in [".".join(path.relative_to(ROOT).with_suffix("").parts)]
+    for name, node in _documented(ast.parse(path.read_text("utf-8")), module)
+}
+EXAMPLES = {
+    name: (module, text)
+    for name, (module, node) in NODES.items()
+    if ">>>" in (text := ast.get_docstring(node) or "")
+}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_run(name: str) -> None:
+    module, text = EXAMPLES[name]
+    names = dict(vars(importlib.import_module(module)))
+    example = doctest.DocTestParser().get_doctest(text, names, name, module, 0)
+    said: list[str] = []
+    doctest.DocTestRunner().run(example, out=said.append)
+    assert not said, "".join(said)
+
+
+def test_every_public_function_of_the_pure_rooms_has_an_example() -> None:
+    lacking = [
+        name
+        for name, (module, node) in NODES.items()
+        if module.split(".")[1] in PURE
+        and module.count(".") == 2
+        and name == f"{module}.{node.name}"
+        and isinstance(node, ast.FunctionDef)
+        and not node.name.startswith("_")
+        and name not in EXAMPLES
+    ]
+    assert not lacking

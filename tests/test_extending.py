@@ -1,0 +1,154 @@
+"""docs/extending.md, carried out: every block is run as it stands there."""
+
+import json
+import pathlib
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from ml_collections import ConfigDict
+from PIL import Image
+
+from radejax import models
+from radejax.core.errors import UserError
+from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.dataset import DATA_SETS
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOLS
+from radejax.losses.detection import BOX_LOSSES
+from radejax.models.backbone import BACKBONES
+from radejax.models.heads import HEADS
+from radejax.models.neck import NECKS
+from radejax.runs import check_config, experiment
+from radejax.runs.data import Data
+from radejax.runs.evaluate import evaluate_run
+from radejax.runs.sources import Sources
+from radejax.training import sharding
+
+from . import small_models as small
+from .evaluation.scenes import random_scene
+
+PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "extending.md"
+NAMES = (NECKS, HEADS, BACKBONES, BOX_LOSSES, DATA_SETS, PROTOCOLS)
+BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.S)
+
+
+@pytest.fixture(autouse=True)
+def _page() -> Iterator[None]:
+    """Carries out the page, and takes its names out again."""
+    before = [dict(names) for names in NAMES]
+    for number, block in enumerate(BLOCKS):
+        exec(
+            compile(block, f"{PAGE}, block {number + 1}", "exec"), {"__name__": "page"}
+        )
+    yield
+    for names, kept in zip(NAMES, before, strict=True):
+        names.clear()
+        names.update(kept)
+
+
+def _config() -> ConfigDict:
+    """The small model with every part of the page."""
+    config = small.radar_config()
+    config.model.update(backbone="flat", neck="strip", heads="wide")
+    config.loss.weights.height = 0.5
+    config.data.format = "toy"
+    config.train.update(batch_size=2, num_epochs=1, warmup_steps=0)
+    config.evaluation.update(batch_size=2, num_pictures=0)
+    config.evaluation.protocols = ("exact",)
+    return config
+
+
+def _write_toy(root: pathlib.Path) -> pathlib.Path:
+    """Two drives of two frames, the first frame with a picture."""
+    rng, grid = np.random.default_rng(0), small.small_grid()
+    (root / "1").mkdir(parents=True)
+    (root / "2").mkdir()
+    (root / "grid.json").write_text(json.dumps(grid.to_dict()))
+    angles = {"yaw_deg": 90.0, "pitch_deg": 0.0, "roll_deg": 90.0}
+    height, width = small.IMAGE_SIZE
+    camera = {"intrinsics": [24, 24, 24, 16], "translation_m": [0, 0, 0], **angles}
+    camera |= {"width": width, "height": height}
+    (root / "camera.json").write_text(json.dumps(camera))
+    Image.fromarray(small.images(1)[0]).save(root / "1" / "0001.png")
+    for path in ("1/0001", "1/0002", "2/0001", "2/0002"):
+        np.savez(
+            root / f"{path}.npz",
+            power=rng.uniform(1e3, 1e9, grid.shape_drea).astype(np.float32),
+            boxes=np.array([[12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]] * 2),
+            classes=np.array(["Sedan", "Tram"]),
+        )
+    return root
+
+
+def test_the_page_has_every_kind_of_part() -> None:
+    assert len(BLOCKS) == len(NAMES)
+    for names, name in zip(
+        NAMES, ("strip", "wide", "flat", "height", "toy", "free101"), strict=True
+    ):
+        assert name in names
+
+
+def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
+    config = _config()
+    check_config.check(config)
+    model = models.build(config.model)
+    projection = jax.ShapeDtypeStruct((1, 16, 14, 5), "float32")
+    made = jax.eval_shape(model.init, jax.random.key(0), projection)["params"]
+    assert "Conv_1" in made["neck"]
+    assert made["heads"]["box"]["conv_1"]["conv"]["kernel"].shape[-1] == 16
+    assert len(made["backbone"]) == 3
+
+
+def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
+    frames = DATA_SETS["toy"]([_write_toy(tmp_path)], classes=("Sedan",))
+    train = frames.of_split("train")
+    assert [frame.key for frame in train] == ["1/0001", "1/0002"]
+    assert len(frames.without({"1/0001"}, "test")) == 3
+    assert train[0].classes.tolist() == ["Sedan"]
+    assert train[0].read_projection(frames.grid).shape == frames.grid.projection_shape
+    images = camera_inputs(train, small.IMAGE_SIZE, CameraOptions())
+    assert [bool(camera.is_valid) for camera in images.cameras] == [True, False]
+    np.testing.assert_array_equal(images.image(0), small.images(1)[0])
+
+
+def test_the_protocol_counts_every_frame() -> None:
+    truth, found, frames = random_scene(0)
+    data = EvaluationSet(truth, found, frames=frames)
+    result = data.results(protocol="free101", spaces=("3d",), iou_thresholds=(0.3,))[0]
+    assert result.protocol == "free101"
+    assert 0 < result.ap < 100
+
+
+def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
+    config = _config()
+    config.data.format = "nuscenes"
+    with pytest.raises(
+        UserError, match=r"format is 'nuscenes', expected .*kradar, toy"
+    ):
+        Data.open(config, models.build(config.model), Sources(data=("/",)).paths())
+
+
+@pytest.mark.slow
+def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through the doors: one step, a checkpoint, its evaluation on the same data."""
+    mesh = sharding.make_mesh(1)
+    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
+    sources = Sources(data=(str(root),))
+    experiment.run(_config(), name="toy", workdir=folder, sources=sources)
+    row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
+    assert row["step"] == 1
+    assert np.isfinite([row[name] for name in ("focal", "gwd", "height")]).all()
+    config = json.loads((folder / "config.json").read_text())
+    assert config["loss"]["weights"]["height"] == 0.5
+    report = evaluate_run(folder)
+    assert report is not None
+    source = json.loads((folder / "evaluation" / "source.json").read_text())
+    assert source["roots"] == [str(root)]
+    assert (folder / "evaluation" / "metrics.json").is_file()
