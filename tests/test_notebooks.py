@@ -18,8 +18,10 @@ by_name = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 @pytest.fixture(scope="session")
 def work(tmp_path_factory) -> pathlib.Path:
-    """Runs and data of the notebooks; the first one trains for all."""
-    return tmp_path_factory.mktemp("notebooks")
+    """Runs and data of the notebooks: of `.ci/run quickstart`; else the first one that
+    needs a run trains it in short."""
+    given = os.environ.get("RADEJAX_WORK")
+    return pathlib.Path(given) if given else tmp_path_factory.mktemp("notebooks")
 
 
 def code_cells(path: pathlib.Path) -> list[dict]:
