@@ -60,6 +60,8 @@ RUN_IN = {
     "::test_cfar_baseline_fits_detects_and_reports",
     "examples/fusion_by_lens.py": "tests/test_fusion_run.py"
     "::test_example_compares_fusion_and_radar_by_the_lens",
+    "examples/silhouettes.py": "tests/examples/test_silhouettes.py"
+    "::test_both_runs_see_the_same_scenes_and_the_bar_decides",
     "examples/online_training.py": "tests/examples/test_online_training.py"
     "::test_fresh_frames_train_a_model_and_a_stop_changes_nothing",
     "examples/reference_points.py": "tests/test_fusion_run.py"
@@ -71,6 +73,7 @@ RUN_IN = {
         if not path.name.startswith("torch_")  # modules of the others
     },
     "docs/images/house.py": HELP,
+    "docs/images/networks.py": HELP,
     "docs/images/simulator_pictures.py": HELP,
 }
 

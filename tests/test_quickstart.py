@@ -72,6 +72,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Path,
     return folder, _finish(_start(folder))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
     folder, output = undisturbed
@@ -107,6 +108,7 @@ def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
     assert not list(folder.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
     undisturbed: tuple,
@@ -130,6 +132,7 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
     assert len(list((folder / "boxes").glob("3_*.json"))) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -> None:
     folder, _ = undisturbed
@@ -160,6 +163,7 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
     run = undisturbed[0] / "run"
@@ -173,6 +177,7 @@ def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
         jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_wrong_use_is_one_line_and_exit_code_2(undisturbed: tuple) -> None:
     folder, _ = undisturbed

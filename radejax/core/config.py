@@ -136,10 +136,10 @@ def renewed(
     Fields that it lacks are as they were `before` they could be chosen, else at their
     default; weights of losses in a row, `(2.0, 1.0, 1.0)`, get their names.
     """
-    loss = config.get("loss", {})
-    if isinstance(loss.get("weights"), list | tuple):
-        names = ("focal", "gwd", "smooth_l1")
-        by_name = dict(zip(names, loss["weights"], strict=True))
+    loss, names = config.get("loss"), ("focal", "gwd", "smooth_l1")
+    weights = loss.get("weights") if isinstance(loss, Mapping) else None
+    if isinstance(weights, list | tuple) and len(weights) == len(names):
+        by_name = dict(zip(names, weights, strict=True))
         config = {**config, "loss": {**loss, "weights": by_name}}
     return _filled_up(_filled_up(config, before), json.loads(base_config().to_json()))
 

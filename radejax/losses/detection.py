@@ -35,7 +35,12 @@ _WEIGHTS: Weights = MappingProxyType({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0
 
 
 def loss_names() -> tuple[str, ...]:
-    """Parts that the loss may have: what `weights` may name."""
+    """Parts that the loss may have: what `weights` may name.
+
+    Examples:
+        >>> loss_names()
+        ('focal', 'gwd', 'smooth_l1')
+    """
     return ("focal", "gwd", *BOX_LOSSES)
 
 
@@ -310,7 +315,11 @@ def _weighted_sum(
 
 
 def check_weights(weights: Weights) -> None:
-    """`UserError` for weights of no part, or of one that there is not."""
+    """`UserError` for weights of no part, or of one that there is not.
+
+    Examples:
+        >>> check_weights({"focal": 2.0, "gwd": 1.0})
+    """
     unknown = [name for name in weights if name not in loss_names()]
     if unknown or not weights:
         raise UserError(

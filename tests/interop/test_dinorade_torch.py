@@ -98,6 +98,7 @@ def test_released_camera_neck(shared):
     np.testing.assert_allclose(out.max((0, 1)), stats[:, 3], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_released_fusion(shared):
     file = np.load(shared / "fixtures" / "dinorade" / "fusion.npz")
     tensors = part(shared, "fusion", "fusion.")

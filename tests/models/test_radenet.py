@@ -148,7 +148,7 @@ def test_build_names_unknown_and_missing_keys(small):
         models.build(broken)
 
 
-@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("field", [name for name in FIELDS if name != "backbone"])
 def test_every_field_is_required(small, field):
     with pytest.raises(UserError, match=rf"missing \['{field}'\]"):
         models.build({k: v for k, v in small.items() if k != field})

@@ -105,7 +105,7 @@ def test_two_runs_of_one_seed_are_equal_bit_for_bit(
     assert _losses(workdir) == _losses(undisturbed[1])
 
 
-@pytest.mark.parametrize("batch", [2, 6])
+@pytest.mark.parametrize("batch", [2, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
     batch: int, run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
 ) -> None:
@@ -214,7 +214,9 @@ def test_a_damaged_newest_checkpoint_falls_back(
     chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
 
 
-@pytest.mark.parametrize(("first", "then"), [(4, 1), (1, 4)])
+@pytest.mark.parametrize(
+    ("first", "then"), [pytest.param(4, 1, marks=pytest.mark.slow), (1, 4)]
+)
 def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
     first: int, then: int, undisturbed: Any, tmp_path: pathlib.Path, tiny: Tiny
 ) -> None:
@@ -237,7 +239,9 @@ def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "then"), [(4, 1), (1, 4)])
+@pytest.mark.parametrize(
+    ("first", "then"), [pytest.param(4, 1, marks=pytest.mark.slow), (1, 4)]
+)
 def test_a_run_continues_on_another_number_of_devices(
     first: int,
     then: int,

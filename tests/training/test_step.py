@@ -190,7 +190,7 @@ def test_parts_of_a_batch_stay_on_their_devices(tiny: Tiny) -> None:
     ("num_devices", "num_parts", "normalize"),
     [
         (1, 4, True),
-        (1, 2, False),
+        pytest.param(1, 2, False, marks=pytest.mark.slow),
         pytest.param(4, 2, True, marks=pytest.mark.slow),
     ],
 )
