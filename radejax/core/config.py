@@ -136,8 +136,8 @@ def renewed(
     Fields that it lacks are as they were `before` they could be chosen, else at their
     default; weights of losses in a row, `(2.0, 1.0, 1.0)`, get their names.
     """
-    loss, names = config.get("loss"), ("focal", "gwd", "smooth_l1")
-    weights = loss.get("weights") if isinstance(loss, Mapping) else None
+    loss, names = config.get("loss", {}), ("focal", "gwd", "smooth_l1")
+    weights = loss["weights"] if isinstance(loss, Mapping) and "weights" in loss else ()
     if isinstance(weights, list | tuple) and len(weights) == len(names):
         by_name = dict(zip(names, weights, strict=True))
         config = {**config, "loss": {**loss, "weights": by_name}}
