@@ -92,9 +92,10 @@ def detection_loss(
         grid: The grid of the maps (padded where they are).
         sigma: Target shape, see `gaussian_heatmap`.
         sigma_cells: Standard deviation of targets in bins, for "fixed".
-        gwd_transform, gwd_tau: See `gwd_loss`; "sqrt" in the paper, "none" as released.
-        normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released:
-            raw). Smooth L1 always sees it raw, which teaches the network its length.
+        gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
+        gwd_tau: Likewise.
+        normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released: raw).
+            Smooth L1 always sees it raw, which teaches the network its length.
         matching: "center": boxes at each object's own bin (as released); "nms": those
             that survive NMS with the object that they overlap most (the paper).
         weights: Of some of `loss_names()`; a part without one is not computed.
@@ -125,16 +126,15 @@ def detection_loss(
     check_weights(weights)
     _check(maps, batch, grid, matching)
     boxes, is_valid = _objects(batch, is_frame_valid)
-    draw = partial(gaussian_heatmap, num_classes=maps.heatmap_logits.shape[-1])
-    shape: Any = {"sigma": sigma, "sigma_cells": sigma_cells}
-    target = draw(boxes, batch.classes, is_valid, grid, **shape)
+    logits, spread = maps.heatmap_logits, {"sigma": sigma, "sigma_cells": sigma_cells}
+    draw: Any = partial(gaussian_heatmap, num_classes=logits.shape[-1], **spread)
+    target = draw(boxes, batch.classes, is_valid, grid)
     pair = _pairs_at_centers if matching == "center" else partial(_after_nms, nms)
     predicted, wanted, is_matched = pair(maps, boxes, is_valid, grid, z0_m)
     losses = BOX_LOSSES | {"gwd": partial(_gwd, gwd_tau, gwd_transform, normalize_yaw)}
     parts = {}
     for name in weights:
         if name == "focal":
-            logits = maps.heatmap_logits
             parts[name] = focal_loss(logits, target, is_frame_valid=is_frame_valid)
             continue
         values = losses[name](predicted, wanted)

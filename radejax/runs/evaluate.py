@@ -50,9 +50,11 @@ def evaluate(
     """Detects on a split as the config says, on all devices, and writes the report.
 
     Args:
-        config, workdir: Of the run.
-        model, variables: What `config.model` describes.
+        config: Of the run.
+        model: What `config.model` describes.
+        variables: Of the model.
         data: To evaluate on.
+        workdir: Of the run.
         out: Folder of the results; `evaluation` in the work folder if None.
         split: "test", "validation", "train", "all" or a split file.
         exchange_images: Seed; see `evaluate_run`.
@@ -82,14 +84,11 @@ def evaluate(
             roi=config.evaluation.roi,
             score_threshold=config.decode.score_threshold,
         )
-        ground_truth, table = tables_from_frames(frames, split)
+        truth, table = tables_from_frames(frames, split)
+        options["rare"] = _rare_classes(config, data)
         made = write_report(
-            ground_truth,
-            predictions,
-            table,
-            folder,
+            *(truth, predictions, table, folder),
             report_options(config, f"{workdir.name}{remark}"),
-            rare=_rare_classes(config, data),
             bootstrap=config.evaluation.bootstrap,
             left_out_before=frames.summary().counts,
             draw_frame=drawer,
