@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -126,9 +126,9 @@ def detection_loss(
     check_weights(weights)
     _check(maps, batch, grid, matching)
     boxes, is_valid = _objects(batch, is_frame_valid)
-    logits, spread = maps.heatmap_logits, {"sigma": sigma, "sigma_cells": sigma_cells}
-    draw: Any = partial(gaussian_heatmap, num_classes=logits.shape[-1], **spread)
-    target = draw(boxes, batch.classes, is_valid, grid)
+    logits = maps.heatmap_logits
+    draw = partial(gaussian_heatmap, sigma=sigma, sigma_cells=sigma_cells)
+    target = draw(boxes, batch.classes, is_valid, grid, num_classes=logits.shape[-1])
     pair = _pairs_at_centers if matching == "center" else partial(_after_nms, nms)
     predicted, wanted, is_matched = pair(maps, boxes, is_valid, grid, z0_m)
     losses = BOX_LOSSES | {"gwd": partial(_gwd, gwd_tau, gwd_transform, normalize_yaw)}
