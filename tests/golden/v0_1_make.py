@@ -2,6 +2,8 @@
 
     python v0_1_make.py OUT && cd OUT && zip -9 -X ../v0.1.zip $(find . -type f | sort)
 
+The name of its temporary folder was replaced afterwards by one of the same length.
+
 A run of one step with its records, and a packed model and embeddings of small detectors.
 """
 
