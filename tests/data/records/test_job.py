@@ -116,7 +116,7 @@ def test_resumes_after_a_kill(root, tmp_path):
 @pytest.mark.slow
 def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
     out = tmp_path / "out"
-    blocked = root / "2/radar_tesseract/tesseract_00005.mat"
+    blocked = root / "1/radar_tesseract/tesseract_00005.mat"
     blocked.unlink()
     os.mkfifo(blocked)  # the worker waits there until it is opened below
     # Started in the background, Ctrl-C would be ignored by all of them.
@@ -131,9 +131,14 @@ def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
         text=True,
         start_new_session=True,
     )
-    with blocked.open("wb"):  # returns when the worker reads
-        os.killpg(job.pid, signal.SIGINT)
-        time.sleep(1.0)
+    # The file of records is there, so the worker is at its first frame, or soon will be:
+    # it looks whether to stop behind a frame only.
+    wait_until(lambda: any("arrayrecord" in path.name for path in out.glob("*")))
+    os.killpg(job.pid, signal.SIGINT)
+    time.sleep(1.0)
+    assert job.poll() is None  # waits for its worker
+    with blocked.open("wb"):
+        pass
     _, errors = job.communicate(timeout=120)
     assert job.returncode == 130
     assert errors.rstrip().splitlines()[-1] == "error: interrupted"
