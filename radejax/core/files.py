@@ -111,12 +111,21 @@ def read_text(path: str | os.PathLike[str]) -> str:
         content = pathlib.Path(path).read_bytes()
     except (IsADirectoryError, NotADirectoryError):
         raise DataError(f"{path}: is no file, expected a text file") from None
+    return decoded(content, str(path))
+
+
+def decoded(content: bytes, where: str) -> str:
+    """Bytes of a text file as text, without a byte order mark.
+
+    Raises:
+        DataError: They are not UTF-8; names `where` and the line.
+    """
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise DataError(
-            f"{path}:{line}: byte {content[error.start]:#04x} is not UTF-8 text"
+            f"{where}:{line}: byte {content[error.start]:#04x} is not UTF-8 text"
         ) from None
 
 

@@ -19,6 +19,7 @@ import os
 import pathlib
 import re
 
+from radejax.core import files
 from radejax.core.errors import DataError, UserError
 
 LABEL_CLASSES = (
@@ -252,13 +253,7 @@ def _decode(content: bytes, where: str) -> str:
     """The text of a file, without a byte order mark."""
     if not content.strip():
         raise DataError(f"{where}:1: the file is empty, expected a header line")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        number = content[: error.start].count(b"\n") + 1
-        raise DataError(
-            f"{where}:{number}: byte {content[error.start]:#04x} is not UTF-8 text"
-        ) from None
+    return files.decoded(content, where)
 
 
 def _split_header(line: str) -> tuple[str, str]:
