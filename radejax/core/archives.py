@@ -6,9 +6,11 @@ taken for it; whatever the standard readers raise on damage becomes a `DataError
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import io
 import math
+import operator
 import os
 import pathlib
 import struct
@@ -25,6 +27,9 @@ PathLike = str | os.PathLike[str]
 
 DEFLATE_RATIO = 1032
 """Bytes that deflate makes of one byte at most."""
+
+_LENGTHS = {(1, 0): struct.Struct("<H"), (2, 0): struct.Struct("<I")}
+_MAX_HEADER = 10_000  # NumPy's own limit
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _DAMAGE = (
@@ -163,13 +168,19 @@ def _read_header(
 ) -> tuple[np.dtype, tuple[int, ...], bool]:
     """Type, shape and memory order; leaves the file at the first number."""
     version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        header = np.lib.format.read_array_header_1_0(file)
-    elif version == (2, 0):
-        header = np.lib.format.read_array_header_2_0(file)
-    else:
+    if version not in _LENGTHS:
         raise DataError(f"{where}: NumPy's format {version}, expected 1.0 or 2.0")
-    shape, is_fortran, dtype = header
+    length = _LENGTHS[version]
+    (size,) = length.unpack(file.read(length.size))
+    if size > _MAX_HEADER:
+        raise DataError(f"{where}: header of {size} bytes, at most {_MAX_HEADER}")
+    # NumPy's own reader mends headers of Python 2 with a warning, which is no error.
+    header = ast.literal_eval(file.read(size).decode("latin1").strip())
+    if set(header) != {"descr", "fortran_order", "shape"}:
+        raise DataError(f"{where}: damaged, header {one_line(str(header))}")
+    dtype = np.lib.format.descr_to_dtype(header["descr"])
+    is_fortran = bool(header["fortran_order"])
+    shape = tuple(operator.index(size) for size in header["shape"])
     if dtype.hasobject or dtype.itemsize == 0 or min(shape, default=0) < 0:
         raise DataError(
             f"{where}: damaged, shape {shape} of {dtype}, expected an array of numbers "

@@ -29,7 +29,7 @@ def build(config: Mapping[str, Any]) -> nn.Module:
     Raises:
         UserError: The name is unknown, a field is missing, unknown or impossible.
     """
-    if "name" not in config or config["name"] not in _MAKERS:
+    if config.get("name") not in tuple(_MAKERS):  # also what cannot be looked up
         name = repr(config["name"]) if "name" in config else "missing"
         raise UserError(
             f"config.model.name is {name}; available models: {sorted(_MAKERS)}"

@@ -10,6 +10,10 @@ import pytest
 from radejax import Detector, UserError
 from radejax.core.structures import Batch
 from radejax.data.cameras import CameraOptions
+from radejax.geometry.calibration import (
+    EGO_FROM_LIDAR_M,
+    KRADAR_LIDAR_TO_RADAR_Z_M,
+)
 from radejax.geometry.camera import stack_cameras
 from radejax.inference.inputs import prepare
 from radejax.models.lifting import reference_points
@@ -36,7 +40,9 @@ def test_every_form_of_a_camera_gives_the_same(
     fusion: Detector, tmp_path: pathlib.Path
 ) -> None:
     projection, image = small.projections(2), small.images(2)
-    calibration = small.calibration()
+    # A path says nothing about the radar's place: it has K-Radar's.
+    shift = (*EGO_FROM_LIDAR_M[:2], KRADAR_LIDAR_TO_RADAR_Z_M)
+    calibration = small.calibration(ego_from_lidar_m=shift)
     path = tmp_path / "cam_front0.yml"
     path.write_text(calibration.to_kradar_text())
     camera = calibration.camera("raw")
@@ -61,7 +67,7 @@ def test_every_form_of_a_camera_gives_the_same(
     )
     _equal(fusion(batch), expected)
     assert _differs(fusion(projection, image[::-1], calibration), expected)
-    turned = small.calibration(yaw_deg=70.0)
+    turned = small.calibration(yaw_deg=70.0, ego_from_lidar_m=shift)
     assert _differs(fusion(projection, image, turned), expected)
     assert _differs(fusion(projection), expected)
 

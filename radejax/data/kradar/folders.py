@@ -257,7 +257,8 @@ def find_camera_calibration(
 
 def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
     """Whether the simulator has left its `simulation.json` in one of the folders."""
-    return any((folder / SIMULATION_MARKER).is_file() for folder in folders)
+    # Impossible names are no folders; pathlib would raise.
+    return any(os.path.isfile(folder / SIMULATION_MARKER) for folder in folders)
 
 
 def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
