@@ -15,10 +15,12 @@ from absl import flags
 # the older way, which compiles several times as fast (jaxlib 0.11 has it no more, and ends
 # a process that asks for it). Read by `import jax`. With XLA_FLAGS= in the environment
 # programs are what users get: CI's slow tests.
-_FLAGS = ["--xla_backend_optimization_level=0"]
-if importlib.metadata.version("jaxlib") < "0.11":
-    _FLAGS.append("--xla_cpu_use_fusion_emitters=false")
-os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0"
+    + " --xla_cpu_use_fusion_emitters=false"
+    * (importlib.metadata.version("jaxlib") < "0.11"),
+)
 
 import jax
 
