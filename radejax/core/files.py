@@ -18,6 +18,8 @@ from typing import IO, Any
 from radejax.core import schema
 from radejax.core.errors import DataError, DiskFullError, UserError
 
+PathLike = str | os.PathLike[str]
+
 _log = logging.getLogger(__name__)
 
 _LONGEST_INT = 30  # digits; 64 bits have 20

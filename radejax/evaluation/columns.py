@@ -88,7 +88,7 @@ def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
     if bounds is None:
         return np.ones(len(box), bool)
     low, high = np.array(bounds[::2]), np.array(bounds[1::2])
-    return ((box[:, :3] >= low) & (box[:, :3] <= high)).all(axis=1)
+    return np.all((box[:, :3] >= low) & (box[:, :3] <= high), axis=1)
 
 
 def roi_name(roi: str | Sequence[float] | None) -> str:
@@ -103,7 +103,7 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
     if isinstance(roi, str):
         return roi
     bounds = tuple(float(value) for value in np.asarray(roi).reshape(-1))
-    names = {known: name for name, known in ROIS.items()}
+    names: dict[tuple[float, ...], str] = {roi: name for name, roi in ROIS.items()}
     return names.get(bounds) or ",".join(f"{value:g}" for value in bounds)
 
 

@@ -19,6 +19,8 @@ from radejax.evaluation.result import SPACES, Result
 MOST_PAIRS = 1_000_000
 """Of predictions and ground truths of a class in a frame; 100 and 20 are many."""
 
+Matches = matching.KradarMatches | np.ndarray
+
 # Scores [K], falling; frames [K]; how many true positives (or matches) each adds [K].
 Falling = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -81,10 +83,12 @@ class EvaluationSet:
             self.gt_group, minlength=self.frame.size * num_classes
         ).reshape(self.frame.size, num_classes)
         self._overlaps: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        self._matches: dict[tuple, object] = {}
+        self._matches: dict[tuple, Matches] = {}
         self._parts: dict[tuple, list[Falling]] = {}
 
-    def _select(self, table: tuple, name: str, roi: object) -> columns.Objects:
+    def _select(
+        self, table: tuple, name: str, roi: str | Sequence[float] | None
+    ) -> columns.Objects:
         """Boxes of the evaluated classes in the region, sorted; counts the others."""
         frame, box, cls_name, score = table
         dense = columns.dense_frames(frame, self.frame, name=name)
@@ -139,9 +143,10 @@ class EvaluationSet:
             z_center=1.0 if geometry == "exchanged_top" else 0.5,
         )
         # The original stores overlaps in single and compares them in double precision.
-        return tuple(iou.astype(np.float32).astype(np.float64) for iou in (bev, iou_3d))
+        bev, iou_3d = (i.astype(np.float32).astype(np.float64) for i in (bev, iou_3d))
+        return bev, iou_3d
 
-    def match(self, protocol: Protocol, space: str, iou: float) -> object:
+    def match(self, protocol: Protocol, space: str, iou: float) -> Matches:
         """Matches of all frames and classes: `KradarMatches` or `[M]` object or -1."""
         geometry = protocol.geometry
         if geometry == "exchanged_top" and space == "bev":
@@ -151,6 +156,7 @@ class EvaluationSet:
             values = self.overlaps(geometry)[SPACES.index(space)]
             pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
             score = self.pred.score
+            match: Matches
             if protocol.matching == "kradar":
                 match = matching.match_kradar(pairs, score, self.gt_group, iou)
             elif protocol.matching == "best":
@@ -281,7 +287,7 @@ class EvaluationSet:
             parts = [tuple(v[among[part[1]]] for v in part) for part in whole]
         else:
             match, mine = self.match(*terms[:3]), self.by_score[cls]
-            if protocol.matching == "kradar":
+            if isinstance(match, matching.KradarMatches):
                 first, event = match.first_pred, match.event_pred
                 counts = [(pred, np.ones_like(pred)) for pred in (mine, first)]
                 counts.append((event, match.event_delta))

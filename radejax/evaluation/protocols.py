@@ -18,6 +18,9 @@ PROTOCOL_DEFAULT = "protocol"
 
 EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall
 
+Geometry = Literal["plain", "rounded", "exchanged", "exchanged_top"]
+CurveKind = Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "exact"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
@@ -37,9 +40,9 @@ class Protocol:
     """
 
     name: str
-    geometry: Literal["plain", "rounded", "exchanged", "exchanged_top"]
+    geometry: Geometry
     matching: Literal["kradar", "best", "free"]
-    curve: Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "exact"]
+    curve: CurveKind
     skip_empty: Literal["class", "frame"] | None
     summary: str
 
@@ -52,11 +55,11 @@ RECOMMENDED = "exact"
 """The protocol of our own choice; docs/evaluation.md says why."""
 
 
-def _kradar(name: str, geometry: str, curve: str, summary: str) -> Protocol:
+def _kradar(name: str, geometry: Geometry, curve: CurveKind, summary: str) -> Protocol:
     return Protocol(name, geometry, "kradar", curve, "frame", f"K-Radar's {summary}")
 
 
-def _radenet(curve: str, summary: str) -> Protocol:
+def _radenet(curve: CurveKind, summary: str) -> Protocol:
     summary = f"RADE-Net's evaluator, {summary}"
     return Protocol(curve, "plain", "best", curve, "class", summary)
 
@@ -179,7 +182,7 @@ def kradar_curve(
     events: tuple[np.ndarray, np.ndarray],
     detections: tuple[np.ndarray, np.ndarray],
     num_gt: int,
-    samples: Literal["r40", "r11"],
+    samples: CurveKind,
 ) -> Curve:
     """AP in K-Radar's protocol from the steps of `matching.match_kradar`.
 
@@ -191,7 +194,7 @@ def kradar_curve(
         detections: `[M]` scores of all predictions, falling, and the weights of their
             frames.
         num_gt: Number of ground truths.
-        samples: All 41 precision samples, or every fourth (11).
+        samples: "r40" all 41 precision samples, "r11" every fourth.
 
     Examples:
         >>> both = np.array([0.9, 0.6]), np.ones(2)

@@ -98,10 +98,10 @@ def write_kitti(
             "preds": "\n".join(found.get(frame, [DUMMY])) + "\n",
             "desc": "\n".join(tags.get(kind, "unknown") for kind in DESCRIPTION),
         }
-        for part in ("all", *tags.values()):
-            listed.setdefault(root / part, []).append(f"{position:06d}")
+        for tag in ("all", *tags.values()):
+            listed.setdefault(root / tag, []).append(f"{position:06d}")
             for kind, text in texts.items():
-                path = root / part / kind / f"{position:06d}.txt"
+                path = root / tag / kind / f"{position:06d}.txt"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(text, encoding="utf-8")
     for part, names in listed.items():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -12,12 +11,11 @@ import numpy as np
 
 from radejax.core import files, schema
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import are_simulated
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.files import kitti, predictions
-
-PathLike = str | os.PathLike
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,12 +102,13 @@ def _load(
     path: pathlib.Path, source: Source, classes: Sequence[str]
 ) -> tuple[Columns, Columns, Columns, dict[str, int]]:
     """As `load`, of all frames."""
+    frames: Columns | None = None
+    left_out: dict[str, int] = {}
     if (path / "predictions.npz").is_file():
         frames = _frames_of_report(path)
         truth = predictions.read_table(path / "ground_truth.npz", frames, scored=False)
         found = predictions.read_table(path / "predictions.npz", frames)
-        return truth, found, frames, {}
-    frames, left_out = None, {}
+        return truth, found, frames, left_out
     is_boxes = any(path.glob("*.json")) and not (path / "preds").is_dir()
     if source.ground_truth:
         truth, frames = _ground_truth(source.ground_truth, source.frames)
@@ -174,20 +173,21 @@ def _read_frames(path: PathLike) -> Columns:
     columns = files.read_json(path, dict[str, column])
     hint = {"frame": list[int], "name?": list[str], "sequence?": list[int]}
     columns = schema.check(columns, hint, str(path))
-    for name, column in columns.items():
-        if len(column) != len(columns["frame"]):
+    for name, values in columns.items():
+        if len(values) != len(columns["frame"]):
             raise DataError(
-                f"{path}: column {name!r} has {len(column)} entries for "
+                f"{path}: column {name!r} has {len(values)} entries for "
                 f"{len(columns['frame'])} frames"
             )
-    return {name: np.asarray(column) for name, column in columns.items()}
+    return {name: np.asarray(values) for name, values in columns.items()}
 
 
 def _of_detect(folder: pathlib.Path, found: Columns, frames: Columns) -> Columns:
     """KITTI's files of `radejax detect`, whose list says which frame has which number."""
     names = _read_frames(folder / "frames.json")["name"]
-    named = {**found, "frame": names[found["frame"]]}
-    named = predictions.of_known_frames(named, frames)
+    named = predictions.of_known_frames(
+        {**found, "frame": names[found["frame"]]}, frames
+    )
     ids = predictions.find_frames(named["frame"], frames, where=str(folder))
     return {**named, "frame": ids}
 

@@ -252,8 +252,8 @@ def _read_csv(path: pathlib.Path) -> Columns:
 
 def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float:
     try:
-        return float(text)
-    except (TypeError, ValueError):
+        return float(text or "")
+    except ValueError:
         raise DataError(
             f"{path}: line {line}: {name} is {text!r:.80}, expected a number"
         ) from None
@@ -285,7 +285,8 @@ def write_table(
         columns["score"] = np.asarray(table["score"], np.float64)
     if path.suffix == ".npz":
         with files.atomic_path(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **columns)
+            # NumPy would have `allow_pickle`, which none is named, a bool.
+            np.savez_compressed(file, **columns)  # type: ignore[arg-type]
     elif path.suffix == ".json":
         files.write_text(path, json.dumps({k: v.tolist() for k, v in columns.items()}))
     elif path.suffix == ".csv":
@@ -295,7 +296,7 @@ def write_table(
 
 
 def _csv_text(columns: Columns) -> str:
-    flat = columns | dict(zip(BOX_FIELDS, columns["box"].T, strict=True))
+    flat = {**columns, **dict(zip(BOX_FIELDS, columns["box"].T, strict=True))}
     names = [name for name in ("frame", "cls", *BOX_FIELDS, "score") if name in flat]
     rows = zip(*(flat[name].tolist() for name in names), strict=True)
     buffer = io.StringIO()

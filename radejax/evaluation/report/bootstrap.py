@@ -62,7 +62,7 @@ def resample(
     skip = chosen.frame_rule(skip_empty)
     terms = Terms(chosen, space, iou, float(score_threshold))
     num_classes = len(data.classes)
-    among = weights.any(axis=0)
+    among = np.any(weights, axis=0)
     ap = np.full((len(weights), num_classes + 1), np.nan)
     for row, weight in enumerate(weights):
         by_class = data.frame_weights(skip, weight)

@@ -41,7 +41,9 @@ class Slice:
 
 def matched_objects(data: EvaluationSet, space: str, iou: float) -> np.ndarray:
     """`[M]` ground truth that each prediction found, or -1 (recommended protocol)."""
-    return data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
+    match = data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
+    assert isinstance(match, np.ndarray)  # the recommended protocol is not K-Radar's
+    return match
 
 
 def by_distance(
@@ -186,11 +188,12 @@ def box_errors(
     result = {}
     for cls, name in enumerate(data.classes):
         mine = data.pred.cls[rows] == cls
-        numbers = result[name] = {"count": int(mine.sum())}
+        numbers: dict[str, float] = {"count": int(mine.sum())}
         for what, values in errors.items():
             numbers[f"{what}_mean"] = _or_nan(np.mean, values[mine])
             numbers[f"{what}_median"] = _or_nan(np.median, values[mine])
         numbers["reversed"] = _or_nan(np.mean, turn[mine] > np.pi / 2)
+        result[name] = numbers
     return result
 
 
@@ -218,10 +221,10 @@ def confusion(
     table = np.zeros((num_classes + 1, num_classes + 1), np.int64)
     hit = match >= 0
     np.add.at(table, (data.gt.cls[match[hit]], pred.cls[hit]), 1)
-    np.add.at(table, (num_classes, pred.cls[~hit]), 1)
+    np.add.at(table[num_classes], pred.cls[~hit], 1)
     missed = np.ones(len(data.gt), bool)
     missed[match[hit]] = False
-    np.add.at(table, (data.gt.cls[missed], num_classes), 1)
+    np.add.at(table[:, num_classes], data.gt.cls[missed], 1)
     return table
 
 
@@ -232,7 +235,7 @@ def worst_frames(
     *,
     count: int = 10,
     operating_score: float = 0.3,
-) -> list[dict[str, float]]:
+) -> list[dict[str, int]]:
     """Frames with the most mistakes above the operating score.
 
     Returns:

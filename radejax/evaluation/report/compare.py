@@ -8,9 +8,10 @@ from collections.abc import Mapping, Sequence
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.core.files import PathLike
 from radejax.evaluation.columns import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import PathLike, Source, load, stored_from
+from radejax.evaluation.files.load import Source, load, stored_from
 from radejax.evaluation.report import bootstrap, paper_tables, tables
 from radejax.evaluation.report.measure import Options, measure, repair_sizes
 from radejax.evaluation.report.report import Report, plain, write_report

@@ -30,8 +30,10 @@ ORDER = {
 }
 """K-Radar's tags in the order of its papers."""
 
-_OF_RESULT = ("num_gt", "num_det", "num_frames", "score_threshold")
-_OF_RESULT += ("skip_empty", "roi", "label_version")
+_OF_RESULT = (
+    *("num_gt", "num_det", "num_frames", "score_threshold"),
+    *("skip_empty", "roi", "label_version"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,7 +209,7 @@ def measure(
 
     The last class of every group is "mean": the mean over the classes that occur.
     """
-    conditions = [("all", "all", None)]
+    conditions: list[tuple[str, str, np.ndarray | None]] = [("all", "all", None)]
     for kind in kinds:
         masks = condition_masks(frames, kind)
         conditions += [(kind, name, mask) for name, mask in masks.items()]

@@ -58,7 +58,8 @@ def draw(
         written.append(save_figure(figure, path, dpi=110))
     match = breakdown.matched_objects(data, "3d", iou)
     axis = draw_calibration(data.pred.score, match >= 0, title=f"3d, IoU {iou:g}{kind}")
-    return [*written, save_figure(axis.figure, out_dir / "calibration.png", dpi=110)]
+    figure = axis.figure.figure
+    return [*written, save_figure(figure, out_dir / "calibration.png", dpi=110)]
 
 
 def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Any:

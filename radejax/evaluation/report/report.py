@@ -52,7 +52,7 @@ def write_report(
     ground_truth: Columns,
     predictions: Columns,
     frames: Columns,
-    out_dir: str | pathlib.Path,
+    out_dir: files.PathLike,
     options: Options | None = None,
     **changes: Any,
 ) -> Report:
@@ -151,7 +151,8 @@ def with_intervals(
     """The rows with 95 % intervals: all over all frames, the main ones per weather."""
     main = (protocols.RECOMMENDED, "kradar_r40", options.paper_protocol)
     weathers = measure.condition_masks(frames, "weather")
-    found, none = {}, (None, None)
+    found: dict[tuple, tuple[float, float]] = {}
+    none = (None, None)
     for name in options.protocols:
         found |= bootstrap.add_intervals(
             data,
@@ -179,13 +180,16 @@ def collect(
 ) -> dict[str, Any]:
     """Everything of metrics.json, as plain values (NaN where nothing is defined)."""
     iou, cut = options.iou_thresholds[0], options.operating_score
-    terms = {"space": "3d", "iou": iou, "operating_score": cut}
-    slices = {"distance": breakdown.by_distance(data, **terms)}
+    slices = {"distance": breakdown.by_distance(data, "3d", iou, operating_score=cut)}
     for kind in ("weather", "environment", "time"):
         if masks := measure.condition_masks(frames, kind):
-            slices[kind] = breakdown.by_condition(data, masks, **terms)
+            slices[kind] = breakdown.by_condition(
+                data, masks, "3d", iou, operating_score=cut
+            )
     confusion = breakdown.confusion(data, "bev", iou, operating_score=cut)
-    worst = breakdown.worst_frames(data, **terms, count=options.worst_frames)
+    worst = breakdown.worst_frames(
+        data, "3d", iou, count=options.worst_frames, operating_score=cut
+    )
     return {
         "run": options.run,
         "options": options.to_dict(),

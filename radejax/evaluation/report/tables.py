@@ -256,12 +256,12 @@ def slice_table(slices: Mapping[str, Any], kind: str) -> Table:
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
     """Median errors of matched boxes, and how many headings are reversed."""
-    body = []
+    body: list[list[str | int]] = []
     for cls, found in errors.items():
         medians = (
             number(found[f"{key}_median"], digits=digits) for key, _, digits in ERRORS
         )
-        body.append([cls, found["count"], *medians, number(found["reversed"])])
+        body.append([cls, int(found["count"]), *medians, number(found["reversed"])])
     return Table(
         "Median errors of matched boxes (all scores); reversed: heading off by more"
         " than 90 deg",
