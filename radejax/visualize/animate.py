@@ -123,10 +123,11 @@ def make_palette(first: Image.Image, num_colors: int) -> Image.Image:
     lines = np.concatenate([lines, COLOR_MAP(np.linspace(0, 1, _MAP_COLORS))[:, :3]])
     # Half for smooth shades of large areas, half for rare but vivid colours.
     kept = max(2, (min(num_colors, 256) - len(lines)) // 2)
-    colors = []
+    colors: list[int] = []
     for method in (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE):
-        quantized = first.quantize(kept, method=method)
-        colors += quantized.getpalette()[: 3 * kept]
+        chosen = first.quantize(kept, method=method).getpalette()
+        assert chosen is not None  # quantized images have one
+        colors += chosen[: 3 * kept]
     palette = Image.new("P", (1, 1))
     palette.putpalette(colors + np.round(255 * lines).astype(int).ravel().tolist())
     return palette
@@ -144,7 +145,8 @@ def _write_mp4(
     # The pixel format halves colour resolution, so sizes must be even.
     options = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"]
     options += ["-pix_fmt", "yuv420p", "-f", "mp4"]
-    writer = FFMpegWriter(rate, "libx264", extra_args=options)
+    # `fps` may be a fraction.
+    writer = FFMpegWriter(rate, "libx264", extra_args=options)  # type: ignore[arg-type]
     first = next(pictures)
     height, width = first.shape[:2]
     figure = new_figure(width / 100, height / 100, dpi=100)

@@ -132,11 +132,11 @@ def _draw_boxes(
         autolim=False,
     )
     hulls = [segments[i][is_visible[i]].reshape(-1, 2) for i in drawn]
-    lines = np.concatenate([segments[i][is_visible[i]] for i in drawn] or [[]])
+    lines = [line for i in drawn for line in segments[i][is_visible[i]]]
     heights = [np.repeat(np.ptp(hull[:, 1]), len(hull) // 2) for hull in hulls]
     # Lines of a small box are thinner, or they would fill it.
-    heights_pt = np.concatenate(heights or [[]]) * _points_per_pixel(ax, calibration)
-    thickness = np.clip(heights_pt / 24.0, 0.4, 1.0)
+    height_px = np.concatenate([*heights, np.zeros(0)])
+    thickness = np.clip(height_px * _points_per_pixel(ax, calibration) / 24.0, 0.4, 1.0)
     for stroke, extra, order in (("black", 1.0, 4), (style.color, 0.0, 4.1)):
         collection = LineCollection(
             lines,

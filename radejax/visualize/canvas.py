@@ -41,6 +41,7 @@ SERIES_COLORS = (
 )
 
 
+Layout = Literal["constrained"] | None
 Side = Literal["left", "right", "above"]
 
 
@@ -112,8 +113,8 @@ def as_objects(
                 f"{what} must be (boxes, classes) or (boxes, scores, classes), "
                 f"got {len(value)} parts"
             )
-        boxes, *scores, classes = value
-        scores = scores[0] if scores else None
+        boxes, *middle, classes = value
+        scores = middle[0] if middle else None
     else:
         boxes = _field(value, "boxes", "box")
         classes = _field(value, "classes", "cls")
@@ -283,7 +284,7 @@ def halo(width: float, color: str = "black") -> list:
 
 
 def new_figure(
-    width_in: float, height_in: float, *, dpi: float = 110, layout: str | None = None
+    width_in: float, height_in: float, *, dpi: float = 110, layout: Layout = None
 ) -> Figure:
     """An empty figure outside pyplot's list of open figures."""
     return Figure(figsize=(width_in, height_in), dpi=dpi, layout=layout)

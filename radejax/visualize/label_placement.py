@@ -120,19 +120,19 @@ def draw_labels(
         font_size: Points.
         keep_boxes_clear: Texts avoid all outlines, not only other texts.
     """
-    frame = ax.get_window_extent().extents
+    frame = np.asarray(ax.get_window_extent().extents)
     low, high = frame[:2], frame[2:]
-    shown, anchors = [], []
+    shown, rectangles = [], []
     for label in labels:
         pixels = ax.transData.transform(label.outline)
         first, last = pixels.min(0), pixels.max(0)
         center = (first + last) / 2
         if ((center >= low) & (center <= high)).all():
             shown.append(label)
-            anchors.append([*np.clip(first, low, high), *np.clip(last, low, high)])
+            rectangles.append([*np.clip(first, low, high), *np.clip(last, low, high)])
     if not shown:
         return
-    anchors = np.array(anchors)
+    anchors = np.array(rectangles)
     pixel_per_point = ax.figure.dpi / 72
     line = font_size * pixel_per_point
     sizes = np.array(
@@ -182,10 +182,12 @@ def _draw_label(
     has_moved = np.hypot(*(near - edge)) > 0.75 * size[1]
     leader = {"arrowstyle": "-", "color": label.color, "lw": 0.6}
     leader |= {"shrinkA": 0, "shrinkB": 0}
+    x, y = ax.transData.inverted().transform(edge)
+    right, up = (target - edge) * 72 / ax.figure.dpi
     ax.annotate(
         label.text,
-        xy=ax.transData.inverted().transform(edge),
-        xytext=(target - edge) * 72 / ax.figure.dpi,
+        xy=(x, y),
+        xytext=(right, up),
         textcoords="offset points",
         ha=align,
         va="center",

@@ -98,7 +98,8 @@ def extent_m(
             raise UserError(
                 f"extent must be x_min, x_max, y_min, y_max in metres, got {extent}"
             )
-        return tuple(float(v) for v in extent)
+        x0, x1, y0, y1 = map(float, extent)
+        return x0, x1, y0, y1
     if extent not in ("roi", "fov"):
         raise UserError(f"extent must be 'roi', 'fov' or 4 numbers, got {extent!r}")
     far = grid.range_m[-1] + grid.range_step_m / 2

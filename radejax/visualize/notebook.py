@@ -66,7 +66,7 @@ def show(
     if isinstance(what, np.ndarray):
         pixels = what
     else:
-        figure = getattr(what, "figure", what)
+        figure = what.figure.figure  # the root: axes may lie in a part of it
         figure.set_dpi(dpi)
         pixels = render(figure)
     image = Image.fromarray(pixels)

@@ -8,7 +8,7 @@ velocity, never the velocity: pictures say so.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,6 +29,7 @@ from radejax.visualize.canvas import (
 )
 
 Channels = Literal["all", "doppler", "elevation"]
+Plane = Literal["range_azimuth", "range_doppler", "azimuth_elevation"]
 Reduce = Literal["max", "mean"]
 Units = Literal["normalized", "db"]
 
@@ -132,7 +133,7 @@ def bin_edges(centers: np.ndarray) -> np.ndarray:
 
 
 def draw_slice(
-    plane: Literal["range_azimuth", "range_doppler", "azimuth_elevation"],
+    plane: Plane,
     projection: Any,
     grid: RadarGrid,
     *,
@@ -210,12 +211,8 @@ def draw_slices(
     figure = new_figure(14.0, 4.2, layout="constrained")
     axes = figure.subplots(1, 3)
     limits = color_limits_of(to_units(check_projection(projection, grid), units))
-    for ax, plane, index in zip(
-        axes,
-        ("range_azimuth", "range_doppler", "azimuth_elevation"),
-        (None, azimuth_idx, range_idx),
-        strict=True,
-    ):
+    indices = (None, azimuth_idx, range_idx)
+    for ax, plane, index in zip(axes, get_args(Plane), indices, strict=True):
         draw_slice(
             plane,
             projection,

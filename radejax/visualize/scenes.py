@@ -7,7 +7,8 @@ References:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -50,7 +51,9 @@ def draw_scenes(
     width, height = _COLUMN_IN * columns, _ROW_IN * rows + _FOOT_IN
     figure = new_figure(width, height)
     limits = _common_limits(scenes)
-    options = {"color_limits": limits, "show_legend": False, "show_colorbar": False}
+    draw = functools.partial(
+        bev.draw_bev, color_limits=limits, show_legend=False, show_colorbar=False
+    )
     for index, scene in enumerate(scenes):
         row, column = divmod(index, columns)
         left = (column + 0.14) / columns
@@ -65,12 +68,12 @@ def draw_scenes(
             # Labels are readable on the map; here they would hide the image.
             bev.draw_view(above, scene, show_labels=False)
         below = figure.add_axes(place(0.55, 4.9))
-        bev.draw_bev(dataclasses.replace(scene, title=""), ax=below, **options)
+        draw(dataclasses.replace(scene, title=""), ax=below)
         if column:
             below.set_ylabel("")
         (above or below).set_title(scene.title, fontsize=11)
         if scene.zoom is not None:
-            _magnify(below, scene, zoom_m, options)
+            _magnify(below, scene, zoom_m, draw)
     _draw_colorbar(figure, limits)
     figure.legend(
         handles=legend_handles(scenes[0], show_counts=False),  # of one scene alone
@@ -101,8 +104,9 @@ def _draw_colorbar(figure: Figure, limits: tuple[float, float]) -> None:
     bar.ax.tick_params(labelsize=8)
 
 
-def _magnify(ax: Axes, scene: Scene, size_m: float, options: dict) -> None:
+def _magnify(ax: Axes, scene: Scene, size_m: float, draw: Callable[..., Axes]) -> None:
     """An orange square on the map and what is in it, larger, in a corner."""
+    assert scene.zoom is not None
     x, y = scene.zoom
     half = size_m / 2
     # The axes show y to the left and x up.
@@ -112,12 +116,11 @@ def _magnify(ax: Axes, scene: Scene, size_m: float, options: dict) -> None:
         )
     )
     inset = ax.inset_axes((0.60, 0.02, 0.38, 0.38 * _aspect(ax)))
-    bev.draw_bev(
+    draw(
         dataclasses.replace(scene, title="", roi=None),
         ax=inset,
         extent=(x - half, x + half, y - half, y + half),
         show_labels=False,
-        **options,
     )
     inset.set(xticks=[], yticks=[], xlabel="", ylabel="")
     for spine in inset.spines.values():
@@ -127,5 +130,5 @@ def _magnify(ax: Axes, scene: Scene, size_m: float, options: dict) -> None:
 def _aspect(ax: Axes) -> float:
     """Width over height of the axes on paper, so that an inset becomes a square."""
     box = ax.get_position()
-    width, height = ax.figure.get_size_inches()
+    width, height = ax.figure.figure.get_size_inches()
     return float(np.clip(box.width * width / (box.height * height), 0.2, 5.0))
