@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
@@ -99,7 +99,7 @@ class SimulationConfig:
     radar: Mapping[str, Any] = dataclasses.field(
         default_factory=lambda: {"azimuth_elements": 40.0, "elevation_elements": 12.0}
     )
-    output: str = "tesseract"
+    output: Literal["tesseract", "projection"] = "tesseract"
     image_width: int = 320
     image_height: int = 180
     cover_lens: bool = True
@@ -124,8 +124,8 @@ class SimulationConfig:
         for name in names:
             if name not in values:
                 raise UserError(f"simulation field {name!r} is missing")
-        values["lidar_to_radar_m"] = tuple(map(float, values["lidar_to_radar_m"]))
-        return cls(**values)
+        offset = tuple(map(float, values["lidar_to_radar_m"]))
+        return cls(**dict(values, lidar_to_radar_m=offset))
 
     def __post_init__(self) -> None:
         is_procedural = self.scenes == "procedural"

@@ -117,7 +117,9 @@ def _marker(config: SimulationConfig) -> dict[str, Any]:
     }
 
 
-def _cameras(config: SimulationConfig) -> tuple[CameraCalibration, ...]:
+def _cameras(
+    config: SimulationConfig,
+) -> tuple[CameraCalibration, CameraCalibration] | tuple[()]:
     """Left and right camera, or none."""
     if not config.image_width:
         return ()
@@ -129,7 +131,7 @@ def _write_common(
     root: pathlib.Path, config: SimulationConfig, source: SceneSource
 ) -> None:
     """Splits, sensor axes, camera calibrations."""
-    names = {"train": [], "test": []}
+    names: dict[str, list[tuple[int, str]]] = {"train": [], "test": []}
     for number in source.numbers:
         for spec in source.frames(number):
             names[spec.split].append((number, spec.name))

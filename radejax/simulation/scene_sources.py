@@ -135,11 +135,11 @@ class LabelSource:
         )
 
 
-def _header_indices(header: LabelHeader) -> tuple[int, ...]:
+def _header_indices(header: LabelHeader) -> tuple[int, int, int, int, int]:
     """Frame numbers of `FrameSpec`; old labels name some sensors only."""
-    camera, long_lidar = header.camera_front, header.lidar_long
-    numbers = header.radar, header.lidar, camera, long_lidar, header.camera_lrr
-    return tuple(header.lidar if n is None else n for n in numbers)
+    maybe = header.camera_front, header.lidar_long, header.camera_lrr
+    camera, long_lidar, others = (header.lidar if n is None else n for n in maybe)
+    return header.radar, header.lidar, camera, long_lidar, others
 
 
 SceneSource = ProceduralSource | LabelSource

@@ -15,7 +15,7 @@ FRONT, REAR, LEFT, RIGHT, TOP = range(5)
 
 
 class Detail(NamedTuple):
-    """A rectangle on a face, or columns `[K, ...]` of many.
+    """A rectangle on a face.
 
     Attributes:
         block: Index of the block.

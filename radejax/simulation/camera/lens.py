@@ -131,7 +131,8 @@ def _blurred(image: Image.Image, factor: float) -> Image.Image:
     width, height = image.size
     factor = max(factor * width / 1280.0, 1.01)
     small = (max(int(width / factor), 2), max(int(height / factor), 2))
-    return image.resize(small, Image.BOX).resize(image.size, Image.BICUBIC)
+    smaller = image.resize(small, Image.Resampling.BOX)
+    return smaller.resize(image.size, Image.Resampling.BICUBIC)
 
 
 def _drop_mask(size, share: float, rng: np.random.Generator) -> Image.Image:
@@ -146,5 +147,5 @@ def _drop_mask(size, share: float, rng: np.random.Generator) -> Image.Image:
         draw.ellipse((x - radius, y - radius, x + radius, y + 1.15 * radius), fill=255)
         covered = float(np.asarray(mask).mean()) / 255.0 if tries % 8 == 7 else covered
         tries += 1
-    small = mask.resize((width // 2, height // 2), Image.BOX)
-    return small.resize(size, Image.BICUBIC)
+    small = mask.resize((width // 2, height // 2), Image.Resampling.BOX)
+    return small.resize(size, Image.Resampling.BICUBIC)

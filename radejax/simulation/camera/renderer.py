@@ -53,7 +53,7 @@ def stereo_calibration(
         width: Width of one of the two images.
         height: Height.
     """
-    return tuple(
+    left, right = (
         CameraCalibration.from_angles(
             intrinsics=_INTRINSICS,
             distortion=_DISTORTION,
@@ -63,6 +63,7 @@ def stereo_calibration(
         ).resized(width, height)
         for translation in _TRANSLATIONS
     )
+    return left, right
 
 
 @dataclasses.dataclass(frozen=True)

@@ -223,11 +223,11 @@ def _object_faces(boxes, classes, colors, origin) -> Faces:
         roles = _ROLE_COLORS | {"body": colors[index, 0], "legs": colors[index, 1]}
         color = np.array([roles[role] for *_, role, _ in BLOCKS[cls]], float)[block]
         if depth < _DETAIL_M:  # after their blocks, so that they are painted on them
-            d = _DETAIL_TABLES[cls]
-            chosen = quads[d.block * len(_NORMALS) + d.face]
-            quads = np.concatenate([quads, details.on_faces(chosen, d.u, d.v)])
-            block, face = np.r_[block, d.block], np.r_[face, d.face]
-            color = np.concatenate([color, d.color])
+            on_block, on_face, u, v, paint = _DETAIL_TABLES[cls]
+            chosen = quads[on_block * len(_NORMALS) + on_face]
+            quads = np.concatenate([quads, details.on_faces(chosen, u, v)])
+            block, face = np.r_[block, on_block], np.r_[face, on_face]
+            color = np.concatenate([color, paint])
         block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)[block]
         same = np.full(len(quads), depth), np.full(len(quads), index)
         normal = _NORMALS[face] @ turn.T
@@ -253,7 +253,7 @@ def _project_faces(
     outlines = faces[:, :, None] + part * (following - faces)[:, :, None]
     outlines = outlines.reshape(len(faces), -1, 3)
     size = np.array([calibration.width, calibration.height], float)
-    result = []
+    result: list[list[tuple[float, float]]] = []
     for points, depth, outline in zip(
         *project(outlines, camera), outlines, strict=True
     ):
@@ -264,7 +264,7 @@ def _project_faces(
             points, _ = project(_cut_near(outline, depth, _NEAR_M), camera)
         is_off = (points.max(0) < 0).any() or (points.min(0) > size).any()
         points = np.clip(points, -2.0 * size, 3.0 * size)
-        result.append([] if is_off else list(map(tuple, points.tolist())))
+        result.append([] if is_off else [(x, y) for x, y in points.tolist()])
     return result
 
 
@@ -282,7 +282,7 @@ def _cut_near(outline, depth, near_m) -> np.ndarray:
 
 
 _BLOCK_CORNERS = {name: blocks_of(name) for name in BLOCKS}
-_DETAIL_TABLES = {
-    name: details.Detail(*map(np.array, zip(*details.DETAILS[name], strict=True)))
+_DETAIL_TABLES = {  # the fields of `Detail` as columns
+    name: [np.array(column) for column in zip(*details.DETAILS[name], strict=True)]
     for name in BLOCKS
 }

@@ -170,7 +170,7 @@ def _aspect_mean(normal: np.ndarray, weight: np.ndarray, glint: np.ndarray) -> f
     return float((weight[:, None] * face_gain(cosine, glint[:, None])).sum(0).mean())
 
 
-def face_gain(cosine: np.ndarray, glint: np.ndarray) -> np.ndarray:
+def face_gain(cosine: np.ndarray, glint: np.ndarray | float) -> np.ndarray:
     """Power of a scatterer on a face seen under an angle to its normal.
 
     Diffuse part `cos^2`, a Gaussian flash near the normal, and a small rest from
@@ -308,4 +308,4 @@ def to_scatterers(
     )
     missing = -len(distance) % CAPACITY_STEP if len(distance) else CAPACITY_STEP
     columns = np.pad(columns, ((0, 0), (0, missing))).astype(np.float32)
-    return Scatterers(*columns[:4], columns[4:].T)
+    return Scatterers(columns[0], columns[1], columns[2], columns[3], columns[4:].T)

@@ -60,8 +60,7 @@ class RadarParameters:
     max_scatterers_per_row: int = 96
 
 
-@struct.dataclass
-class Scatterers:
+class Scatterers(struct.PyTreeNode):
     """Point targets of one frame as the radar sees them; a JAX pytree.
 
     Attributes:
@@ -81,7 +80,7 @@ class Scatterers:
 
 
 def window_response(
-    x: jax.Array, pedestal: float, num_samples: float = 0.0
+    x: jax.Array | np.ndarray, pedestal: float, num_samples: float = 0.0
 ) -> jax.Array:
     """Zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
 
@@ -99,7 +98,7 @@ def window_response(
         Real amplitudes, shape of `x`.
     """
 
-    def dirichlet(t: jax.Array) -> jax.Array:
+    def dirichlet(t: jax.Array | np.ndarray) -> jax.Array:
         if not num_samples:
             return jnp.sinc(t)
         small = jnp.sin(jnp.pi * t / num_samples)

@@ -93,7 +93,7 @@ def collect_tracks(
     columns: dict[tuple, dict[int, tuple]] = {}
     for index, frame in enumerate(frames):
         for number, label in enumerate(frame.labels):
-            key = (label.cls, label.track_id)
+            key: tuple = (label.cls, label.track_id)
             if label.track_id < 0 or index in columns.get(key, {}):
                 key = (label.cls, label.track_id, index, number)
             columns.setdefault(key, {})[index] = label.box

@@ -176,7 +176,7 @@ class Sequence:
         velocity = tracks.velocity_mps[index, chosen]
         return SceneFrame(
             boxes=boxes[chosen],
-            velocity_mps=np.stack(rotate(*velocity.T, -pose[2]), 1),
+            velocity_mps=np.stack(rotate(velocity[:, 0], velocity[:, 1], -pose[2]), 1),
             cls=tracks.cls[chosen],
             track=chosen,
             track_id=tracks.track_id[chosen],

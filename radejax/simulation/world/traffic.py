@@ -6,9 +6,16 @@ Vehicles of a lane keep the lane's speed, so they keep their distances.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
-from radejax.simulation.world.environments import ENVIRONMENTS, GROUND_M, SIGHT_M
+from radejax.simulation.world.environments import (
+    ENVIRONMENTS,
+    GROUND_M,
+    SIGHT_M,
+    Environment,
+)
 from radejax.simulation.world.roadside import make_surroundings
 from radejax.simulation.world.scene import (
     FRAME_PERIOD_S,
@@ -80,16 +87,19 @@ def _speed_wave(clock: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return 1.0 + 0.12 * np.sin(2 * np.pi * (clock / period + rng.random()))
 
 
+@dataclasses.dataclass
 class _Traffic:
     """Collects the objects of one sequence, each as a path along the road."""
 
-    def __init__(self, law, road, clock, ego_along, ego_speed, rng):
-        self.law, self.road, self.rng = law, road, rng
-        self.clock, self.ego_along, self.ego_speed = clock, ego_along, ego_speed
-        self.paths: list[
-            tuple
-        ] = []  # (cls, size, along [F], left [F], speed [F], turn)
-        self.lane_borders: tuple[float, ...] = ()
+    law: Environment
+    road: Road
+    clock: np.ndarray
+    ego_along: np.ndarray
+    ego_speed: np.ndarray
+    rng: np.random.Generator
+    # (cls, size, along [F], left [F], speed [F], turn)
+    paths: list[tuple] = dataclasses.field(default_factory=list)
+    lane_borders: tuple[float, ...] = ()
 
     def fill(self) -> tuple[float, float]:
         """Adds everybody; returns the right and left edges of the road."""
@@ -213,9 +223,9 @@ class _Traffic:
         There are some: every road type has oncoming traffic.
         """
         paths = sorted(self.paths, key=lambda p: abs(p[2][0]))
-        cls, size, along, left, speed, turn = zip(*paths, strict=True)
-        size = np.stack(size)
-        along, left, speed = (np.stack(v, 1) for v in (along, left, speed))  # [F, N]
+        cls, sizes, *path, turn = zip(*paths, strict=True)
+        size = np.stack(sizes)
+        along, left, speed = (np.stack(v, 1) for v in path)  # [F, N]
         x, y, heading = self.road.position(along, left)
         yaw = heading + np.array(turn)[None]
         z = np.broadcast_to(GROUND_M + size[:, 2] / 2.0, x.shape)
