@@ -7,12 +7,12 @@ RADE-Net's), `image_neck.*`, `fusion.*` and `image_backbone.*`.
 from __future__ import annotations
 
 import itertools
-import pathlib
 import re
 from collections.abc import Mapping
 from typing import Any
 
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
 from radejax.interop import dinov3_hf, radenet_torch, resnet_torch
 from radejax.interop.state_dict import StateDictReader, read_state_dict, to_numpy
 from radejax.models.dinorade import DinoRade
@@ -27,9 +27,9 @@ _UNUSED = (r"fusion\.output_proj\.",)  # built by the released code, never calle
 
 
 def load(
-    state_dict_or_path: Mapping[str, Any] | str | pathlib.Path,
+    state_dict_or_path: Mapping[str, Any] | PathLike,
     *,
-    dinov3: str | pathlib.Path | None = None,
+    dinov3: PathLike | None = None,
     **model_overrides: Any,
 ) -> tuple[DinoRade, dict[str, Any]]:
     """Model and variables from an official checkpoint, with the released geometry.
@@ -265,7 +265,8 @@ def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
     The released settings have rank and alpha 16, hence a factor of 1; they also never
     train them, which leaves B at zero.
     """
-    merged, pairs = {}, {}
+    merged: dict[str, Any] = {}
+    pairs: dict[str, dict[str, Any]] = {}
     for name, value in tensors.items():
         if match := _LORA.match(name):
             pairs.setdefault(match[1], {})[match[2]] = to_numpy(value)

@@ -16,7 +16,7 @@ import numpy as np
 
 from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import read_json
+from radejax.core.files import PathLike, read_json
 from radejax.interop.state_dict import StateDictReader
 from radejax.models.vit import ViT
 
@@ -54,9 +54,7 @@ _NUMBERS = ("rope_theta", "layer_norm_eps", "layerscale_value")
 _MOST = 65536  # of any size: the largest DINOv3 has an mlp of 8192
 
 
-def load(
-    folder: str | pathlib.Path, **model_overrides: Any
-) -> tuple[ViT, dict[str, Any]]:
+def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]:
     """Model and variables from a folder with `config.json` and `model.safetensors`.
 
     Args:

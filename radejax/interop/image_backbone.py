@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,14 +15,13 @@ import numpy as np
 
 from radejax import models
 from radejax.core.errors import UserError
+from radejax.core.files import PathLike
 from radejax.data.records.embeddings import embeddings_sha256
 from radejax.interop import dinov3_hf, resnet_torch
 from radejax.models import dinorade_config
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
 from radejax.models.vit import ViT
-
-PathLike = str | os.PathLike
 
 # Fields of a ViT that are not its weights' own.
 _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
@@ -114,7 +112,7 @@ def check_fits(
     def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, *shape), dtype)
 
-    inputs = [array(bins, bins, channels)]
+    inputs: list[jax.ShapeDtypeStruct | ReferencePoints] = [array(bins, bins, channels)]
     if radar is not model:
         queries = (bins, bins, model.axes.num_elevation)
         points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))

@@ -59,7 +59,7 @@ def backbone_names(levels: int) -> dict[str, str]:
 
 def neck_names(kind: str) -> dict[str, str]:
     """Official module name of every module of the neck, by our path."""
-    names = {}
+    names: dict[str, str] = {}
     for i in (1, 2, 3):
         theirs = f"neck.{i - 1}"
         if kind == "plain":
@@ -73,7 +73,7 @@ def neck_names(kind: str) -> dict[str, str]:
 
 def head_names(kind: str) -> dict[str, str]:
     """Official module name of every module of both heads, by our path."""
-    names = {}
+    names: dict[str, str] = {}
     convs = 3 if kind == "expanded" else 1
     for ours, theirs in (("heatmap", "heatmap_head.head"), ("box", "reg_head.head")):
         # Convolution, normalisation and activation each take a number.

@@ -14,6 +14,7 @@ import numpy as np
 import safetensors.numpy
 
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
 from radejax.interop import torch_file
 from radejax.interop.radenet_names import (
     from_torch_layout,
@@ -28,7 +29,7 @@ StateDict = Mapping[str, Any]
 
 
 def load(
-    state_dict_or_path: StateDict | str | pathlib.Path, **model_overrides: Any
+    state_dict_or_path: StateDict | PathLike, **model_overrides: Any
 ) -> tuple[RadeNet, dict[str, Any]]:
     """Model and variables from an official checkpoint.
 
@@ -143,8 +144,8 @@ def _to_params(model: RadeNet, tensors: StateDict, source: str) -> dict[str, Any
 
 def _model_text(model: RadeNet) -> str:
     """One line with the fields that decide about parameters."""
-    names = ("widths", "decoder_width", "num_classes", "cbam", "input_stem")
-    names += ("neck", "heads")
+    names = ["widths", "decoder_width", "num_classes", "cbam", "input_stem"]
+    names += ["neck", "heads"]
     return f"RadeNet({', '.join(f'{n}={getattr(model, n)!r}' for n in names)})"
 
 
@@ -245,10 +246,11 @@ def _common_size(
 # Files -------------------------------------------------------------------------------
 
 
-_WRITERS: dict[str, Callable[[pathlib.Path, dict[str, np.ndarray]], None]] = {
+_WRITERS: dict[str, Callable[[pathlib.Path, dict[str, np.ndarray]], object]] = {
     ".pth": torch_file.write,
     ".pt": torch_file.write,
-    ".npz": lambda path, state: np.savez(path, **state),
+    # NumPy would have `allow_pickle`, which no tensor is named, a bool.
+    ".npz": lambda path, state: np.savez(path, **state),  # type: ignore[arg-type]
     # `save_file` would write for the owner alone.
     ".safetensors": lambda path, state: path.write_bytes(safetensors.numpy.save(state)),
 }

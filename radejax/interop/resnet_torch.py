@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 from radejax.core.errors import DataError
+from radejax.core.files import PathLike
 from radejax.interop.state_dict import StateDictReader, read_state_dict
 
 DEPTHS = (3, 4, 6, 3)
 WIDTH = 64
 
 
-def load(state_dict_or_path: Mapping[str, Any] | str | pathlib.Path) -> dict[str, Any]:
+def load(state_dict_or_path: Mapping[str, Any] | PathLike) -> dict[str, Any]:
     """Variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 
     Args:

@@ -18,7 +18,7 @@ import pathlib
 import struct
 import zipfile
 from collections.abc import Mapping
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from radejax.interop.torch_pickle import (
     Tensor,
     Unpickler,
 )
+
+Order = Literal["<", ">"]
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_PROTOCOL = 1001
@@ -131,7 +133,7 @@ def _read_zip(path: pathlib.Path) -> Any:
         if len(pickles) != 1:
             raise DataError("not a torch file (a zip archive without data.pkl)")
         root = pickles[0].removesuffix("data.pkl")
-        order = "<"
+        order: Order = "<"
         if f"{root}byteorder" in names and read(f"{root}byteorder") == b"big":
             order = ">"
         storages: dict[str, Storage] = {}
@@ -152,7 +154,7 @@ def _read_legacy(file: _File) -> Any:
         raise DataError("not a torch file (a pickle without torch's magic number)")
     if (protocol := load()) != _LEGACY_PROTOCOL:
         raise DataError(f"unknown version {protocol!r} of the old torch format")
-    order = "<" if load().get("little_endian", True) else ">"
+    order: Order = "<" if load().get("little_endian", True) else ">"
     content = load()
     for key in load():
         if key not in storages:
@@ -166,12 +168,12 @@ def _read_legacy(file: _File) -> Any:
     return content
 
 
-def _raw_dtype(storage: Storage, order: str) -> np.dtype:
+def _raw_dtype(storage: Storage, order: Order) -> np.dtype:
     raw = np.uint16 if storage.dtype == BFLOAT16 else storage.dtype
     return np.dtype(raw).newbyteorder(order)
 
 
-def _decode(data: bytes, storage: Storage, order: str, key: str) -> np.ndarray:
+def _decode(data: bytes, storage: Storage, order: Order, key: str) -> np.ndarray:
     dtype = _raw_dtype(storage, order)
     if len(data) < storage.size * dtype.itemsize:
         raise DataError(

@@ -15,7 +15,7 @@ BFLOAT16 = "bfloat16"
 
 _MAX_DEPTH, _MAX_VALUES = 64, 10_000
 
-STORAGE_DTYPES = {
+STORAGE_DTYPES: dict[str, type[np.generic] | str] = {
     "DoubleStorage": np.float64,
     "FloatStorage": np.float32,
     "HalfStorage": np.float16,
