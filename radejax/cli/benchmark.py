@@ -47,9 +47,9 @@ def benchmark(
 
     entry.set_up_jax()
     detector = (
-        timing.untrained(load_config(config), dtype=dtype)
-        if config is not None
-        else Detector.from_loaded(load(source), dtype=dtype)
+        Detector.from_loaded(load(source), dtype=dtype)
+        if source is not None
+        else timing.untrained(dict(load_config(str(config))), dtype=dtype)
     )
     rows = timing.measure(
         detector, batches or (1, 10), repeats=repeats, tesseract=kind == "tesseract"

@@ -55,6 +55,7 @@ def embed(
     settings = load_config(config)
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
+    assert variables is not None  # as there is a path
     frames = KRadar(roots, labels, version=settings.data.label_version, **part)
     counts = embed_dataset(
         model,

@@ -124,11 +124,11 @@ def join_processes(
     given = [coordinator, num_processes, process_id]
     if None in given and given != [None] * 3:
         raise UserError("give --coordinator, --num_processes and --process_id together")
-    if process_id == 0:
+    if coordinator is not None and process_id == 0:
         _check_port(coordinator)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
-        jax.distributed.initialize(*given)
+        jax.distributed.initialize(coordinator, num_processes, process_id)
     except ValueError as error:
         raise UserError(
             f"--distributed finds no cluster to join ({error}); without Slurm, Open MPI "

@@ -142,6 +142,7 @@ def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     if lost := [option.name for option in others if option.name in given]:
         names = ", --".join(lost).replace("_", "-")
         raise UserError(f"--{names}: only {'without' if is_run else 'with'} --workdir")
+    values: dict[str, Any] | list[dict[str, Any]]
     if is_run:
         if "data" in given and not flags["data"]:
             raise UserError("--data names no folder")
@@ -159,7 +160,9 @@ def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any
     from radejax.runs.sources import Sources
 
     entry.set_up_jax()
-    other = {name: flags[name] or () for name in ("sequences", "weather")}
+    other: dict[str, Any] = {
+        name: flags[name] or () for name in ("sequences", "weather")
+    }
     other |= {name: flags[name] for name in _OF_OTHER_DATA - other.keys()}
     report = evaluate_run(
         flags["workdir"],
@@ -172,6 +175,7 @@ def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any
         **_scoring(flags),
         **_given(flags, "min_score", "batch_size", "num_pictures"),
     )
+    assert report is not None  # as this is the only process
     # The table has been logged already, to standard error.
     return report.metrics, f"Written to {report.files[0].parent}"
 
@@ -223,8 +227,8 @@ def _source(flags: dict[str, Any]) -> Any:
 def _options(flags: dict[str, Any], name: str) -> Any:
     from radejax.evaluation.report.measure import Options
 
-    values = {"run": name, "label_version": flags["label_version"] or "v2.1"}
-    values |= {"bootstrap": 200, **_scoring(flags)}
+    values: dict[str, Any] = {"run": name, "bootstrap": 200}
+    values |= {"label_version": flags["label_version"] or "v2.1", **_scoring(flags)}
     if values.get("skip_empty") == "none":
         values["skip_empty"] = None
     return Options(**values)

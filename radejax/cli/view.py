@@ -86,9 +86,9 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
         image, calibration = front_view(frame)
         found = None
         if detector is not None:
-            inputs = (projection,)
+            inputs = [projection]
             if detector.takes_camera and calibration is not None:
-                inputs += frame.camera_path, calibration
+                inputs += [frame.camera_path, calibration]
             found = jax.tree.map(lambda x: np.asarray(x[0]), detector(*inputs))
         yield Scene(
             projection,

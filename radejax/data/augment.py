@@ -145,5 +145,5 @@ def add_range_gain(
     """
     chex.assert_shape(projection, grid.projection_shape)
     db = gain_db + slope_db * grid.range_m / grid.range_m[-1]
-    shift = np.float32(db / LOG_SCALE_DB)[:, None, None]
+    shift = np.asarray(db / LOG_SCALE_DB, np.float32)[:, None, None]
     return encode(decode(projection) + shift, projection.dtype.name)

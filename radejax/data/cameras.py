@@ -105,12 +105,11 @@ class CameraInputs:
 
     def image(self, index: int) -> np.ndarray:
         """Image (or features) of a frame, black where it is missing."""
-        if self.features is not None and self.feature_record[index] >= 0:
-            return self.features.read(int(self.feature_record[index]))
-        if self.features is None and self.image_paths[index] is not None:
-            return read_left_image(
-                self.image_paths[index], self.image_size, resize=self.options.resize
-            )
+        record, path = self.feature_record, self.image_paths[index]
+        if self.features is None and path is not None:
+            return read_left_image(path, self.image_size, resize=self.options.resize)
+        if self.features is not None and record is not None and record[index] >= 0:
+            return self.features.read(int(record[index]))
         return self.empty_images(1)[0]
 
 
@@ -187,7 +186,7 @@ def camera_inputs(
             no_camera(image_size) if gone else camera(frame)
             for frame, gone in zip(frames, has_none, strict=True)
         ),
-        tuple(image_size),
+        (*image_size,),
         options,
         features,
         tuple(frame.camera_path for frame in frames),

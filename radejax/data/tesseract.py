@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import os
 import pathlib
@@ -67,14 +68,14 @@ def project_file(
     timings = {"reading": 0.0} if timings is None else timings
     with _open(path) as file, _damage_named(path):
         layout = _layout(path, file, shape_drea)
-        is_streamed = layout is not None and _is_streamed(layout)
-        if is_streamed:
+        projection = None
+        if layout is not None and _is_streamed(layout):
             file.seek(layout.offset)
             slab = np.empty(layout.shape[2::-1], layout.dtype)
             azimuth = layout.shape[3]
             columns = _read_slabs(file, slab, azimuth, timings)
             projection = project_columns(columns, dtype=dtype)
-    if not is_streamed:
+    if projection is None:
         began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)
         timings["reading"] += time.perf_counter() - began
@@ -85,10 +86,10 @@ def project_file(
 
 
 def _read_slabs(
-    file: BinaryIO, slab: np.ndarray, count: int, timings: dict[str, float]
+    file: io.FileIO, slab: np.ndarray, count: int, timings: dict[str, float]
 ) -> Iterator[np.ndarray]:
     """The next `count` slabs of a file, all in the same buffer."""
-    view = memoryview(slab).cast("B")
+    view = slab.data.cast("B")
     for i in range(count):
         began = time.perf_counter()
         filled = 0
@@ -115,7 +116,7 @@ def _damage_named(path: str | os.PathLike) -> Iterator[None]:
         ) from None
 
 
-def _open(path: str | os.PathLike) -> BinaryIO:
+def _open(path: str | os.PathLike) -> io.FileIO:
     """The file, unbuffered; errors for a missing and an empty one."""
     try:
         file = open(path, "rb", buffering=0)  # noqa: SIM115  the caller closes it

@@ -278,7 +278,7 @@ def _check_sequence(
     is_kradar = how[0] == RadarGrid.kradar().shape_drea
     return SequenceHealth(
         number,
-        *dataclasses.astuple(_check_conditions(number, folder, findings, is_kradar)),
+        *_check_conditions(number, folder, findings, is_kradar),
         len(frames),
         split_counts["train"],
         split_counts["test"],
@@ -325,8 +325,8 @@ def _check_conditions(
     is_published = is_kradar and number in sequences.KRADAR_CONDITIONS
     if is_published and found != published:
         findings.notes.append(
-            f"{path}: {','.join(dataclasses.astuple(found))}; K-Radar published "
-            f"{','.join(dataclasses.astuple(published))} for sequence {number}"
+            f"{path}: {','.join(found)}; K-Radar published "
+            f"{','.join(published)} for sequence {number}"
         )
     return found
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import collections
 import copy
-import dataclasses
 import itertools
 import os
 import pathlib
@@ -213,7 +212,7 @@ class KRadar(Sequence[Frame]):
             self._info = self._read_info(files)
         else:  # not the labels of other weathers
             self._info = self._read_info(keys)
-            files = self._read_label_files(self._of_weather(keys))
+            files = self._read_label_files(self._of_weather(keys, self._weather))
         self._frames = self._make_frames(files)
 
     def _read_info(self, keys: Iterable[Key]) -> dict[int, SequenceInfo]:
@@ -231,9 +230,9 @@ class KRadar(Sequence[Frame]):
             for number in sorted({number for number, _ in keys})
         }
 
-    def _of_weather(self, keys: list[Key]) -> list[Key]:
+    def _of_weather(self, keys: list[Key], weather: tuple[str, ...]) -> list[Key]:
         """The keys of the weathers that were asked for; the others are counted."""
-        kept = [k for k in keys if self._info[k[0]].conditions.weather in self._weather]
+        kept = [k for k in keys if self._info[k[0]].conditions.weather in weather]
         self.counts["frames left out by weather"] = len(keys) - len(kept)
         return kept
 
@@ -256,7 +255,8 @@ class KRadar(Sequence[Frame]):
         for key in keys:
             if key not in self._parsed:
                 _, content = next(contents)
-                where, problems = self._source.where(key), []
+                problems: list[Problem] = []
+                where = self._source.where(key)
                 try:
                     if isinstance(content, DataError):
                         raise content
@@ -358,7 +358,7 @@ class KRadar(Sequence[Frame]):
         return Frame(
             *key,
             header,
-            *dataclasses.astuple(info.conditions),
+            *info.conditions,
             tuple(file.labels),
             boxes,
             classes,

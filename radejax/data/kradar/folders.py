@@ -155,7 +155,7 @@ class LabelSource:
 
 def own_labels(sequences: dict[int, SequenceFolder], version: str) -> LabelSource:
     """Labels from the sequences' own folders, as the data set is delivered."""
-    files = {}
+    files: dict[tuple[int, str], pathlib.Path | str] = {}
     for number, folder in sequences.items():
         for subfolder in _OWN_LABEL_FOLDERS[version]:
             listing = folder.listing(subfolder)
@@ -176,6 +176,7 @@ def labels_from(path: pathlib.Path) -> LabelSource:
         UserError: It is neither a folder nor a zip, or holds no label files.
         DataError: A frame is in it twice, or the zip is damaged.
     """
+    members: list[tuple[tuple[int, str] | None, pathlib.Path | str]]
     if path.is_dir():
         relative = [file.relative_to(path) for file in path.rglob("*.txt")]
         members = [(_label_key(name), path / name) for name in sorted(relative)]

@@ -271,16 +271,16 @@ def _parse_header(line: str, where: str) -> LabelHeader:
                 f"{where}:1: the header has indices {match[2]!r}, expected five: "
                 "radar, LiDAR OS2-64, front camera, LiDAR OS1-128, other cameras"
             )
-        time_text, numbers = match[3], [int(index) for index in indices]
+        time_text, numbers = match[3], indices
     elif match := _TOOL_HEADER.fullmatch(line):
-        radar, lidar, camera = (int(match[i]) for i in (1, 2, 3))
-        time_text, numbers = match[4], [radar, lidar, camera, None, None]
+        time_text, numbers = match[4], [match[1], match[2], match[3]]
     else:
         raise DataError(
             f"{where}:1: {_short(line)} is no header, expected "
             "'* idx(...)=00033_00001_00002_00001_00004, timestamp=...'"
         )
-    if max(number or 0 for number in numbers) >= _MAX_INDEX:
+    radar, lidar, *others = map(int, numbers)
+    if max(radar, lidar, *others) >= _MAX_INDEX:
         raise DataError(f"{where}:1: {_short(line)} has frame numbers of {_MAX_INDEX}")
     try:
         timestamp_s = float(time_text)
@@ -290,7 +290,8 @@ def _parse_header(line: str, where: str) -> LabelHeader:
         raise DataError(
             f"{where}:1: timestamp {_short(time_text)} is no Unix time in s"
         )
-    return LabelHeader(*numbers, timestamp_s)
+    camera, long_lidar, cameras = [*others, None, None][:3]
+    return LabelHeader(radar, lidar, camera, long_lidar, cameras, timestamp_s)
 
 
 def _parse_object(line: str, version: str, where: str) -> Label:
@@ -309,8 +310,8 @@ def _parse_object(line: str, version: str, where: str) -> Label:
             f"{where}: class {cls!r} is unknown, expected one of "
             + ", ".join(LABEL_CLASSES)
         )
-    extents = [2.0 * half for half in half_extents]
-    box = (x, y, z, *extents, math.radians(yaw_deg))
+    length, width, height = (2.0 * half for half in half_extents)
+    box = (x, y, z, length, width, height, math.radians(yaw_deg))
     if not (
         all(abs(value) <= _MAX_DISTANCE_M for value in (x, y, z))
         and all(0 < half <= _MAX_HALF_EXTENT_M for half in half_extents)

@@ -12,6 +12,7 @@ import os
 import pathlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from radejax.core.errors import DataError
 from radejax.core.files import read_text
@@ -61,8 +62,7 @@ _CONDITIONS = {
 }
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Conditions:
+class Conditions(NamedTuple):
     """Circumstances of a sequence, as in its `description.txt`."""
 
     environment: str

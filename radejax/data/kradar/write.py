@@ -120,10 +120,10 @@ def _object_line(label: Label, version: str) -> str:
     x, y, z, length, width, height, yaw = map(float, label.box)
     previous = -1 if label.previous_track_id is None else label.previous_track_id
     leading = {
-        "v1.0": [label.track_id, previous],
-        "v1.1": [label.visibility, label.track_id, previous],
-        "v2.0": [label.track_id],
-        "v2.1": [label.visibility, label.track_id],
+        "v1.0": (label.track_id, previous),
+        "v1.1": (label.visibility, label.track_id, previous),
+        "v2.0": (label.track_id,),
+        "v2.1": (label.visibility, label.track_id),
     }[version]
     numbers = [x, y, z, math.degrees(yaw), length / 2, width / 2, height / 2]
     return ", ".join(["*", *map(str, leading), label.cls, *map(repr, numbers)])

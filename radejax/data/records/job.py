@@ -298,6 +298,7 @@ def _start_worker(done: Any, stop: Any) -> None:
     global _done, _stop
     _done, _stop = done, stop
     parent = multiprocessing.parent_process()
+    assert parent is not None  # this is a worker
 
     def watch() -> None:
         parent.join()
@@ -352,12 +353,13 @@ def _finish(
     earlier: Manifest | None,
 ) -> bool:
     """Writes the manifest of the folder, after an earlier one's, if every file is there."""
-    entries = [files.read_manifest_of(out_dir, name) for name in names]
-    if any(entry is None for entry in entries):
+    found = (files.read_manifest_of(out_dir, name) for name in names)
+    entries = [entry for entry in found if entry is not None]
+    if len(entries) < len(names):
         return False
     paths = [frame.radar_path for frame in frames if frame.radar_path is not None]
     num_released = sum(path.suffix == ".npy" for path in paths)
-    described = {
+    described: dict[str, Any] = {
         "tesseracts": len(paths) - num_released,
         "released_projections": num_released,
         "folders": sorted({str([path, *path.parents][:4][-1]) for path in paths}),

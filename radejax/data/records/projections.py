@@ -93,14 +93,14 @@ def read_manifest(folder: str | os.PathLike) -> Manifest:
     path = folder / MANIFEST
     if not path.is_file():
         started = len(list(folder.glob("projections-*.json")))
-        hint = (
+        advice = (
             f"; {started} files of records are finished: run the same projection again "
             "to finish the rest"
             if started
             else "; expected a folder that `radejax project` wrote"
         )
         raise FileNotFoundError(
-            f"{folder}: no {MANIFEST}{hint if folder.is_dir() else ''}"
+            f"{folder}: no {MANIFEST}{advice if folder.is_dir() else ''}"
         )
     hint = {
         "grid": RadarGrid,
@@ -170,7 +170,7 @@ class RecordSource(ArrayRecords):
             verify=verify,
         )
 
-    def __getitem__(self, index: Any) -> dict[str, Any]:
+    def __getitem__(self, index: Any) -> Any:
         return {"projection": self.read(int(index)), "frame": int(index)}
 
 
