@@ -14,6 +14,8 @@ import jax
 import numpy as np
 from flax import struct
 
+Array = jax.Array | np.ndarray
+
 CLASSES = ("Sedan", "Bus or Truck", "Pedestrian", "Motorcycle", "Bicycle")
 """K-Radar's five detection classes in the order of every class axis."""
 
@@ -37,8 +39,7 @@ ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
 """Regions by name; bounds are inclusive, and of box centers."""
 
 
-@struct.dataclass
-class Batch:
+class Batch(struct.PyTreeNode):
     """One batch of frames as the pipeline delivers it and the losses consume it.
 
     Attributes:
@@ -51,17 +52,16 @@ class Batch:
         camera: Pytree of `[B, ...]` arrays that describe the camera, or None.
     """
 
-    projection: jax.Array
-    boxes: jax.Array
-    classes: jax.Array
-    is_valid: jax.Array
-    frame: jax.Array
-    image: jax.Array | None = None
+    projection: Array
+    boxes: Array
+    classes: Array
+    is_valid: Array
+    frame: Array
+    image: Array | None = None
     camera: object | None = None
 
 
-@struct.dataclass
-class DetectionMaps:
+class DetectionMaps(struct.PyTreeNode):
     """What a detector predicts for every range-azimuth bin.
 
     Attributes:
@@ -73,8 +73,7 @@ class DetectionMaps:
     box_params: jax.Array
 
 
-@struct.dataclass
-class Detections:
+class Detections(struct.PyTreeNode):
     """Boxes of a batch, by descending score, padded to a fixed number K.
 
     Attributes:

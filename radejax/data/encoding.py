@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.errors import UserError
-from radejax.core.structures import Batch
+from radejax.core.structures import Array, Batch
 from radejax.data.projection import LOG_SCALE_DB
 
 Encoding = Literal["float16", "uint8", "float32"]
@@ -57,7 +57,7 @@ def decode(stored: np.ndarray) -> np.ndarray:
     return stored.astype(np.float32)
 
 
-def to_float(projection: jax.Array) -> jax.Array:
+def to_float(projection: Array) -> jax.Array:
     """`decode` on the device: stored values of a batch to float32 network input.
 
     Batches travel in the type of the records (a quarter to a half of the bytes); the
@@ -69,9 +69,8 @@ def to_float(projection: jax.Array) -> jax.Array:
     Returns:
         `[...]` float32.
     """
-    if projection.dtype == jnp.uint8:
-        return projection.astype(jnp.float32) / 255.0
-    return projection.astype(jnp.float32)
+    values = jnp.asarray(projection).astype(jnp.float32)
+    return values / 255.0 if projection.dtype == jnp.uint8 else values
 
 
 def model_inputs(batch: Batch) -> tuple[Any, ...]:

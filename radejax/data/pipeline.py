@@ -18,7 +18,7 @@ from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import no_camera
 from radejax.data.frame_table import FrameTable
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera import Camera, stack_cameras
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,8 @@ def make_loader(
         prefetch_buffer_size=max(options.prefetch, options.num_threads),
     )
     order = _make_order(len(table), options).repeat(options.num_epochs)
-    dataset = order.map(_LoadBatch(table, augment)).to_iter_dataset(threads)
+    batches: grain.MapDataset[Batch] = order.map(_LoadBatch(table, augment))
+    dataset = batches.to_iter_dataset(threads)
     if options.num_workers:
         dataset = dataset.mp_prefetch(
             grain.MultiprocessingOptions(
@@ -155,12 +156,13 @@ def _make_order(
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
     if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
-    dataset = dataset.random_map(_AddSeed()).batch(
+    seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_AddSeed())
+    batches = seeded.batch(
         batch_size * count, drop_remainder=drop_remainder, batch_fn=np.stack
     )
     # Of every global batch, its own rows: what is trained on, and in which order, does
     # not depend on the number of processes.
-    return dataset if count == 1 else dataset.map(_Share(index, count))
+    return batches if count == 1 else batches.map(_Share(index, count))
 
 
 class _AddSeed(grain.transforms.RandomMap):
@@ -189,13 +191,14 @@ class _LoadBatch(grain.transforms.Map):
     def __init__(self, table: FrameTable, augment: Augmentation | None) -> None:
         self._table, self._augment = table, augment
         images = table.images
-        self._no_camera = None if images is None else no_camera(images.image_size)
+        self._no_camera = no_camera(images.image_size if images else (1, 1))
 
     def __repr__(self) -> str:
         return "_LoadBatch()"
 
     def map(self, element: np.ndarray) -> Batch:
-        batch, cameras = self._empty(len(element)), []
+        cameras: list[Camera] = []
+        batch = self._empty(len(element))
         for row, (index, seed) in enumerate(element):
             if index >= len(self._table):
                 cameras.append(self._no_camera)

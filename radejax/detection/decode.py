@@ -22,8 +22,7 @@ from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
 
-@struct.dataclass
-class Peaks:
+class Peaks(struct.PyTreeNode):
     """The strongest heatmap peaks of a batch, by descending score, before NMS.
 
     Attributes:

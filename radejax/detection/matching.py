@@ -10,8 +10,7 @@ from flax import struct
 from radejax.geometry.rotated_iou import bev_iou
 
 
-@struct.dataclass
-class Matches:
+class Matches(struct.PyTreeNode):
     """The object of each prediction.
 
     Attributes:

@@ -16,8 +16,7 @@ from flax import struct
 from radejax.geometry.boxes import array_module
 
 
-@struct.dataclass
-class Camera:
+class Camera(struct.PyTreeNode):
     """A calibrated camera as arrays, one or a batch of them: a pytree for jitted code.
 
     Attributes:

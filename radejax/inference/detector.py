@@ -18,11 +18,12 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch, Detections
 from radejax.data.cameras import CameraOptions
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.open import (
     LoadedModel,
     PathLike,
+    Step,
     load,
     load_torch,
     settings_of_config,
@@ -80,7 +81,7 @@ class Detector:
         *,
         classes: Sequence[str] = CLASSES,
         decode_options: Mapping[str, Any] | None = None,
-        azimuth_mapping: str = "true",
+        azimuth_mapping: AzimuthMapping = "true",
         score_threshold: float = 0.3,
         nms_iou: float = 0.3,
         roi: Sequence[float] | str | None = None,
@@ -129,7 +130,7 @@ class Detector:
     def from_workdir(
         cls,
         path: PathLike,
-        step: int | str | None = None,
+        step: Step = None,
         *,
         image_backbone: PathLike | None = None,
         **overrides: Any,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import hashlib
 import os
 import pathlib
@@ -120,17 +121,16 @@ class _Reader:
     batch_size: int
 
     def __call__(self, frames: Sequence[Frame]) -> Iterator[tuple[list, np.ndarray]]:
+        paths = [f.camera_path for f in frames if f.camera_path is not None]
         frames = [frame for frame in frames if frame.camera_path is not None]
-        images = self.pool.map(self._read, frames)  # in order, ahead of use
+        read = functools.partial(read_left_image, size=self.size, resize=self.resize)
+        images = self.pool.map(read, paths)  # in order, ahead of use
         for start in range(0, len(frames), self.batch_size):
             part = frames[start : start + self.batch_size]
             batch = np.zeros((self.batch_size, *self.size, 3), np.uint8)
             for row, _ in enumerate(part):
                 batch[row] = next(images)
             yield [frame.key for frame in part], batch
-
-    def _read(self, frame: Frame) -> np.ndarray:
-        return read_left_image(frame.camera_path, self.size, resize=self.resize)
 
 
 def _write_file(

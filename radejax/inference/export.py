@@ -6,12 +6,12 @@ All formats hold `config.json` and `model.safetensors`, which
 
 from __future__ import annotations
 
-import importlib.util
 import pathlib
 import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import flatbuffers
 import jax
 import jax.export  # not a part of `import jax`
 import jax.numpy as jnp
@@ -205,8 +205,7 @@ def _copy_loader(folder: pathlib.Path) -> None:
     files.write_text(
         folder / "load.py", pathlib.Path(exported_loader.__file__).read_text()
     )
-    spec = importlib.util.find_spec("flatbuffers")
-    source = pathlib.Path(spec.origin).parent
+    source = pathlib.Path(flatbuffers.__file__).parent
     target = folder / "third_party" / "flatbuffers"
     target.mkdir(parents=True, exist_ok=True)
     for path in source.glob("*.py"):

@@ -25,7 +25,8 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     """`detect(projection, ...)` -> dictionary of arrays; see README.md."""
     folder = pathlib.Path(folder)
     config = json.loads((folder / "config.json").read_text())["decode"]
-    program = jax.export.deserialize((folder / "detector.stablehlo").read_bytes())
+    content = bytearray((folder / "detector.stablehlo").read_bytes())
+    program = jax.export.deserialize(content)
     run = jax.jit(program.call)
     weights = jax.device_put(read_weights(folder / "model.safetensors"), device)
 

@@ -11,7 +11,7 @@ import logging
 import os
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 from ml_collections import ConfigDict
@@ -19,7 +19,7 @@ from ml_collections import ConfigDict
 from radejax import models
 from radejax.core.config import renewed
 from radejax.core.errors import UserError
-from radejax.core.files import differences
+from radejax.core.files import PathLike, differences
 from radejax.data.cameras import CameraOptions
 from radejax.data.records.embeddings import embeddings_sha256
 from radejax.geometry.radar_grid import RadarGrid
@@ -33,8 +33,7 @@ from radejax.training.checkpoints import Checkpoints
 
 _log = logging.getLogger(__name__)
 
-PathLike = str | os.PathLike
-Step = int | str | None
+Step = int | Literal["best"] | None
 """Of a checkpoint: a number, "best" by the run's metric, or None for the newest."""
 
 
@@ -110,6 +109,7 @@ def load_torch(
     if isinstance(content, str | os.PathLike):
         content, _ = read_state_dict(content)
     settings: dict[str, Any] = {"azimuth_mapping": "stretched"}
+    model: nn.Module
     if dinorade_torch.is_dinorade(content):
         model, variables = dinorade_torch.load(
             path_or_state_dict, dinov3=image_backbone, **model_overrides
@@ -185,6 +185,7 @@ def starting_weights(
             digest = embeddings_sha256(embeddings)
         else:
             given = variables if pretrained is None else pretrained
+            assert given is not None  # without both there has been an error
             digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
     return StartingWeights(source, variables, pretrained, digest)
 
@@ -221,19 +222,18 @@ def _check_no_step(path: pathlib.Path, step: Step) -> None:
 def _read_checkpoint(folder: pathlib.Path, step: Step) -> LoadedModel:
     """A checkpoint; it carries config, grid and what its run was made with."""
     with Checkpoints(folder, read_only=True) as checkpoints:
-        if step == "best":
-            step = checkpoints.best_step()
-        state, info, step = checkpoints.restore_variables(step)
+        chosen = checkpoints.best_step() if step == "best" else step
+        state, info, number = checkpoints.restore_variables(chosen)
     config = ConfigDict(renewed(info["config"]), convert_dict=True)
     params = state["ema_params"] if state.get("ema_params") else state["params"]
     return LoadedModel(
         models.build(config.model),
         {"params": params, **(state.get("model_state") or {})},
         RadarGrid.from_dict(info["grid"]),
-        settings_of_config(config),
+        settings_of_config(dict(config)),
         config,
         run=info["run"],
-        step=step,
+        step=number,
     )
 
 
@@ -264,9 +264,9 @@ def _find_backbone(loaded: LoadedModel, given: PathLike | None) -> dict[str, Any
         part = _fitting_variables(start, loaded.model)
     else:
         return {}
-    if IMAGE_BACKBONE not in part["params"]:
+    if part is None or IMAGE_BACKBONE not in part["params"]:
         return {}
     params = part["params"][IMAGE_BACKBONE]
-    if embeddings is not None and pathlib.Path(embeddings).exists():
+    if source is not None and embeddings and pathlib.Path(embeddings).exists():
         image_backbone.check_same_backbone(params, embeddings, source)
     return {IMAGE_BACKBONE: params}

@@ -12,13 +12,13 @@ import tqdm
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.core.structures import Batch, Detections
+from radejax.core.structures import Array, Batch, Detections
 from radejax.data.cameras import CameraInputs
 from radejax.data.dataset import FrameSequence
 from radejax.data.frame_table import make_table
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import check_backbone
 from radejax.inference.program import detect
@@ -46,7 +46,7 @@ class Predictor:
         *,
         classes: Sequence[str],
         decode: Mapping[str, Any],
-        azimuth_mapping: str = "true",
+        azimuth_mapping: AzimuthMapping = "true",
         mesh: jax.sharding.Mesh | None = None,
     ) -> None:
         self.mesh = sharding.make_mesh() if mesh is None else mesh
@@ -54,7 +54,7 @@ class Predictor:
         self.update(None)
         map_grid = models.map_grid(grid, model, azimuth_mapping)
 
-        def predict(variables: Any, batch: Batch) -> tuple[Detections, jax.Array]:
+        def predict(variables: Any, batch: Batch) -> tuple[Detections, Array]:
             inputs = batch.projection, batch.image, batch.camera
             return detect(model, map_grid, decode, variables, *inputs), batch.frame
 
@@ -70,7 +70,7 @@ class Predictor:
         devices = self.mesh.devices.size
         return -(-batch_size // devices) * devices // jax.process_count()
 
-    def __call__(self, batch: Batch) -> tuple[Detections, jax.Array]:
+    def __call__(self, batch: Batch) -> tuple[Detections, Array]:
         """Detections of a global batch, of which each process gives its rows.
 
         Args:
@@ -135,8 +135,10 @@ def predict_dataset(
         classes=detector.classes,
         images=images,
     )
+    if isinstance(detector, Predictor):
+        batch_size = detector.rows(batch_size)
     options = LoaderOptions(
-        batch_size=detector.rows(batch_size) if on_mesh else batch_size,
+        batch_size=batch_size,
         shuffle=False,
         num_epochs=1,
         drop_remainder=False,
@@ -146,8 +148,8 @@ def predict_dataset(
     )
     loader = make_loader(table, options)
 
-    def start(batch: Batch) -> tuple[Detections, Any]:
-        if on_mesh:
+    def start(batch: Batch) -> tuple[Detections, Array]:
+        if isinstance(detector, Predictor):
             return detector(batch)
         return detector(batch.projection, batch.image, batch.camera), batch.frame
 
@@ -158,7 +160,7 @@ def predict_dataset(
         unit="frame",
         disable=not (progress and processes.is_main()),
     ) as bar:
-        pending = None
+        pending: tuple[Detections, Array] | None = None
         for batch in loader:
             if should_stop is not None and should_stop():
                 raise processes.Stopped
@@ -167,6 +169,7 @@ def predict_dataset(
             if pending is not None:
                 bar.update(_collect(parts, *pending, detector.classes))
             pending = started
+        assert pending is not None  # there is a frame
         bar.update(_collect(parts, *pending, detector.classes))
     return {
         name: np.concatenate([part[name] for part in parts])
@@ -177,11 +180,11 @@ def predict_dataset(
 def _collect(
     parts: list[dict[str, np.ndarray]],
     detections: Detections,
-    frame: jax.Array,
+    frames: Array,
     classes: Sequence[str],
 ) -> int:
     """Adds the columns of a batch; returns its number of real frames."""
-    frame = np.asarray(frame)  # -1 where a batch was filled up
+    frame = np.asarray(frames)  # -1 where a batch was filled up
     columns = detections.to_columns(classes)
     columns["frame"] = frame[columns["frame"]]
     is_real = columns["frame"] >= 0

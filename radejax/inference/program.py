@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
-import jax
 
-from radejax.core.structures import Detections
+from radejax.core.structures import Array, Detections
 from radejax.data.encoding import to_float
 from radejax.data.projection import project_jax
 from radejax.detection.decode import decode
@@ -20,7 +19,7 @@ def detect(
     grid: RadarGrid,
     options: Mapping[str, Any],
     variables: Any,
-    frames: jax.Array,
+    frames: Array,
     image: Any = None,
     camera: Any = None,
     *,
@@ -41,4 +40,5 @@ def detect(
     if is_tesseract:
         frames = project_jax(frames)
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
-    return decode(model.apply(variables, *inputs, train=False), grid, **options)
+    maps: Any = model.apply(variables, *inputs, train=False)
+    return decode(maps, grid, **options)

@@ -193,7 +193,7 @@ def _objects(
     batch: Batch, is_frame_valid: jax.Array | None
 ) -> tuple[jax.Array, jax.Array]:
     """Boxes `[B, N, 8]` float32, and `[B, N]` where they are objects."""
-    is_valid = batch.is_valid
+    is_valid = jnp.asarray(batch.is_valid)
     if is_frame_valid is not None:
         is_valid &= is_frame_valid[:, None]
     # Padding rows may hold anything; NaN times 0 would reach the gradients.

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from radejax.core.structures import Array
 from radejax.geometry.radar_grid import RadarGrid
 
 Sigma = Literal["fixed", "adaptive", "anisotropic"]
@@ -22,7 +23,7 @@ _SMALLEST_SIGMA = 1e-3  # bins; an object of zero size is a single bin
 
 def gaussian_heatmap(
     boxes: jax.Array,
-    classes: jax.Array,
+    classes: Array,
     is_valid: jax.Array,
     grid: RadarGrid,
     *,

@@ -70,7 +70,7 @@ def deformable_attention(
         @jax.checkpoint
         def chunk(arrays: tuple[jax.Array, jax.Array]) -> jax.Array:
             locations, weights = arrays  # [n, L, P, 2], [n, L, P]
-            out = 0.0
+            out = jnp.asarray(0.0)
             for level, (height, width) in enumerate(sizes):
                 pixels = value[starts[level] : starts[level + 1]]
                 x = locations[:, level, :, 0] * width - 0.5
@@ -155,13 +155,13 @@ def lifted_attention(
 
         return jax.lax.map(head, (value, offsets, logits, offset_bias, logit_bias))
 
-    arrays = (value, *by_head, scale)
+    arrays: tuple[jax.Array, ...] = (value, *by_head, scale)
     if reference.shape[0] != 1 or query_weights.shape[0] != 1:
         arrays += tuple(
             jnp.broadcast_to(x, (b, *x.shape[1:])) for x in (reference, query_weights)
         )
     if b == 1:  # a loop of one step is still a loop to the compiler
-        return jnp.moveaxis(sample([x[0] for x in arrays]), 0, 1)[None]
+        return jnp.moveaxis(sample(tuple(x[0] for x in arrays)), 0, 1)[None]
     return jnp.moveaxis(jax.lax.map(sample, arrays), 1, 2)
 
 
@@ -253,16 +253,16 @@ def _head_backward(chunk_size: int, grad: jax.Array, *saved: jax.Array) -> tuple
     )
     chunks = (_to_chunks(per_bin, chunk_size), _to_chunks([grad], chunk_size)[0])
     (grad_pixels, *grad_biases), grad_parts = jax.lax.scan(chunk, zeros, chunks)
-    grad_parts = [x.reshape(-1, *x.shape[2:])[:bins] for x in grad_parts]
+    own_grads = [x.reshape(-1, *x.shape[2:])[:bins] for x in grad_parts]
     grad_value = grad_pixels.reshape(value.shape).astype(value.dtype)
-    return (grad_value, *grad_parts, *grad_biases)
+    return (grad_value, *own_grads, *grad_biases)
 
 
 _lifted_head.defvjp(_lifted_head_forward, _lifted_head_backward)
 
 
 def _lifted_samples(
-    size: tuple[int, int],
+    size: tuple[int, ...],
     parts: Sequence[jax.Array],
     offset_bias: jax.Array,
     logit_bias: jax.Array,

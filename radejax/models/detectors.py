@@ -9,7 +9,7 @@ from typing import Any
 import flax.linen as nn
 
 from radejax.core.errors import UserError
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.models import dinorade_config, radenet
 from radejax.models.dinorade import DinoRade
 
@@ -55,7 +55,9 @@ def with_dtype(model: nn.Module, dtype: str) -> nn.Module:
     return model.clone(dtype=dtype)
 
 
-def map_grid(grid: RadarGrid, model: nn.Module, azimuth_mapping: str) -> RadarGrid:
+def map_grid(
+    grid: RadarGrid, model: nn.Module, azimuth_mapping: AzimuthMapping
+) -> RadarGrid:
     """Grid of the maps that a model makes from projections on `grid`.
 
     Args:

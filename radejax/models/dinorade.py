@@ -66,8 +66,9 @@ class DinoRade(nn.Module):
         backbone, neck, heads = radenet.radar_parts(radar)
         self.backbone, self.neck, self.heads = backbone(), neck(), heads()
         if self.vit is None:
-            self.image_backbone = ResNetTrunk(self.resnet_width, dtype=dtype)
-            self.image_neck = ResNetNeck(
+            trunk = ResNetTrunk(self.resnet_width, dtype=dtype)
+            self.image_backbone: ResNetTrunk | ViT = trunk
+            self.image_neck: ResNetNeck | CameraNeck = ResNetNeck(
                 radar.decoder_width, self.resnet_width, dtype=dtype
             )
         else:
@@ -166,9 +167,9 @@ class DinoRade(nn.Module):
     ) -> ReferencePoints:
         b, r, a = shape[:3]
         if isinstance(camera, Camera):
-            camera = jax.tree.map(jnp.asarray, camera)
+            arrays = jax.tree.map(jnp.asarray, camera)
             invalid = self.fusion["invalid"]
-            camera = reference_points(camera, self.axes, r, a, invalid)
+            camera = reference_points(arrays, self.axes, r, a, invalid)
         expected = (r, a, self.axes.num_elevation)
         found = camera.is_valid.shape
         if found[1:] != expected or found[0] not in (1, b):

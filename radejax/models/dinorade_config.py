@@ -85,7 +85,7 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
         vit=_vit(image) if image["kind"] == "vit" else None,
         fusion=fusion,
         axes=LiftingAxes(
-            **{k: tuple(map(float, axes[k])) for k in AXES_FIELDS},
+            **{k: (float(axes[k][0]), float(axes[k][1])) for k in AXES_FIELDS},
             num_elevation=fusion["num_elevation"],
         ),
         image_size=image["size"],
@@ -108,8 +108,8 @@ def _section(
 
 
 def _vit(image: Mapping[str, Any]) -> ViT:
-    names = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
-    names += ("num_registers", "gated_mlp", "layer_scale", "attention")
+    names = ["hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size"]
+    names += ["num_registers", "gated_mlp", "layer_scale", "attention"]
     activation = "silu" if image["gated_mlp"] else "gelu"
     return ViT(**{n: image[n] for n in names}, activation=activation)
 

@@ -40,8 +40,7 @@ of square image crops."""
 _OFFICIAL_DEPTH_OFFSET_M = 1e-6
 
 
-@struct.dataclass
-class ReferencePoints:
+class ReferencePoints(struct.PyTreeNode):
     """Where the queries of a radar map appear in the image.
 
     Attributes:
@@ -241,6 +240,6 @@ class WeightingNetwork(nn.Module):
 def _centers_in_program(axes: LiftingAxes, num_range: int, num_azimuth: int) -> Any:
     """`centers_ego` as outer products of small tables."""
     unit = dataclasses.replace(axes, range_m=(1.0, 0.0)).centers_ego(1, num_azimuth)
-    range_m = axes.range_m[0] + axes.range_m[1] * np.arange(num_range)
-    range_m = jnp.asarray(range_m, jnp.float32).reshape(-1, 1, 1, 1)
+    centers_m = axes.range_m[0] + axes.range_m[1] * np.arange(num_range)
+    range_m = jnp.asarray(centers_m, jnp.float32).reshape(-1, 1, 1, 1)
     return range_m * jnp.asarray(unit, jnp.float32)

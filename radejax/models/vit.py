@@ -11,6 +11,7 @@ References:
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -92,9 +93,9 @@ class ViT(nn.Module):
             in_axes=nn.broadcast,
             length=self.num_layers,
         )
-        fields = ("num_heads", "mlp_dim", "num_prefix", "epsilon", "gated_mlp")
-        fields += ("activation", "qkv_bias", "proj_bias", "mlp_bias", "layer_scale")
-        fields += ("attention", "dtype")
+        fields = ["num_heads", "mlp_dim", "num_prefix", "epsilon", "gated_mlp"]
+        fields += ["activation", "qkv_bias", "proj_bias", "mlp_bias", "layer_scale"]
+        fields += ["attention", "dtype"]
         settings = {name: getattr(self, name) for name in fields}
         tokens, _ = layers(**settings, name="layers")(tokens, rope)
         return _layer_norm(self.epsilon, jnp.float32, "norm")(tokens)
@@ -152,13 +153,14 @@ class Block(nn.Module):
         return self._dense(c, "out", self.proj_bias)(y)
 
     def _mlp(self, x: jax.Array) -> jax.Array:
-        act = {"gelu": functools.partial(nn.gelu, approximate=False), "silu": nn.silu}
+        gelu: Callable = functools.partial(nn.gelu, approximate=False)
+        act = {"gelu": gelu, "silu": nn.silu}[self.activation]
         y = self._dense(self.mlp_dim, "up", self.mlp_bias)(x)
         if self.gated_mlp:
             gate = self._dense(self.mlp_dim, "gate", self.mlp_bias)(x)
-            y = act[self.activation](gate) * y
+            y = act(gate) * y
         else:
-            y = act[self.activation](y)
+            y = act(y)
         return self._dense(x.shape[-1], "down", self.mlp_bias)(y)
 
     def _dense(self, features: int, name: str, use_bias: bool) -> nn.Dense:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import functools
 import hashlib
@@ -182,7 +183,7 @@ class Data:
         numbers = {frame.sequence for frame in frames}
         held = held_out(numbers, chosen, self.options.get("validation_seed", 0))
         if name == "train":
-            other, reason = held, "held out for validation"
+            other, reason = set(held), "held out for validation"
         else:
             other, reason = numbers.difference(held), "of sequences to train on"
         keys = {frame.key for frame in frames if frame.sequence in other}
@@ -199,7 +200,7 @@ class Data:
         Raises:
             UserError: Images or calibrations are missing or of another size.
         """
-        if self.camera is None:
+        if self.camera is None or self.image_size is None:
             return None
         return camera_inputs(frames, self.image_size, self.camera, self.features)
 
@@ -288,7 +289,8 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
 def _tell_what_is_held_out(data: Data) -> None:
     """The sequences and their objects, with a warning for a class that they lack."""
     frames, num_left = data.split("validation"), len(data.split("train"))
-    counts = frames.class_counts()
+    found = collections.Counter(cls for frame in frames for cls in frame.classes)
+    counts = {cls: found[cls] for cls in data.classes}
     _log.info(
         "validation: sequences %s of the train split are held out, %d frames beside %d "
         "to train on; %s",
@@ -317,6 +319,7 @@ def data_of_run(
         FileNotFoundError: A folder is not there.
     """
     config, own = loaded.config, loaded.run.get("data")
+    assert config is not None  # of a run there is one
     own = own and DataPaths.from_dict(own)
     paths = own if other is None else other.paths(own)
     if paths is None:

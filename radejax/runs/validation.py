@@ -16,7 +16,7 @@ from ml_collections import ConfigDict
 from PIL import Image
 
 from radejax.core.errors import UserError
-from radejax.evaluation.columns import Columns
+from radejax.evaluation.columns import Columns, roi_bounds
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.report.measure import measure, repair_sizes
@@ -82,8 +82,8 @@ class Validation:
         Raises:
             processes.Stopped: `should_stop`, asked at every batch, said so.
         """
-        predictions = self._predict(state.eval_variables, should_stop)
-        predictions, _ = repair_sizes(predictions, self._options.invalid_sizes)
+        found = self._predict(state.eval_variables, should_stop)
+        predictions, _ = repair_sizes(found, self._options.invalid_sizes)
         ground_truth, table = self._tables
         data = EvaluationSet(
             ground_truth,
@@ -141,7 +141,7 @@ class Validation:
             self._records,
             self._frames,
             predictions,
-            roi=self._options.roi,
+            roi=roi_bounds(self._options.roi),
             score_threshold=self._config.decode.score_threshold,
         )
         pictures = {}

@@ -189,7 +189,8 @@ class Checkpoints:
         Raises:
             DataError: There are checkpoints, and none restores; they stay as they are.
         """
-        steps, failed = self.steps(), []
+        failed: list[int] = []
+        steps = self.steps()
         for step in reversed(steps):
             restored, reason = None, "another process could not read it"
             try:
@@ -205,7 +206,7 @@ class Checkpoints:
             # Whatever a damaged file makes orbax, tensorstore or json raise.
             except Exception as error:
                 restored, reason = None, str(error).strip().split("\n")[0]
-            if processes.all_agree(restored is not None):
+            if processes.all_agree(restored is not None) and restored is not None:
                 for damaged in failed:
                     self._set_aside(damaged)
                 return restored["state"], restored["info"], step

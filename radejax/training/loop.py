@@ -118,10 +118,8 @@ def train(
                 is_due = _is_due(step, options.checkpoint_every_steps, num_steps)
                 if is_due or is_stopped or scores is not None:
                     told = _check_skipped(state, plan, told)
-                    found, kept = (
-                        scores and scores.with_best(),
-                        state.replace(frozen={}),
-                    )
+                    found = None if scores is None else scores.with_best()
+                    kept = state.replace(frozen={})
                     checkpoints.save(step, kept, loader, info=plan.info, metrics=found)
             checkpoints.wait()
     return TrainResult(state, step, finished=step >= num_steps and not is_cut)

@@ -8,7 +8,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import jax
 import numpy as np
@@ -43,7 +43,7 @@ def main_first(prepare: Callable[[], T]) -> T:
     if not is_main():
         result = prepare()
     wait_for_all("main_first")
-    return result
+    return cast(T, result)  # it is None on the other processes alone
 
 
 def main_only(work: Callable[[], T]) -> T | None:

@@ -125,7 +125,7 @@ def state_sharding(
         if not axes:
             return replicated(mesh)
         widest = max(axes, key=lambda a: x.shape[a])
-        spec = [None] * len(x.shape)
+        spec: list[str | None] = [None] * len(x.shape)
         spec[widest] = DATA_AXIS
         return NamedSharding(mesh, PartitionSpec(*spec))
 

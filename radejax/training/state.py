@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.typing import ArrayLike
 
 from radejax.core.errors import UserError
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """Everything a training step reads and writes.
 
     Attributes:
@@ -116,7 +116,7 @@ def _cyclic_cosine(peak: float, floor: float, half_period: int) -> optax.Schedul
     where it is small and after any number of epochs.
     """
 
-    def rate(step: jax.Array) -> jax.Array:
+    def rate(step: ArrayLike) -> jax.Array:
         from_floor = jnp.abs(jnp.mod(step, 2 * half_period) - half_period)
         angle = jnp.asarray(from_floor, jnp.float32) * (jnp.pi / (2 * half_period))
         return floor + (peak - floor) * jnp.square(jnp.sin(angle))
@@ -137,10 +137,10 @@ def make_optimizer(
         weight_decay: Decoupled weight decay.
         gradient_clip_norm: Global norm to clip to, or None.
     """
-    parts = [optax.adamw(schedule, weight_decay=weight_decay)]
-    if gradient_clip_norm is not None:
-        parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
-    return optax.chain(*parts)
+    adamw = optax.adamw(schedule, weight_decay=weight_decay)
+    if gradient_clip_norm is None:
+        return optax.chain(adamw)
+    return optax.chain(optax.clip_by_global_norm(gradient_clip_norm), adamw)
 
 
 def create_state(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from radejax.core.structures import Batch
+from radejax.core.structures import Array, Batch
 from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss, whole_batch_loss
@@ -145,7 +145,7 @@ def _accumulate(
 
 
 def _taken_if(
-    is_finite: jax.Array, state: TrainState, frames: jax.Array, **changed: Any
+    is_finite: jax.Array, state: TrainState, frames: Array, **changed: Any
 ) -> TrainState:
     """The state with what a step changed, or the step counted as skipped."""
     kept = {name: getattr(state, name) for name in changed}

@@ -19,7 +19,9 @@ import numpy as np
 import tensorboardX
 import tqdm
 from tensorboardX import summary
-from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+# Protobuf makes them when it is imported.
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # type: ignore[attr-defined]
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
