@@ -74,7 +74,7 @@ RUN_IN = {
     **{
         f"benchmarks/{path.name}": HELP
         for path in (ROOT / "benchmarks").glob("*.py")
-        if not path.name.startswith("torch_")  # modules of the others
+        if "__main__" in path.read_text(encoding="utf-8")  # not modules of the others
     },
     "docs/images/house.py": HELP,
     "docs/images/networks.py": HELP,
