@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -29,8 +28,6 @@ from radejax.inference.open import (
     settings_of_config,
 )
 from radejax.inference.program import detect
-
-_log = logging.getLogger(__name__)
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
@@ -64,8 +61,6 @@ class Detector:
     Attributes:
         num_radar_alone: Frames that a radar-camera model has so far predicted without
             an image.
-        num_impossible: Frames in host memory that had a cell that no power gives (NaN,
-            infinite); their boxes mean nothing. The first is warned of.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
@@ -93,7 +88,8 @@ class Detector:
         self.model = model = model if dtype is None else models.with_dtype(model, dtype)
         self.takes_camera = models.has_camera(model)
         self.camera_options = camera_options
-        self.num_radar_alone = self.num_impossible = 0
+        self.num_radar_alone = 0
+        self._impossible = detector_inputs.ImpossibleFrames()
         self._lock = threading.Lock()
         self.grid = grid
         self.classes = tuple(classes)
@@ -213,6 +209,13 @@ class Detector:
         arguments = settings_of_config(config) | overrides
         return cls(models.build(config["model"]), variables, grid, **arguments)
 
+    @property
+    def num_impossible(self) -> int:
+        """Frames so far with a cell that no power gives (NaN, infinite): their boxes mean
+        nothing. The first is warned of, of arrays on a device at a later call or here.
+        """
+        return self._impossible.total()
+
     # Use -----------------------------------------------------------------------------
 
     def __call__(
@@ -257,7 +260,7 @@ class Detector:
         num_frames = frames.shape[0]
         if num_frames == 0:
             raise UserError("no frames: the batch is empty")
-        self._count_impossible(frames, is_tesseract)
+        self._impossible.look(frames, is_tesseract)
         image, camera = self._camera_inputs(image, camera, num_frames)
         roi = self.roi if roi is None else detector_inputs.named_region(roi)
         settings = (
@@ -309,6 +312,7 @@ class Detector:
         """The same detector compiling other batch sizes; weights are shared."""
         other = copy.copy(self)
         other._batch_sizes = detector_inputs.checked_sizes(batch_sizes)
+        other._impossible = detector_inputs.ImpossibleFrames()
         return other
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
@@ -361,15 +365,6 @@ class Detector:
             return found.replace(class_names=self.classes)
 
         return function
-
-    def _count_impossible(self, frames: Any, is_tesseract: bool) -> None:
-        """Counts frames with cells that no power gives; warns of the first."""
-        if count := detector_inputs.num_impossible(frames, is_tesseract):
-            with self._lock:
-                is_first = self.num_impossible == 0
-                self.num_impossible += count
-            if is_first:
-                _log.warning(detector_inputs.IMPOSSIBLE, count, len(frames))
 
     def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
         """Images and cameras as arrays; counts the frames without."""

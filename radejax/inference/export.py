@@ -97,10 +97,8 @@ def export(
         training_config=training_config,
         with_backbone=with_backbone,
         half=half,
+        programs=programs,
     )
-    for name, program in programs.items():
-        with files.atomic_write(folder / name) as file:
-            file.write(program)
     if kind == "stablehlo":
         _copy_loader(folder)
         text = _program_readme(detector, platforms)

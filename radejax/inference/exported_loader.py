@@ -1,5 +1,6 @@
 """Boxes from radar with jax and numpy alone: python load.py projection.npy [...]."""
 
+import hashlib
 import json
 import pathlib
 import sys
@@ -11,9 +12,16 @@ FOLDER = pathlib.Path(__file__).resolve().parent
 sys.path.append(str(FOLDER / "third_party"))  # flatbuffers, with which jax.export reads
 
 
-def read_weights(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Arrays of a safetensors file: a JSON header, then float32 numbers."""
+def read_file(path: pathlib.Path, sha256: str) -> bytes:
+    """Content of a file; `ValueError` if it is not what was exported."""
     data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise ValueError(f"{path}: damaged, its sha256 is not the one in config.json")
+    return data
+
+
+def read_weights(data: bytes) -> dict[str, np.ndarray]:
+    """Arrays of a safetensors file: a JSON header, then float32 numbers."""
     start = 8 + int.from_bytes(data[:8], "little")
     header = {k: v for k, v in json.loads(data[8:start]).items() if k[0] != "_"}
     flat = np.frombuffer(data, "<f4", offset=start)
@@ -24,11 +32,11 @@ def read_weights(path: pathlib.Path) -> dict[str, np.ndarray]:
 def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     """`detect(projection, ...)` -> dictionary of arrays; see README.md."""
     folder = pathlib.Path(folder)
-    config = json.loads((folder / "config.json").read_text())["decode"]
-    content = bytearray((folder / "detector.stablehlo").read_bytes())
-    program = jax.export.deserialize(content)
-    run = jax.jit(program.call)
-    weights = jax.device_put(read_weights(folder / "model.safetensors"), device)
+    config = json.loads((folder / "config.json").read_text())
+    data = {name: read_file(folder / name, x) for name, x in config["sha256"].items()}
+    config = config["decode"]
+    run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)
+    weights = jax.device_put(read_weights(data["model.safetensors"]), device)
 
     def detect(*inputs, score_threshold=None, nms_iou=None, roi=None):
         score = (

@@ -6,7 +6,9 @@ What comes out is what `data.pipeline` puts into `Batch.image` and `Batch.camera
 from __future__ import annotations
 
 import dataclasses
+import logging
 import pathlib
+import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,6 +30,8 @@ from radejax.geometry.camera import Camera, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
+
+_log = logging.getLogger(__name__)
 
 PathLike = str | pathlib.Path
 
@@ -63,29 +67,61 @@ def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
     )
 
 
-IMPOSSIBLE = (
-    "%d of %d frames have cells that are NaN, infinite or otherwise no radar power: their "
-    "boxes mean nothing (further ones are counted in num_impossible)"
-)
-"""What a `Detector` says of the first such frames."""
-
-
-def num_impossible(frames: Any, is_tesseract: bool) -> int:
-    """Number of frames with a cell that no power gives, NaN for example.
-
-    Args:
-        frames: Of `radar_batch`. Arrays on a device are not looked at, 0: that would
-            wait for them.
-        is_tesseract: Linear power, finite and not negative; otherwise levels.
-    """
-    if not isinstance(frames, np.ndarray):
-        return 0
+def _num_impossible(frames: Any, is_tesseract: bool) -> Any:
+    """Number of frames that are no linear power (a tesseract), or no level of it."""
     axes = tuple(range(1, frames.ndim))
     low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
     limits = (
         (0.0, np.finfo(np.float32).max) if is_tesseract else (-MAX_LEVEL, MAX_LEVEL)
     )
-    return int((~((low >= limits[0]) & (high <= limits[1]))).sum())
+    return (~((low >= limits[0]) & (high <= limits[1]))).sum()
+
+
+_num_on_device = jax.jit(_num_impossible, static_argnums=1)
+
+
+class ImpossibleFrames:
+    """Counts frames with cells that no power gives, NaN for example; warns of the first.
+
+    Arrays on a device are looked at there and nothing waits for them: their number is
+    fetched in a later call that finds it computed, or when the total is asked for.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._total, self._started = 0, list[tuple[Any, int]]()
+
+    def look(self, frames: Any, is_tesseract: bool) -> None:
+        """Looks at the frames of `radar_batch`; traced ones (`jit`) have no values."""
+        if isinstance(frames, np.ndarray):
+            count = _num_impossible(frames, is_tesseract)
+        elif isinstance(frames, jax.Array) and not isinstance(frames, jax.core.Tracer):
+            count = _num_on_device(frames, is_tesseract)
+        else:
+            return
+        with self._lock:
+            self._started.append((count, len(frames)))
+        self.total(waits=False)
+
+    def total(self, *, waits: bool = True) -> int:
+        """Number so far; without waiting, of what is computed."""
+        with self._lock:
+            started, self._started = self._started, []
+            for count, num_frames in started:
+                # Its type lacks `is_ready`.
+                if not waits and isinstance(count, jax.Array) and not count.is_ready():  # type: ignore[attr-defined]
+                    self._started.append((count, num_frames))
+                elif found := int(count):
+                    if self._total == 0:
+                        _log.warning(
+                            "%d of %d frames have cells that are NaN, infinite or "
+                            "otherwise no radar power: their boxes mean nothing "
+                            "(further ones are counted in num_impossible)",
+                            found,
+                            num_frames,
+                        )
+                    self._total += found
+            return self._total
 
 
 def _stack_frames(frames: Sequence[Any], grid: RadarGrid) -> np.ndarray:

@@ -29,6 +29,7 @@ from radejax.core.archives import read_safetensors
 from radejax.core.config import renewed
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
+from radejax.data.records.files import sha256
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.interop.image_backbone import check_fits
 from radejax.models import dinorade_config, radenet
@@ -61,6 +62,7 @@ _HINTS = {
     "camera": dict[str, Any],
     "grid": RadarGrid,
     "training_config": dict[str, Any] | None,
+    "sha256?": dict[str, str],
 }
 """What `config.json` holds."""
 
@@ -101,6 +103,7 @@ def write_packed(
     training_config: ConfigDict | None = None,
     with_backbone: bool = False,
     half: bool = False,
+    programs: Mapping[str, bytes] | None = None,
 ) -> dict[str, Any]:
     """Writes `config.json` and `model.safetensors`.
 
@@ -111,9 +114,10 @@ def write_packed(
         with_backbone: Keep the image transformer's weights. DINOv3's are for own
             machines and not to be passed on.
         half: Store float16, to half the size; it is computed in float32 as ever.
+        programs: Further files by name.
 
     Returns:
-        The content of `config.json`.
+        The content of `config.json`; "sha256" has the checksum of each other file.
 
     Raises:
         UserError: The image transformer was trained along: without its weights the
@@ -158,6 +162,11 @@ def write_packed(
     folder.mkdir(parents=True, exist_ok=True)
     with files.atomic_path(folder / WEIGHTS_FILE) as temporary:
         safetensors.numpy.save_file(arrays, temporary, {"format": "jax"})
+    for name, program in (programs or {}).items():
+        with files.atomic_write(folder / name) as file:
+            file.write(program)
+    written = (WEIGHTS_FILE, *(programs or {}))
+    content["sha256"] = {name: sha256(folder / name) for name in written}
     files.write_json(folder / CONFIG_FILE, content)
     return content
 
@@ -184,6 +193,12 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
     try:
         model = models.build(content["model"])
         weights = path.with_name(WEIGHTS_FILE)
+        saved = content.get("sha256", {}).get(WEIGHTS_FILE)  # 0.2 and before: without
+        if saved and sha256(weights) != saved:
+            raise DataError(
+                f"{weights}: damaged or of another model, its sha256 is not the one in "
+                f"{CONFIG_FILE}, {saved[:12]}...: export or download it again"
+            )
         arrays = {
             name: value.astype(np.float32)
             for name, value in read_safetensors(weights).items()

@@ -33,6 +33,8 @@ BEST = "best"
 _CHECKSUMS = "checksums"
 """Item of a checkpoint; those of earlier versions are without."""
 
+_METRICS = "metrics"
+
 _VARIABLES = ("params", "ema_params", "model_state")
 
 _NO_NEWS = (
@@ -52,6 +54,46 @@ def _is_worth_telling(record: logging.LogRecord) -> bool:
 
 def _best_of(metrics: Mapping[str, float]) -> float:
     return metrics[BEST]
+
+
+def _saved_checksums(folder: pathlib.Path) -> dict[str, Any] | None:
+    """Of a checkpoint's folder; None of one of an earlier version."""
+    folder = folder / _CHECKSUMS
+    return files.read_json(folder / "metadata") if folder.is_dir() else None
+
+
+class _Manager(ocp.CheckpointManager):
+    """Orbax's, for which a checkpoint with damaged metrics was not evaluated.
+
+    Attributes:
+        damaged: Its step, and what is wrong.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.damaged: dict[int, str] = {}
+        super().__init__(*args, **kwargs)
+
+    def metrics(self, step: int) -> Any:
+        """Overrides orbax's, which its other methods ask."""
+        try:
+            found = super().metrics(step)
+            if found is not None:
+                float(found[BEST])
+                saved = _saved_checksums(pathlib.Path(self.directory, f"{step}")) or {}
+                if _METRICS in saved:
+                    checksums.check(
+                        {_METRICS: checksums.of_values(found)}, saved, "part"
+                    )
+        # What damaged text makes json and the lines above raise.
+        except (ValueError, TypeError, LookupError) as error:
+            if step not in self.damaged:
+                _log.warning(
+                    "the metrics of checkpoint %d are damaged: it counts as not evaluated",
+                    step,
+                )
+            self.damaged[step] = str(error).strip().split("\n")[0]
+            return None
+        return found
 
 
 class Checkpoints:
@@ -85,7 +127,7 @@ class Checkpoints:
             read_only=read_only,
             enable_async_checkpointing=not read_only,
         )
-        self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._manager = _Manager(self.folder, options=options)
 
     def steps(self) -> list[int]:
         """Steps of the finished checkpoints, oldest first."""
@@ -97,15 +139,21 @@ class Checkpoints:
 
         Raises:
             FileNotFoundError: None was evaluated.
+            DataError: Metrics are damaged: the best one is not known.
         """
-        self._manager.reload()
-        step = self._manager.best_step()
-        if step is None:
+        for step in self.steps():
+            if reason := self._manager.damaged.get(step):
+                raise DataError(
+                    f"{self.folder}: the metrics of checkpoint {step} are damaged "
+                    f"({reason}), which one is best is not known: name a step"
+                )
+        best = self._manager.best_step()
+        if best is None:
             raise FileNotFoundError(
                 f"no checkpoint in {self.folder} was evaluated: train with "
                 "--config.train.evaluate_every_epochs=1 to have a best one"
             )
-        return step
+        return best
 
     def save(
         self,
@@ -130,6 +178,13 @@ class Checkpoints:
         """
         if step in self._manager.all_steps():
             return
+        sums = {
+            "state": checksums.of_arrays(state),
+            "info": checksums.of_values(dict(info)),
+            "data": checksums.of_values(data_iterator.get_state()),
+        }
+        if metrics:
+            sums[_METRICS] = checksums.of_values(dict(metrics))
         with self._told_if_full():
             self._manager.save(
                 step,
@@ -137,13 +192,7 @@ class Checkpoints:
                     state=ocp.args.StandardSave(state),
                     data=grain.checkpoint.CheckpointSave(data_iterator),
                     info=ocp.args.JsonSave(dict(info)),
-                    checksums=ocp.args.JsonSave(
-                        {
-                            "state": checksums.of_arrays(state),
-                            "info": checksums.of_values(dict(info)),
-                            "data": checksums.of_values(data_iterator.get_state()),
-                        }
-                    ),
+                    checksums=ocp.args.JsonSave(sums),
                 ),
                 metrics=dict(metrics) if metrics else None,
             )
@@ -290,15 +339,10 @@ class Checkpoints:
 
     def _verify(self, step: int, state: Any, info: Mapping[str, Any]) -> None:
         """`DataError` if what was restored is not what was saved."""
-        saved = self._saved_checksums(step)
+        saved = _saved_checksums(self.folder / str(step))
         if saved is not None:
             checksums.check(checksums.of_arrays(state), saved["state"], "array")
             checksums.check({"info": checksums.of_values(info)}, saved, "part")
-
-    def _saved_checksums(self, step: int) -> dict[str, Any] | None:
-        """None of a checkpoint of an earlier version."""
-        folder = self.folder / str(step) / _CHECKSUMS
-        return files.read_json(folder / "metadata") if folder.is_dir() else None
 
     def _restore_position(self, step: int, data_iterator: Any) -> None:
         """Sets the iterator to where it was, with any number of processes then and now.
@@ -311,7 +355,7 @@ class Checkpoints:
         if not saved:
             raise FileNotFoundError(f"no position in the data in {folder}")
         position = files.read_json(saved[0])
-        known = self._saved_checksums(step)
+        known = _saved_checksums(self.folder / str(step))
         if known is not None:
             checksums.check({"data": checksums.of_values(position)}, known, "part")
         data_iterator.set_state(position)

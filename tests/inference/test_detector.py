@@ -4,6 +4,7 @@ import pathlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -243,21 +244,38 @@ def test_detections_carry_the_names_of_their_detector(
     assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]
 
 
+@pytest.mark.parametrize("place", [np.asarray, jnp.asarray])
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
 def test_impossible_cells_are_counted_and_told_once(
-    detector: Detector, projections: np.ndarray, caplog: Any, value: float
+    detector: Detector, projections: np.ndarray, caplog: Any, value: float, place: Any
 ) -> None:
     detector = detector.with_batch_sizes((1, 4))
     frames = projections[:3].copy()
-    detector(frames)
+    detector(place(frames))
     assert detector.num_impossible == 0
     frames[1, 2, 3, 1] = value
     for _ in range(2):
-        detector(frames)
+        jax.block_until_ready(detector(place(frames)))
     assert detector.num_impossible == 2
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert [w for w in warnings if "1 of 3 frames have cells" in w] == warnings[:1]
     assert len(warnings) == 1
+
+
+def test_arrays_on_a_device_are_told_of_at_a_later_call(
+    detector: Detector, tesseracts: np.ndarray, caplog: Any
+) -> None:
+    detector = detector.with_batch_sizes((4,))
+    tesseracts = tesseracts[:4].copy()
+    bad = jnp.asarray(tesseracts).at[1, 0, 1, 2, 1].set(-1.0)
+    jax.eval_shape(detector, bad)  # traced: no values to look at
+    detector(bad)
+    for _ in range(100):  # until one finds it computed
+        jax.block_until_ready(detector(tesseracts))
+        if caplog.text:
+            break
+    assert "1 of 4 frames have cells" in caplog.text
+    assert detector.num_impossible == 1
 
 
 def test_arguments_by_name_and_wrong_ones() -> None:

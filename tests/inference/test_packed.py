@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import random
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ from radejax.cli.demo import MODEL
 from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference import packed
+from radejax.inference import exported_loader, packed
 from radejax.inference.open import load
 
 from .. import small_models as small
@@ -71,6 +72,7 @@ def test_the_demo_comes_with_a_small_model_of_simulated_data() -> None:
     files = list(MODEL.iterdir())
     assert sum(path.stat().st_size for path in files) < 4e6
     loaded = packed.read_packed(MODEL)
+    assert "sha256" in json.loads((MODEL / "config.json").read_text())
     card = (MODEL / "README.md").read_text()
     assert "float16" in card
     assert "simulated data alone" in card
@@ -125,9 +127,7 @@ def test_damaged_and_absent_folders_are_named(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-8])
-    with pytest.raises(
-        DataError, match=r"model.safetensors: damaged, not a safetensors"
-    ):
+    with pytest.raises(DataError, match=r"model.safetensors: damaged"):
         Detector.from_checkpoint(tmp_path)
     config = tmp_path / "config.json"
     config.write_text(json.dumps({"format": "other"}))
@@ -153,6 +153,34 @@ def test_grid_survives_json_exactly(tmp_path: pathlib.Path) -> None:
     packed.write_packed(tmp_path, small.detector())
     assert load(tmp_path).grid == small.small_grid()
     assert RadarGrid.kradar() != small.small_grid()
+
+
+def test_a_flipped_bit_of_the_weights_is_found(tmp_path: pathlib.Path) -> None:
+    programs = {"detector.stablehlo": b"a program"}
+    packed.write_packed(tmp_path, small.detector(), programs=programs)
+    whole, draw = packed.read_packed(tmp_path), random.Random(0)
+    path = tmp_path / "model.safetensors"
+    content = path.read_bytes()
+    for bit in draw.sample(range(8 * len(content)), 20):
+        damaged = bytearray(content)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"model\.safetensors: damaged or of"):
+            packed.read_packed(tmp_path)
+        with pytest.raises(ValueError, match=r"model\.safetensors: damaged"):
+            exported_loader.load(tmp_path)
+    path.write_bytes(content)
+    (tmp_path / "detector.stablehlo").write_bytes(b"e program")
+    with pytest.raises(ValueError, match=r"detector\.stablehlo: damaged"):
+        exported_loader.load(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["sha256"]  # as of 0.2 and before
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        packed.read_packed(tmp_path).variables,
+        whole.variables,
+    )
 
 
 def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> None:

@@ -1,6 +1,7 @@
 """A checkpoint that is not what was saved is found, whatever of it is damaged."""
 
 import gc
+import itertools
 import pathlib
 import random
 import shutil
@@ -70,45 +71,67 @@ def _files(folder: pathlib.Path) -> list[pathlib.Path]:
     return [path for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
-# Of each file, one bit at a time; the many are some thousand, each restored twice.
-@pytest.mark.parametrize("flips", [5, pytest.param(150, marks=pytest.mark.slow)])
-@pytest.mark.timeout(3000)
+@pytest.fixture
+def tiny(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A checkpoint of few bytes, so that each of its bits has its turn."""
+    state = {"params": {"w": jnp.asarray(WEIGHTS[:2, :2])}}
+    iterator = _iterator()
+    next(iterator)
+    with Checkpoints(tmp_path / "checkpoints") as checkpoints:
+        checkpoints.save(1, state, iterator, info={"a": 1.5}, metrics={"best": 0.5})
+    return tmp_path / "checkpoints"
+
+
+def _bits(folder: pathlib.Path) -> Iterator[tuple[pathlib.Path, int]]:
+    """All bits of the headers, and a thousand of the rest.
+
+    Headers are what describes the arrays, the position, the configuration and the
+    metrics, and the frame of the file with the numbers. The rest are the numbers, and
+    what is written and never read: what orbax merged, and the texts "was successful".
+    """
+    rest = []
+    for path in _files(folder):
+        bits = [(path, bit) for bit in range(8 * path.stat().st_size)]
+        name = path.relative_to(folder).as_posix()
+        if "ocdbt.process_0" in name or path.suffix == ".txt":
+            rest += bits
+        elif path.parent.name == "d":
+            rest += bits[8 * 14 : -8 * 4]
+            yield from bits[: 8 * 14] + bits[-8 * 4 :]
+        else:
+            yield from bits
+    yield from random.Random(0).sample(rest, 1000)
+
+
+# All 13,000 take three processor minutes, 15 ms a restore; the suite takes some.
+@pytest.mark.parametrize("every", [101, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.timeout(1200)
 def test_a_flipped_bit_anywhere_is_found_or_does_no_harm(
-    folder: pathlib.Path, flips: int
+    tiny: pathlib.Path, every: int
 ) -> None:
-    draw, messages, num_set_aside = random.Random(0), [], 0
-    whole = folder.with_name("whole")
-    shutil.copytree(folder, whole)
-    for path in _files(folder / "3"):
-        content = path.read_bytes()
-        for _ in range(flips if content else 0):
-            bit = draw.randrange(8 * len(content))
-            damaged = bytearray(content)
-            damaged[bit // 8] ^= 1 << bit % 8
-            path.write_bytes(damaged)
-            try:
-                state, info, step = _read(folder)
-            except DataError as error:
-                messages.append(str(error))
-            else:
-                assert (info, step) == ({"config": {"a": 1.5}}, 3)
-                np.testing.assert_array_equal(state["params"]["w"], WEIGHTS * 3)
+    whole, num_found, bits = sharding.replicated(sharding.make_mesh(1)), 0, _bits(tiny)
+    state = {"params": {"w": jax.ShapeDtypeStruct((2, 2), "f4", sharding=whole)}}
+    with Checkpoints(tiny) as writer, Checkpoints(tiny, read_only=True) as reader:
+        for number, (path, bit) in enumerate(itertools.islice(bits, 0, None, every)):
+            content = bytearray(path.read_bytes())
+            content[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(content)
             iterator = _iterator()
-            with Checkpoints(folder, max_to_keep=None) as checkpoints:
-                state, info, step = checkpoints.restore(_abstract(), iterator)
-            assert info == {"config": {"a": 1.5}}
-            assert int(state["step"]) == step == next(iterator)
-            np.testing.assert_array_equal(state["params"]["w"], WEIGHTS * step)
-            np.testing.assert_array_equal(state["opt_state"][0]["w"], -WEIGHTS * step)
-            if step != 3:
-                num_set_aside += 1
-                shutil.rmtree(folder)  # what was damaged was set aside
-                shutil.copytree(whole, folder)
-        path.write_bytes(content)
-    assert min(len(messages), num_set_aside) > 3 * flips
-    for message in messages:
-        assert message.startswith(f"checkpoint 3 in {folder} is damaged (")
-        assert message.endswith("); step 2 is whole")
+            try:
+                if number % 8:
+                    found, info, step = writer.restore(state, iterator)
+                    assert next(iterator) == 1
+                else:
+                    found, info, step = reader.restore_variables(reader.best_step())
+            except DataError:
+                num_found += 1
+            else:
+                assert (info, step) == ({"a": 1.5}, 1), (path, bit)
+                weights = np.asarray(found["params"]["w"])
+                assert np.array_equal(weights, WEIGHTS[:2, :2]), (path, bit)
+            content[bit // 8] ^= 1 << bit % 8
+            path.write_bytes(content)
+    assert num_found > 0.3 * number
 
 
 def test_whole_files_with_other_weights_are_found(folder: pathlib.Path) -> None:
@@ -183,3 +206,13 @@ def test_an_empty_folder_with_the_name_of_a_step(folder: pathlib.Path) -> None:
     (folder / "99").mkdir()
     with pytest.raises(DataError, match=r"checkpoint 99 .*; step 3 is whole"):
         _read(folder)
+
+
+def test_damaged_metrics_are_told_and_make_none_the_best(tiny: pathlib.Path) -> None:
+    path = tiny / "1" / "metrics" / "metrics"
+    for text in (b'{"best": 0.7}', b'{"cest": 0.5}', b'{"best": 0.', b"[]", b"\xff"):
+        path.write_bytes(text)
+        with Checkpoints(tiny, read_only=True) as checkpoints:
+            assert checkpoints.restore_variables()[2] == 1
+            with pytest.raises(DataError, match=r"metrics of checkpoint 1 are damaged"):
+                checkpoints.best_step()
