@@ -75,9 +75,18 @@ def devices_table(runs):
 
 
 def row_text(row, where):
-    clock = row["processor_s" if where == "cpu" else "wall_s"]
-    walls = {name: wall / row["frames"] for name, wall in row["wall_s"].items()}
-    others = [name for name in walls if name != "radejax"]
+    """A line of a device's table; on a CPU processor time is shown and compared too."""
+    is_cpu = where == "cpu"
+    clock = row["processor_s" if is_cpu else "wall_s"]
+    others = [name for name in clock if name != "radejax"]
+
+    def cell(name):
+        wall, processor = (
+            duration(row[kind][name] / row["frames"])
+            for kind in ("wall_s", "processor_s")
+        )
+        return f"{wall} ({processor})" if is_cpu else wall
+
     ratios = [
         f"{clock[name] / clock['radejax']:.2f}" if clock["radejax"] else "-"
         for name in others
@@ -86,8 +95,8 @@ def row_text(row, where):
         row["name"],
         row["dtype"],
         str(row["frames"]),
-        duration(walls["radejax"]),
-        "; ".join(f"{name} {duration(walls[name])}" for name in others) or "-",
+        cell("radejax"),
+        "; ".join(f"{name} {cell(name)}" for name in others) or "-",
         "; ".join(ratios) or "-",
         "-" if row["error"] is None else f"{row['error']:.0e}",
         "-" if row["mib"] is None else f"{row['mib']:.0f} MiB",

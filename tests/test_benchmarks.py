@@ -53,8 +53,8 @@ def test_rivals_take_turns_and_what_did_not_fit_is_said(modules: Any) -> None:
     assert (row["error"], other["error"]) == (1e-6, None)
     text = modules.page.table({"runs": [json.loads(json.dumps(result))]})
     assert (
-        "| something | float32 | 2 | 10 ms | rival 25 ms | 2.50 | 1e-06 | 3 MiB | after it |"
-        in text
+        "| something | float32 | 2 | 10 ms (20 ms) | rival 25 ms (50 ms) | 2.50 | 1e-06 "
+        "| 3 MiB | after it |" in text
     )
     assert "Not run, for want of time: long (takes 700 s, 600 s were left)." in text
 
