@@ -92,23 +92,26 @@ class Work:
         return self.out / "runs" / kind / folder / f"seed{seed}"
 
     def report(self, name: str, seed: int) -> pathlib.Path:
-        """Evaluation of a cell on the held-out scenes; complete where it exists."""
+        """Evaluation of a cell on the held-out scenes."""
         end = "_exchanged" if self.study.cells[name].exchanges else ""
         return self.run_folder(name, seed) / f"held{end}"
 
     def is_done(self, name: str, seed: int) -> bool:
-        """Whether a cell is trained and evaluated."""
-        return (self.report(name, seed) / "metrics.json").exists()
+        """Whether a cell is trained and evaluated: what is written last is there."""
+        return (self.report(name, seed) / "cell.json").exists()
+
+    def root(self, cell: Cell, seed: int | None) -> pathlib.Path:
+        """Folder of the data of a seed's runs, or of the held-out scenes for None."""
+        name = "held" if seed is None else f"seed{seed}"
+        return self.out / "data" / f"{cell.config.partition(':')[0]}-{name}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
-        """Data of a seed's runs, or the held-out scenes; simulated if missing."""
-        name = "held" if seed is None else f"seed{seed}"
-        root = self.out / "data" / f"{cell.config.partition(':')[0]}-{name}"
+        """These data; simulated if missing."""
         simulation = plain(self.config(cell, seed or 0).simulation)
         if seed is None:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
-        return str(simulate_dataset(simulation, root))
+        return str(simulate_dataset(simulation, self.root(cell, seed)))
 
     def image_backbone(self, cell: Cell) -> str | None:
         """Folder of the frozen backbone that a cell needs; pretrained if missing."""
@@ -121,17 +124,18 @@ class Work:
         return str(folder)
 
     def command(self, name: str, seed: int) -> str:
-        """What makes a cell's run, for one who repeats it."""
+        """What makes a cell's run anew and evaluates it, with the data of `out`."""
         cell = self.study.cells[name]
         file, _, words = cell.config.partition(":")
-        backbone = self.backbone or self.out / "backbone"
-        words = f"{file}.py:{words}" if words else f"{file}.py"
-        fields = " ".join(
-            f"--config.{key}={value}" for key, value in self.fields(cell, seed).items()
-        )
-        given = f" --image_backbone {backbone}" * ("pretrained" in words)
-        data = self.out / "data" / f"{file}-seed{seed}"
-        return f"python train.py --config configs/{words} {fields} --data {data}{given}"
+        fields = self.fields(cell, seed).items()
+        parts = [f"python train.py --config configs/{file}.py{words and f':{words}'}"]
+        parts += [f"--config.{key}={value}" for key, value in fields]
+        parts.append(f"--data {self.root(cell, seed)} --workdir RUN")
+        if "pretrained" in words:
+            parts.append(f"--image_backbone {self.backbone or self.out / 'backbone'}")
+        parts.append("&& python evaluate.py --workdir RUN --split all")
+        parts.append(f"--data {self.root(cell, None)}")
+        return " ".join([*parts, *["--exchange_images 0"] * bool(cell.exchanges)])
 
     def make(self, name: str, seed: int) -> bool:
         """Trains and evaluates a cell; False where a signal ended it early."""
@@ -374,7 +378,8 @@ def main(table, seeds, out, minutes, backbone, resamples, table_only):
         goes_on = True
         while goes_on:
             left = [(name, s) for s, name in every if not work.is_done(name, s)]
-            write_tables(work, table, seeds, resamples)
+            if len(left) < len(every):
+                write_tables(work, table, seeds, resamples)
             click.echo(told(work, left, len(every)))
             goes_on = bool(left) and not table_only and work.make(*left[0])
 

@@ -372,7 +372,8 @@ def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
     if not data:
         # The same folder as before the config had its later fields.
         values = without_later_fields(json.loads(simulation.to_json()))
-        digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()[:8]
+        text = json.dumps(values, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:8]
         return str(pathlib.Path("data") / f"simulated-{digest}")
     if len(data) != 1:
         raise UserError(f"a simulated data set has one folder, got {list(data)}")
