@@ -2,6 +2,8 @@
 
     python benchmarks/programs.py             # full size, bfloat16; a minute, no accelerator
 
+Written are `docs/benchmarks/programs.json` and its table in `docs/benchmarks.md`.
+
 Every program is lowered by `jax.export` for a platform that need not be there. `facts`
 reads its text: types, host callbacks, convolutions, transposes, loops. `work` counts the
 operations and bytes of matrix products, convolutions and gathers, loops and the chosen
@@ -13,16 +15,18 @@ peak and bytes over bandwidth.
 
 import argparse
 import collections
+import datetime
 import functools
+import json
 import math
 import pathlib
 import re
+import shlex
 import sys
 
 import jax
 import jax.export
 import jax.numpy as jnp
-from tabulate import tabulate
 
 from radejax import models
 from radejax.core.config import load_config
@@ -34,6 +38,9 @@ from radejax.inference.program import detect
 from radejax.simulation.radar import tensor
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import page
 
 CONFIGS = pathlib.Path(__file__).parents[1] / "configs"
 
@@ -128,8 +135,8 @@ def facts(text):
     Returns:
         "ops" by name; "types" of elements; "calls" to code outside of the program;
         "convolutions" by type of result; "turned": shapes of the arrays of four axes and
-        more whose innermost axis a transpose moves; "branches": greatest number of
-        branches that hold more than a constant in one `case`.
+        more whose innermost axis a transpose moves; "wide": the primitives that compute
+        in 64 bits.
     """
     lines = text.splitlines()
     turned = []
@@ -146,12 +153,19 @@ def facts(text):
         for line in lines
         if "stablehlo.convolution" in line
     ]
+    origins = dict(re.findall(r'^(#loc\d*) = loc\("([^"]*)"', text, re.MULTILINE))
+    wide = [
+        re.findall(r"loc\((#loc\d*)\)", line)[-1]
+        for line in lines
+        if re.search(r"tensor<(?:\d+x)*(?:f|i|ui)64>", line)
+    ]
     return {
         "ops": collections.Counter(re.findall(r"(?:stablehlo|chlo)\.(\w+)", text)),
         "types": set(re.findall(r"tensor<(?:\d+x)*([a-z]\w*)>", text)),
         "calls": collections.Counter(re.findall(r"custom_call @(\w+)", text)),
         "convolutions": collections.Counter(convolutions),
         "turned": turned,
+        "wide": {origins.get(place, "?") for place in wide},
     }
 
 
@@ -265,12 +279,16 @@ def rows(size):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batch", type=int, default=8)
-    table = [
-        {k: v for k, v in row.items() if k != "least_ms_a_frame"}
-        | {f"{name}, ms": ms for name, ms in row["least_ms_a_frame"].items()}
-        for row in rows(parser.parse_args().batch)
-    ]
-    print(tabulate(table, headers="keys", floatfmt=".3g"))
+    result = {
+        "command": shlex.join(["python", "benchmarks/programs.py", *sys.argv[1:]]),
+        "date": datetime.date.today().isoformat(),
+        "jax": jax.__version__,
+        "programs": list(rows(parser.parse_args().batch)),
+    }
+    print(page.programs_table(result))
+    text = json.dumps(result, indent=1) + "\n"
+    (page.RESULTS / "programs.json").write_text(text)
+    page.write_page()
 
 
 if __name__ == "__main__":

@@ -1,10 +1,13 @@
-"""DinoRADE in PyTorch, for comparison of speed only.
+"""DinoRADE in PyTorch, for comparison only.
 
 The network of `configs/dinorade.py` without a word: layers and sizes as described in
-the paper and the released code, weights random. Deformable attention is in its
+the paper and the released code, every query in the image. Deformable attention is in its
 pure-torch form (`grid_sample`), as the released code runs where its CUDA operator was
-not built; self-attention is torch's own fused one.
+not built; self-attention is torch's own fused one. Tensors of the radar branch have
+RADE-Net's released names, the others those of our parameters (`networks.torch_state`).
 """
+
+import collections
 
 import torch
 import torch_radenet
@@ -53,23 +56,24 @@ class ViT(nn.Module):
     def __init__(self, c):
         super().__init__()
         width, self.patch = c["hidden_size"], c["patch_size"]
-        self.embed = nn.Conv2d(3, width, self.patch, stride=self.patch)
-        self.prefix = nn.Parameter(torch.randn(1, 1 + c["num_registers"], width))
-        self.blocks = nn.ModuleList([Block(c) for _ in range(c["num_layers"])])
+        self.patch_embed = nn.Conv2d(3, width, self.patch, stride=self.patch)
+        self.prefix_tokens = nn.Parameter(torch.randn(1, 1 + c["num_registers"], width))
+        self.layers = nn.ModuleList([Block(c) for _ in range(c["num_layers"])])
         self.norm = nn.LayerNorm(width)
         rows, columns = (n // self.patch for n in c["size"])
-        # The angles' values do not matter for the time.
-        angle = torch.rand(rows * columns, width // c["num_heads"])
-        self.register_buffer("cos", angle.cos())
-        self.register_buffer("sin", angle.sin())
+        for name in ("cos", "sin"):  # of the rotary angles: they come with the weights
+            table = torch.zeros(rows * columns, width // c["num_heads"])
+            self.register_buffer(name, table)
 
     def forward(self, image):
-        x = self.embed(image)
+        x = self.patch_embed(image)
         b, c, h, w = x.shape
-        x = torch.cat([self.prefix.expand(b, -1, -1), x.flatten(2).transpose(1, 2)], 1)
-        for block in self.blocks:
+        x = torch.cat(
+            [self.prefix_tokens.expand(b, -1, -1), x.flatten(2).transpose(1, 2)], 1
+        )
+        for block in self.layers:
             x = block(x, self.cos, self.sin)
-        return self.norm(x)[:, self.prefix.shape[1] :].reshape(b, h, w, c)
+        return self.norm(x)[:, self.prefix_tokens.shape[1] :].reshape(b, h, w, c)
 
 
 class CameraNeck(nn.Module):
@@ -78,17 +82,18 @@ class CameraNeck(nn.Module):
     def __init__(self, inputs, features):
         super().__init__()
         self.proj = nn.Linear(inputs, features)
-        layers = []
-        for i in range(3):
-            if i < 2:
-                layers.append(nn.ConvTranspose2d(features, features, 4, 2, 1))
-            else:
-                layers.append(nn.Conv2d(features, features, 3, padding=1))
-            layers += [nn.BatchNorm2d(features), nn.ReLU()]
-        self.layers = nn.Sequential(*layers)
+        self.up_1 = nn.ConvTranspose2d(features, features, 4, 2, 1)
+        self.up_2 = nn.ConvTranspose2d(features, features, 4, 2, 1)
+        self.refine = nn.Conv2d(features, features, 3, padding=1)
+        for name in ("up_1", "up_2", "refine"):
+            self.add_module(f"{name}_norm", nn.BatchNorm2d(features))
 
     def forward(self, tokens):
-        return self.layers(self.proj(tokens).permute(0, 3, 1, 2))
+        x = self.proj(tokens).permute(0, 3, 1, 2)
+        for name in ("up_1", "up_2", "refine"):
+            x = getattr(self, name)(x)
+            x = functional.relu(getattr(self, f"{name}_norm")(x))
+        return x
 
 
 class Attention(nn.Module):
@@ -140,14 +145,15 @@ class DinoRade(nn.Module):
         self.neck, self.head = torch_radenet.Neck(c), torch_radenet.Heads(c)
         self.radar_neck, self.camera_neck = torch_radenet.Neck(c), torch_radenet.Neck(c)
         self.weighting = nn.Sequential(
-            nn.Linear(bins, 64), nn.ReLU(), nn.Linear(64, segments)
+            collections.OrderedDict(
+                hidden=nn.Linear(bins, 64), relu=nn.ReLU(), out=nn.Linear(64, segments)
+            )
         )
         self.attention = Attention(width, fusion["num_heads"], fusion["num_points"])
-        self.gate = nn.Sequential(
-            nn.Linear(2 * width, width), nn.ReLU(), nn.Linear(width, width)
-        )
+        self.gate_hidden = nn.Linear(2 * width, width)
+        self.gate_out = nn.Linear(width, width)
         self.dropout = nn.Dropout(fusion["dropout"])
-        self.register_buffer("points", points)
+        self.register_buffer("points", points, persistent=False)
 
     def embed(self, image):
         """`[B, H, W, 3]` uint8 -> features of the frozen backbone."""
@@ -158,12 +164,12 @@ class DinoRade(nn.Module):
             x = (x - mean[:, None, None]) / deviation[:, None, None]
             return self.image_backbone(x)
 
-    def forward(self, x, features=None):
-        """`[B, D+E, R, A]`, R and A padded; `features` of `embed`, or radar alone."""
+    def forward(self, x, image):
+        """`[B, D+E, R, A]`, R and A padded, and `[B, H, W, 3]` uint8."""
         elevation = x[:, self.doppler_bins :]
         x = self.radar_neck(self.backbone(x))
-        if features is not None:
-            x = self._fuse(x, elevation, self.camera_neck(self.image_neck(features)))
+        camera = self.camera_neck(self.image_neck(self.embed(image)))
+        x = self._fuse(x, elevation, camera)
         return self.head(self.neck(self.dropout(x)))
 
     def _fuse(self, x, elevation, camera):
@@ -171,6 +177,7 @@ class DinoRade(nn.Module):
         radar = x.flatten(2).transpose(1, 2)
         scale = self.weighting(elevation.flatten(2).transpose(1, 2)).softmax(-1)
         seen = self.attention(radar, scale, self.points, camera)
-        gate = torch.sigmoid(self.gate(torch.cat([radar, seen], -1)))
+        gate = functional.relu(self.gate_hidden(torch.cat([radar, seen], -1)))
+        gate = torch.sigmoid(self.gate_out(gate))
         x = gate * radar + (1 - gate) * seen
         return x.transpose(1, 2).reshape(b, c, r, a)

@@ -9,8 +9,9 @@ what the camera adds. `docs/radar_camera.md` has the numbers to expect.
 
 Words: `radar` for the model without the camera; `silhouettes` for images of the objects
 alone, in the colour of their class and brighter when nearer, a control of what a perfect
-image would give; `short` makes a run of two minutes that learns next to nothing, to see
-that everything works.
+image would give; `pretrained` for an image transformer that stays as it is given, by
+`--image_backbone` (`examples/pretrain_backbone.py` makes one); `short` makes a run of two
+minutes that learns next to nothing, to see that everything works.
 """
 
 import pathlib
@@ -30,8 +31,8 @@ def _neighbour(name: str) -> types.ModuleType:
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
-    sensors, content, length = parse_words(
-        arg, ("radar",), ("silhouettes",), ("short",)
+    sensors, content, length, backbone = parse_words(
+        arg, ("radar",), ("silhouettes",), ("short",), ("pretrained",)
     )
     config = base_config()
     config.simulation = ConfigDict(default_config())
@@ -68,6 +69,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.evaluation.protocols = ("kradar_r40", "exact")
     if sensors != "radar":
         _add_camera(config)
+        config.model.image.freeze = backbone == "pretrained"
     if length == "short":
         config.simulation.update(
             train_sequences=4, test_sequences=2, frames_per_sequence=2

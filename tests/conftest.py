@@ -1,5 +1,6 @@
 """Settings shared by all tests."""
 
+import importlib.metadata
 import logging
 import os
 import pathlib
@@ -11,11 +12,14 @@ import pytest
 from absl import flags
 
 # Compiling takes most of the time here: LLVM optimises nothing, and fusions are emitted
-# the older way, which compiles several times as fast. Read by `import jax`. With XLA_FLAGS=
-# in the environment programs are what users get: CI's slow tests.
+# the older way, which compiles several times as fast (jaxlib 0.11 has it no more, and ends
+# a process that asks for it). Read by `import jax`. With XLA_FLAGS= in the environment
+# programs are what users get: CI's slow tests of single programs.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_optimization_level=0"
+    + " --xla_cpu_use_fusion_emitters=false"
+    * (importlib.metadata.version("jaxlib") < "0.11"),
 )
 
 import jax

@@ -4,6 +4,7 @@ import functools
 import pathlib
 from typing import Any
 
+import flax.linen as nn
 import jax
 import numpy as np
 from ml_collections import ConfigDict
@@ -56,22 +57,30 @@ def camera_config() -> ConfigDict:
 
 @functools.lru_cache(maxsize=4)
 def _variables(kind: str) -> Any:
-    """Random and not as initialised, where zeros hide what they multiply."""
+    """Where zeros, as initialised, would hide what they multiply."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
-    model = models.build(config.model)
     inputs = [np.zeros((1, *small_grid().projection_shape), np.float32)]
     if kind == "camera":
         inputs.append(np.zeros((1, *IMAGE_SIZE, 3), np.uint8))
         inputs.append(stack_cameras([calibration().camera()]))
-    # Shapes alone: to compile the initialisation takes longer than the tests.
-    shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
-    rng = np.random.default_rng(0)
+    return drawn(models.build(config.model), *inputs)
+
+
+def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
+    """Random variables of a module, and not as initialised.
+
+    From shapes alone: to compile an initialisation takes longer than most tests.
+    """
+    shapes = jax.eval_shape(module.init, jax.random.key(0), *inputs)
+    rng = np.random.default_rng(seed)
 
     def fill(path: tuple, shape: jax.ShapeDtypeStruct) -> np.ndarray:
-        noise = rng.normal(size=shape.shape).astype(shape.dtype)
+        noise = rng.normal(size=shape.shape)
         if path[-1].key in ("scale", "var", "layer_scale_1", "layer_scale_2"):
-            return np.exp(0.1 * noise)
-        return noise / np.sqrt(max(1, np.prod(shape.shape[:-1])))
+            values = np.exp(0.1 * noise)
+        else:
+            values = noise / np.sqrt(max(1, np.prod(shape.shape[:-1])))
+        return values.astype(shape.dtype)
 
     return jax.tree_util.tree_map_with_path(fill, shapes)
 

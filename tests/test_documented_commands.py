@@ -62,6 +62,10 @@ RUN_IN = {
     "::test_example_compares_fusion_and_radar_by_the_lens",
     "examples/silhouettes.py": "tests/examples/test_silhouettes.py"
     "::test_both_runs_see_the_same_scenes_and_the_bar_decides",
+    "examples/ablation.py": "tests/examples/test_ablation.py"
+    "::test_what_is_missing_is_run_and_judged",
+    "examples/pretrain_backbone.py": "tests/examples/test_pretrain_backbone.py"
+    "::test_it_learns_and_its_folder_is_a_frozen_backbone",
     "examples/online_training.py": "tests/examples/test_online_training.py"
     "::test_fresh_frames_train_a_model_and_a_stop_changes_nothing",
     "examples/reference_points.py": "tests/test_fusion_run.py"
@@ -70,7 +74,7 @@ RUN_IN = {
     **{
         f"benchmarks/{path.name}": HELP
         for path in (ROOT / "benchmarks").glob("*.py")
-        if not path.name.startswith("torch_")  # modules of the others
+        if "__main__" in path.read_text(encoding="utf-8")  # not modules of the others
     },
     "docs/images/house.py": HELP,
     "docs/images/networks.py": HELP,

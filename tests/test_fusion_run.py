@@ -411,7 +411,7 @@ def test_example_draws_reference_points(data, from_images, tmp_path):
     assert out.stat().st_size > 10_000
 
 
-def test_embed_command(data, from_images, tmp_path):
+def test_embed_command(data, from_images, tmp_path, monkeypatch):
     config = tmp_path / "config.py"
     fields = json.loads(small_config().to_json())
     config.write_text(
@@ -423,6 +423,13 @@ def test_embed_command(data, from_images, tmp_path):
     result = CliRunner().invoke(main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout.splitlines()[-1])["embedded"] == 12
+    # Without a folder: of what the config simulates, here made anew.
+    monkeypatch.chdir(tmp_path)
+    command = ["embed", *command[2:], "--out", "again"]
+    result = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert json.loads(result.stdout.splitlines()[-1])["embedded"] == 12
+    (made,) = (tmp_path / "data").glob("simulated-*")
+    assert (made / "1" / "cam-front").is_dir()
     half = open_embeddings(tmp_path / "out")
     assert half.dtype == np.float32
     assert half.shape == (2, 6, 96)

@@ -3,15 +3,15 @@
 import itertools
 import pathlib
 import runpy
+import sys
 from types import SimpleNamespace
 
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-ROOT = pathlib.Path(__file__).resolve().parents[1]
-networks = SimpleNamespace(
-    **runpy.run_path(str(ROOT / "docs" / "images" / "networks.py"))
-)
+IMAGES = pathlib.Path(__file__).resolve().parents[1] / "docs" / "images"
+sys.path.append(str(IMAGES))  # where `python docs/images/networks.py` finds its sheet
+networks = SimpleNamespace(**runpy.run_path(str(IMAGES / "networks.py")))
 SHAPES = {
     "radenet": {"64 × 256 × 37 × 107", "32 × 14 × 512", "256 × 112 × 5"},
     "dinorade": {"720 × 1280 × 3", "256 × 112 × 10 queries", "180 × 320 × 128"},

@@ -49,6 +49,7 @@ CASES = [
     ("radar", "train_step", "cuda"),
     ("radar", "train_step", "tpu"),
     ("camera", "detector", "cuda"),
+    ("camera", "train_step", "tpu"),
 ]
 
 
@@ -58,7 +59,10 @@ def test_accelerators_get_lean_programs(
     facts: Any, kind: str, task: str, platform: str
 ) -> None:
     found = facts(kind, task, platform)
-    assert not found["types"] & {"f64", "i64", "ui64", "complex"}
+    assert not found["types"] & {"f64", "i64", "complex"}
+    # JAX counts the random numbers of dropout in 64 bits, and splits the counter in two.
+    has_dropout = (kind, task) == ("camera", "train_step")
+    assert found["wide"] == ({"iota_2x32_shape"} if has_dropout else set())
     assert not found["calls"]  # neither the host nor a library outside of XLA
     assert set(found["convolutions"]) == {"bf16"}
     # Channels stay innermost from first to last; heads of the ViT's tokens do not.

@@ -15,8 +15,10 @@ torch = pytest.importorskip("torch")
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
-def test_same_parameters_and_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_maps_from_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import case
+    import networks
     import torch_dinorade
 
     config = load_config(str(ROOT / "configs" / "dinorade.py")).model
@@ -24,24 +26,19 @@ def test_same_parameters_and_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     config.image.update(size=(32, 64), hidden_size=24, num_layers=2, mlp_dim=48)
     config.image.num_heads = 2
     config.fusion.update(num_heads=2, num_elevation=3)
+    rng = np.random.default_rng(0)
     bins, channels = 8, config.doppler_bins + config.elevation_bins
-    points = np.random.default_rng(0).random((1, bins, bins, 3, 2), np.float32)
+    points = rng.random((1, bins, bins, 3, 2), np.float32)
+    x = rng.random((1, bins, bins, channels), np.float32)
+    image = rng.integers(0, 256, (1, 32, 64, 3), np.uint8)
     ours = build(config)
-    inputs = (
-        np.zeros((1, bins, bins, channels), np.float32),
-        np.zeros((1, 32, 64, 3), np.uint8),
-        ReferencePoints(points, np.ones(points.shape[:-1], bool)),
-    )
-    shapes = jax.eval_shape(ours.init, jax.random.key(0), *inputs)["params"]
-    torch_points = torch.tensor(points.reshape(-1, 3, 2))
-    model = torch_dinorade.DinoRade(config, torch_points).eval()
-    numbers = [sum(x.numel() for x in model.parameters())]
-    numbers.append(sum(x.size for x in jax.tree.leaves(shapes)))
-    assert numbers[0] == numbers[1]
+    inputs = (x, image, ReferencePoints(points, np.ones(points.shape[:-1], bool)))
+    variables = networks.random_variables(ours, *inputs)
+    maps = jax.tree.leaves(ours.apply(variables, *inputs))
+    model = torch_dinorade.DinoRade(config, torch.tensor(points.reshape(-1, 3, 2)))
+    state = networks.torch_state(ours, variables)
+    model.load_state_dict({k: torch.tensor(v) for k, v in state.items()})
     with torch.inference_mode():
-        x = torch.zeros(1, channels, bins, bins)
-        heatmap, boxes = model(
-            x, model.embed(torch.zeros(1, 32, 64, 3, dtype=torch.uint8))
-        )
-    assert heatmap.shape == (1, config.num_classes, bins, bins)
-    assert boxes.shape == (1, 8, bins, bins)
+        theirs = model.eval()(torch.tensor(x).permute(0, 3, 1, 2), torch.tensor(image))
+    found = [np.moveaxis(np.asarray(m), -1, 1) for m in maps]
+    assert case.difference(found, [t.numpy() for t in theirs]) < 1e-4

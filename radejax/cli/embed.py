@@ -11,7 +11,7 @@ from radejax.cli import entry, options
 
 
 @click.command(cls=options.Command)
-@options.roots
+@options.roots_or_none
 @click.option("--config", required=True, help="As of `radejax train`, :words too.")
 @click.option(
     "--image-backbone",
@@ -41,6 +41,7 @@ def embed(
     """Run the front images through the frozen backbone once, to train from.
 
     Resumes where it stopped. Training then takes --embeddings OUT in place of images.
+    Without ROOTS: of the data set that the config simulates, made if it is not there.
 
     Example: radejax embed /disk1/kradar --config dinorade
     --image-backbone dinov3-vits16 --out /fast/embeddings
@@ -50,12 +51,14 @@ def embed(
     from radejax.data.kradar import KRadar
     from radejax.inference.embed import embed_dataset
     from radejax.interop.image_backbone import load_image_backbone
+    from radejax.runs.data import existing_roots
 
     entry.set_up_jax()
     settings = load_config(config)
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
-    frames = KRadar(roots, labels, version=settings.data.label_version, **part)
+    places = roots or existing_roots(settings.get("simulation"), ())
+    frames = KRadar(places, labels, version=settings.data.label_version, **part)
     counts = embed_dataset(
         model,
         variables,

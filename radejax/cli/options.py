@@ -43,9 +43,9 @@ def _chained(
     return tuple(itertools.chain(*values))
 
 
-roots = click.argument(
-    "roots", nargs=-1, required=True, type=Paths(), callback=_chained
-)
+_roots: dict[str, Any] = {"nargs": -1, "type": Paths(), "callback": _chained}
+roots = click.argument("roots", required=True, **_roots)
+roots_or_none = click.argument("roots", **_roots)
 data_roots = click.option(
     "--data",
     "roots",

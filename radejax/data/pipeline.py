@@ -36,7 +36,7 @@ class LoaderOptions:
         num_threads: Threads that prepare batches; 0: the caller's.
         prefetch: Batches prepared ahead.
         num_workers: Worker processes, each with its threads; 0: threads alone, which
-            are faster for large frames (see benchmarks/pipeline.py).
+            are faster for large frames (two cores: 0.7 times the frames).
         process_index: This host of several; None asks jax.
         process_count: Number of hosts; None asks jax.
         device: Device or sharding to put batches on ahead of use; None: host arrays.

@@ -1,4 +1,4 @@
-"""DINOv3 weights as Hugging Face distributes them, to Flax. torch is not needed.
+"""DINOv3 weights as Hugging Face distributes them, to Flax and back, without torch.
 
 The weights are gated and their licence restricts passing them on: download them
 yourself, and keep them out of checkpoints that are published.
@@ -13,10 +13,11 @@ from typing import Any
 
 import jax
 import numpy as np
+import safetensors.numpy
 
+from radejax.core import files
 from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import read_json
 from radejax.interop.state_dict import StateDictReader
 from radejax.models.vit import ViT
 
@@ -39,6 +40,20 @@ _FIELDS = {
     "proj_bias": "proj_bias",
     "mlp_bias": "mlp_bias",
     "layerscale_value": "layer_scale",
+}
+
+_LAYER_NAMES = {
+    "norm_1": "norm1",
+    "norm_2": "norm2",
+    "scale_1": "layer_scale1.lambda1",
+    "scale_2": "layer_scale2.lambda1",
+    "query": "attention.q_proj",
+    "key": "attention.k_proj",
+    "value": "attention.v_proj",
+    "out": "attention.o_proj",
+    "up": "mlp.up_proj",
+    "gate": "mlp.gate_proj",
+    "down": "mlp.down_proj",
 }
 
 _SIZES = (
@@ -81,10 +96,30 @@ def load(
             f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 model folder"
             " as downloaded from Hugging Face"
         )
-    config = read_json(folder / CONFIG_FILE, dict[str, Any])
+    config = files.read_json(folder / CONFIG_FILE, dict[str, Any])
     model = model_from_config(config, **model_overrides)
     path = folder / WEIGHTS_FILE
     return model, {"params": to_params(model, read_safetensors(path), str(path))}
+
+
+def save(model: ViT, params: Mapping[str, Any], folder: str | pathlib.Path) -> None:
+    """Writes a model as a folder that `load`, and transformers, read.
+
+    Args:
+        model: Says what the parameters belong to.
+        params: Its parameters, as of `load(folder)[1]["params"]`.
+        folder: Made if missing; files in it are replaced.
+    """
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
+    biases = zip(("query", "key", "value"), model.qkv_bias, strict=True)
+    config |= {f"{name}_bias": bias for name, bias in biases}
+    config |= {"model_type": "dinov3_vit", "architectures": ["DINOv3ViTModel"]}
+    files.write_json(folder / CONFIG_FILE, config)
+    content = safetensors.numpy.save(to_tensors(model, params), {"format": "pt"})
+    with files.atomic_write(folder / WEIGHTS_FILE) as file:
+        file.write(content)
 
 
 def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
@@ -182,23 +217,55 @@ def to_params(
     return params
 
 
+def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """DINOv3 tensors by name of the parameters of `model`: inverse of `to_params`."""
+    params = jax.tree.map(np.asarray, dict(params))
+    channels, size = model.hidden_size, model.patch_size
+    tensors = {"embeddings.mask_token": np.zeros((1, 1, channels), np.float32)}
+    tensors["embeddings.cls_token"] = params["prefix_tokens"][:, :1]
+    if model.num_registers:
+        tensors["embeddings.register_tokens"] = params["prefix_tokens"][:, 1:]
+
+    def put(name: str, part: Mapping[str, np.ndarray]) -> None:
+        for field, array in part.items():
+            is_bias = field == "bias"
+            tensors[f"{name}.{'bias' if is_bias else 'weight'}"] = array.T
+
+    patches = dict(params["patch_embed"])
+    kernel = patches.pop("kernel").reshape(size, size, 3, channels)
+    put("embeddings.patch_embeddings", patches)
+    tensors["embeddings.patch_embeddings.weight"] = kernel.transpose(3, 2, 0, 1)
+    put("norm", params["norm"])
+    for index in range(model.num_layers):
+        layer = jax.tree.map(lambda x, i=index: x[i], params["layers"])
+        for ours, part in layer.items():
+            name = f"layer.{index}.{_LAYER_NAMES[ours]}"
+            if ours.startswith("scale"):
+                tensors[name] = part
+            else:
+                put(name, part)
+    return {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+
+
 def _layer(reader: StateDictReader, model: ViT, prefix: str) -> dict[str, Any]:
     channels, hidden = model.hidden_size, model.mlp_dim
 
-    def linear(name: str, size_in: int, size_out: int, bias: bool) -> dict[str, Any]:
-        return reader.linear(prefix + name, size_in, size_out, use_bias=bias)
+    def name(ours: str) -> str:
+        return prefix + _LAYER_NAMES[ours]
 
-    layer = {
-        "norm_1": reader.norm(f"{prefix}norm1", channels),
-        "norm_2": reader.norm(f"{prefix}norm2", channels),
-        "scale_1": reader.take(f"{prefix}layer_scale1.lambda1", (channels,)),
-        "scale_2": reader.take(f"{prefix}layer_scale2.lambda1", (channels,)),
-        "out": linear("attention.o_proj", channels, channels, model.proj_bias),
-        "up": linear("mlp.up_proj", channels, hidden, model.mlp_bias),
-        "down": linear("mlp.down_proj", hidden, channels, model.mlp_bias),
-    }
-    for name, bias in zip(("query", "key", "value"), model.qkv_bias, strict=True):
-        layer[name] = linear(f"attention.{name[0]}_proj", channels, channels, bias)
+    def linear(ours: str, size_in: int, size_out: int, bias: bool) -> dict[str, Any]:
+        return reader.linear(name(ours), size_in, size_out, use_bias=bias)
+
+    layer: dict[str, Any] = {}
+    for ours in ("norm_1", "norm_2"):
+        layer[ours] = reader.norm(name(ours), channels)
+    for ours in ("scale_1", "scale_2"):
+        layer[ours] = reader.take(name(ours), (channels,))
+    layer["out"] = linear("out", channels, channels, model.proj_bias)
+    layer["up"] = linear("up", channels, hidden, model.mlp_bias)
+    layer["down"] = linear("down", hidden, channels, model.mlp_bias)
+    for ours, bias in zip(("query", "key", "value"), model.qkv_bias, strict=True):
+        layer[ours] = linear(ours, channels, channels, bias)
     if model.gated_mlp:
-        layer["gate"] = linear("mlp.gate_proj", channels, hidden, model.mlp_bias)
+        layer["gate"] = linear("gate", channels, hidden, model.mlp_bias)
     return layer

@@ -255,17 +255,8 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
         FileNotFoundError: A folder that was named is not there.
     """
     check_folders(filter(None, [sources.camera_calibration]))  # simulating takes long
-    simulation = config.get("simulation")
-    if not sources.data and simulation is None:
-        raise UserError(
-            "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
-            "config that simulates them, such as quickstart"
-        )
-    if simulation is not None:
-        root = _simulated_root(simulation, sources.data)
-        processes.main_first(lambda: simulate_dataset(simulation, root))
-        sources = dataclasses.replace(sources, data=(root,))
-    data = Data.open(config, model, sources.paths())
+    roots = existing_roots(config.get("simulation"), sources.data)
+    data = Data.open(config, model, dataclasses.replace(sources, data=roots).paths())
     _log.info("%s", data.frames.summary().to_text())
     if config.data.get("validation"):
         _tell_what_is_held_out(data)
@@ -346,6 +337,30 @@ def data_of_run(
             f"{workdir} was trained on {describe_grid(loaded.grid)}"
         )
     return config, data
+
+
+def existing_roots(
+    simulation: ConfigDict | None, roots: Sequence[str]
+) -> Sequence[str]:
+    """Folders of the data, those of a config that simulates them made if missing.
+
+    Args:
+        simulation: `config.simulation`; None for real data.
+        roots: What the user says.
+
+    Raises:
+        UserError: Neither is there.
+    """
+    if simulation is not None:
+        root = _simulated_root(simulation, roots)
+        processes.main_first(lambda: simulate_dataset(simulation, root))
+        return (root,)
+    if not roots:
+        raise UserError(
+            "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
+            "config that simulates them, such as quickstart"
+        )
+    return roots
 
 
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:

@@ -40,6 +40,27 @@ def test_tokens_of_the_tiny_model(folder, golden, make):
     np.testing.assert_allclose(tokens[0], expected, atol=TOLERANCE)
 
 
+@pytest.mark.parametrize("changes", [{}, {"use_gated_mlp": True, "mlp_bias": False}])
+def test_a_folder_that_is_written_is_the_one_that_was_read(
+    folder, tensors, changes, make, tmp_path
+):
+    model, variables = dinov3_hf.load(folder)
+    if changes:
+        model = dinov3_hf.model_from_config(make.TINY_CONFIG | changes)
+        shapes = jax.eval_shape(model.init, jax.random.key(0), np.zeros((1, 16, 16, 3)))
+        rng = np.random.default_rng(0)
+        variables = jax.tree.map(lambda x: rng.normal(size=x.shape), shapes)
+        variables = jax.tree.map(np.float32, variables)
+    dinov3_hf.save(model, variables["params"], tmp_path / "written")
+    again, found = dinov3_hf.load(tmp_path / "written")
+    assert again == model
+    chex.assert_trees_all_equal(found["params"], variables["params"])
+    written = safetensors.numpy.load_file(tmp_path / "written" / "model.safetensors")
+    if not changes:  # by the names and in the shapes of transformers
+        tensors = dict(tensors) | {"embeddings.mask_token": np.zeros((1, 1, 96))}
+        chex.assert_trees_all_equal(written, tensors)
+
+
 def test_the_first_layers_alone(golden, make, tensors):
     # Without the final normalisation's statistics, to see where an error starts.
     expected = np.load(golden / "dinorade_vit.npz")

@@ -12,10 +12,23 @@ from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.models.radenet import FIELDS, pad_to_multiple
 
+from ..small_models import drawn
+
 
 @pytest.fixture(scope="module")
 def small(radenet_golden):
     return radenet_golden["SMALL"]
+
+
+@pytest.fixture(scope="module")
+def variables(small):
+    return drawn(models.build(small), np.zeros((1, 8, 8, 13)))
+
+
+@pytest.fixture(scope="module")
+def apply(small):
+    """Compiled once for a shape."""
+    return jax.jit(models.build(small).apply)
 
 
 def num_parameters(model):
@@ -53,34 +66,27 @@ def test_pads_at_the_far_and_right_end():
     assert padded.sum() == 5 * 7 * 2
 
 
-def test_padding_inside_equals_padding_outside(small):
-    model = models.build(small)
+def test_padding_inside_equals_padding_outside(variables, apply):
     x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
-    variables = model.init(jax.random.key(1), x)
-    maps = jax.jit(model.apply)(variables, x)
+    maps = apply(variables, x)
     assert maps.heatmap_logits.shape == (1, 24, 16, 3)
     assert maps.box_params.shape == (1, 24, 16, 8)
-    outside = jax.jit(model.apply)(variables, pad_to_multiple(x, 8))
+    outside = apply(variables, pad_to_multiple(x, 8))
     chex.assert_trees_all_close(maps, outside, atol=1e-5)
 
 
-def test_cropped_maps_are_the_padded_ones_cut(small):
+def test_cropped_maps_are_the_padded_ones_cut(small, variables, apply):
     x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
-    model = models.build(small)
-    variables = model.init(jax.random.key(1), x)
-    maps = jax.jit(model.apply)(variables, x)
+    maps = apply(variables, x)
     cropped = jax.jit(models.build(small | {"crop_output": True}).apply)(variables, x)
     assert cropped.heatmap_logits.shape == (1, 21, 14, 3)
     expected = jax.tree.map(lambda m: m[:, :21, :14], maps)
     chex.assert_trees_all_close(cropped, expected, atol=1e-5)
 
 
-def test_frames_do_not_touch_each_other(small):
-    model = models.build(small)
-    x = jax.random.uniform(jax.random.key(0), (3, 16, 16, 13))
-    variables = model.init(jax.random.key(1), x[:1])
-    together = jax.jit(model.apply)(variables, x)
-    alone = jax.jit(model.apply)(variables, x[1:2])
+def test_frames_do_not_touch_each_other(variables, apply):
+    x = jax.random.uniform(jax.random.key(0), (3, 24, 16, 13))
+    together, alone = apply(variables, x), apply(variables, x[1:2])
     middle = jax.tree.map(lambda m: m[1:2], together)
     chex.assert_trees_all_close(middle, alone, atol=2e-5)
 
@@ -91,7 +97,7 @@ def test_remat_changes_neither_parameters_nor_gradients(small):
     # One level and short ends: rematerialised gradients are slow to compile.
     small = small | {"widths": (16,), "neck": "plain", "heads": "default"}
     model = models.build(small)
-    variables = model.init(jax.random.key(1), x)
+    variables = drawn(model, x)
 
     def gradient(model):
         def loss(v):
@@ -107,13 +113,11 @@ def test_remat_changes_neither_parameters_nor_gradients(small):
     assert models.build(small | {"remat": True}).remat == "blocks"
 
 
-def test_bfloat16_is_near_float32(small):
-    x = jax.random.uniform(jax.random.key(0), (1, 16, 16, 13))
-    model = models.build(small)
-    variables = model.init(jax.random.key(1), x)
+def test_bfloat16_is_near_float32(small, variables, apply):
+    x = jax.random.uniform(jax.random.key(0), (1, 24, 16, 13))
     narrow = models.build(small | {"dtype": "bfloat16"})
     maps = jax.jit(narrow.apply)(variables, x)
-    expected = jax.jit(model.apply)(variables, x)
+    expected = apply(variables, x)
     assert maps.heatmap_logits.dtype == jnp.float32
     for actual, wide in zip(
         jax.tree.leaves(maps), jax.tree.leaves(expected), strict=True

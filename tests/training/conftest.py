@@ -14,6 +14,8 @@ from radejax.core.config import base_config
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
 
+from ..small_models import drawn
+
 NUM_FRAMES = 16
 
 
@@ -23,6 +25,7 @@ class Tiny:
 
     config: Any
     model: Any
+    variables: Any
     grid: RadarGrid
     map_grid: RadarGrid
     frames: Batch
@@ -63,13 +66,23 @@ def tiny() -> Tiny:
         max_skipped_steps=2,
     )
     model = models.build(config.model)
+    variables = drawn(model, np.zeros((1, *grid.projection_shape)))
     return Tiny(
         config=config,
         model=model,
+        variables=jax.tree_util.tree_map_with_path(_without_biases, variables),
         grid=grid,
         map_grid=models.map_grid(grid, model, "true"),
         frames=make_frames(grid, seed=0),
     )
+
+
+def _without_biases(path: tuple, x: np.ndarray) -> np.ndarray:
+    """As a training begins: all zero but the heatmap's, a confidence of 0.1."""
+    name = "/".join(key.key for key in path)
+    if name.endswith("heatmap/out/bias"):
+        return np.full_like(x, np.log(0.1 / 0.9))
+    return np.zeros_like(x) if name.endswith("bias") else x
 
 
 def make_frames(grid: RadarGrid, seed: int) -> Batch:

@@ -6,22 +6,50 @@ import json
 import os
 import pathlib
 import signal
+from collections.abc import Iterator
 from typing import Any
 
 import chex
+import flax.linen as nn
 import grain
 import jax
 import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.training import loop, processes, sharding
+from radejax.training import loop, processes, sharding, start
 from radejax.training.checkpoints import Checkpoints, abstract_state
 from radejax.training.start import Plan
 from radejax.training.watch import Scores
 
 Tiny = Any  # the fixture `tiny` of conftest.py
 STEPS_PER_EPOCH = 4
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_once() -> Iterator[None]:
+    """Plans of one optimizer share it and their step, which JAX then traces once.
+
+    Runs differ in what goes on around their steps, and tracing takes the longest.
+    """
+    optimizers, steps = {}, {}
+    make_optimizer, make_step = Plan.optimizer, start.make_train_step
+    fields = ("learning_rate", "final_learning_rate", "warmup_steps", "schedule")
+    fields += ("weight_decay", "gradient_clip_norm")
+
+    def optimizer(plan: Plan) -> Any:
+        assert plan.options.schedule == "cosine"  # does not count epochs
+        key = (plan.num_steps, *(plan.options[name] for name in fields))
+        return optimizers.setdefault(key, make_optimizer(plan))
+
+    def step(*parts: Any, **options: Any) -> Any:
+        key = (*map(id, parts), repr(options))
+        return steps.setdefault(key, make_step(*parts, **options))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Plan, "optimizer", optimizer)
+        patch.setattr(start, "make_train_step", step)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +72,7 @@ def run(tiny: Tiny) -> Any:
         plan = dataclasses.replace(plan, **{name: others.pop(name) for name in names})
         return loop.train(
             tiny.model,
-            None,
+            tiny.variables,
             tiny.loader() if loader is None else loader,
             tiny.map_grid,
             workdir,
@@ -103,6 +131,36 @@ def test_two_runs_of_one_seed_are_equal_bit_for_bit(
     again = run(workdir)
     chex.assert_trees_all_equal(again.state, undisturbed[0].state)
     assert _losses(workdir) == _losses(undisturbed[1])
+
+
+class Dense(nn.Module):
+    """A model whose initialisation is soon compiled."""
+
+    @nn.compact
+    def __call__(self, projection: jax.Array, train: bool) -> jax.Array:
+        return nn.Dense(3)(projection)
+
+
+def test_a_seed_draws_its_variables(tiny: Tiny, tmp_path: pathlib.Path) -> None:
+    def drawn(seed: int) -> Any:
+        plan = Plan(
+            options=tiny.config.train,
+            loss={},
+            watch=tiny.config.watch,
+            seed=seed,
+            info={},
+            steps_per_epoch=STEPS_PER_EPOCH,
+        )
+        init = start.initial(Dense(), None, tiny.loader(), plan.optimizer(), plan)
+        with Checkpoints(tmp_path) as checkpoints:
+            mesh = sharding.make_mesh(1)
+            state, step = start.restore(checkpoints, tiny.loader(), init, mesh, plan)
+        assert step == 0
+        return state
+
+    chex.assert_trees_all_equal(drawn(0), drawn(0))
+    kernels = [drawn(seed).params["Dense_0"]["kernel"] for seed in (0, 1)]
+    assert np.abs(kernels[0] - kernels[1]).min() > 0
 
 
 @pytest.mark.parametrize("batch", [2, pytest.param(6, marks=pytest.mark.slow)])
@@ -296,23 +354,23 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
     run: Any, tiny: Tiny, workdir: Any
 ) -> None:
     config = tiny.config.copy_and_resolve_references()
-    config.train.update(evaluate_every_epochs=1, num_epochs=3, checkpoints_to_keep=1)
+    config.train.update(evaluate_every_epochs=1, num_epochs=4, checkpoints_to_keep=1)
     seen = []
 
     def evaluate(state: Any, step: int, should_stop: Any) -> Scores:
         seen.append((step, int(state.step)))
-        best = {4: 1.5, 8: 3.5, 12: 2.5}[step]
+        best = {2: 1.5, 4: 3.5, 6: 2.5, 8: 2.0}[step]
         picture = np.zeros((4, 6, 3), np.uint8)
         return Scores({"validation/ap_bev_iou30/exact": best}, best, {"a": picture})
 
-    run(workdir, config=config, evaluate=evaluate)
-    assert seen == [(4, 4), (8, 8), (12, 12)]
+    run(workdir, config=config, evaluate=evaluate, steps_per_epoch=2)
+    assert seen == [(2, 2), (4, 4), (6, 6), (8, 8)]
     rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
     name = "validation/ap_bev_iou30/exact"
-    assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5]
+    assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5, 2.0]
     with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
-        assert checkpoints.steps() == [8, 12]
-        assert checkpoints.best_step() == 8
+        assert checkpoints.steps() == [4, 8]
+        assert checkpoints.best_step() == 4
 
 
 @pytest.mark.slow

@@ -25,6 +25,8 @@ from radejax.training.start import Plan
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step
 
+from ..small_models import drawn
+
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SIZE = (32, 576)  # the released crop leaves out 280 columns on both sides
 ALL = [
@@ -244,7 +246,7 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
     inputs = [batch.projection]
     inputs += [] if batch.image is None else [batch.image, batch.camera]
     start = create_state(
-        jax.jit(model.init)(jax.random.key(0), *inputs),
+        drawn(model, *inputs),
         optimizer,
         batch_size=2,
         use_ema=False,

@@ -29,8 +29,9 @@ class Source:
         labels: Folder or zip of a label revision.
         label_version: v1.0, v1.1, v2.0 or v2.1.
         split: "train", "test", a split file, or None for every frame.
-        ground_truth: File of ground truth instead, with `frames`.
-        frames: JSON file of the frame table (columns) for `ground_truth`.
+        ground_truth: File of ground truth instead, or a report's folder.
+        frames: JSON file of the frame table (columns) for `ground_truth`; by default the
+            `frames.json` beside it.
         sequences: Only frames of these; all if empty.
         weather: Likewise.
         z_offset_m: Added to the z of predictions.
@@ -111,8 +112,7 @@ def _load(
     frames, left_out = None, {}
     is_boxes = any(path.glob("*.json")) and not (path / "preds").is_dir()
     if source.ground_truth:
-        frames = _read_frames(source.frames) if source.frames else None
-        truth = predictions.read_table(source.ground_truth, frames, scored=False)
+        truth, frames = _ground_truth(source.ground_truth, source.frames)
     elif source.data or source.labels:
         data = KRadar(
             list(source.data) or None,
@@ -139,6 +139,21 @@ def _load(
     if frames is None:
         frames = {"frame": np.union1d(truth["frame"], found["frame"])}
     return truth, found, frames, left_out
+
+
+def _ground_truth(
+    path: PathLike, table: PathLike | None
+) -> tuple[Columns, Columns | None]:
+    """Of a file or a report, with the frame table that is named or lies beside it."""
+    path = pathlib.Path(path)
+    if (path / "ground_truth.npz").is_file():
+        path = path / "ground_truth.npz"
+    frames = None
+    if table:
+        frames = _read_frames(table)
+    elif path.with_name("frames.json").is_file():
+        frames = _frames_of_report(path.parent)
+    return predictions.read_table(path, frames, scored=False), frames
 
 
 def stored_from(path: PathLike) -> float:

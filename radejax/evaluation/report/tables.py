@@ -33,6 +33,9 @@ ERRORS = (
     ("axis_deg", "Axis deg", 1),
 )
 STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+WIDEST_IN_A_COLUMN = (
+    7  # columns of a table; more of them stand across the page in LaTeX
+)
 Key = tuple[str, str, str, str, float]  # protocol, condition, class, space, IoU
 
 
@@ -59,13 +62,14 @@ class Table:
             self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         if style == "latex":
+            kind = "table*" if len(self.header) > WIDEST_IN_A_COLUMN else "table"
             lines = [
-                "\\begin{table}[t]",
+                f"\\begin{{{kind}}}[t]",
                 f"\\centering\\footnotesize\n\\caption{{{_latex(self.title)}}}",
-                f"\\begin{{adjustbox}}{{max width=\\columnwidth}}\n{body}",
+                f"\\begin{{adjustbox}}{{max width=\\linewidth}}\n{body}",
                 "\\end{adjustbox}",
                 *(f"\\par {_latex(note)}" for note in self.notes),
-                "\\end{table}\n",
+                f"\\end{{{kind}}}\n",
             ]
             return "\n".join(lines)
         title = f"**{self.title}**" if style == "markdown" else self.title

@@ -8,6 +8,7 @@ enough for a network to find vehicles and people at the pixels the labels say.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -84,6 +85,7 @@ class Ground:
     up: np.ndarray
 
 
+@functools.lru_cache(maxsize=4)  # of a data set's cameras, for all its sequences
 def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
     """Where every pixel's ray meets the ground plane `z = ground_m` (radar frame)."""
     fx, fy, cx, cy = calibration.intrinsics
@@ -161,9 +163,9 @@ class CameraRenderer:
 
     def render(self, frame: SceneFrame) -> np.ndarray:
         """`[H, 2 W, 3]` uint8 image of the pair, left half first."""
-        return np.concatenate([self._one(frame, side) for side in (0, 1)], axis=1)
+        return np.concatenate([self.view(frame, side) for side in (0, 1)], axis=1)
 
-    def _one(self, frame: SceneFrame, side: int) -> np.ndarray:
+    def view(self, frame: SceneFrame, side: int) -> np.ndarray:
         """`[H, W, 3]` image of one camera."""
         if self.content == "objects":
             return self.silhouettes(frame, side)
@@ -199,6 +201,18 @@ class CameraRenderer:
                 share = _HALF_BRIGHT_M / (_HALF_BRIGHT_M + polygon.depth_m)
                 color = _CLASS_COLORS[frame.cls[polygon.box]] * share
                 draw.polygon(polygon.points, fill=tuple(color.astype(int).tolist()))
+        return np.asarray(canvas)
+
+    def shown_boxes(self, frame: SceneFrame, side: int) -> np.ndarray:
+        """`[H, W]` int32 index of the box of the frame that a pixel shows, -1 for none.
+
+        As if air and lens were clear; what the roadside hides is not shown.
+        """
+        calibration = self.calibrations[side]
+        canvas = Image.new("I", (calibration.width, calibration.height), -1)
+        draw = ImageDraw.Draw(canvas)
+        for polygon in self.polygons(frame, side):
+            draw.polygon(polygon.points, fill=polygon.box)
         return np.asarray(canvas)
 
     def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:

@@ -253,19 +253,26 @@ def _project_faces(
     outlines = faces[:, :, None] + part * (following - faces)[:, :, None]
     outlines = outlines.reshape(len(faces), -1, 3)
     size = np.array([calibration.width, calibration.height], float)
-    result = []
-    for points, depth, outline in zip(
-        *project(outlines, camera), outlines, strict=True
-    ):
-        if depth.max() < _NEAR_M:
-            result.append([])
-            continue
-        if depth.min() < _NEAR_M:
-            points, _ = project(_cut_near(outline, depth, _NEAR_M), camera)
-        is_off = (points.max(0) < 0).any() or (points.min(0) > size).any()
-        points = np.clip(points, -2.0 * size, 3.0 * size)
-        result.append([] if is_off else list(map(tuple, points.tolist())))
+    places, depth = project(outlines, camera)
+    low, high = places.min(1), places.max(1)
+    shown = ((high >= 0) & (low <= size)).all(1)
+    points = np.clip(places, -2.0 * size, 3.0 * size).tolist()
+    result = [
+        list(map(tuple, p)) if s else [] for p, s in zip(points, shown, strict=True)
+    ]
+    for index in np.flatnonzero(depth.min(1) < _NEAR_M):
+        result[index] = []
+        if depth[index].max() >= _NEAR_M:
+            cut = _cut_near(outlines[index], depth[index], _NEAR_M)
+            result[index] = _on_image(project(cut, camera)[0], size)
     return result
+
+
+def _on_image(points: np.ndarray, size: np.ndarray) -> list[tuple[float, float]]:
+    """Pixels `[P, 2]` of a face, not too far off an image of a size; or none."""
+    is_off = (points.max(0) < 0).any() or (points.min(0) > size).any()
+    points = np.clip(points, -2.0 * size, 3.0 * size)
+    return [] if is_off else list(map(tuple, points.tolist()))
 
 
 def _cut_near(outline, depth, near_m) -> np.ndarray:

@@ -35,6 +35,23 @@ def test_ground_truth_by_id_without_a_frame_table(random_scene, tmp_path):
     np.testing.assert_array_equal(frames["frame"], both)
 
 
+def test_ground_truth_of_a_report(stored):
+    folder, source = stored
+    expected = load.load(folder / "found.json", source, ("Sedan",))
+    beside = dataclasses.replace(source, frames=None)
+    truth = predictions.read_table(folder / "truth.csv", expected[2], scored=False)
+    report = folder / "report"
+    report.mkdir()
+    predictions.write_table(report / "ground_truth.npz", truth, expected[2])
+    (report / "frames.json").write_bytes((folder / "frames.json").read_bytes())
+    for other in (beside, dataclasses.replace(beside, ground_truth=str(report))):
+        found = load.load(folder / "found.json", other, ("Sedan",))
+        for a, b in zip(found[:3], expected[:3], strict=True):
+            assert a.keys() == b.keys()
+            for name in a:
+                np.testing.assert_array_equal(a[name], b[name])
+
+
 def test_a_part_of_the_frames(stored, random_scene):
     folder, source = stored
     _, _, whole, _ = load.load(folder / "found.json", source, ("Sedan",))

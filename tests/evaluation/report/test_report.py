@@ -138,9 +138,15 @@ def test_tables_stand_beside_the_published_rows(written):
     latex = (out / "tables.tex").read_text()
     count = latex.count(r"\begin{tabular}")
     assert count > 5
-    for part in (r"\end{tabular}", r"\toprule", r"\begin{table}[t]", r"\caption{"):
+    for part in (r"\end{tabular}", r"\toprule", r"\begin{table", r"\caption{"):
         assert latex.count(part) == count
-    assert latex.count(r"\begin{adjustbox}{max width=\columnwidth}") == count
+    assert latex.count(r"\begin{adjustbox}{max width=\linewidth}") == count
+    for table in latex.split(r"\begin{table")[1:]:  # wide ones stand across the page
+        columns = table.split(r"\begin{tabular}{")[1].split("}")[0]
+        star = "*" * (len(columns) > 7)
+        assert table.startswith(star + "}[t]")
+        assert rf"\end{{table{star}}}" in table
+    assert r"\begin{table*}" in latex
     captions = [line for line in latex.splitlines() if line.startswith(r"\caption{")]
     assert any(r"kradar\_r40, score$>$0, skip=frame" in line for line in captions)
     assert not any(re.search(r"[^\\$][_&%><]", line[9:]) for line in captions)

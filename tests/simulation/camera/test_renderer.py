@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
@@ -50,16 +49,6 @@ def make_scene(boxes, classes, *, time="day", weather="normal"):
     )
 
 
-def object_mask(renderer, frame, side=0):
-    """`[H, W]` int32: which box of the frame each pixel shows, -1 for none."""
-    size = renderer.calibrations[side].width, renderer.calibrations[side].height
-    canvas = Image.new("I", size, -1)
-    draw = ImageDraw.Draw(canvas)
-    for polygon in renderer.polygons(frame, side):
-        draw.polygon(polygon.points, fill=polygon.box)
-    return np.asarray(canvas)
-
-
 def bounds(pixels):
     return np.concatenate([pixels.min(0), pixels.max(0)])
 
@@ -95,7 +84,7 @@ class TestLabelsProjectOntoObjects:
         for side in (0, 1):
             pixels, _ = PAIR[side].project_ego(corners(box))
             expected = bounds(pixels)
-            drawn = mask_bounds(object_mask(renderer, sequence.frame(0), side), 0)
+            drawn = mask_bounds(renderer.shown_boxes(sequence.frame(0), side), 0)
             size = expected[2:] - expected[:2]
             # Never outside, and up to the rim: rounded bodies leave at most a tenth.
             assert (drawn[:2] >= expected[:2] - 1.5).all()
@@ -107,7 +96,7 @@ class TestLabelsProjectOntoObjects:
         sequence = make_scene([box], ["Bus or Truck"])
         renderer = camera.CameraRenderer(sequence, PAIR, 0)
         pixels, _ = PAIR[0].project_ego(corners(box))
-        drawn = mask_bounds(object_mask(renderer, sequence.frame(0)), 0)
+        drawn = mask_bounds(renderer.shown_boxes(sequence.frame(0), 0), 0)
         np.testing.assert_allclose(drawn, bounds(pixels), atol=1.5)
 
     def test_through_label_file_and_calibration_file(self, tmp_path):
@@ -128,21 +117,25 @@ class TestLabelsProjectOntoObjects:
         read = read_labels(tmp_path / "1.txt")[0]
         assert read.visibility == "R"
         pixels, _ = calibration.project_lidar(corners(read.box))
-        mask = object_mask(camera.CameraRenderer(sequence, PAIR, 0), frame)
+        mask = camera.CameraRenderer(sequence, PAIR, 0).shown_boxes(frame, 0)
         np.testing.assert_allclose(mask_bounds(mask, 0), bounds(pixels), atol=1.5)
 
     def test_near_objects_hide_far_ones(self):
         near = [10.0, 0.0, -0.15, 4.5, 1.9, 1.5, 0.0]
         far = [30.0, 0.0, -0.15, 4.5, 1.9, 1.5, 0.0]
         sequence = make_scene([far, near], ["Sedan", "Sedan"])
-        mask = object_mask(camera.CameraRenderer(sequence, PAIR, 0), sequence.frame(0))
+        mask = camera.CameraRenderer(sequence, PAIR, 0).shown_boxes(
+            sequence.frame(0), 0
+        )
         pixel, _ = PAIR[0].project_ego(np.array([10.0 - 2.25, 0.0, -0.3]))
         assert mask[int(pixel[1]), int(pixel[0])] == 1
 
     def test_object_through_the_camera_plane_does_not_break(self):
         box = [-2.0, 2.5, 0.6, 12.0, 2.5, 3.0, 0.0]
         sequence = make_scene([box], ["Bus or Truck"])
-        mask = object_mask(camera.CameraRenderer(sequence, PAIR, 0), sequence.frame(0))
+        mask = camera.CameraRenderer(sequence, PAIR, 0).shown_boxes(
+            sequence.frame(0), 0
+        )
         assert 0.02 < (mask == 0).mean() < 0.5
 
 
@@ -234,7 +227,7 @@ class TestSilhouettes:
             renderer = camera.CameraRenderer(sequence, pair, 0, content="objects")
             frame = sequence.frame(0)
             images.append(renderer.render(frame))
-        image, mask = images[0], object_mask(renderer, frame)
+        image, mask = images[0], renderer.shown_boxes(frame, 0)
         np.testing.assert_array_equal(images[1], image)
         np.testing.assert_array_equal(image[:, :320].any(-1), mask >= 0)
         far, near, person = (

@@ -1,0 +1,195 @@
+"""The table of benchmarks: what `run.py` measures, beside what, at which sizes.
+
+Each entry yields cases one after the other; what a case holds is let go before the next
+is built.
+"""
+
+import collections
+import contextlib
+import functools
+import itertools
+import pathlib
+import tempfile
+
+import inputs
+import jax
+import networks
+import numpy as np
+import scipy.io
+from case import Case, compiled, difference, timed, waiting
+
+from radejax.data.frame_table import make_table
+from radejax.data.kradar.write import write_tesseract
+from radejax.data.pipeline import LoaderOptions, make_loader
+from radejax.data.projection import project, project_jax, project_plain
+from radejax.data.tesseract import project_file
+from radejax.evaluation.average_precision import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOLS
+from radejax.evaluation.report.measure import Options, measure
+from radejax.geometry.radar_grid import RadarGrid
+
+GRID = RadarGrid.kradar()
+
+
+def tpm(machine):
+    """Tensor max projection of a tesseract, as `loadmat` lays it out."""
+    tesseract = inputs.make_tesseract(GRID.shape_drea)
+    columns = {
+        "radejax": lambda: timed(lambda: project(tesseract)),
+        "released formula": lambda: timed(lambda: project_plain(tesseract)),
+        "plain read (sum)": lambda: timed(tesseract.sum),
+    }
+    yield Case(
+        name="TPM on the host",
+        columns=columns,
+        error=difference([project(tesseract)], [project_plain(tesseract)]),
+        note="beside a plain read: the share of its bandwidth",
+    )
+    if machine["platform"] != "cpu":
+        x = jax.device_put(np.ascontiguousarray(tesseract)[None])
+        program, cost = compiled(project_jax, x)
+        columns = {"radejax": waiting(program, x)}
+        yield Case(name="TPM on the device", columns=columns, **cost)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, is_small in (("uncompressed", False), ("compressed", True)):
+            path = pathlib.Path(folder) / f"{name}.mat"
+            write_tesseract(path, tesseract, compress=is_small)
+            columns = {
+                "radejax": functools.partial(timed, lambda p=path: project_file(p))
+            }
+            if not is_small:
+                columns["loadmat, released formula"] = lambda p=path: timed(
+                    lambda: project_plain(scipy.io.loadmat(p)["arrDREA"])
+                )
+            note = (
+                f"{tesseract.nbytes / 1e6:.0f} MB of cells, the file in the page cache"
+            )
+            yield Case(name=f"TPM from a .mat, {name}", columns=columns, note=note)
+
+
+def nms(machine):
+    """Peaks to boxes, against the released loops in Python."""
+    for peaks in (40, 100):
+        maps, loops = inputs.make_maps(peaks), inputs.peaks_on_host(peaks)
+        ours = inputs.jitted_decode(128)
+        found = ours(maps)
+        kept = np.stack([f[2] for f in inputs.loop_decode(*loops)])
+        boxes = np.asarray(found.boxes[0])[np.asarray(found.is_valid[0])]
+        yield Case(
+            name=f"decoding and NMS, {peaks} peaks",
+            columns={
+                "radejax": waiting(ours, maps),
+                "released loops": lambda loops=loops: timed(
+                    lambda: inputs.loop_decode(*loops)
+                ),
+            },
+            error=difference([boxes], [kept]),
+        )
+
+
+def evaluate(machine):
+    """A test split's worth of predictions, every protocol, all weathers."""
+    for false_per_frame in (2, 50):
+        truth, found, frames = inputs.synthetic_set(false_per_frame=false_per_frame)
+        options = Options(protocols=tuple(PROTOCOLS))
+
+        def everything(truth=truth, found=found, frames=frames, options=options):
+            measure(EvaluationSet(truth, found, frames=frames), frames, options)
+
+        yield Case(
+            name=f"evaluation of the test split, {len(found['frame']):,} predictions",
+            columns={"radejax": functools.partial(timed, everything)},
+            note=f"{len(frames['frame']):,} frames in one call, {len(PROTOCOLS)} protocols",
+        )
+
+
+def load(machine):
+    """Records to host batches of 8, against the released `.npy` files."""
+    size, count = 8, 128
+    with contextlib.ExitStack() as stack:
+        columns = {}
+        for name, dtype in (("radejax", "float16"), ("radejax, uint8", "uint8")):
+            source = stack.enter_context(inputs.folder_of_records(32, GRID, dtype))
+            table = make_table(source, inputs.labelled(source), max_objects=32)
+            batches = make_loader(table, LoaderOptions(size))
+            take = functools.partial(itertools.islice, batches, count // size)
+            # The last batch alone is kept, as in training.
+            columns[name] = functools.partial(
+                timed, lambda take=take: collections.deque(take(), maxlen=1)
+            )
+        folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        paths = inputs.write_npy(folder, size, GRID)
+        columns["released .npy"] = functools.partial(
+            timed, lambda: inputs.read_npy(paths, size, count)
+        )
+        yield Case(name="records to batches", columns=columns, frames=count)
+
+
+def compress(machine):
+    """Reading records of the simulator's projections, compressed and not."""
+    projections = list(inputs.simulated(8))
+
+    def read(records):
+        return [records.read(i) for i in range(len(records))]
+
+    with tempfile.TemporaryDirectory() as folder:
+        for dtype in ("float16", "uint8"):
+            written = [
+                inputs.write_records(pathlib.Path(folder), projections, dtype, how)
+                for how in (False, True)
+            ]
+            plain, small = (entry.num_bytes / 8e6 for _, entry in written)
+            arrays = [read(records) for records, _ in written]
+            names = ("radejax", "radejax, compressed")
+            yield Case(
+                name=f"reading records, {dtype}",
+                columns={
+                    name: functools.partial(timed, functools.partial(read, records))
+                    for name, (records, _) in zip(names, written, strict=True)
+                },
+                frames=len(projections),
+                error=difference(*arrays),
+                tolerance=0.0,
+                note=f"{plain:.2f} MB a frame, compressed {small:.2f}",
+            )
+
+
+def simulate(machine):
+    """Fused projections of the simulator: one frame, and a batch on an accelerator."""
+    count = 1 if machine["platform"] == "cpu" else 16
+    frames, run = inputs.simulator_of(count)
+    arrays = jax.device_put(
+        jax.tree.map(
+            lambda *leaves: np.stack(leaves),
+            *[(x.scatterers, x.noise_power, x.key) for x in frames],
+        )
+    )
+    program, cost = compiled(jax.vmap(run), *arrays)
+    yield Case(
+        name="simulator, fused projection",
+        columns={"radejax": waiting(program, *arrays)},
+        frames=count,
+        **cost,
+    )
+
+
+BENCHMARKS = {
+    "radenet": (networks.radenet, 40),
+    "radenet_training": (networks.radenet_training, 90),
+    "dinorade": (networks.dinorade, 120),
+    "tpm": (tpm, 60),
+    "simulator": (simulate, 30),
+    "dinorade_training": (
+        functools.partial(networks.dinorade, task="training step"),
+        240,
+    ),
+    "detector": (networks.detector, 120),
+    "evaluation": (evaluate, 60),
+    "attention": (networks.attention, 30),
+    "nms": (nms, 30),
+    "loader": (load, 40),
+    "feeding": (networks.feeding, 60),
+    "records": (compress, 40),
+}
+"""Function, and seconds that it takes on two cores, by name for `--only`, in the order in
+which they are run: what matters most comes first."""

@@ -1,0 +1,280 @@
+"""Inputs of the benchmarks: tensors, maps, records and predictions, and the released loops.
+
+Sizes are K-Radar's. Random numbers do where their values do not matter for the time.
+"""
+
+import contextlib
+import functools
+import itertools
+import pathlib
+import tempfile
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import shapely
+
+from radejax.core.structures import CLASSES, Batch, DetectionMaps
+from radejax.data.encoding import encode
+from radejax.data.kradar.sequences import WEATHERS
+from radejax.data.records.arrays import ArrayRecords
+from radejax.data.records.files import RecordFileWriter, file_name
+from radejax.data.records.projections import Manifest, RecordSource, write_manifest
+from radejax.detection.decode import decode
+from radejax.geometry.boxes import bev_corners
+from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
+from radejax.simulation.radar import tensor
+from radejax.simulation.simulator import SequenceSimulator
+from radejax.simulation.world.traffic import make_sequence
+
+# K-Radar's front camera, sequence 1.
+CALIBRATION = CameraCalibration.from_angles(
+    intrinsics=(567.7208, 577.2137, 628.7208, 369.3069),
+    distortion=(-0.0288738, 0.0006023, 0.0039573, -0.0050472, 0.0),
+    yaw_deg=88.6,
+    pitch_deg=0.6,
+    roll_deg=89.6,
+    translation_m=(0.18, -0.13, 0.0),
+)
+
+
+# Tesseracts and projections ----------------------------------------------------------
+
+
+def make_tesseract(shape):
+    """Column-major noise with K-Radar's order of magnitude, `[D, R, E, A]`."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_exponential(shape[::-1], np.float32)
+    return (noise * np.float32(1e10)).T
+
+
+def frames_of(size, **camera):
+    """Random projections with a few boxes in view."""
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((size, 8, 8), np.float32)
+    boxes[..., 0] = rng.uniform(5, 70, (size, 8))
+    boxes[..., 1] = rng.uniform(-5, 5, (size, 8))
+    boxes[..., 3:6] = (4.2, 1.9, 1.6)
+    boxes[..., 7] = 1.0
+    return Batch(
+        projection=0.6
+        * rng.random((size, *RadarGrid.kradar().projection_shape), np.float32),
+        boxes=boxes,
+        classes=rng.integers(0, 5, (size, 8)).astype(np.int32),
+        is_valid=np.ones((size, 8), bool),
+        frame=np.arange(size, dtype=np.int32),
+        **camera,
+    )
+
+
+def simulator_of(count, weather="rain"):
+    """Radar inputs of frames of a scene, and the function that makes projections of them."""
+    config = SimulationConfig.from_mapping(default_config() | FULL_SIZE)
+    sequence = make_sequence(
+        1, environment="urban", time="day", weather=weather, num_frames=count,
+        rng=np.random.default_rng(len(weather)),
+    )  # fmt: skip
+    grid, parameters = config.make_grid(), config.make_parameters()
+    simulator = SequenceSimulator(sequence, grid, parameters, seed=0)
+    inputs = [simulator.radar_input(sequence.frame(i)) for i in range(count)]
+    return inputs, functools.partial(tensor.simulate, grid=grid, parameters=parameters)
+
+
+def simulated(count):
+    """`count` full-size projections of two scenes, float32, their noise included.
+
+    Random numbers would not compress, and empty scenes too well.
+    """
+    for weather in ("rain", "normal"):
+        inputs, run = simulator_of(count // 2, weather)
+        run = jax.jit(run)
+        for given in inputs:
+            yield np.asarray(run(given.scatterers, given.noise_power, given.key))
+
+
+# Records -----------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def folder_of_records(count, grid, dtype):
+    """Random projections as one file of records, while the block runs."""
+    levels = np.random.default_rng(0).random(grid.projection_shape, np.float32)
+    stored = encode(levels, dtype)
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        writer = RecordFileWriter(folder, file_name(0, 1))
+        for k in range(count):
+            writer.write(f"1/{k:05d}", stored)
+        write_manifest(folder, Manifest(grid, dtype, {}, [writer.commit()]))
+        yield RecordSource(folder, grid=grid)
+
+
+def labelled(records):
+    """The frames of records with five boxes each."""
+    box = np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]])
+    return [
+        types.SimpleNamespace(
+            key=key, boxes=np.repeat(box, 5, 0), classes=np.array(["Sedan"] * 5)
+        )
+        for key in records.frames
+    ]
+
+
+def write_records(folder, projections, dtype, compress):
+    """Records of projections, and their file's manifest."""
+    name = file_name(int(compress), 2, dtype)
+    with RecordFileWriter(folder, name, compress=compress) as writer:
+        for i, x in enumerate(projections):
+            writer.write(str(i), encode(x, dtype))
+        entry = writer.commit()
+    shape = projections[0].shape
+    return ArrayRecords(folder, [entry], shape, dtype, compressed=compress), entry
+
+
+def write_npy(folder, count, grid):
+    """Random projections as the released code stores them, float64."""
+    r, a, c = grid.projection_shape
+    stored = np.random.default_rng(0).random((c, r, a))
+    paths = [folder / f"DERA_tesseract_{i:05d}.npy" for i in range(count)]
+    for path in paths:
+        np.save(path, stored)
+    return paths
+
+
+def read_npy(paths, size, count):
+    """`np.load` and `np.stack` of `count` frames, the files again and again."""
+    names = itertools.cycle(paths)
+    for _ in range(count // size):
+        np.stack([np.load(path) for path in itertools.islice(names, size)])
+
+
+# Maps, and the released post-processing step by step ---------------------------------
+
+MAP_GRID = RadarGrid.kradar().padded(8)
+MAP_SHAPE = (MAP_GRID.num_range, MAP_GRID.num_azimuth, 5)
+THRESHOLD, NMS_IOU = 0.3, 0.3
+
+
+def make_maps(num_peaks: int, seed: int = 0) -> DetectionMaps:
+    """Single-bin peaks of distinct scores, far enough apart not to hide each other."""
+    rng = np.random.default_rng(seed)
+    logits = rng.uniform(-6, -4, MAP_SHAPE).astype(np.float32)
+    cells = [(i, j) for i in range(20, 256, 3) for j in range(1, 111, 3)]
+    cells = rng.permutation(cells)[:num_peaks]
+    classes = rng.integers(0, 5, num_peaks)
+    logits[cells[:, 0], cells[:, 1], classes] = np.linspace(4, -0.5, num_peaks)
+    params = rng.normal(0, 0.3, (*MAP_SHAPE[:2], 8)).astype(np.float32)
+    params[..., 3:6] += [4.5, 2.0, 1.6]
+    yaw = rng.uniform(-np.pi, np.pi, MAP_SHAPE[:2])
+    params[..., 6], params[..., 7] = np.sin(yaw), np.cos(yaw)
+    return DetectionMaps(jnp.asarray(logits[None]), jnp.asarray(params[None]))
+
+
+def loop_decode(logits: np.ndarray, params: np.ndarray) -> list[tuple]:
+    """(score, class, box) of every peak, bin by bin, then NMS: by descending score."""
+    scores = 1 / (1 + np.exp(-logits))
+    around = np.pad(scores, [(1, 1), (1, 1), (0, 0)], constant_values=-np.inf)
+    around = np.lib.stride_tricks.sliding_window_view(around, (3, 3), (0, 1))
+    is_peak = (scores >= around.max((-2, -1))) & (scores > THRESHOLD)
+    found = {}
+    for i, j, cls in np.argwhere(is_peak):
+        if (i, j) not in found or scores[i, j, cls] > found[i, j][0]:
+            x, y = MAP_GRID.cell_to_ego(int(i), int(j))
+            dx, dy, z, length, width, height, sin, cos = params[i, j]
+            box = (x + dx, y + dy, z, length, width, height, np.arctan2(sin, cos))
+            found[i, j] = (scores[i, j, cls], cls, np.array(box))
+    return loop_nms(sorted(found.values(), key=lambda f: -f[0]))
+
+
+def loop_nms(found: list[tuple]) -> list[tuple]:
+    """Keeps the best box, drops what overlaps it, and so on with the rest."""
+    kept = []
+    while found:
+        best, rest = found[0], found[1:]
+        kept.append(best)
+        found = [f for f in rest if loop_iou(best[2], f[2]) < NMS_IOU]
+    return kept
+
+
+def loop_iou(a: np.ndarray, b: np.ndarray) -> float:
+    shape_a, shape_b = (shapely.Polygon(bev_corners(box)) for box in (a, b))
+    shared = shape_a.intersection(shape_b).area
+    return shared / (shape_a.area + shape_b.area - shared)
+
+
+def jitted_decode(pre_nms):
+    """Maps to boxes; so many peaks may enter NMS."""
+    return jax.jit(
+        functools.partial(
+            decode,
+            grid=MAP_GRID,
+            max_detections=pre_nms,
+            pre_nms=pre_nms,
+            score_threshold=THRESHOLD,
+            nms_iou=NMS_IOU,
+        )
+    )
+
+
+def peaks_on_host(num_peaks):
+    """Arguments of `loop_decode`: one frame's maps."""
+    maps = make_maps(num_peaks)
+    return [np.asarray(x[0]) for x in (maps.heatmap_logits, maps.box_params)]
+
+
+# Predictions -----------------------------------------------------------------------
+
+COUNTS = (20000, 4200, 1800, 160, 570)
+SIZES = ((4.4, 1.9, 1.6), (9, 2.6, 3), (0.7, 0.7, 1.7), (2, 0.8, 1.5), (1.8, 0.7, 1.6))
+
+
+def synthetic_set(num_frames: int = 17536, false_per_frame: float = 2.0, seed: int = 0):
+    """Ground truth, predictions and frames with the counts of the real split."""
+    rng = np.random.default_rng(seed)
+    counts = [int(n * num_frames / 17536) for n in COUNTS]
+    cls = np.repeat(np.arange(5), counts)
+    num = cls.size
+    # Objects gather in some frames, as in traffic.
+    weight = rng.gamma(0.7, size=num_frames)
+    frame = np.sort(rng.choice(num_frames, num, p=weight / weight.sum()))
+    rng.shuffle(cls)
+    box = np.column_stack(
+        [
+            rng.uniform(2, 72, num),
+            rng.uniform(-6.4, 6.4, num),
+            rng.normal(0.5, 0.4, num),
+            np.array(SIZES)[cls] * rng.uniform(0.85, 1.15, (num, 3)),
+            rng.choice([0, np.pi / 2, np.pi], num) + rng.normal(0, 0.2, num),
+        ]
+    )
+    copies = rng.choice([0, 1, 2, 3], num, p=[0.2, 0.6, 0.15, 0.05])
+    source = np.repeat(np.arange(num), copies)
+    noise = rng.normal(0, [0.4, 0.25, 0.15, 0.4, 0.15, 0.12, 0.1], (source.size, 7))
+    found = box[source] + noise * rng.choice([0.3, 1, 2], (source.size, 1))
+    found[:, 6] += np.pi * (rng.random(source.size) < 0.1)
+    found[:, 3:6] = np.maximum(np.abs(found[:, 3:6]), 0.1)
+    found_cls = np.where(
+        rng.random(source.size) < 0.08, rng.integers(0, 5, source.size), cls[source]
+    )
+    num_false = int(false_per_frame * num_frames)
+    false = box[rng.integers(0, num, num_false)] + rng.normal(0, 4, (num_false, 7))
+    false[:, 3:6] = np.maximum(np.abs(false[:, 3:6]), 0.3)
+    frame_all = np.concatenate([frame[source], rng.integers(0, num_frames, num_false)])
+    score = np.concatenate([rng.beta(4, 2, source.size), rng.beta(1.2, 4, num_false)])
+    names = np.array(CLASSES)
+    sequence = np.arange(num_frames) * 58 // num_frames + 1
+    frames = {
+        "frame": np.arange(num_frames),
+        "sequence": sequence,
+        "weather": np.array(WEATHERS)[sequence % 7],
+    }
+    predictions = {
+        "frame": frame_all,
+        "box": np.concatenate([found, false]),
+        "cls": names[np.concatenate([found_cls, rng.integers(0, 5, num_false)])],
+        "score": np.round(score, 4),
+    }
+    return {"frame": frame, "box": box, "cls": names[cls]}, predictions, frames

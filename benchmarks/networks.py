@@ -1,0 +1,387 @@
+"""Cases of the networks, beside the same ones in plain torch, with the same weights.
+
+Random weights and inputs at full size: 256 x 107 x 101 projections, 720 x 1280 images.
+"""
+
+import functools
+import itertools
+import pathlib
+import time
+
+import flax.traverse_util
+import inputs
+import jax
+import jax.numpy as jnp
+import numpy as np
+from case import Case, compiled, difference, timed, waiting
+from rival import ATTENTION
+
+from radejax import models
+from radejax.core.config import load_config
+from radejax.data.frame_table import make_table
+from radejax.data.pipeline import LoaderOptions, make_loader
+from radejax.data.projection import project_plain
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference import benchmark as stages
+from radejax.interop import radenet_names, radenet_torch
+from radejax.models.deformable_attention import DeformableAttention
+from radejax.models.lifting import ReferencePoints, static_reference_points
+from radejax.models.vit import rotary_angles
+from radejax.training.state import create_state, make_optimizer
+from radejax.training.step import make_train_step
+
+CONFIGS = pathlib.Path(__file__).parents[1] / "configs"
+GRID = RadarGrid.kradar()
+
+TOLERANCES = {"float32": 1e-3, "tf32": 0.05, "bfloat16": 0.2}
+
+FORWARD = [
+    *(("bfloat16", size) for size in (1, 8, 10, 32)),
+    *(("tf32", size) for size in (1, 10)),
+    ("float32", 10),
+]
+TRAINING = [("bfloat16", 8), ("bfloat16", 32), ("tf32", 8), ("float32", 8)]
+COMPILED = {("bfloat16", 8), ("bfloat16", 10), ("tf32", 8), ("tf32", 10)}
+"""Dtypes and batch sizes on an accelerator; those that `torch.compile` runs as well."""
+
+
+def settings(machine, those):
+    """Pairs of dtype and batch size that fit."""
+    return [("float32", 1)] if machine["platform"] == "cpu" else those
+
+
+# Weights and models ------------------------------------------------------------------
+
+
+def random_variables(model, *arguments):
+    shapes = jax.eval_shape(model.init, jax.random.key(0), *arguments)
+    rng = np.random.default_rng(0)
+
+    def draw(path, x):
+        drawn = 0.05 * rng.standard_normal(x.shape, np.float32)
+        return np.abs(drawn) + 0.1 if path[-1].key in ("var", "scale") else drawn
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def network(path, dtype, **fields):
+    """Config, model, and the precision of its products."""
+    config = load_config(str(CONFIGS / path))
+    config.model.update(
+        dtype="bfloat16" if dtype == "bfloat16" else "float32", **fields
+    )
+    precision = "highest" if dtype == "float32" else None
+    return config, models.build(config.model), precision
+
+
+def torch_state(model, variables):
+    """Tensors of a `DinoRade` by the names of `torch_dinorade.DinoRade`."""
+    named = radenet_names.torch_names(model.radar)
+    necks = radenet_names.neck_names("dilated")
+    state = {}
+    for path, value in flax.traverse_util.flatten_dict(variables["params"]).items():
+        *modules, leaf = path
+        leaf = {"kernel": "weight", "scale": "weight"}.get(leaf, leaf)
+        if modules[:1] == ["image_fusion"]:
+            modules = modules[1:]
+        if modules[0] in ("radar_neck", "camera_neck"):
+            modules = [modules[0], necks["/".join(modules[1:])]]
+        name = named.get(path, ".".join((*modules, leaf)))
+        if modules[:2] == ["image_backbone", "layers"]:
+            rest = ".".join((*modules[2:], leaf))
+            state |= {
+                f"image_backbone.layers.{i}.{rest}": x.T for i, x in enumerate(value)
+            }
+        elif modules[-1] == "patch_embed" and leaf == "weight":  # flat patches
+            size = model.vit.patch_size
+            state[name] = value.reshape(size, size, 3, -1).transpose(3, 2, 0, 1)
+        elif modules[-1] in ("up_1", "up_2") and leaf == "weight":
+            state[name] = value.transpose(2, 3, 0, 1)
+        else:
+            state[name] = radenet_names.to_torch_layout(name, value)
+    stats = flax.traverse_util.flatten_dict(variables["batch_stats"])
+    for (*modules, leaf), value in stats.items():
+        state[".".join((*modules, f"running_{leaf}"))] = value
+        state[".".join((*modules, "num_batches_tracked"))] = np.array(0)
+    rows, columns, channels = model.feature_shape
+    vit = model.vit
+    angles = rotary_angles(rows, columns, channels // vit.num_heads, vit.rope_theta)
+    names = ("image_backbone.cos", "image_backbone.sin")
+    return state | dict(zip(names, map(np.asarray, angles), strict=True))
+
+
+# Parts of cases ----------------------------------------------------------------------
+
+
+def rivals(machine, *arguments):
+    return machine["rival"].columns(*arguments) if machine["rival"] else {}
+
+
+def same_maps(machine, maps):
+    """Difference of our maps from those that torch has built; None without torch."""
+    if not machine["rival"]:
+        return None
+    ours = [np.moveaxis(np.asarray(x), -1, 1) for x in jax.tree.leaves(maps)]
+    # Torch's are on the padded bins.
+    theirs = [x[..., : ours[0].shape[-1]] for x in machine["rival"].outputs()]
+    return difference(ours, theirs)
+
+
+def step_of(config, model, variables, batch, precision):
+    """The package's training step on a state that it keeps, and its cost.
+
+    The function takes a batch, or the one given here.
+    """
+    optimizer = make_optimizer(lambda _: 1e-4, weight_decay=0.01)
+    state = create_state(
+        jax.tree.map(jnp.array, variables),
+        optimizer,
+        batch_size=len(batch.frame),
+        use_ema=False,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
+    map_grid = models.map_grid(GRID, model, "true")
+    step = make_train_step(model, optimizer, map_grid, loss=dict(config.loss))
+    given, rng = jax.device_put(batch), jax.random.key(0)
+    program, cost = compiled(
+        step, state, given, rng, precision=precision, donate_argnums=0
+    )
+    held = [state]
+
+    def run(batch=given):
+        held[0], metrics = program(held[0], batch, rng)
+        jax.block_until_ready(metrics)
+
+    return run, cost
+
+
+NO_LOSSES = "ours with the losses, torch's with a mean square in their place"
+
+
+# Cases -------------------------------------------------------------------------------
+
+
+def radenet(machine):
+    """RADE-Net's forward pass."""
+    for dtype, size in settings(machine, FORWARD):
+        config, model, precision = network("radenet.py", dtype)
+        x = inputs.frames_of(size).projection
+        variables = random_variables(model, x)
+        on_device = jax.device_put((variables, x))
+        forward, cost = compiled(model.apply, *on_device, precision=precision)
+        state = radenet_torch.save(model, variables)
+        how = dtype, "forward", (dtype, size) in COMPILED
+        columns = {"radejax": waiting(forward, *on_device)}
+        columns |= rivals(machine, "radenet", dict(config.model), state, x, *how)
+        yield Case(
+            name="RADE-Net, forward",
+            columns=columns,
+            frames=size,
+            dtype=dtype,
+            error=same_maps(machine, forward(*on_device)),
+            tolerance=TOLERANCES[dtype],
+            **cost,
+        )
+
+
+def radenet_training(machine):
+    """RADE-Net's training step."""
+    chosen = [(*pair, "none") for pair in settings(machine, TRAINING)]
+    if machine["platform"] != "cpu":
+        chosen += [("bfloat16", 32, kind) for kind in ("blocks", "full")]
+    for dtype, size, remat in chosen:
+        config, model, precision = network("radenet.py", dtype, remat=remat)
+        batch = inputs.frames_of(size)
+        variables = random_variables(model, batch.projection)
+        step, cost = step_of(config, model, variables, batch, precision)
+        columns = {"radejax": functools.partial(timed, step)}
+        if remat == "none":
+            state = radenet_torch.save(model, variables)
+            how = dtype, "training step", (dtype, size) in COMPILED
+            given = dict(config.model), state, batch.projection
+            columns |= rivals(machine, "radenet", *given, *how)
+        yield Case(
+            name="RADE-Net, training step",
+            columns=columns,
+            frames=size,
+            dtype=dtype,
+            note=NO_LOSSES if remat == "none" else f"rematerialisation: {remat}",
+            **cost,
+        )
+
+
+def feeding(machine):
+    """Records from the loader into RADE-Net's training step."""
+    dtype, size = ("float32", 1) if machine["platform"] == "cpu" else ("bfloat16", 8)
+    config, model, precision = network("radenet.py", dtype)
+    with inputs.folder_of_records(32, GRID, "float16") as records:
+        table = make_table(records, inputs.labelled(records), max_objects=8)
+        batches = make_loader(table, LoaderOptions(size))
+        first = next(batches)
+        variables = random_variables(model, np.asarray(first.projection))
+        step, cost = step_of(config, model, variables, first, precision)
+        spent = []
+
+        def run():
+            began = time.perf_counter()
+            batch = next(batches)
+            spent.append((time.perf_counter() - began, began))
+            step(jax.device_put(batch))
+            spent[-1] = spent[-1][0], time.perf_counter() - began
+
+        def note():
+            waits, walls = zip(*spent[1:], strict=True)  # without what fills the queue
+            return f"waits for data: {sum(waits) / sum(walls):.2%}"
+
+        yield Case(
+            name="RADE-Net, training step fed by the loader",
+            columns={"radejax": functools.partial(timed, run)},
+            frames=size,
+            dtype=dtype,
+            note=note,
+            **cost,
+        )
+
+
+def dinorade(machine, task="forward"):
+    """DinoRADE from image and projection: forward pass, or training step."""
+    sizes = (1, 8, 10) if task == "forward" else (8,)
+    for dtype, size in settings(
+        machine, list(itertools.product(("bfloat16", "tf32"), sizes))
+    ):
+        config, model, precision = network("dinorade.py", dtype)
+        rng = np.random.default_rng(0)
+        image = rng.integers(0, 256, (size, *model.image_size, 3), np.uint8)
+        places = static_reference_points(
+            inputs.CALIBRATION, model.axes, 256, 112
+        ).points
+        places = np.asarray(places, np.float32)
+        # All in the image, as torch's has it.
+        camera = ReferencePoints(places, np.ones(places.shape[:-1], bool))
+        batch = inputs.frames_of(size, image=image, camera=camera)
+        arguments = batch.projection, image, camera
+        variables = random_variables(model, *arguments)
+        error, note = None, NO_LOSSES
+        if task == "forward":
+            on_device = jax.device_put((variables, *arguments))
+            program, cost = compiled(model.apply, *on_device, precision=precision)
+            run = waiting(program, *on_device)
+        else:
+            step, cost = step_of(config, model, variables, batch, precision)
+            run = functools.partial(timed, step)
+        others = rivals(
+            machine,
+            "dinorade",
+            config.model.to_dict(),
+            torch_state(model, variables),
+            places.reshape(256 * 112, -1, 2),
+            batch.projection,
+            image,
+            dtype,
+            task,
+            (dtype, size) in COMPILED,
+        )
+        if task == "forward":
+            error, note = same_maps(machine, program(*on_device)), ""
+        yield Case(
+            name=f"DinoRADE, {task}",
+            columns={"radejax": run} | others,
+            frames=size,
+            dtype=dtype,
+            error=error,
+            tolerance=TOLERANCES[dtype],
+            note=note,
+            **cost,
+        )
+
+
+def attention(machine):
+    """Deformable attention of 286,720 queries on a 180 x 320 map."""
+    width, heads, points = ATTENTION
+    bins, elevation = 256 * 112, 10
+    rng = np.random.default_rng(0)
+    sizes = {
+        "sampling_offsets": 2 * heads * points,
+        "attention_weights": heads * points,
+        "value_proj": width,
+        "output_proj": width,
+    }
+    normal = functools.partial(rng.standard_normal, dtype=np.float32)
+    params = {
+        name: {"kernel": 0.1 * normal((width, n)), "bias": normal(n)}
+        for name, n in sizes.items()
+    }
+    state = {f"{k}.weight": v["kernel"].T for k, v in params.items()}
+    state |= {f"{k}.bias": v["bias"] for k, v in params.items()}
+    _, model, _ = network("dinorade.py", "float32")
+    places = static_reference_points(inputs.CALIBRATION, model.axes, 256, 112).points
+    scale = np.exp(normal((1, bins, elevation)))
+    given = (
+        normal((1, bins, width)),
+        scale / scale.sum(-1, keepdims=True),
+        np.asarray(places, np.float32).reshape(1, bins, elevation, 2),
+        normal((1, 180, 320, width)),
+    )
+
+    def ours(params, feature, scale, places, value):
+        module = DeformableAttention(*ATTENTION)
+        mean = jnp.full(places.shape[:-1], 1 / elevation)
+        return module.apply(
+            {"params": params}, feature, scale, places, mean, value, method="lifted"
+        )
+
+    arrays = jax.device_put((params, *given))
+    program, cost = compiled(ours, *arrays, precision="highest")
+    others = rivals(machine, "attention", state, *given)
+    error = None
+    if others:
+        error = difference([np.asarray(program(*arrays))], machine["rival"].outputs())
+    yield Case(
+        name="deformable attention, forward",
+        columns={"radejax": waiting(program, *arrays)} | others,
+        error=error,
+        **cost,
+    )
+
+
+def detector(machine):
+    """Tesseracts in host memory to boxes, beside the released order of things."""
+    is_cpu = machine["platform"] == "cpu"
+    for dtype, size in itertools.product(
+        ("float32",) if is_cpu else ("bfloat16", "tf32"), (1, 10)
+    ):
+        config, model, _ = network("radenet.py", dtype)
+        found = stages.untrained(config, dtype=config.model.dtype)
+        sized = found.with_batch_sizes((size,))
+        rng = np.random.default_rng(0)
+        frames = rng.standard_exponential((size, *GRID.shape_drea), np.float32)
+        frames *= 1e9
+        columns = {"radejax": waiting(sized, frames)}
+        if machine["rival"]:
+            variables = jax.tree.map(np.asarray, found.variables)
+            state = radenet_torch.save(model, variables)
+            x = inputs.frames_of(size).projection
+            how = dtype, "forward", False
+            (theirs,) = rivals(
+                machine, "radenet", dict(config.model), state, x, *how
+            ).values()
+            columns["released chain"] = functools.partial(
+                released_chain, frames, theirs, inputs.peaks_on_host(40)
+            )
+        yield Case(
+            name="tesseract to boxes",
+            columns=columns,
+            frames=size,
+            dtype=dtype,
+            note="released chain: formula of all cells, torch, loops over 40 peaks",
+        )
+
+
+def released_chain(frames, network, maps):
+    """Wall and processor seconds of projection, network and loops over peaks, in turn."""
+    parts = [
+        timed(lambda: [project_plain(frame) for frame in frames]),
+        network(),
+        timed(lambda: [inputs.loop_decode(*maps) for _ in frames]),
+    ]
+    return tuple(map(sum, zip(*parts, strict=True)))

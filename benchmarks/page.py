@@ -1,0 +1,135 @@
+"""The tables of `docs/benchmarks.md`, from the JSON files in `docs/benchmarks/`."""
+
+import json
+import pathlib
+import re
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+RESULTS, PAGE = ROOT / "docs" / "benchmarks", ROOT / "docs" / "benchmarks.md"
+BEGIN, END = "<!-- tables: benchmarks/run.py -->", "<!-- end of tables -->"
+
+
+def store(run, folder):
+    """Writes a run into its device's file, which keeps what this run did not measure."""
+    folder.mkdir(parents=True, exist_ok=True)
+    name = re.sub(r"[^a-z0-9]+", "_", run["device"].lower()).strip("_")
+    path = folder / f"{name}.json"
+    runs = json.loads(path.read_text())["runs"] if path.is_file() else []
+    new = {row["benchmark"] for row in run["rows"]}
+    for old in runs:
+        old["rows"] = [row for row in old["rows"] if row["benchmark"] not in new]
+    runs = [*(old for old in runs if old["rows"]), run]
+    path.write_text(json.dumps({"runs": runs}, indent=1) + "\n")
+
+
+def write_page():
+    """Puts the tables of all JSON files into the page, between its two marks."""
+    results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
+    before, rest = PAGE.read_text().split(BEGIN)
+    _, after = rest.split(END)
+    tables = "".join(f"{table(result)}\n\n" for result in results)
+    PAGE.write_text(f"{before}{BEGIN}\n\n{tables}{END}{after}")
+
+
+def table(result):
+    """Markdown of one file: of a device, of programs, or of runs of other commands."""
+    if "tables" in result:
+        return "\n\n".join(map(plain_table, result["tables"]))
+    return devices_table(result["runs"]) if "runs" in result else programs_table(result)
+
+
+def plain_table(content):
+    """Markdown of a table that was written by hand, with title and text."""
+    lines = [f"### {content['title']}", "", content["text"], ""]
+    head, rows = content["columns"], content["rows"]
+    lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
+    return "\n".join(lines)
+
+
+def devices_table(runs):
+    """Markdown of what `run.py` measured on one device, in one run or several."""
+    lines = [
+        f"### {runs[-1]['device']}",
+        "",
+        "| what | dtype | frames | radejax, a frame | others, a frame | times faster | "
+        "greatest difference | memory | |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    rows = [(row, run["platform"]) for run in runs for row in run["rows"]]
+    lines += [row_text(*row) for row in rows if "refused" not in row[0]]
+    for row, _ in rows:
+        if "refused" in row:
+            lines += ["", f"Not measured: {row['name']}: {row['refused']}."]
+    for run in runs:
+        versions = ", ".join(f"{k} {v}" for k, v in run["versions"].items())
+        names = dict.fromkeys(row["benchmark"] for row in run["rows"])
+        lines += [
+            "",
+            f"`{run['command']}`, {run['date']}, Python {run['python']}, {versions}, "
+            f"{run['minutes']} minutes, load at the end {run['load']:.1f}: "
+            f"{', '.join(names)}.",
+        ]
+        if run["not_run"]:
+            lines.append(f"Not run, for want of time: {', '.join(run['not_run'])}.")
+    return "\n".join(lines)
+
+
+def row_text(row, where):
+    """A line of a device's table; on a CPU processor time is shown and compared too."""
+    is_cpu = where == "cpu"
+    clock = row["processor_s" if is_cpu else "wall_s"]
+    others = [name for name in clock if name != "radejax"]
+
+    def cell(name):
+        wall, processor = (
+            duration(row[kind][name] / row["frames"])
+            for kind in ("wall_s", "processor_s")
+        )
+        return f"{wall} ({processor})" if is_cpu else wall
+
+    ratios = [
+        f"{clock[name] / clock['radejax']:.2f}" if clock["radejax"] else "-"
+        for name in others
+    ]
+    cells = [
+        row["name"],
+        row["dtype"],
+        str(row["frames"]),
+        cell("radejax"),
+        "; ".join(f"{name} {cell(name)}" for name in others) or "-",
+        "; ".join(ratios) or "-",
+        "-" if row["error"] is None else f"{row['error']:.0e}",
+        "-" if row["mib"] is None else f"{row['mib']:.0f} MiB",
+        row["note"],
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def duration(seconds):
+    """Three digits with a unit."""
+    if seconds >= 1:
+        return f"{seconds:.3g} s"
+    return f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.3g} us"
+
+
+def programs_table(result):
+    """Markdown of what `programs.py` found."""
+    devices = list(result["programs"][0]["least_ms_a_frame"])
+    lines = [
+        "### Programs, lowered for CUDA and not run",
+        "",
+        f"`{result['command']}`, {result['date']}, jax {result['jax']}, bfloat16. Bytes are "
+        "those of matrix products, convolutions, gathers and scatters alone. The least time "
+        "is by published dense peaks.",
+        "",
+        "| program | batch | GFLOP a frame | MiB a frame | convolutions | products | loops | "
+        f"other ops | {' | '.join(f'{d}, ms a frame at least' for d in devices)} |",
+        f"|{'---|' * (8 + len(devices))}",
+    ]
+    for row in result["programs"]:
+        cells = [row["program"], row["batch"]]
+        cells += [f"{row[key]:.4g}" for key in ("gflop_a_frame", "mib_a_frame")]
+        cells += [row[key] for key in ("convolutions", "products", "loops", "fusable")]
+        cells += [f"{row['least_ms_a_frame'][d]:.3g}" for d in devices]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)

@@ -1,0 +1,67 @@
+"""Torch's half of a process pair, seen from ours: builds, runs and times networks there.
+
+Neither library's threads or memory are in the other's way; while one half runs, the other
+waits. The half itself is `torch_half.py`.
+"""
+
+import functools
+import importlib.util
+import multiprocessing.connection
+import os
+import pathlib
+import subprocess
+import sys
+
+ATTENTION = 128, 4, 4
+"""Channels, heads and points of DinoRADE's deformable attention."""
+
+
+class Rival:
+    """Torch in another process; `columns` are what `run.py` times beside ours.
+
+    Args:
+        device: "cpu" or "cuda".
+    """
+
+    def __init__(self, device):
+        key = os.urandom(16)
+        with multiprocessing.connection.Listener(authkey=key) as listener:
+            code = "import sys, torch_half; torch_half.serve(*sys.argv[1:])"
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", code, listener.address, key.hex(), device],
+                cwd=pathlib.Path(__file__).parent,
+            )
+            self._connection = listener.accept()
+        self.is_there = self._connection.recv()
+
+    def ask(self, *message):
+        """The answer to a message; what fails there fails here."""
+        self._connection.send(message)
+        answer = self._connection.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def columns(self, what, *arguments):
+        """Name -> function that gives wall and processor seconds of what is built."""
+        names = self.ask("build", what, *arguments)
+        return {name: functools.partial(self.ask, "time", name) for name in names}
+
+    def outputs(self):
+        """Arrays that a call gives."""
+        return self.ask("outputs", "torch")
+
+    def close(self):
+        self._connection.send(None)
+        self._process.wait()
+
+
+def start(platform):
+    """The rival on the device that jax names; None where torch is not installed or blind to it."""
+    if importlib.util.find_spec("torch") is None:
+        return None
+    rival = Rival("cpu" if platform == "cpu" else "cuda")
+    if rival.is_there:
+        return rival
+    rival.close()
+    return None

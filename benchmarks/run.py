@@ -1,0 +1,149 @@
+"""Every benchmark that fits this machine, ours beside the reference's, in one command.
+
+    python benchmarks/run.py                          # everything
+    python benchmarks/run.py --only radenet tpm       # a part
+    python benchmarks/run.py --minutes 15             # what did not fit is listed
+    python benchmarks/run.py --tables                 # only write the page's tables again
+
+Ours and torch (where it is installed: eager, and `torch.compile` on a GPU) are a pair of
+processes that run in turns; results are compared first, and a case whose numbers differ
+is an error and no measurement. Written are `docs/benchmarks/DEVICE.json`, and from all
+such files the tables of `docs/benchmarks.md`. Times are medians of wall and processor
+time a frame; ratios are of processor time on a CPU, where others may be at work, else of
+wall time. What is measured again takes the place of what the file had, the rest stays.
+"""
+
+import argparse
+import datetime
+import os
+import pathlib
+import platform
+import re
+import shlex
+import statistics
+import sys
+import time
+import traceback
+from importlib import metadata
+
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # torch needs some too
+
+import jax
+import page
+import rival
+from cases import BENCHMARKS
+
+MAX_REPEATS = 20
+SECONDS_A_CASE = 15.0
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=list(BENCHMARKS), metavar="NAME",
+                        help=f"of {', '.join(BENCHMARKS)}")  # fmt: skip
+    parser.add_argument("--minutes", type=float, default=20.0, help="that it may take")
+    parser.add_argument(
+        "--out", type=pathlib.Path, default=page.RESULTS, help="JSON file's folder"
+    )
+    parser.add_argument("--tables", action="store_true", help="measure nothing")
+    arguments = parser.parse_args()
+    is_whole = True
+    if not arguments.tables:
+        jax.config.update("jax_enable_compilation_cache", False)
+        chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
+        result = run(chosen, 60 * arguments.minutes)
+        is_whole = not any("refused" in row for row in result["rows"])
+        print(page.devices_table([result]))
+        page.store(result, arguments.out)
+    if arguments.out == page.RESULTS:
+        page.write_page()
+    sys.exit(not is_whole)
+
+
+def run(chosen, seconds):
+    """Everything that there is time for, as the JSON file holds it."""
+    began = time.perf_counter()
+    device = jax.devices()[0]
+    other = rival.start(device.platform)
+    machine = {"platform": device.platform, "rival": other}
+    rows, not_run = [], []
+    for name, (cases, expected_s) in chosen.items():
+        left = seconds - (time.perf_counter() - began)
+        if left < expected_s:
+            not_run.append(f"{name} (takes {expected_s} s, {left:.0f} s were left)")
+            continue
+        try:
+            for case in cases(machine):
+                sys.stderr.write(f"{case.name}, {case.dtype}, {case.frames}\n")
+                left = seconds - (time.perf_counter() - began)
+                if left < 0:
+                    not_run.append(f"{name} from {case.name}, {case.dtype} on")
+                    break
+                rows.append({"benchmark": name} | measured(case, left))
+        except Exception as error:  # said in the table; the others are measured yet
+            traceback.print_exc()
+            rows.append({"benchmark": name, "name": name, "refused": repr(error)[:300]})
+    if other:
+        other.close()
+    return facts(device, "torch" if other else None) | {
+        "minutes": round((time.perf_counter() - began) / 60, 1),
+        "rows": rows,
+        "not_run": not_run,
+    }
+
+
+def measured(case, seconds_left):
+    """One row: medians by column, after a first call each; all take turns."""
+    row = {"name": case.name, "dtype": case.dtype, "frames": case.frames}
+    row |= {"error": case.error, "mib": case.mib, "compile_s": case.compile_s}
+    if case.error is not None and not case.error <= case.tolerance:
+        return row | {
+            "refused": f"results differ by {case.error:.2e} of the greatest value, "
+            f"expected at most {case.tolerance:.0e}"
+        }
+    times = {name: [] for name in case.columns}
+    first = {name: function()[0] for name, function in case.columns.items()}
+    until = time.perf_counter() + min(SECONDS_A_CASE, max(seconds_left, 0.0))
+    while not times["radejax"] or (
+        len(times["radejax"]) < MAX_REPEATS and time.perf_counter() < until
+    ):
+        for name, function in case.columns.items():
+            times[name].append(function())
+    return row | {
+        "repeats": len(times["radejax"]),
+        "note": case.note if isinstance(case.note, str) else case.note(),
+        "first_s": first,
+        "wall_s": {n: statistics.median(w for w, _ in t) for n, t in times.items()},
+        "processor_s": {
+            n: statistics.median(p for _, p in t) for n, t in times.items()
+        },
+    }
+
+
+def facts(device, *more):
+    """What ran, where and when."""
+    packages = ("jax", "numpy", *filter(None, more))
+    name = device.device_kind
+    if device.platform == "cpu":
+        name = f"{processor_name()}, {os.cpu_count()} cores"
+    return {
+        "device": name,
+        "platform": device.platform,
+        "date": datetime.date.today().isoformat(),
+        "python": platform.python_version(),
+        "versions": {p: metadata.version(p) for p in packages},
+        "load": os.getloadavg()[0],
+        "command": shlex.join(["python", "benchmarks/run.py", *sys.argv[1:]]),
+    }
+
+
+def processor_name():
+    """Of the CPU; its architecture where Linux does not say."""
+    path = pathlib.Path("/proc/cpuinfo")
+    text = path.read_text() if path.is_file() else ""
+    found = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
+    return found[1] if found else platform.machine()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,383 @@
+"""The ablations of both papers on simulated data: trained, compared, judged.
+
+    python examples/ablation.py --table sigma --seeds 0,1,2
+    python examples/ablation.py --table 3 --minutes 60
+    python examples/ablation.py --table 4 --seeds 0,1,2
+
+Table 3 is RADE-Net's (attention, heads, neck, stem, decoder), 4 DinoRADE's (radar, camera,
+elevation weights, backbone), sigma the spread of the heatmap's targets. Every cell is an
+ordinary run of a config, trained on scenes of its seed and evaluated on other ones, which
+all cells share. The same command goes on where an earlier one ended or was killed, also
+within a run. `--table_only` writes the tables of what is there.
+
+AP is BEV at IoU 0.3, protocol `exact`, mean over seeds; intervals are of 95 %, paired,
+over resampled sequences of the scenes to evaluate on. A claim is shown where the interval
+lies above 0 (and the difference reaches what is claimed), refuted where it ends below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import os
+import pathlib
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import click
+import fusion_by_lens
+import numpy as np
+import pretrain_backbone
+from ablation_studies import CONFIGS, STUDIES, Cell, Study
+from ml_collections import ConfigDict
+
+from radejax.cli import entry
+from radejax.core import files
+from radejax.core.config import load_config
+from radejax.core.structures import CLASSES
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.files.load import Source, load
+from radejax.evaluation.report import bootstrap
+from radejax.evaluation.report.measure import repair_sizes
+from radejax.evaluation.report.tables import Table, number
+from radejax.runs import experiment
+from radejax.runs.evaluate import evaluate_run
+from radejax.runs.sources import Sources
+from radejax.simulation.config import plain
+from radejax.simulation.dataset import simulate_dataset
+
+HELD_OUT_SEED = 1_000_003
+COMMON = {
+    "simulation.output": "projection",
+    "simulation.test_sequences": 2,  # evaluated on the held-out scenes instead
+    "evaluation.num_pictures": 0,
+}
+"""Fields of every run, beside its seed and its cell's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """Where a study's runs and data are, and how they are made.
+
+    Attributes:
+        study: What is compared.
+        out: Folder of all.
+        backbone: Pretrained image backbone; made below `out` if None.
+    """
+
+    study: Study
+    out: pathlib.Path
+    backbone: pathlib.Path | None = None
+
+    def fields(self, cell: Cell, seed: int) -> dict[str, Any]:
+        """Fields of the config of a run, by their dotted names."""
+        return {"seed": seed, "simulation.seed": seed, **COMMON, **cell.fields}
+
+    def config(self, cell: Cell, seed: int) -> ConfigDict:
+        """Of a run."""
+        name, _, words = cell.config.partition(":")
+        config = load_config(f"{CONFIGS / name}.py:{words}")
+        config.update_from_flattened_dict(self.fields(cell, seed))
+        return config
+
+    def run_folder(self, name: str, seed: int) -> pathlib.Path:
+        """Work folder of a cell's run."""
+        cell = self.study.cells[name]
+        kind = cell.config.partition(":")[0]
+        folder = (cell.exchanges or name).replace(" ", "_")
+        return self.out / "runs" / kind / folder / f"seed{seed}"
+
+    def report(self, name: str, seed: int) -> pathlib.Path:
+        """Evaluation of a cell on the held-out scenes; complete where it exists."""
+        end = "_exchanged" if self.study.cells[name].exchanges else ""
+        return self.run_folder(name, seed) / f"held{end}"
+
+    def is_done(self, name: str, seed: int) -> bool:
+        """Whether a cell is trained and evaluated."""
+        return (self.report(name, seed) / "metrics.json").exists()
+
+    def data(self, cell: Cell, seed: int | None) -> str:
+        """Data of a seed's runs, or the held-out scenes; simulated if missing."""
+        name = "held" if seed is None else f"seed{seed}"
+        root = self.out / "data" / f"{cell.config.partition(':')[0]}-{name}"
+        simulation = plain(self.config(cell, seed or 0).simulation)
+        if seed is None:
+            simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
+            simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
+        return str(simulate_dataset(simulation, root))
+
+    def image_backbone(self, cell: Cell) -> str | None:
+        """Folder of the frozen backbone that a cell needs; pretrained if missing."""
+        config = self.config(cell, 0)
+        if "image" not in config.model or not config.model.image.freeze:
+            return None
+        folder = self.backbone or self.out / "backbone"
+        if self.backbone is None and not (folder / pretrain_backbone.REPORT).exists():
+            pretrain_backbone.pretrain(config, folder)
+        return str(folder)
+
+    def command(self, name: str, seed: int) -> str:
+        """What makes a cell's run, for one who repeats it."""
+        cell = self.study.cells[name]
+        file, _, words = cell.config.partition(":")
+        backbone = self.backbone or self.out / "backbone"
+        words = f"{file}.py:{words}" if words else f"{file}.py"
+        fields = " ".join(
+            f"--config.{key}={value}" for key, value in self.fields(cell, seed).items()
+        )
+        given = f" --image_backbone {backbone}" * ("pretrained" in words)
+        data = self.out / "data" / f"{file}-seed{seed}"
+        return f"python train.py --config configs/{words} {fields} --data {data}{given}"
+
+    def make(self, name: str, seed: int) -> bool:
+        """Trains and evaluates a cell; False where a signal ended it early."""
+        cell, folder = self.study.cells[name], self.run_folder(name, seed)
+        started, backbone = time.perf_counter(), self.image_backbone(cell)
+        trained = folder / "evaluation" / "metrics.json"
+        if not trained.exists():
+            data = (self.data(cell, seed),)
+            experiment.run(
+                self.config(cell, seed),
+                name=name,
+                sources=Sources(data=data, image_backbone=backbone),
+                workdir=folder,
+            )
+        if not trained.exists():
+            return False
+        evaluate_run(
+            folder,
+            split="all",
+            out=self.report(name, seed),
+            image_backbone=backbone,
+            exchange_images=0 if cell.exchanges else None,
+            other=Sources(data=(self.data(cell, None),)),
+            num_pictures=0,
+        )
+        minutes = (time.perf_counter() - started) / 60
+        content = {"minutes": minutes, "command": self.command(name, seed)}
+        files.write_json(self.report(name, seed) / "cell.json", content)
+        return True
+
+
+# Comparing ----------------------------------------------------------------------------
+
+
+def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """`[F]` masks of the frames by condition; of a camera also by weather and lens."""
+    weather = np.asarray(frames["weather"])
+    found = {"all": np.ones(len(weather), bool)}
+    base = work.study.cells[work.study.base]
+    if base.config.startswith("quickstart_fusion"):
+        lens = fusion_by_lens.lens_of_frames(work.data(base, None), frames)
+        found |= {str(name): weather == name for name in np.unique(weather)}
+        for name, rule in fusion_by_lens.GROUPS.items():
+            rows = zip(weather, lens, strict=True)
+            found[name] = np.array([rule(*row) for row in rows])
+    sequence = np.asarray(frames["sequence"])
+    return {n: mask for n, mask in found.items() if len(set(sequence[mask])) > 1}
+
+
+def resampled(
+    work: Work, name: str, seed: int, resamples: int
+) -> dict[str, np.ndarray]:
+    """`[1 + B, C + 1]` APs by condition, of all sequences first, of classes and mean."""
+    path = work.report(name, seed) / f"resampled_{resamples}.npz"
+    if path.exists():
+        with np.load(path) as stored:
+            return dict(stored)
+    config = work.config(work.study.cells[name], seed)
+    classes, roi = tuple(config.classes), tuple(config.evaluation.roi)
+    truth, found, frames, _ = load(path.parent, Source(), classes)
+    found, _ = repair_sizes(found, "false_positive")
+    data = EvaluationSet(truth, found, classes=classes, frames=frames, roi=roi)
+    sequence, result = np.asarray(frames["sequence"]), {}
+    for condition, mask in conditions(work, frames).items():
+        weights = np.zeros((1 + resamples, len(mask)), np.int16)
+        weights[0, mask] = 1
+        weights[1:, mask] = bootstrap.sequence_weights(
+            sequence[mask], resamples=resamples, seed=0
+        )
+        cut = config.evaluation.score_threshold
+        result[condition] = bootstrap.resample(
+            data, weights, "exact", "bev", 0.3, score_threshold=cut
+        )
+    with files.atomic_write(path) as file:
+        np.savez(file, **result)
+    return result
+
+
+def verdict(difference: float, low: float, high: float, least: float = 0.0) -> str:
+    """Of a claim that a difference is positive, and reaches what is claimed."""
+    if low > 0 and difference >= least:
+        return "shown"
+    return "refuted" if high < least or high < 0 else "undecided"
+
+
+@dataclasses.dataclass
+class Comparer:
+    """Differences of cells over the seeds that both have."""
+
+    work: Work
+    seeds: tuple[int, ...]
+    resamples: int
+
+    def __post_init__(self) -> None:
+        self.samples = functools.cache(
+            lambda name, seed: resampled(self.work, name, seed, self.resamples)
+        )
+
+    def done(self, *names: str) -> list[int]:
+        """Seeds with all of some cells."""
+        return [s for s in self.seeds if all(self.work.is_done(n, s) for n in names)]
+
+    def mean(self, name: str, seeds: list[int], condition: str) -> np.ndarray:
+        """`[1 + B, C + 1]` APs, mean over seeds."""
+        return np.mean([self.samples(name, s)[condition] for s in seeds], axis=0)
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """AP of every cell, condition and class, and its difference to the base."""
+        base = self.work.study.base
+        for name in self.work.study.cells:
+            if not (seeds := self.done(name)):
+                continue
+            both = self.done(name, base)
+            for condition in self.samples(name, seeds[0]):
+                whole = self.mean(name, seeds, condition)[0]
+                for index, cls in enumerate((*CLASSES, "mean")):
+                    row = {"cell": name, "seeds": seeds, "condition": condition}
+                    row |= {"cls": cls, "ap": float(whole[index])}
+                    if both and name != base and not np.isnan(whole[index]):
+                        row |= self.gap(name, base, cls, condition)
+                    yield row
+
+    def gap(self, a: str, b: str, cls: str, condition: str = "all") -> dict[str, Any]:
+        """Difference a - b of a class with its interval; empty without a common seed."""
+        if not (seeds := self.done(a, b)):
+            return {}
+        ap_a, ap_b = (self.mean(name, seeds, condition) for name in (a, b))
+        gaps = (ap_a - ap_b)[:, (*CLASSES, "mean").index(cls)]
+        low, high = bootstrap.interval(gaps[1:])
+        return {"difference": float(gaps[0]), "low": low, "high": high}
+
+    def claims(self) -> Iterator[dict[str, Any]]:
+        """The study's claims with difference, interval and verdict."""
+        for claim in self.work.study.claims:
+            found = self.gap(claim.a, claim.b, claim.cls)
+            word = verdict(**found, least=claim.least) if found else "open"
+            seeds = self.done(claim.a, claim.b)
+            yield dataclasses.asdict(claim) | found | {"seeds": seeds, "verdict": word}
+
+
+def interval_text(row: Mapping[str, Any]) -> str:
+    """A difference as "+1.2 (0.3 to 2.1)"."""
+    if "difference" not in row:
+        return "-"
+    low, high = (number(row[name], digits=1) for name in ("low", "high"))
+    return f"{number(row['difference'], signed=True, digits=1)} ({low} to {high})"
+
+
+def tables(study: Study, rows: list[dict], claims: list[dict]) -> list[Table]:
+    """One table of APs, one of differences a condition, one of claims."""
+    terms = "AP BEV at IoU 0.3, exact, mean over seeds"
+    by = {(row["condition"], row["cell"], row["cls"]): row for row in rows}
+    columns, cells = (
+        (*CLASSES, "mean"),
+        [c for c in study.cells if ("all", c, "mean") in by],
+    )
+    body = [
+        [c, ", ".join(map(str, by["all", c, "mean"]["seeds"]))]
+        + [number(by["all", c, cls]["ap"], digits=1) for cls in columns]
+        for c in cells
+    ]
+    result = [Table(f"{study.title}: {terms}", ["Cell", "Seeds", *columns], body)]
+    for condition in dict.fromkeys(row["condition"] for row in rows):
+        body = [
+            [c, *(interval_text(by[condition, c, cls]) for cls in columns)]
+            for c in cells
+            if c != study.base
+        ]
+        title = f"{study.title}: difference to {study.base}, {condition}, 95 %"
+        result.append(Table(title, ["Cell", *columns], body))
+    body = [
+        [
+            *(claim[name] for name in ("text", "a", "b", "cls")),
+            interval_text(claim),
+            ", ".join(map(str, claim["seeds"])),
+            claim["verdict"],
+        ]
+        for claim in claims
+    ]
+    head = ["Claim", "A", "B", "Class", "A - B", "Seeds", "Verdict"]
+    return [
+        table.of_simulated()
+        for table in [*result, Table(f"{study.title}: claims", head, body)]
+    ]
+
+
+def write_tables(
+    work: Work, table: str, seeds: tuple[int, ...], resamples: int
+) -> None:
+    """`table_<name>.md`, `.tex` and `.json` of the cells that are done."""
+    comparer = Comparer(work, seeds, resamples)
+    rows, claims = list(comparer.rows()), list(comparer.claims())
+    made = tables(work.study, rows, claims)
+    content = {"rows": rows, "claims": claims, "resamples": resamples}
+    content["commands"] = {
+        f"{name}, seed {seed}": work.command(name, seed)
+        for name in work.study.cells
+        for seed in comparer.done(name)
+    }
+    path = work.out / f"table_{table}"
+    files.write_json(path.with_suffix(".json"), content)
+    for suffix, style in ((".md", "markdown"), (".tex", "latex")):
+        text = "\n".join(t.render(style) for t in made)
+        files.write_text(path.with_suffix(suffix), text)
+    click.echo("\n".join(t.render() for t in (made[0], made[-1])))
+    click.echo(f"written to {path}.md, .tex and .json")
+
+
+def told(work: Work, left: list[tuple[str, int]], num_all: int) -> str:
+    """What is left, and about how long that takes."""
+    paths = work.out.glob("runs/*/*/seed*/held*/cell.json")
+    minutes = [files.read_json(path)["minutes"] for path in paths]
+    hours = len(left) * float(np.mean(minutes)) / 60 if minutes else None
+    about = "" if hours is None else f", about {hours:.1f} hours"
+    names = "; next: {}, seed {}".format(*left[0]) if left else ""
+    return f"{num_all - len(left)} of {num_all} cells are done{about}{names}"
+
+
+@click.command()
+@click.option("--table", type=click.Choice(sorted(STUDIES)), required=True)
+@click.option("--seeds", default="0,1,2", show_default=True)
+@click.option("--out", default="runs/ablation", type=click.Path(path_type=pathlib.Path))
+@click.option("--minutes", type=click.FloatRange(0), help="Then save and stop.")
+@click.option("--backbone", type=click.Path(exists=True, path_type=pathlib.Path))
+@click.option("--resamples", default=1000, show_default=True, type=click.IntRange(1))
+@click.option("--table_only", is_flag=True, help="Train nothing.")
+def main(table, seeds, out, minutes, backbone, resamples, table_only):
+    """Trains what is missing of a table, and writes it."""
+    entry.set_up_jax()
+    with entry.exit_codes():
+        seeds = entry.numbers("--seeds", [seeds])
+        work = Work(STUDIES[table], out.absolute(), backbone)
+        every = list(itertools.product(seeds, work.study.cells))
+        if minutes is not None:  # the training under way saves a checkpoint
+            alarm = threading.Timer(
+                60 * minutes, os.kill, (os.getpid(), signal.SIGTERM)
+            )
+            alarm.daemon = True
+            alarm.start()
+        goes_on = True
+        while goes_on:
+            left = [(name, s) for s, name in every if not work.is_done(name, s)]
+            write_tables(work, table, seeds, resamples)
+            click.echo(told(work, left, len(every)))
+            goes_on = bool(left) and not table_only and work.make(*left[0])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""What `ablation.py` trains and compares: cells and claims of the papers' tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from radejax.core.config import load_module
+from radejax.core.structures import CLASSES
+
+CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
+_VARIANTS = load_module(CONFIGS / "radenet.py").VARIANTS
+_LABELS = {"data.label_permutation_seed": 0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A run, or another look at one.
+
+    Attributes:
+        config: File and words.
+        fields: Of the config, on top.
+        exchanges: The cell whose run is evaluated with the images of other frames.
+    """
+
+    config: str
+    fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    exchanges: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """That cell `a` is better than `b` in a class, by so many points at `least`."""
+
+    text: str
+    a: str
+    b: str
+    cls: str = "Sedan"
+    least: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """A table.
+
+    Attributes:
+        title: Of the table.
+        base: Cell that the others are compared with.
+        cells: By name; equal ones of two studies are one run.
+        claims: That are judged.
+        held_out: Scenes to evaluate on.
+    """
+
+    title: str
+    base: str
+    cells: Mapping[str, Cell]
+    claims: tuple[Claim, ...]
+    held_out: int
+
+
+def _radar(**fields: Any) -> Cell:
+    return Cell(
+        "quickstart", {name.replace("__", "."): v for name, v in fields.items()}
+    )
+
+
+def _row(name: str) -> Cell:
+    """A row of Table III; its wide decoder is twice the quickstart's own too."""
+    fields = {f"model.{k}": v for k, v in _VARIANTS[name].items()}
+    return Cell(
+        "quickstart", fields | ({"model.decoder_width": 64} if name == "expand" else {})
+    )
+
+
+STUDIES = {
+    "3": Study(
+        "RADE-Net's Table III",
+        "base",
+        {n: _row(n) for n in ("base", "cbam", "cbam_heads", "model", "no_cbam", "stem", "expand")}
+        | {"labels exchanged": Cell("quickstart", _LABELS)},
+        (
+            Claim("the whole network beats the plain one (64.06 to 57.96)", "model", "base"),
+            Claim("attention alone does not pay (55.13 to 57.96)", "base", "cbam"),
+            Claim("larger heads help (58.35 to 55.13)", "cbam_heads", "cbam"),
+            Claim("the dilated neck helps (64.06 to 58.35)", "model", "cbam_heads"),
+            Claim("attention pays with neck and heads (64.06 to 59.81)", "model", "no_cbam"),
+            Claim("without a second stem it is better (64.06 to 63.47)", "model", "stem"),
+            Claim("with a narrow decoder it is better (64.06 to 63.12)", "model", "expand"),
+            Claim("control: labels teach", "model", "labels exchanged"),
+        ),
+        512,
+    ),
+    "sigma": Study(
+        "spread of the heatmap's targets",
+        "sigma 3",
+        {
+            "sigma 3": _radar(loss__sigma_cells=3.0),
+            "model": _row("model"),  # sigma 1
+            "sigma 0.75": _radar(loss__sigma_cells=0.75),
+            "adaptive": _radar(loss__sigma="adaptive"),
+            "anisotropic": _radar(loss__sigma="anisotropic"),
+            "labels exchanged": Cell("quickstart", _LABELS),
+        },
+        (
+            Claim("0.75 is best for all classes", "sigma 0.75", "sigma 3", "mean"),
+            *(
+                Claim(f"0.75 helps {cls}", "sigma 0.75", "sigma 3", cls)
+                for cls in CLASSES[2:]
+            ),
+            Claim("control: labels teach", "model", "labels exchanged"),
+        ),
+        512,
+    ),
+    "4": Study(
+        "DinoRADE's Table 4",
+        "R",
+        {
+            "R": Cell("quickstart_fusion:radar"),
+            "R+C": Cell("quickstart_fusion:pretrained", {"model.fusion.weighting": "off"}),
+            "R+C+W": Cell("quickstart_fusion:pretrained"),
+            "R+C+W from scratch": Cell("quickstart_fusion"),
+            "images exchanged": Cell("quickstart_fusion:pretrained", exchanges="R+C+W"),
+            "labels exchanged": Cell("quickstart_fusion:pretrained", _LABELS),
+        },
+        (
+            Claim("the camera helps (69.61 to 61.65)", "R+C", "R"),
+            Claim("the whole model gains 4 (71.38 to 61.65)", "R+C+W", "R", least=4.0),
+            Claim("the same in the mean", "R+C+W", "R", "mean", 4.0),
+            Claim("elevation weights help (71.38 to 69.61)", "R+C+W", "R+C"),
+            Claim("a pretrained backbone helps", "R+C+W", "R+C+W from scratch", "mean"),
+            Claim("control: its own images count", "R+C+W", "images exchanged"),
+            Claim("control: labels teach", "R+C+W", "labels exchanged"),
+        ),
+        1024,
+    ),
+}  # fmt: skip

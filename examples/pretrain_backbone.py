@@ -1,0 +1,292 @@
+"""Trains the small image transformer on simulated images, to be used frozen.
+
+    python examples/pretrain_backbone.py --out backbones/small
+    python train.py --config configs/quickstart_fusion.py:pretrained \\
+        --image_backbone backbones/small
+
+What DINOv3 is for K-Radar, this is for simulated data: a backbone that knows images
+before the detector is trained, and stays as it is. It learns from images alone, of
+scenes of another seed than the data set's, what of each class every patch shows and how
+near it is, which the renderer knows; no detection label enters. The folder is one of
+Hugging Face's DINOv3 format. Average precision by class tells, on scenes of a third
+seed, how well patches that show an object are told from the others.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+import pathlib
+import time
+from typing import Any, NamedTuple
+
+import click
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from ml_collections import ConfigDict
+
+from radejax import models
+from radejax.cli import entry
+from radejax.core import files
+from radejax.core.config import load_config
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES
+from radejax.interop import dinov3_hf
+from radejax.models.image import normalize
+from radejax.models.vit import ViT
+from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
+from radejax.simulation.camera.shapes import camera_position
+from radejax.simulation.config import SimulationConfig, plain
+from radejax.simulation.scene_sources import make_source
+from radejax.simulation.world.scene import Sequence
+from radejax.simulation.world.traffic import SIZES
+
+CONFIG = (
+    pathlib.Path(__file__).resolve().parents[1]
+    / "configs"
+    / "quickstart_fusion.py:pretrained"
+)
+SEEDS = (2_000_003, 3_000_017)
+"""Added to the seed of the data: of scenes to learn from, of those to be tested on."""
+
+REPORT = "pretraining.json"
+PIXELS_SHOWN = 4
+"""From so many pixels of a class on, a patch shows it."""
+NEAR_M = 10.0
+SMALL = tuple(map(CLASSES.index, ("Pedestrian", "Motorcycle", "Bicycle")))
+SHARE_TURNED = 0.4
+"""Of the cars in the images to learn from; see `with_small_ones`."""
+
+
+class Images(NamedTuple):
+    """Images and what their patches show.
+
+    Attributes:
+        image: `[N, H, W, 3]` uint8.
+        pixels: `[N, h, w, K]` uint16 pixels of each class.
+        nearness: `[N, h, w]` 10 m / distance, mean over the pixels of objects.
+    """
+
+    image: np.ndarray
+    pixels: np.ndarray
+    nearness: np.ndarray
+
+
+def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
+    """A share of the cars become people and two-wheelers, which are few otherwise."""
+    rng = np.random.default_rng([seed, sequence.name, 17])
+    tracks, cls = sequence.tracks, sequence.tracks.cls.copy()
+    size, position = tracks.size_m.copy(), tracks.position_m.copy()
+    is_car = cls == CLASSES.index("Sedan")
+    for index in np.flatnonzero(is_car & (rng.random(cls.size) < share)):
+        cls[index] = rng.choice(SMALL)
+        mean, deviation = SIZES[CLASSES[cls[index]]]
+        size[:, index] = np.array(mean) + np.array(deviation) * rng.normal(size=3)
+        position[:, index, 2] = sequence.ground_m + size[:, index, 2] / 2.0
+    tracks = dataclasses.replace(tracks, cls=cls, size_m=size, position_m=position)
+    return dataclasses.replace(sequence, tracks=tracks)
+
+
+def draw(
+    simulation: dict[str, Any], patch: int, count: int, seed: int, share: float = 0.0
+) -> Images:
+    """One image of each of `count` procedural scenes; for `share` see above."""
+    fields = {"seed": seed, "train_sequences": count, "test_sequences": 0}
+    fields |= {"frames_per_sequence": 1}
+    config = SimulationConfig.from_mapping(simulation | fields)
+    if config.scenes != "procedural" or not config.image_width:
+        raise UserError("images are drawn of procedural scenes, of a size above 0")
+    height, width = config.image_height, config.image_width
+    cameras = stereo_calibration(config.lidar_to_radar_m, width, height)
+    origin = camera_position(cameras[0])
+    source = make_source(config)
+    shape = (count, height // patch, width // patch)
+    images = Images(
+        np.empty((count, height, width, 3), np.uint8),
+        np.empty((*shape, len(CLASSES)), np.uint16),
+        np.empty(shape, np.float32),
+    )
+
+    def of_patches(pixels: np.ndarray) -> np.ndarray:
+        """`[H, W, K]` summed over patches."""
+        rows, columns = shape[1:]
+        return pixels.reshape(rows, patch, columns, patch, -1).sum((1, 3))
+
+    def draw_one(index: int) -> None:
+        sequence = with_small_ones(source.make(index + 1), share, seed)
+        renderer = CameraRenderer(
+            sequence,
+            cameras,
+            seed,
+            cover_lens=config.cover_lens,
+            content=config.camera_content,
+        )
+        frame = sequence.frame(0)
+        box = renderer.shown_boxes(frame, 0)
+        cls = np.append(frame.cls, -1)[box]  # the last for -1, no box
+        near = NEAR_M / np.linalg.norm(frame.boxes[:, :3] - origin, axis=1)
+        near = np.append(near, 0.0)[box][..., None]
+        pixels = of_patches(cls[..., None] == np.arange(len(CLASSES)))
+        images.image[index] = renderer.view(frame, 0)
+        images.pixels[index] = pixels
+        total = np.maximum(pixels.sum(-1), 1)
+        images.nearness[index] = of_patches(near)[..., 0] / total
+
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        list(pool.map(draw_one, range(count)))
+    return images
+
+
+class Patches(nn.Module):
+    """A backbone with a linear layer: `[B, h, w, K + 1]` logits and nearness."""
+
+    backbone: ViT
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        size = self.backbone.patch_size
+        shape = (len(image), image.shape[1] // size, image.shape[2] // size, -1)
+        tokens = self.backbone(normalize(image))[:, self.backbone.num_prefix :]
+        return nn.Dense(len(CLASSES) + 1)(tokens).reshape(shape)
+
+
+def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
+    """Of what patches show: cross-entropy by class, and the error of the nearness."""
+    # A few pixels of a class are it: a far pedestrian has no more.
+    target = jnp.minimum(pixels / (2.0 * PIXELS_SHOWN), 1.0)
+    entropy = optax.sigmoid_binary_cross_entropy(found[..., :-1], target)
+    entropy = jnp.sum(entropy * (1.0 + 2.0 * target), axis=-1)
+    error = jnp.square(found[..., -1] - nearness)
+    return jnp.mean(entropy + jnp.where(nearness > 0, error, 0.0))
+
+
+def train(
+    model: Patches, data: Images, *, epochs: int, seed: int, batch_size: int = 16
+) -> Any:
+    """Parameters after so many epochs: AdamW, a cosine, mirrored at random."""
+    steps = epochs * (len(data.image) // batch_size)
+    schedule = optax.warmup_cosine_decay_schedule(0.0, 1.5e-3, steps // 20, steps)
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=0.01)
+    )
+    params = jax.jit(model.init)(jax.random.key(seed), data.image[:1])
+    state = optimizer.init(params)
+
+    @functools.partial(jax.jit, donate_argnums=(0, 1))
+    def step(params: Any, state: Any, batch: Images) -> tuple[Any, Any, jax.Array]:
+        def total(params: Any) -> jax.Array:
+            found = model.apply(params, batch.image)
+            return loss(found, batch.pixels.astype(jnp.float32), batch.nearness)
+
+        value, gradient = jax.value_and_grad(total)(params)
+        updates, state = optimizer.update(gradient, state, params)
+        return optax.apply_updates(params, updates), state, value
+
+    rng, started = np.random.default_rng(seed), time.perf_counter()
+    for epoch in range(epochs):
+        order, values = rng.permutation(len(data.image)), []
+        for start in range(0, len(order) - batch_size + 1, batch_size):
+            chosen = order[start : start + batch_size]
+            turn = slice(None, None, -1 if rng.random() < 0.5 else 1)
+            batch = Images(*(part[chosen][:, :, turn] for part in data))
+            params, state, value = step(params, state, batch)
+            values.append(value)
+        minutes = (time.perf_counter() - started) / 60
+        mean = float(np.mean(values))
+        click.echo(f"epoch {epoch + 1}: loss {mean:.4f}, {minutes:.1f} minutes")
+    return params
+
+
+def average_precision(score: np.ndarray, is_shown: np.ndarray) -> float:
+    """Of the order of scores; NaN where nothing is shown."""
+    right = is_shown.ravel()[np.argsort(-score.ravel(), kind="stable")]
+    precision = np.cumsum(right) / np.arange(1, right.size + 1)
+    return float(precision[right].mean()) if right.any() else float("nan")
+
+
+def patch_ap(model: Patches, params: Any, data: Images) -> dict[str, float]:
+    """Average precision of patches by class: do they show so many pixels of it?"""
+    predict = jax.jit(model.apply)
+    found = [
+        predict(params, data.image[i : i + 32]) for i in range(0, len(data[0]), 32)
+    ]
+    found = np.concatenate(found)
+    return {
+        cls: average_precision(found[..., k], data.pixels[..., k] >= PIXELS_SHOWN)
+        for k, cls in enumerate(CLASSES)
+    }
+
+
+def pretrain(
+    config: ConfigDict,
+    out: pathlib.Path,
+    *,
+    images: int = 3072,
+    held_out: int = 512,
+    epochs: int = 10,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Writes a backbone for a config, for its kind of images; patch AP by class.
+
+    Args:
+        config: Of a radar-camera model, with a `simulation` section.
+        out: Folder in Hugging Face's DINOv3 format.
+        images: To learn from.
+        held_out: Images to be tested on.
+        epochs: Times that each is seen.
+        seed: Of weights and order, and added to that of the scenes.
+
+    Raises:
+        UserError: The config has no simulated images, or no ViT.
+    """
+    simulation = plain(config.get("simulation") or {})
+    if not simulation or "image" not in config.model:
+        raise UserError("the config has no simulated images, or its model no camera")
+    if (vit := models.build(config.model).vit) is None:
+        raise UserError(
+            f"config.model.image.kind is {config.model.image.kind!r}, expected 'vit'"
+        )
+    started, base = time.perf_counter(), simulation["seed"] + seed
+    learnt, tested = (
+        draw(simulation, vit.patch_size, count, base + offset, share)
+        for count, offset, share in zip(
+            (images, held_out), SEEDS, (SHARE_TURNED, 0.0), strict=True
+        )
+    )
+    seconds = time.perf_counter() - started
+    click.echo(f"{images + held_out} images drawn in {seconds:.0f} s")
+    model = Patches(vit)
+    params = train(model, learnt, epochs=epochs, seed=seed)
+    found = patch_ap(model, params, tested)
+    dinov3_hf.save(vit, params["params"]["backbone"], out)
+    minutes = (time.perf_counter() - started) / 60
+    report = {"images": images, "epochs": epochs, "seed": seed, "minutes": minutes}
+    files.write_json(out / REPORT, report | {"patch_ap": found})
+    text = ", ".join(f"{cls} {ap:.2f}" for cls, ap in found.items())
+    click.echo(f"patches found on {held_out} other images (AP): {text}")
+    click.echo(f"{minutes:.1f} minutes; written to {out}")
+    return found
+
+
+@click.command()
+@click.option(
+    "--config", default=str(CONFIG), help="Of the detector: its images and backbone."
+)
+@click.option("--out", required=True, type=click.Path(path_type=pathlib.Path))
+@click.option("--images", default=3072, show_default=True, type=click.IntRange(16))
+@click.option("--held-out", default=512, show_default=True, type=click.IntRange(1))
+@click.option("--epochs", default=10, show_default=True, type=click.IntRange(1))
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+def main(config, out, **options):
+    """Pretrains the image backbone of a config into the folder OUT."""
+    entry.set_up_jax()
+    with entry.exit_codes():
+        pretrain(load_config(config), out, **options)
+
+
+if __name__ == "__main__":
+    main()

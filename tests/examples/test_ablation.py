@@ -1,0 +1,224 @@
+"""The ablations: what is run, that a kill costs nothing, differences and verdicts."""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import ablation
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from radejax.core.config import load_config
+from radejax.core.structures import CLASSES
+from radejax.evaluation.report.report import write_report
+from radejax.runs import check_config
+from radejax.runs.override import override
+
+SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "labels exchanged": 0.1}
+"""Of what share of the objects a cell finds; 0.5 where it is not told."""
+
+
+class _Runs:
+    """Stands for training and evaluation: objects of which a share is found."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.trained: list[tuple[str, Any, Any]] = []
+        self.simulated: set[tuple[str, str]] = set()
+        self.stops_at: str | None = None
+        patch.setattr(ablation.experiment, "run", self.run)
+        patch.setattr(ablation, "evaluate_run", self.evaluate)
+        patch.setattr(ablation, "simulate_dataset", self.simulate)
+
+    def simulate(self, simulation: Any, root: pathlib.Path) -> pathlib.Path:
+        self.simulated.add((root.name, json.dumps(simulation)))
+        return root
+
+    def run(self, config: Any, *, name: str, sources: Any, workdir: Any) -> None:
+        self.trained.append((name, config, sources))
+        if name != self.stops_at:
+            (workdir / "evaluation").mkdir(parents=True)
+            (workdir / "evaluation" / "metrics.json").write_text("{}")
+
+    def evaluate(self, folder: pathlib.Path, *, out: Any, **options: Any) -> None:
+        assert options["split"] == "all"
+        frame, name = np.arange(60), folder.parent.name.replace("_", " ")
+        box = np.tile([20.0, 0, 0, 4, 2, 1.5, 0], (60, 1))
+        truth = {"frame": frame, "box": box, "cls": np.full(60, "Sedan")}
+        rng = np.random.default_rng(int(folder.name[4:]))
+        is_found = rng.random(60) < SKILL.get(name, 0.5)
+        found = {key: column[is_found] for key, column in truth.items()}
+        found["score"] = np.full(is_found.sum(), 0.9)
+        frames = {"frame": frame, "sequence": frame, "weather": np.full(60, "fog")}
+        write_report(
+            truth, found, frames, out, protocols=("exact",), iou_thresholds=(0.3,),
+            classes=CLASSES, plots=False,
+        )  # fmt: skip
+
+
+def _call(out: pathlib.Path, *more: str) -> str:
+    command = ["--table", "sigma", "--resamples", "40", "--out", str(out), *more]
+    result = CliRunner().invoke(ablation.main, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_what_is_missing_is_run_and_judged(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = _Runs(monkeypatch)
+    runs.stops_at = "adaptive"  # as a signal does
+    text = _call(tmp_path, "--seeds", "0")
+    assert "3 of 6 cells are done" in text
+    assert "next: adaptive, seed 0" in text
+    runs.stops_at = None
+    text = _call(tmp_path, "--seeds", "0,4")
+    assert "12 of 12 cells are done" in text
+    names = [(name, config.seed) for name, config, _ in runs.trained]
+    cells = list(ablation.STUDIES["sigma"].cells)
+    assert names == [(n, 0) for n in [*cells[:4], *cells[3:]]] + [(n, 4) for n in cells]
+    # Scenes are those of the seed, the same for all cells; no cell is trained on those
+    # that it is evaluated on.
+    assert sorted({name for name, _ in runs.simulated}) == [
+        "quickstart-held",
+        "quickstart-seed0",
+        "quickstart-seed4",
+    ]
+    assert len(runs.simulated) == 3
+    seeds = {n: json.loads(text)["seed"] for n, text in runs.simulated}
+    assert len(set(seeds.values())) == 3
+    for _, config, sources in runs.trained:
+        assert sources.data[0].endswith(f"quickstart-seed{config.seed}")
+        assert config.simulation.seed == config.seed
+
+    content = json.loads((tmp_path / "table_sigma.json").read_text())
+    by = {(r["cell"], r["cls"]): r for r in content["rows"] if r["condition"] == "all"}
+    row = by["sigma 0.75", "Sedan"]
+    assert row["seeds"] == [0, 4]
+    assert row["ap"] > 75 > 60 > by["sigma 3", "Sedan"]["ap"]
+    base = by["sigma 3", "Sedan"]["ap"]
+    assert row["difference"] == pytest.approx(row["ap"] - base)
+    assert row["low"] < row["difference"] < row["high"]
+    verdicts = {claim["text"]: claim["verdict"] for claim in content["claims"]}
+    assert verdicts["0.75 is best for all classes"] == "shown"
+    assert verdicts["control: labels teach"] == "shown"
+    assert "shown" in (tmp_path / "table_sigma.md").read_text()
+    assert r"\begin{table}" in (tmp_path / "table_sigma.tex").read_text()
+    # One table's cells are another's: nothing is run again.
+    before = len(runs.trained)
+    command = ["--table", "3", "--seeds", "0", "--resamples", "40"]
+    CliRunner().invoke(ablation.main, [*command, "--out", str(tmp_path)])
+    assert len(runs.trained) == before + 6  # not model, not the exchanged labels
+
+
+@pytest.mark.parametrize(
+    ("numbers", "word"),
+    [
+        ((5.0, 1.0, 9.0, 0.0), "shown"),
+        ((5.0, -1.0, 9.0, 0.0), "undecided"),
+        ((-5.0, -9.0, -1.0, 0.0), "refuted"),
+        ((3.0, 1.0, 5.0, 4.0), "undecided"),
+        ((5.0, 1.0, 9.0, 4.0), "shown"),
+        ((2.0, 1.0, 3.0, 4.0), "refuted"),
+    ],
+)
+def test_verdicts(numbers: tuple[float, ...], word: str) -> None:
+    assert ablation.verdict(*numbers) == word
+
+
+def test_intervals_are_paired(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Equal runs differ by nothing, however few scenes there are."""
+    runs = _Runs(monkeypatch)
+    monkeypatch.setitem(SKILL, "sigma 3", 0.5)
+    _call(tmp_path, "--seeds", "1")
+    assert len(runs.trained) == 6
+    rows = json.loads((tmp_path / "table_sigma.json").read_text())["rows"]
+    (row,) = (r for r in rows if (r["cell"], r["cls"]) == ("adaptive", "Sedan"))
+    assert (row["difference"], row["low"], row["high"]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("table", sorted(ablation.STUDIES))
+def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
+    study = ablation.STUDIES[table]
+    work = ablation.Work(study, pathlib.Path("/none"))
+    seen = []
+    for name, cell in study.cells.items():
+        config = work.config(cell, 2)
+        check_config.check(config)
+        words = work.command(name, 2).split()
+        again = load_config(
+            str(ablation.CONFIGS.parent / words[words.index("--config") + 1])
+        )
+        texts = dict(
+            w[len("--config.") :].split("=") for w in words if "--config." in w
+        )
+        override(again, texts)
+        assert again.to_json() == config.to_json()
+        if not cell.exchanges:
+            seen.append(config.to_json())
+        assert work.run_folder(name, 2).name == "seed2"
+    assert len(set(seen)) == len(seen)  # cells differ
+    for claim in study.claims:
+        assert {claim.a, claim.b} <= set(study.cells)
+        assert claim.cls in (*CLASSES, "mean")
+
+
+TINY = """
+import sys
+sys.path[:0] = [{examples!r}]
+import ablation
+small = {{
+    "simulation.train_sequences": 2, "simulation.frames_per_sequence": 4,
+    "simulation.test_sequences": 1, "simulation.image_width": 0,
+    "simulation.grid.num_range": 16, "simulation.grid.num_azimuth": 16,
+    "simulation.grid.num_doppler": 4, "simulation.grid.num_elevation": 3,
+    "model.doppler_bins": 4, "model.elevation_bins": 3, "model.widths": (8, 8),
+    "model.num_groups": 4, "model.decoder_width": 8, "model.pad_multiple": 4,
+    "model.neck": "plain", "model.heads": "default", "model.cbam": "off",
+    "train.batch_size": 2, "train.num_epochs": 8, "train.warmup_steps": 0,
+    "train.checkpoint_every_steps": 2, "train.log_every_steps": 1,
+}}
+cells = {{
+    "plain": ablation.Cell("quickstart", small),
+    "sharp": ablation.Cell("quickstart", small | {{"loss.sigma_cells": 0.5}}),
+}}
+claims = (ablation.Claim("sharp is better", "sharp", "plain", "mean"),)
+ablation.STUDIES["sigma"] = ablation.Study("tiny", "plain", cells, claims, 3)
+ablation.main()
+"""
+
+
+@pytest.mark.slow  # real runs, in processes that can be killed
+@pytest.mark.timeout(900)
+def test_a_killed_command_goes_on_within_a_run(tmp_path: pathlib.Path) -> None:
+    script, out = tmp_path / "tiny.py", tmp_path / "out"
+    script.write_text(TINY.format(examples=str(pathlib.Path(ablation.__file__).parent)))
+    command = [sys.executable, str(script), "--table", "sigma", "--seeds", "0"]
+    command += ["--out", str(out), "--resamples", "20"]
+    environment = os.environ | {"XLA_FLAGS": "", "JAX_PLATFORMS": "cpu"}
+    folder = out / "runs" / "quickstart" / "plain" / "seed0"
+
+    process = subprocess.Popen(command, env=environment, start_new_session=True)
+    until = time.monotonic() + 400
+    while not list(folder.glob("checkpoints/[0-9]*")) and time.monotonic() < until:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert list(folder.glob("checkpoints/[0-9]*"))
+    assert not (folder / "held").exists()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 cells are done" in done.stdout
+    rows = [json.loads(x) for x in (folder / "metrics.jsonl").read_text().splitlines()]
+    steps = [row["step"] for row in rows if "focal" in row]
+    assert sorted(set(steps)) == list(range(1, 33))  # every step, some of them twice
+    content = json.loads((out / "table_sigma.json").read_text())
+    assert {row["cell"] for row in content["rows"]} == {"plain", "sharp"}
+    assert content["claims"][0]["verdict"] in ("shown", "refuted", "undecided")

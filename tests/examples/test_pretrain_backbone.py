@@ -1,0 +1,99 @@
+"""The backbone for simulated images: what it is shown, that it learns, its folder."""
+
+import pathlib
+
+import jax
+import numpy as np
+import pretrain_backbone as pretraining
+import pytest
+from click.testing import CliRunner
+
+from radejax import models
+from radejax.core.config import load_config
+from radejax.core.structures import CLASSES
+from radejax.interop.image_backbone import load_image_backbone
+from radejax.simulation.config import plain
+
+from .. import small_models as small
+
+
+def _config():
+    config = load_config(str(small.CONFIGS / "quickstart_fusion.py") + ":pretrained")
+    config.simulation.update(image_width=128, image_height=32, cover_lens=False)
+    config.model.image.update(
+        size=(32, 128), hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16
+    )
+    return config
+
+
+def _drawn(count, share=0.0, **fields):
+    simulation = plain(_config().simulation) | fields
+    return pretraining.draw(simulation, 16, count, 7, share)
+
+
+def test_patches_show_the_classes_that_are_drawn():
+    plain_images = _drawn(6)
+    flat = _drawn(6, camera_content="objects")
+    np.testing.assert_array_equal(flat.pixels, plain_images.pixels)
+    # Silhouettes have the colour of their class: where the roadside hides none, each
+    # of its pixels is one of the class.
+    red = (flat.image[..., 0] > 0) & ~flat.image[..., 1:].any(-1)
+    by_patch = red.reshape(6, 2, 16, 8, 16).sum((2, 4))
+    sedans = flat.pixels[..., CLASSES.index("Sedan")]
+    assert sedans.sum() > 100
+    assert (sedans <= by_patch).all()
+    assert (sedans == by_patch).mean() > 0.8
+    # 20 m away: half as bright in a silhouette, 0.5 here.
+    is_full = (sedans == by_patch) & (flat.pixels.sum(-1) == sedans) & (sedans > 60)
+    brightest = flat.image[..., 0].reshape(6, 2, 16, 8, 16).max((2, 4))[is_full] / 255
+    nearest = 2 * brightest / (1 - brightest) * 0.25  # 10 / d from 20 / (20 + d)
+    assert is_full.sum() > 3
+    assert (flat.nearness[is_full] <= nearest * 1.1).all()
+    assert flat.nearness[is_full].min() > 0.08
+
+
+def test_small_objects_take_the_place_of_cars():
+    some, many = _drawn(12), _drawn(12, share=1.0)
+    sedan, *_ = counts = many.pixels.sum((0, 1, 2))
+    assert sedan == 0
+    small_ones = list(pretraining.SMALL)
+    assert (counts[small_ones] > some.pixels.sum((0, 1, 2))[small_ones]).all()
+
+
+def test_average_precision_by_hand():
+    score, right = np.array([0.9, 0.8, 0.7, 0.1]), np.array([1, 0, 1, 0], bool)
+    assert pretraining.average_precision(score, right) == pytest.approx((1 + 2 / 3) / 2)
+    assert np.isnan(pretraining.average_precision(score, right & False))
+
+
+@pytest.mark.slow  # compiles a training
+def test_it_learns_and_its_folder_is_a_frozen_backbone(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pretraining, "load_config", lambda _: _config())
+    options = ["--images", "64", "--held-out", "32", "--epochs", "8"]
+    command = [*options, "--out", str(tmp_path / "backbone")]
+    result = CliRunner().invoke(pretraining.main, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    losses = [float(line.split()[3][:-1]) for line in result.output.splitlines()[1:9]]
+    assert losses[-1] < 0.6 * losses[0]
+    (line,) = (row for row in result.output.splitlines() if "Sedan" in row)
+    shown = pretraining.draw(plain(_config().simulation), 16, 32, pretraining.SEEDS[1])
+    chance = (shown.pixels[..., 0] >= pretraining.PIXELS_SHOWN).mean()
+    assert float(line.split("Sedan ")[1].split(",")[0]) > chance + 0.2
+    model = models.build(_config().model)
+    assert model.freeze
+    params = load_image_backbone(tmp_path / "backbone", model)["params"]
+    shapes = jax.eval_shape(
+        model.vit.init, jax.random.key(0), np.zeros((1, 32, 128, 3))
+    )
+    assert jax.tree.map(np.shape, params["image_backbone"]) == jax.tree.map(
+        lambda leaf: leaf.shape, shapes["params"]
+    )
+
+
+def test_a_model_without_camera_is_refused(tmp_path: pathlib.Path) -> None:
+    command = ["--config", "quickstart", "--out", str(tmp_path / "x")]
+    result = CliRunner().invoke(pretraining.main, command)
+    assert result.exit_code != 0
+    assert "no simulated images, or its model no camera" in result.output

@@ -1,0 +1,131 @@
+"""The runner of the benchmarks: turns, budget, refusal of other numbers, and its page."""
+
+import functools
+import json
+import pathlib
+import types
+from typing import Any
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def modules(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
+    """`run.py`, the page that it writes, and what it measures."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import case
+    import page
+    import run
+
+    monkeypatch.setattr(run, "SECONDS_A_CASE", 0.05)
+    monkeypatch.setattr(run.rival, "start", lambda platform: None)
+    return types.SimpleNamespace(run=run, page=page, Case=case.Case)
+
+
+def _case(modules: Any, order: list[str], **fields: Any) -> Any:
+    def call(name: str, seconds: float) -> tuple[float, float]:
+        order.append(name)
+        return seconds, 2 * seconds
+
+    columns = {
+        "radejax": functools.partial(call, "radejax", 0.02),
+        "rival": functools.partial(call, "rival", 0.05),
+    }
+    fields = {"name": "something", "columns": columns, "frames": 2} | fields
+    return modules.Case(**fields)
+
+
+def test_rivals_take_turns_and_what_did_not_fit_is_said(modules: Any) -> None:
+    order: list[str] = []
+    first = _case(modules, order, error=1e-6, mib=3.0, note=lambda: "after it")
+    chosen = {
+        "first": (lambda machine: iter([first]), 10),
+        "second": (lambda machine: iter([_case(modules, order)]), 10),
+        "long": (lambda machine: iter([_case(modules, order)]), 700),
+    }
+    result = modules.run.run(chosen, 600.0)
+    assert order == ["radejax", "rival"] * (len(order) // 2)
+    row, other = result["rows"]
+    assert (row["benchmark"], row["repeats"]) == ("first", modules.run.MAX_REPEATS)
+    assert row["wall_s"] == {"radejax": 0.02, "rival": 0.05}
+    assert (row["error"], other["error"]) == (1e-6, None)
+    text = modules.page.table({"runs": [json.loads(json.dumps(result))]})
+    assert (
+        "| something | float32 | 2 | 10 ms (20 ms) | rival 25 ms (50 ms) | 2.50 | 1e-06 "
+        "| 3 MiB | after it |" in text
+    )
+    assert "Not run, for want of time: long (takes 700 s, 600 s were left)." in text
+
+
+def test_a_case_that_comes_too_late_is_not_begun(modules: Any) -> None:
+    order: list[str] = []
+    cases = [_case(modules, order, name=f"number {i}") for i in range(2)]
+    late = modules.run.run({"all": (lambda machine: iter(cases), -2)}, -1.0)
+    assert (late["rows"], order) == ([], [])
+    assert late["not_run"] == ["all from number 0, float32 on"]
+
+
+@pytest.mark.parametrize("error", [0.1, float("nan")])
+def test_other_numbers_are_no_measurement(modules: Any, error: float) -> None:
+    order: list[str] = []
+    row = modules.run.measured(_case(modules, order, error=error), 10.0)
+    assert not order
+    assert "wall_s" not in row
+    assert row["refused"].startswith("results differ by")
+
+
+def test_what_fails_is_said_and_the_others_are_measured(modules: Any) -> None:
+    def fails(machine: Any) -> Any:
+        raise RuntimeError("out of memory")
+        yield
+
+    chosen = {
+        "bad": (fails, 0),
+        "good": (lambda machine: iter([_case(modules, [])]), 0),
+    }
+    text = modules.page.devices_table([modules.run.run(chosen, 600.0)])
+    assert "Not measured: bad: RuntimeError('out of memory')." in text
+    assert "| something |" in text
+
+
+def test_what_is_stored_is_on_the_page(
+    modules: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
+) -> None:
+    results, page = tmp_path / "results", tmp_path / "page.md"
+    monkeypatch.setattr(modules.page, "RESULTS", results)
+    monkeypatch.setattr(modules.page, "PAGE", page)
+    page.write_text(f"before\n{modules.page.BEGIN}\nold\n{modules.page.END}\nafter\n")
+    for number, names in enumerate((("one", "two"), ("two",), ("three",))):
+        case = _case(modules, [], name=f"run {number}")
+        chosen = {name: (lambda _, case=case: iter([case]), 0) for name in names}
+        result = modules.run.run(chosen, 600.0) | {"device": "A device (TM), 2 cores"}
+        modules.page.store(result, results)
+    (file,) = results.iterdir()
+    assert file.name == "a_device_tm_2_cores.json"
+    stored = [
+        [(row["benchmark"], row["name"]) for row in run["rows"]]
+        for run in json.loads(file.read_text())["runs"]
+    ]
+    assert stored == [[("one", "run 0")], [("two", "run 1")], [("three", "run 2")]]
+    modules.page.write_page()
+    text = page.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert [text.count(f"| run {i} |") for i in range(3)] == [1, 1, 1]
+    assert "old" not in text
+
+
+def test_the_committed_page_is_what_the_committed_files_give(
+    modules: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
+) -> None:
+    committed = modules.page.PAGE.read_text()
+    page = tmp_path / "page.md"
+    page.write_text(committed)
+    monkeypatch.setattr(modules.page, "PAGE", page)
+    modules.page.write_page()
+    assert page.read_text() == committed, (
+        "docs/benchmarks.md is not what docs/benchmarks/*.json say: "
+        "python benchmarks/run.py --tables"
+    )
