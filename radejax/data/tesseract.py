@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import math
 import os
 import pathlib
@@ -44,6 +45,8 @@ def read_tesseract(
             return mat5.read_array(file, layout)
         with _open_hdf5(path) as data:
             _check(path, data.dtype, data.shape[::-1], shape_drea)
+            for chunk in _chunks(data):  # HDF5 reads one that it cannot find as zeros
+                data.id.read_direct_chunk(chunk.chunk_offset)
             return data[()].T
 
 
@@ -284,4 +287,46 @@ def _open_hdf5(path: str | os.PathLike) -> Iterator[Any]:
                 f"{path}: damaged, {VARIABLE} of shape {data.shape[::-1]} claims "
                 f"{claimed} bytes and stores {stored}"
             )
+        _check_hdf5_storage(path, data)
         yield data
+
+
+def _check_hdf5_storage(path: str | os.PathLike, data: Any) -> None:
+    """`DataError` where one flipped bit of a v7.3 file makes other numbers.
+
+    Such a bit is in the type (exponent, byte order), in the place of the numbers, or in
+    the table of the chunks, of which a missing one would be read as zeros.
+    """
+    import h5py
+
+    stored = data.id.get_type()
+    if stored not in (h5py.h5t.IEEE_F32LE, h5py.h5t.IEEE_F64LE):
+        raise DataError(
+            f"{path}: numbers of {VARIABLE} are stored as an unusual {data.dtype.str}, "
+            "expected little-endian float32 or float64"
+        )
+    head = data.file.userblock_size + h5py.h5o.get_info(data.id).addr
+    if data.chunks is None:
+        places = [(data.id.get_offset() or 0, data.nbytes)]
+        is_whole = data.id.get_storage_size() == data.nbytes
+    else:
+        chunks = _chunks(data)
+        places = [(chunk.byte_offset, chunk.size) for chunk in chunks]
+        found = sorted(chunk.chunk_offset for chunk in chunks)
+        steps = [range(0, *ends) for ends in zip(data.shape, data.chunks, strict=True)]
+        is_whole = len(found) == math.prod(map(len, steps))
+        is_whole = is_whole and found == list(itertools.product(*steps))
+        is_whole = is_whole and not any(chunk.filter_mask for chunk in chunks)
+        if not data.id.get_create_plist().get_nfilters():
+            num_bytes = math.prod(data.chunks) * data.dtype.itemsize
+            is_whole = is_whole and {size for _, size in places} == {num_bytes}
+    if not is_whole or any(0 <= head - start < size for start, size in places):
+        raise DataError(f"{path}: damaged, the table of {VARIABLE}'s numbers is wrong")
+
+
+def _chunks(data: Any) -> list[Any]:
+    """Places of the chunks of a data set; none where it has no chunks."""
+    chunks: list[Any] = []
+    if data.chunks:
+        data.id.chunk_iter(chunks.append)
+    return chunks
