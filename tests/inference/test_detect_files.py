@@ -89,7 +89,7 @@ def test_a_folder_named_twice_is_one(
 
 
 def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
-    detector = small.detector()
+    detector = small.detector(batch_sizes=(2,))  # as below
     packed.write_packed(tmp_path / "packed", detector)
     frames = small.projections(3)
     for i, frame in enumerate(frames):

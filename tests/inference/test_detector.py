@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax import Detector, UserError, models
-from radejax.core.config import base_config
+from radejax import Detector, UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import write
 from radejax.data.projection import project
 from radejax.evaluation.files.kitti import prediction_texts
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.interop import dinorade_torch
 from radejax.visualize.canvas import as_objects
@@ -24,24 +22,8 @@ from .. import small_models as small
 
 @pytest.fixture(scope="module")
 def detector() -> Detector:
-    """Untrained: with this prior nearly every bin is a weak detection."""
-    grid = RadarGrid.reduced(
-        num_doppler=2, num_range=16, num_elevation=3, num_azimuth=14, max_range_m=30.0
-    )
-    config = base_config()
-    config.model.update(
-        doppler_bins=2,
-        elevation_bins=3,
-        widths=(8, 8, 8),
-        decoder_width=8,
-        num_groups=4,
-    )
-    model = models.build(config.model)
-    inputs = np.zeros((1, *grid.projection_shape), np.float32)
-    variables = jax.jit(model.init)(jax.random.key(0), inputs)
-    return Detector.from_config(
-        config, variables, grid, score_threshold=0.3, batch_sizes=(1, 4)
-    )
+    """Untrained: nearly every bin is a weak detection."""
+    return small.detector(score_threshold=0.3, batch_sizes=(1, 4))
 
 
 @pytest.fixture(scope="module")

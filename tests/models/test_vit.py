@@ -12,6 +12,8 @@ from radejax.core.errors import UserError
 from radejax.models import vit
 from radejax.models.vit import ViT
 
+from ..small_models import drawn
+
 TINY = {
     "hidden_size": 16,
     "num_layers": 2,
@@ -115,7 +117,7 @@ def test_shapes_parameters_and_jit(fields):
 
 def test_another_image_size_uses_the_same_parameters():
     model = ViT(**TINY)
-    variables = jax.jit(model.init)(jax.random.key(0), jnp.zeros((1, 8, 8, 3)))
+    variables = drawn(model, jnp.zeros((1, 8, 8, 3)))
     tokens = jax.jit(model.apply)(variables, jnp.zeros((1, 12, 20, 3)))
     chex.assert_shape(tokens, (1, 18, 16))
 
