@@ -9,7 +9,7 @@ from .engine import CORPUS, Child
 from .mutate import mutate
 from .readers import READERS
 
-FACTOR_OF_SLOW = 20
+FACTOR_OF_SLOW = 10
 
 
 @pytest.fixture(scope="module")
