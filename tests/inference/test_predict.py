@@ -22,6 +22,8 @@ from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import processes, sharding
 
+from ..small_models import drawn
+
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
@@ -29,12 +31,15 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp("predict")
     simulation = default_config()
     simulation.update(train_sequences=0, test_sequences=1, frames_per_sequence=5)
+    simulation["grid"].update(
+        num_doppler=4, num_range=32, num_elevation=3, num_azimuth=28
+    )
     root = simulate_dataset(simulation, folder / "data", progress=False)
     config = base_config()
     config.model.update(
         doppler_bins=simulation["grid"]["num_doppler"],
         elevation_bins=simulation["grid"]["num_elevation"],
-        widths=(8, 8, 8),
+        widths=(8, 8),
         decoder_width=8,
         num_groups=4,
         cbam="off",
@@ -49,8 +54,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
     project_dataset(data.frames, data.paths.records, num_workers=0, progress=False)
     records = data.records
-    inputs = np.zeros((1, *records.grid.projection_shape), np.float32)
-    variables = jax.jit(model.init)(jax.random.key(0), inputs)
+    variables = drawn(model, np.zeros((1, *records.grid.projection_shape)))
     return SimpleNamespace(
         config=config,
         model=model,
