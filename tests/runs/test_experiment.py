@@ -110,8 +110,12 @@ def test_labels_are_read_once_and_the_model_is_built_once(
     config.simulation.update(
         train_sequences=3, frames_per_sequence=2, output="projection"
     )
+    config.simulation.grid.update(
+        num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
+    )
     config.data.validation = (2,)
-    config.model.update(widths=(8, 8), decoder_width=8, num_groups=4)
+    config.model.update(doppler_bins=4, elevation_bins=3, cbam="off", widths=(8,))
+    config.model.update(decoder_width=8, num_groups=4, neck="plain", heads="default")
     config.train.update(num_epochs=1, evaluate_every_epochs=1)
     config.evaluation.num_pictures = 1
     evaluated = []
