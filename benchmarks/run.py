@@ -51,22 +51,34 @@ def main():
     if not arguments.tables:
         jax.config.update("jax_enable_compilation_cache", False)
         chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
-        result = run(chosen, 60 * arguments.minutes)
+        result = run(
+            chosen, 60 * arguments.minutes, lambda part: page.store(part, arguments.out)
+        )
         is_whole = not any("refused" in row for row in result["rows"])
         print(page.devices_table([result]))
-        page.store(result, arguments.out)
     if arguments.out == page.RESULTS:
         page.write_page()
     sys.exit(not is_whole)
 
 
-def run(chosen, seconds):
-    """Everything that there is time for, as the JSON file holds it."""
+def run(chosen, seconds, store=lambda so_far: None):
+    """Everything that there is time for, as the JSON file holds it.
+
+    Stored after each benchmark: a run that is stopped keeps what it has measured.
+    """
     began = time.perf_counter()
     device = jax.devices()[0]
     other = rival.start(device.platform)
     machine = {"platform": device.platform, "rival": other}
     rows, not_run = [], []
+
+    def so_far():
+        return facts(device, "torch" if other else None) | {
+            "minutes": round((time.perf_counter() - began) / 60, 1),
+            "rows": rows,
+            "not_run": not_run,
+        }
+
     for name, (cases, expected_s) in chosen.items():
         left = seconds - (time.perf_counter() - began)
         if left < expected_s:
@@ -83,13 +95,12 @@ def run(chosen, seconds):
         except Exception as error:  # said in the table; the others are measured yet
             traceback.print_exc()
             rows.append({"benchmark": name, "name": name, "refused": repr(error)[:300]})
+        store(so_far())
     if other:
         other.close()
-    return facts(device, "torch" if other else None) | {
-        "minutes": round((time.perf_counter() - began) / 60, 1),
-        "rows": rows,
-        "not_run": not_run,
-    }
+    result = so_far()
+    store(result)
+    return result
 
 
 def measured(case, seconds_left):

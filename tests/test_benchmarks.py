@@ -90,6 +90,18 @@ def test_what_fails_is_said_and_the_others_are_measured(modules: Any) -> None:
     assert "| something |" in text
 
 
+def test_a_run_that_is_stopped_keeps_what_it_measured(modules: Any) -> None:
+    def stopped(machine: Any) -> Any:
+        raise KeyboardInterrupt
+        yield
+
+    chosen = {"one": (lambda machine: iter([_case(modules, [])]), 0)}
+    kept: list[dict[str, Any]] = []
+    with pytest.raises(KeyboardInterrupt):
+        modules.run.run(chosen | {"two": (stopped, 0)}, 600.0, kept.append)
+    assert [row["benchmark"] for row in kept[-1]["rows"]] == ["one"]
+
+
 def test_what_is_stored_is_on_the_page(
     modules: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
 ) -> None:
