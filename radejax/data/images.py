@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pathlib
 
 import numpy as np
@@ -33,7 +34,8 @@ def read_left_image(
 
     height, width = size
     try:
-        with Image.open(path) as file:
+        # From memory: of a file, a chunk that claims 4 GB is asked for whole.
+        with Image.open(io.BytesIO(path.read_bytes())) as file:
             found = file.size
             if max(found) > _MAX_SIDE or found[0] * found[1] > _MAX_PIXELS:
                 raise DataError(
