@@ -24,6 +24,27 @@ Columns = Mapping[str, np.ndarray]
 """A table: frames, ground truth or predictions by the name of the column."""
 
 
+_LONGEST_NAME = 200
+
+
+def read_name(value: object, where: str) -> str:
+    """A name that was read, as text.
+
+    An array of names is as wide as its longest one: a single line of a file would take
+    thousands of times its size.
+
+    Raises:
+        DataError: It is longer than any name; says `where` it was read.
+    """
+    name = str(value)
+    if len(name) > _LONGEST_NAME:
+        raise DataError(
+            f"{where}: {name[:40]!r}... is no name: {len(name)} characters, expected "
+            f"at most {_LONGEST_NAME}"
+        )
+    return name
+
+
 @dataclasses.dataclass(frozen=True)
 class Objects:
     """Boxes of many frames, sorted by frame, then class, then the caller's order.

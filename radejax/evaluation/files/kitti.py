@@ -27,7 +27,7 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
-from radejax.evaluation.columns import Columns, dense_frames, frame_ids
+from radejax.evaluation.columns import Columns, dense_frames, frame_ids, read_name
 from radejax.evaluation.files.predictions import find_frames
 
 CLASS_KEYS = {
@@ -243,7 +243,7 @@ def _read_line(line: str, scored: bool, where: str) -> tuple | None:
     expected = 16 if scored else 15
     if len(fields) != expected:
         raise DataError(f"{where}: {len(fields)} fields, expected {expected}")
-    name = CLASS_NAMES.get(fields[0], fields[0])
+    name = CLASS_NAMES.get(fields[0]) or read_name(fields[0], where)
     try:
         height, width, length, y, z, x, yaw = (float(f) for f in fields[8:15])
         score = float(fields[15]) if scored else 0.0
@@ -260,6 +260,7 @@ def _frame_table(numbers: list[int], desc: pathlib.Path | None) -> Columns:
     for number in numbers:
         path = desc / f"{number:06d}.txt"
         words = files.read_text(path).split() if path.is_file() else []
+        words = [read_name(word, str(path)) for word in words]
         tags.append(words if len(words) == 3 else ["unknown"] * 3)
     columns = np.array(tags, dtype=str).reshape(-1, 3).T
     return ids | dict(zip(DESCRIPTION, columns, strict=True))

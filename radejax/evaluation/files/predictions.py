@@ -21,7 +21,7 @@ from radejax.core import files, schema
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS
-from radejax.evaluation.columns import Columns, wanted_columns
+from radejax.evaluation.columns import Columns, read_name, wanted_columns
 
 _SCORED = wanted_columns(scored=True)
 
@@ -213,7 +213,7 @@ def _columns_of_records(records: Iterator[dict], path: pathlib.Path) -> dict[str
         for name in ("frame", "cls"):
             if name not in record:
                 raise DataError(f"{path}: row {row}: lacks {name!r}")
-            columns[name].append(str(record[name]))
+            columns[name].append(read_name(record[name], f"{path}: row {row}"))
         columns["box"].append(box)
         columns["score"].append(record.get("score"))
     lacking = [row for row, score in enumerate(columns["score"]) if score is None]
@@ -238,8 +238,9 @@ def _read_csv(path: pathlib.Path) -> Columns:
             )
         numbers = [n for n in (*BOX_FIELDS, "score") if n in header]
         for line in reader:
-            frame.append(line["frame"])
-            cls.append(line["cls"])
+            where = f"{path}: line {reader.line_num}"
+            frame.append(read_name(line["frame"], where))
+            cls.append(read_name(line["cls"], where))
             values.append([_number(line[n], n, path, reader.line_num) for n in numbers])
     except csv.Error as error:
         raise DataError(f"{path}: line {reader.line_num}: {error}") from None

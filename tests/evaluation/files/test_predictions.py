@@ -121,6 +121,8 @@ def test_wrong_files_are_named(tmp_path):
     raises("a.csv", "frame,cls,x\n", "line 1: lacks columns \\['y', 'z'")
     raises("a.csv", header + "0,Sedan,1,2,3,4,5,6,x,1\n", "line 2: yaw is 'x'")
     raises("a.csv", header + "0,Sedan,1,2\n", "line 2: z is None")
+    long = f"0,{'S' * 999},1,2,3,4,5,6,7,1\n"
+    raises("a.csv", header + long, "line 2: 'SSS.* is no name: 999 characters")
     raises(
         "a.csv",
         header + "1/b,Sedan,1,2,3,4,5,6,7,1\n",
