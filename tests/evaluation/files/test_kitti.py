@@ -113,7 +113,7 @@ def test_errors(tmp_path, scene):
     with pytest.raises(DataError, match="line 2: could not convert"):
         kitti.read_kitti(tmp_path / "0.0")
     path.write_text(f"{'s' * 20000} -1 -1 0 50 50 150 150 1 1 1 0 0 0 0 0.5\n")
-    with pytest.raises(DataError, match="line 1: 'sss.* is no name: 20000 characters"):
+    with pytest.raises(DataError, match=r"line 1: 'sss.* is no name: 20000 characters"):
         kitti.read_kitti(tmp_path / "0.0")
     path.rename(path.with_name("first.txt"))
     with pytest.raises(DataError, match="named by its number"):
