@@ -22,7 +22,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import files
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, one_line
 from radejax.training import checksums, processes, sharding
 
 _log = logging.getLogger(__name__)
@@ -30,10 +30,8 @@ _log = logging.getLogger(__name__)
 BEST = "best"
 """Name of the metric that decides which checkpoint is best; higher is better."""
 
-_CHECKSUMS = "checksums"
-"""Item of a checkpoint; those of earlier versions are without."""
-
 _METRICS = "metrics"
+_DAMAGED_TEXT = (ValueError, TypeError, LookupError, RecursionError)
 
 _VARIABLES = ("params", "ema_params", "model_state")
 
@@ -56,10 +54,19 @@ def _best_of(metrics: Mapping[str, float]) -> float:
     return metrics[BEST]
 
 
-def _saved_checksums(folder: pathlib.Path) -> dict[str, Any] | None:
-    """Of a checkpoint's folder; None of one of an earlier version."""
-    folder = folder / _CHECKSUMS
-    return files.read_json(folder / "metadata") if folder.is_dir() else None
+def _which_is_damaged(folder: pathlib.Path, error: Exception) -> str:
+    """What to tell of a folder whose steps orbax cannot list."""
+    damaged = []
+    for found in ocp.path.step.standard_name_format().find_all(folder):
+        try:
+            _ = found.commit_timestamp
+        except _DAMAGED_TEXT:
+            damaged.append(found.step)
+    names = ", ".join(map(str, sorted(damaged)))
+    return (
+        f"{folder}: the file _CHECKPOINT_METADATA of checkpoint {names} is damaged "
+        f"({one_line(error)}); move that folder away, the others stay usable"
+    )
 
 
 class _Manager(ocp.CheckpointManager):
@@ -79,13 +86,12 @@ class _Manager(ocp.CheckpointManager):
             found = super().metrics(step)
             if found is not None:
                 float(found[BEST])
-                saved = _saved_checksums(pathlib.Path(self.directory, f"{step}")) or {}
+                saved = checksums.read(pathlib.Path(self.directory, f"{step}")) or {}
                 if _METRICS in saved:
-                    checksums.check(
-                        {_METRICS: checksums.of_values(found)}, saved, "part"
-                    )
+                    sums = {_METRICS: checksums.of_values(found)}
+                    checksums.check(sums, saved, "part")
         # What damaged text makes json and the lines above raise.
-        except (ValueError, TypeError, LookupError) as error:
+        except _DAMAGED_TEXT as error:
             if step not in self.damaged:
                 _log.warning(
                     "the metrics of checkpoint %d are damaged: it counts as not evaluated",
@@ -103,6 +109,9 @@ class Checkpoints:
         folder: Made if missing.
         max_to_keep: The newest few are kept, and the best; None keeps all.
         read_only: For evaluation: nothing is written or cleaned up.
+
+    Raises:
+        DataError: The file that describes a step is damaged; names it.
     """
 
     def __init__(
@@ -127,7 +136,11 @@ class Checkpoints:
             read_only=read_only,
             enable_async_checkpointing=not read_only,
         )
-        self._manager = _Manager(self.folder, options=options)
+        try:
+            self._manager = _Manager(self.folder, options=options)
+        # Orbax reads what describes each step before it knows any of them.
+        except _DAMAGED_TEXT as error:
+            raise DataError(_which_is_damaged(self.folder, error)) from None
 
     def steps(self) -> list[int]:
         """Steps of the finished checkpoints, oldest first."""
@@ -339,7 +352,7 @@ class Checkpoints:
 
     def _verify(self, step: int, state: Any, info: Mapping[str, Any]) -> None:
         """`DataError` if what was restored is not what was saved."""
-        saved = _saved_checksums(self.folder / str(step))
+        saved = checksums.read(self.folder / str(step))
         if saved is not None:
             checksums.check(checksums.of_arrays(state), saved["state"], "array")
             checksums.check({"info": checksums.of_values(info)}, saved, "part")
@@ -355,7 +368,7 @@ class Checkpoints:
         if not saved:
             raise FileNotFoundError(f"no position in the data in {folder}")
         position = files.read_json(saved[0])
-        known = _saved_checksums(self.folder / str(step))
+        known = checksums.read(self.folder / str(step))
         if known is not None:
             checksums.check({"data": checksums.of_values(position)}, known, "part")
         data_iterator.set_state(position)

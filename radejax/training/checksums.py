@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from radejax.core import files
 from radejax.core.errors import DataError
 
 
@@ -37,6 +39,12 @@ def of_values(values: Any) -> str:
         values = json.loads(values)
     text = json.dumps(values, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read(folder: pathlib.Path) -> dict[str, Any] | None:
+    """Those in a checkpoint's folder; None of one of an earlier version."""
+    folder = folder / "checksums"
+    return files.read_json(folder / "metadata") if folder.is_dir() else None
 
 
 def check(found: Mapping[str, Any], saved: Mapping[str, Any], what: str) -> None:

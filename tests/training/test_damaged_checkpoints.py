@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import json
 import pathlib
 import random
 import shutil
@@ -206,6 +207,19 @@ def test_an_empty_folder_with_the_name_of_a_step(folder: pathlib.Path) -> None:
     (folder / "99").mkdir()
     with pytest.raises(DataError, match=r"checkpoint 99 .*; step 3 is whole"):
         _read(folder)
+
+
+def test_a_damaged_description_names_its_step(folder: pathlib.Path) -> None:
+    path = folder / "2" / "_CHECKPOINT_METADATA"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"custom_metadata": 1.5}))
+    for read_only in (True, False):
+        with pytest.raises(
+            DataError, match=r"METADATA of checkpoint 2 is damaged \(Obj"
+        ):
+            Checkpoints(folder, read_only=read_only)
+    shutil.move(folder / "2", folder.with_name("2"))
+    with Checkpoints(folder) as checkpoints:
+        assert checkpoints.steps() == [1, 3]
 
 
 def test_damaged_metrics_are_told_and_make_none_the_best(tiny: pathlib.Path) -> None:
