@@ -7,6 +7,8 @@ are `[k, k, in, out]` and `[in, out]`.
 
 from __future__ import annotations
 
+import functools
+
 import flax
 import jax
 import numpy as np
@@ -124,6 +126,7 @@ def _leaf_name(ours: str) -> str:
     return "bias" if ours == "bias" else "weight"
 
 
+@functools.lru_cache(maxsize=8)  # traced a few times for one file otherwise
 def param_shapes(model: RadeNet) -> dict[Path, tuple[int, ...]]:
     """Shape of every parameter of a model, by its path, without making any."""
     channels = model.doppler_bins + model.elevation_bins
