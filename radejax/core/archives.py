@@ -22,8 +22,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from radejax.core.errors import DataError, one_line
-
-PathLike = str | os.PathLike[str]
+from radejax.core.files import PathLike
 
 DEFLATE_RATIO = 1032
 """Bytes that deflate makes of one byte at most."""

@@ -126,9 +126,13 @@ def _leaf_name(ours: str) -> str:
     return "bias" if ours == "bias" else "weight"
 
 
-@functools.lru_cache(maxsize=8)  # traced a few times for one file otherwise
 def param_shapes(model: RadeNet) -> dict[Path, tuple[int, ...]]:
     """Shape of every parameter of a model, by its path, without making any."""
+    return _param_shapes(model.clone(widths=tuple(model.widths)))
+
+
+@functools.lru_cache(maxsize=8)  # traced a few times for one file otherwise
+def _param_shapes(model: RadeNet) -> dict[Path, tuple[int, ...]]:
     channels = model.doppler_bins + model.elevation_bins
     example = jax.ShapeDtypeStruct(
         (1, model.pad_multiple, model.pad_multiple, channels), np.float32

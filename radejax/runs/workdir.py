@@ -15,7 +15,6 @@ import contextlib
 import dataclasses
 import functools
 import json
-import os
 import pathlib
 import shlex
 import sys
@@ -28,13 +27,12 @@ from ml_collections import ConfigDict
 import radejax
 from radejax.core import files
 from radejax.core.config import renewed
+from radejax.core.files import PathLike
 from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.sources import DataPaths, saved_path
 from radejax.simulation.config import default_config
 from radejax.training import processes
-
-PathLike = str | os.PathLike
 
 
 def default_workdir(workdir: PathLike | None, name: str) -> pathlib.Path:

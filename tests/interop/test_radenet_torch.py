@@ -78,6 +78,8 @@ def test_save_is_the_inverse_of_load(small_state):
     saved = radenet_torch.save(model, variables)
     assert saved.keys() == small_state.keys()
     chex.assert_trees_all_equal(saved, small_state)
+    listed = model.clone(widths=list(model.widths))  # not hashable
+    chex.assert_trees_all_equal(radenet_torch.save(listed, variables), small_state)
 
 
 @pytest.mark.parametrize("ending", [".pth", ".pt", ".npz", ".safetensors"])

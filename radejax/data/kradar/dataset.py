@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import folders
 from radejax.data.kradar.findings import Findings, Summary
@@ -35,8 +36,6 @@ from radejax.data.kradar.sequences import (
     read_sequence_info,
 )
 from radejax.data.kradar.splits import Key, check_weather, select_frames
-
-PathLike = str | os.PathLike
 
 _Parsed = tuple[LabelFile | None, list[Problem]]  # None: nothing in it can be trusted
 
