@@ -73,7 +73,7 @@ _RUNS = (
     ),
 )
 _FILES = (
-    _flag("ground-truth", "File of ground truth, or a report's folder."),
+    _flag("ground-truth", "File of ground truth, or the folder of a report or a run."),
     _flag("frames", "JSON of frame columns, for it; the one beside it."),
     _flag("z-offset", "Metres to add to the z of predictions.", default=0.0),
     _flag("yaw-degrees", "Yaws of predictions are degrees.", is_flag=True),

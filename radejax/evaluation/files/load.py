@@ -27,7 +27,7 @@ class Source:
         labels: Folder or zip of a label revision.
         label_version: v1.0, v1.1, v2.0 or v2.1.
         split: "train", "test", a split file, or None for every frame.
-        ground_truth: File of ground truth instead, or a report's folder.
+        ground_truth: File of ground truth instead, or the folder of a report or a run.
         frames: JSON file of the frame table (columns) for `ground_truth`; by default the
             `frames.json` beside it.
         sequences: Only frames of these; all if empty.
@@ -143,10 +143,10 @@ def _load(
 def _ground_truth(
     path: PathLike, table: PathLike | None
 ) -> tuple[Columns, Columns | None]:
-    """Of a file or a report, with the frame table that is named or lies beside it."""
+    """Of a file, a report or a run, with the frame table that is named or beside it."""
     path = pathlib.Path(path)
-    if (path / "ground_truth.npz").is_file():
-        path = path / "ground_truth.npz"
+    of_report = (path / "ground_truth.npz", path / "evaluation" / "ground_truth.npz")
+    path = next((place for place in of_report if place.is_file()), path)
     frames = None
     if table:
         frames = _read_frames(table)

@@ -40,11 +40,12 @@ def test_ground_truth_of_a_report(stored):
     expected = load.load(folder / "found.json", source, ("Sedan",))
     beside = dataclasses.replace(source, frames=None)
     truth = predictions.read_table(folder / "truth.csv", expected[2], scored=False)
-    report = folder / "report"
-    report.mkdir()
+    report = folder / "run" / "evaluation"
+    report.mkdir(parents=True)
     predictions.write_table(report / "ground_truth.npz", truth, expected[2])
     (report / "frames.json").write_bytes((folder / "frames.json").read_bytes())
-    for other in (beside, dataclasses.replace(beside, ground_truth=str(report))):
+    for place in (folder / "truth.csv", report, report.parent):
+        other = dataclasses.replace(beside, ground_truth=str(place))
         found = load.load(folder / "found.json", other, ("Sedan",))
         for a, b in zip(found[:3], expected[:3], strict=True):
             assert a.keys() == b.keys()
