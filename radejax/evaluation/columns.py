@@ -35,6 +35,10 @@ def read_name(value: object, where: str) -> str:
 
     Raises:
         DataError: It is longer than any name; says `where` it was read.
+
+    Example:
+        >>> read_name("Bus or Truck", "detections.csv, line 2")
+        'Bus or Truck'
     """
     name = str(value)
     if len(name) > _LONGEST_NAME:
