@@ -47,7 +47,9 @@ def test_no_list_of_folders_is_an_error(data: object) -> None:
 
 
 def test_frames_are_projected_beside_their_data_once(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     simulation = default_config()
     simulation.update(train_sequences=1, test_sequences=1, frames_per_sequence=2)
@@ -78,7 +80,9 @@ def test_frames_are_projected_beside_their_data_once(
         return {p: p.stat().st_mtime_ns for p in files if p.suffix != ".json"}
 
     before = written()
+    assert "project: 100%" in capsys.readouterr().err
     assert prepare().paths == paths
+    assert "project" not in capsys.readouterr().err
     assert written() == before
 
 
