@@ -61,7 +61,9 @@ def test_frames_are_projected_beside_their_data_once(
         return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
     config = base_config()
-    with pytest.raises(UserError, match=r"is 64.*give --config.model.doppler_bins=16"):
+    with pytest.raises(
+        UserError, match=r"64 Doppler.*doppler_bins=16 --config.model.elev"
+    ):
         prepare()
     config.model.update(doppler_bins=16, elevation_bins=9)
     with pytest.raises(UserError, match="2 frames are fewer than one batch"):
