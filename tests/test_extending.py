@@ -147,6 +147,8 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     assert np.isfinite([row[name] for name in ("focal", "gwd", "height")]).all()
     config = json.loads((folder / "config.json").read_text())
     assert config["loss"]["weights"]["height"] == 0.5
+    source = json.loads((folder / "evaluation" / "source.json").read_text())
+    assert source["step"] == 1
     report = evaluate_run(folder)
     assert report is not None
     source = json.loads((folder / "evaluation" / "source.json").read_text())
