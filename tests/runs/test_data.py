@@ -47,7 +47,9 @@ def test_no_list_of_folders_is_an_error(data: object) -> None:
 
 
 def test_frames_are_projected_beside_their_data_once(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     simulation = default_config()
     simulation.update(train_sequences=1, test_sequences=1, frames_per_sequence=2)
@@ -59,6 +61,11 @@ def test_frames_are_projected_beside_their_data_once(
         return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
     config = base_config()
+    with pytest.raises(
+        UserError, match=r"64 Doppler.*doppler_bins=16 --config.model.elev"
+    ):
+        prepare()
+    config.model.update(doppler_bins=16, elevation_bins=9)
     with pytest.raises(UserError, match="2 frames are fewer than one batch"):
         prepare()
     assert not (tmp_path / "sim" / "records").exists()
@@ -75,7 +82,9 @@ def test_frames_are_projected_beside_their_data_once(
         return {p: p.stat().st_mtime_ns for p in files if p.suffix != ".json"}
 
     before = written()
+    assert "project: 100%" in capsys.readouterr().err
     assert prepare().paths == paths
+    assert "project" not in capsys.readouterr().err
     assert written() == before
 
 
@@ -136,6 +145,7 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     damaged.projection_path.write_bytes(b"half")
     project_dataset(frames, root / "records", skip_bad=True, progress=False)
     config.train.batch_size = 1
+    config.model.update(doppler_bins=16, elevation_bins=9)
     model, sources = models.build(config.model), Sources(data=(str(root),))
     with caplog.at_level("WARNING", "radejax"):
         data = open_data(config, model, sources)
@@ -156,6 +166,7 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
         (None, {1, 3}),
         (Sources(label_version="v2.1"), {1, 3}),
         (Sources(sequences=(2,)), {2}),
+        (Sources(weather=tuple({frame.weather for frame in frames})), {1, 3}),
         (Sources(data=(str(tmp_path / "copy"),)), {1, 2, 3}),
         (Sources(data=(str(tmp_path / "copy"),), sequences=(3,)), {3}),
     ):
