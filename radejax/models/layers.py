@@ -7,6 +7,7 @@ any dtype. Every layer here equals its torch counterpart to rounding.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -28,9 +29,19 @@ def uniform_fan_in(fan_in: int) -> Initializer:
     bound = 1.0 / math.sqrt(fan_in)
 
     def init(key: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> jax.Array:
-        return jax.random.uniform(key, shape, dtype, -bound, bound)
+        # The first numbers are the same however many are drawn: a few generators serve
+        # all shapes.
+        size = math.prod(shape)
+        count = max(2**14, 4 ** math.ceil(math.log(size, 4)))
+        return _cut(jax.random.uniform(key, (count,), dtype, -bound, bound), shape)
 
     return init
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _cut(numbers: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """The first of them in a shape."""
+    return numbers[: math.prod(shape)].reshape(shape)
 
 
 class Conv(nn.Module):

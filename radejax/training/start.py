@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
+import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -12,6 +14,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 import optax
+from jax.interpreters import partial_eval
 
 from radejax.core.files import require_same
 from radejax.core.structures import Batch
@@ -95,37 +98,56 @@ class Plan:
         )
 
 
+Initial = tuple[Callable[[], Any], Callable[[Any], TrainState]]
+"""Gives the variables to start from, and makes the state before the first step of them."""
+
+
 def initial(
     model: nn.Module,
     variables: Mapping[str, Any] | None,
     loader: Any,
     optimizer: optax.GradientTransformation,
     plan: Plan,
-) -> Callable[[], TrainState]:
-    """A function that makes the state before the first step, to be compiled.
+) -> Initial:
+    """What a training starts from, still to be drawn unless it is given.
 
-    What is given need not be drawn. The function is a tree of its arrays: handed to a
-    compiled function, they are arguments and no constants of the program.
+    The first function is a tree of the arrays that were given.
     """
 
-    def init(batch: Batch, variables: Any, pretrained: Any) -> TrainState:
+    def to_start_from(batch: Batch, variables: Any, pretrained: Any) -> Any:
         if variables is None:
             keys = jax.random.split(jax.random.key(plan.seed))
             rngs = {"params": keys[0], "dropout": keys[1]}
             variables = model.init(rngs, *model_inputs(batch), train=False)
         if pretrained is not None:
             variables = with_pretrained(variables, pretrained)
-        return create_state(
-            variables,
-            optimizer,
-            batch_size=plan.options.batch_size,
-            use_ema=plan.options.ema_decay is not None,
-            is_frozen=getattr(model, "is_frozen", None),
-        )
+        return variables
 
+    create = functools.partial(
+        create_state,
+        optimizer=optimizer,
+        batch_size=plan.options.batch_size,
+        use_ema=plan.options.ema_decay is not None,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
     # NumPy arrays: the same on every process, and so on every device.
     given = jax.tree.map(np.asarray, (variables, plan.pretrained))
-    return jax.tree_util.Partial(init, _first_batch(loader), *given)
+    first = _first_batch(loader)
+    return jax.tree_util.Partial(to_start_from, first, *given), create
+
+
+def _evaluated(function: Callable[[], Any]) -> Any:
+    """NumPy arrays of what it returns, one operation after the other, needless ones not.
+
+    Equal operations share a compiled program. In one program each of a hundred random
+    generators is compiled on its own, which takes as long as half a training step.
+    """
+    traced, shape = jax.make_jaxpr(lambda f: f(), return_shape=True)(function)
+    is_result = [True] * len(traced.jaxpr.outvars)
+    needed, is_used = partial_eval.dce_jaxpr(traced.jaxpr, is_result)
+    given = itertools.compress(jax.tree.leaves(function), is_used)
+    leaves = jax.core.eval_jaxpr(needed, traced.consts, *given)
+    return jax.tree.unflatten(jax.tree.structure(shape), map(np.asarray, leaves))
 
 
 def _first_batch(loader: Any) -> Batch:
@@ -139,7 +161,7 @@ def _first_batch(loader: Any) -> Batch:
 def restore(
     checkpoints: Checkpoints,
     loader: Any,
-    init: Callable[[], TrainState],
+    init: Initial,
     mesh: jax.sharding.Mesh,
     plan: Plan,
 ) -> tuple[TrainState, int]:
@@ -156,7 +178,8 @@ def restore(
         UserError: The run would continue with other data or frozen weights.
         DataError: No checkpoint restores.
     """
-    abstract = jax.eval_shape(init)
+    variables, create = init
+    abstract = jax.eval_shape(lambda: create(variables()))
     how = plan.options.parameter_sharding
     placement = sharding.state_sharding(abstract, mesh, how)
     # Frozen parameters are not in a checkpoint: they come from where they came from.
@@ -173,14 +196,7 @@ def restore(
         _log.info("continuing from step %d of %d", step, plan.num_steps)
         if not abstract.frozen:
             return state, step
-    # Compiled in half the time where LLVM does it: drawing runs once, and hundreds of
-    # random generators take long to optimise; the numbers are the same.
-    is_cpu = mesh.devices.flat[0].platform == "cpu"
-    drawn = jax.jit(
-        lambda init: init(),
-        out_shardings=placement,
-        compiler_options={"xla_backend_optimization_level": 1} if is_cpu else {},
-    )(init)
+    drawn = jax.jit(create, out_shardings=placement)(_evaluated(variables))
     return drawn if state is None else state.replace(frozen=drawn.frozen), step
 
 

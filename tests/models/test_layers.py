@@ -132,6 +132,14 @@ def test_initialiser_is_uniform_within_torchs_bound():
     np.testing.assert_allclose(np.var(values), 0.04 / 3, rtol=0.03)
 
 
+@pytest.mark.parametrize("shape", [(5, 7), (129, 128)])
+def test_initial_values_do_not_depend_on_how_many_are_drawn(shape):
+    key = jax.random.key(3)
+    values = jax.jit(uniform_fan_in(25), static_argnums=1)(key, shape)
+    bounds = {"minval": -0.2, "maxval": 0.2}
+    np.testing.assert_array_equal(values, jax.random.uniform(key, shape, **bounds))
+
+
 @pytest.mark.parametrize(
     ("module", "fan_in"),
     [(Conv(64, 3), 9 * 16), (Dense(64), 16), (Upsample(64), 4 * 64)],

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
+from radejax.models.layers import Dense
 from radejax.training import loop, processes, sharding, start
 from radejax.training.checkpoints import Checkpoints, abstract_state
 from radejax.training.start import Plan
@@ -133,15 +134,19 @@ def test_two_runs_of_one_seed_are_equal_bit_for_bit(
     assert _losses(workdir) == _losses(undisturbed[1])
 
 
-class Dense(nn.Module):
-    """A model whose initialisation is soon compiled."""
+class Layers(nn.Module):
+    """A model of three layers, which fails where it is run and not only initialised."""
 
     @nn.compact
     def __call__(self, projection: jax.Array, train: bool) -> jax.Array:
-        return nn.Dense(3)(projection)
+        for features in (3, 4, 5):
+            projection = Dense(features)(projection)
+        return jax.pure_callback(lambda x: 1 / 0, projection, projection)
 
 
-def test_a_seed_draws_its_variables(tiny: Tiny, tmp_path: pathlib.Path) -> None:
+def test_a_seed_draws_its_variables(
+    tiny: Tiny, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
     def drawn(seed: int) -> Any:
         plan = Plan(
             options=tiny.config.train,
@@ -151,14 +156,18 @@ def test_a_seed_draws_its_variables(tiny: Tiny, tmp_path: pathlib.Path) -> None:
             info={},
             steps_per_epoch=STEPS_PER_EPOCH,
         )
-        init = start.initial(Dense(), None, tiny.loader(), plan.optimizer(), plan)
+        init = start.initial(Layers(), None, tiny.loader(), plan.optimizer(), plan)
         with Checkpoints(tmp_path) as checkpoints:
             mesh = sharding.make_mesh(1)
             state, step = start.restore(checkpoints, tiny.loader(), init, mesh, plan)
         assert step == 0
         return state
 
-    chex.assert_trees_all_equal(drawn(0), drawn(0))
+    with jax.log_compiles():
+        first = drawn(0)
+    # One for six shapes.
+    assert caplog.text.count("Finished XLA compilation of jit(_uniform)") == 1
+    chex.assert_trees_all_equal(first, drawn(0))
     kernels = [drawn(seed).params["Dense_0"]["kernel"] for seed in (0, 1)]
     assert np.abs(kernels[0] - kernels[1]).min() > 0
 
