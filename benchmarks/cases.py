@@ -7,6 +7,7 @@ is built.
 import collections
 import contextlib
 import functools
+import importlib.util
 import itertools
 import pathlib
 import tempfile
@@ -18,6 +19,7 @@ import numpy as np
 import scipy.io
 from case import Case, compiled, difference, timed, waiting
 
+from radejax.core.config import load_config
 from radejax.data.frame_table import make_table
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader
@@ -27,6 +29,9 @@ from radejax.evaluation.average_precision import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.report.measure import Options, measure
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference import benchmark as stages
+from radejax.inference.export import export
+from radejax.inference.exported_loader import load as load_exported
 
 GRID = RadarGrid.kradar()
 
@@ -173,6 +178,35 @@ def simulate(machine):
     )
 
 
+def deploy(machine):
+    """What `radejax export` writes, beside the detector that it was written from."""
+    has_onnx = importlib.util.find_spec("onnxruntime") and machine["platform"] == "cpu"
+    for name in ("quickstart", "radenet"):
+        config = load_config(name)
+        found = stages.untrained(config, batch_sizes=(1,), score_threshold=0.0)
+        shape = (1, *found.grid.projection_shape)
+        x = np.random.default_rng(0).random(shape, np.float32)
+        with tempfile.TemporaryDirectory() as folder:
+            export(found, folder)
+            program = load_exported(folder)
+            columns = {"radejax": waiting(found, x), "StableHLO": waiting(program, x)}
+            scores = [np.asarray(program(x)["scores"])]
+            if has_onnx:
+                export(found, folder, kind="onnx")
+                session = inputs.onnx_session(f"{folder}/detector.onnx")
+                columns["ONNX Runtime"] = functools.partial(
+                    timed, functools.partial(session, x)
+                )
+                scores.append(session(x)[1])
+        yield Case(
+            name=f"exported detector, {name}",
+            columns=columns,
+            error=max(difference([s], [np.asarray(found(x).scores)]) for s in scores),
+            tolerance=1e-4,
+            note="projection to boxes; difference of scores",
+        )
+
+
 BENCHMARKS = {
     "radenet": (networks.radenet, 40),
     "radenet_training": (networks.radenet_training, 90),
@@ -189,6 +223,7 @@ BENCHMARKS = {
     "nms": (nms, 30),
     "loader": (load, 40),
     "feeding": (networks.feeding, 60),
+    "deploy": (deploy, 150),
     "records": (compress, 40),
 }
 """Function, and seconds that it takes on two cores, by name for `--only`, in the order in

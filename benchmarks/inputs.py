@@ -278,3 +278,13 @@ def synthetic_set(num_frames: int = 17536, false_per_frame: float = 2.0, seed: i
         "score": np.round(score, 4),
     }
     return {"frame": frame, "box": box, "cls": names[cls]}, predictions, frames
+
+
+def onnx_session(path):
+    """Function of a projection: outputs of an exported detector, nothing left out."""
+    import onnxruntime  # of the extra "onnx"
+
+    session = onnxruntime.InferenceSession(path)
+    settings = {"score_threshold": 0.0, "nms_iou": 0.3, "roi": [-1e9, 1e9] * 3}
+    given = {name: np.asarray(x, np.float32) for name, x in settings.items()}
+    return lambda projection: session.run(None, given | {"projection": projection})

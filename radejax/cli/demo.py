@@ -37,8 +37,9 @@ def demo(out: pathlib.Path, seed: int, as_json: bool) -> None:
     from radejax.simulation.config import default_config
     from radejax.simulation.dataset import simulate_dataset
     from radejax.visualize import bev
-    from radejax.visualize.canvas import Scene
+    from radejax.visualize.canvas import Scene, picture_format
 
+    picture_format(out)  # before the frame is simulated
     entry.set_up_jax()
     simulation = default_config() | {
         "seed": seed,

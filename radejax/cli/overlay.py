@@ -47,8 +47,9 @@ def overlay(
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
-    FRAME is sequence/radar_lidar, or a sequence: its first frame, or all of them where
-    --out ends in .gif or .mp4. So are --sequences and --weather without a FRAME.
+    FRAME is sequence/radar_lidar, sequence/radar, or a sequence: its first frame, or
+    all of them where --out ends in .gif or .mp4. So are --sequences and --weather
+    without a FRAME.
 
     Example: radejax overlay 1/00033_00001 --data ROOT
     """
@@ -72,7 +73,11 @@ def overlay(
     )
     if not len(frames):
         raise UserError("no frames of these sequences and weathers")
-    found = [frame for frame in frames if frame_name in ("", frame.name)]
+    found = [
+        frame
+        for frame in frames
+        if frame_name in ("", frame.name, frame.name.partition("_")[0])
+    ]
     if not found:
         raise UserError(
             f"no frame {frame_name} in sequence {sequence}; there are "

@@ -6,6 +6,7 @@ same fields. Values are plain and resolved: no paths, no devices, nothing comput
 
 from __future__ import annotations
 
+import difflib
 import importlib.util
 import json
 import os
@@ -84,10 +85,11 @@ def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
         return own
     if path.suffix == ".py" and path.is_file():
         return path
-    names = ", ".join(sorted(file.stem for file in CONFIGS.glob("*.py")))
-    hint = f"; did you mean {path.stem}?" if own.is_file() else ""
+    names = sorted(file.stem for file in CONFIGS.glob("*.py"))
+    near = difflib.get_close_matches(path.stem, names, 1)
+    hint = f"; did you mean {near[0]}?" if near else ""
     raise UserError(
-        f"no such config file: {name}; give a .py file, or one of {names}{hint}"
+        f"no such config file: {name}; give a .py file, or one of {', '.join(names)}{hint}"
     )
 
 

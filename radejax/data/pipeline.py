@@ -126,9 +126,10 @@ def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
         count: Of the processes.
     """
     if num_frames < batch_size * count:
+        each = f" ({batch_size} on each of {count} processes)" if count > 1 else ""
         raise UserError(
-            f"{num_frames} frames are fewer than one batch ({batch_size} frames on each "
-            f"of {count} processes); lower batch_size or keep the remainder"
+            f"{num_frames} frames are fewer than one batch of {batch_size * count}{each}; "
+            "lower --config.train.batch_size (of LoaderOptions, set pad_remainder)"
         )
 
 

@@ -327,9 +327,10 @@ class CameraCalibration:
 def _fold_radius(distortion: Float[np.ndarray, "5"]) -> float:
     """Smallest radius at which the radial distortion stops growing; large for none."""
     k1, k2, _, _, k3 = distortion
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-    real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
-    return math.sqrt(real.min()) if real.size else 1e6
+    # In 1 / radius^2: the first coefficient is one, however small the others are.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-12)]
+    return 1 / math.sqrt(real.max()) if real.size else 1e6
 
 
 def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:

@@ -67,14 +67,23 @@ def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
     )
 
 
+_MAX_DECIBELS = 300.0
+
+
 def _num_impossible(frames: Any, is_tesseract: bool) -> Any:
-    """Number of frames that are no linear power (a tesseract), or no level of it."""
+    """Number of frames that are no linear power (a tesseract), or no level of it.
+
+    Decibels are neither: noise alone spans more than they do, with cells below 1.
+    """
     axes = tuple(range(1, frames.ndim))
     low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
     limits = (
         (0.0, np.finfo(np.float32).max) if is_tesseract else (-MAX_LEVEL, MAX_LEVEL)
     )
-    return (~((low >= limits[0]) & (high <= limits[1]))).sum()
+    is_power = (low >= limits[0]) & (high <= limits[1])
+    if jnp.issubdtype(frames.dtype, jnp.floating):  # records may be uint8
+        is_power &= (low <= 1.0) | (high > _MAX_DECIBELS)
+    return (~is_power).sum()
 
 
 _num_on_device = jax.jit(_num_impossible, static_argnums=1)
@@ -115,7 +124,8 @@ class ImpossibleFrames:
                     if self._total == 0:
                         _log.warning(
                             "%d of %d frames have cells that are NaN, infinite or "
-                            "otherwise no radar power: their boxes mean nothing "
+                            "otherwise no linear radar power (decibels?), or level "
+                            "of a projection: their boxes mean nothing "
                             "(further ones are counted in num_impossible)",
                             found,
                             num_frames,
@@ -336,8 +346,8 @@ def named_device(device: jax.Device | str | None) -> jax.Device:
 
 def checked_sizes(sizes: Sequence[int]) -> tuple[int, ...]:
     """Batch sizes in order; `UserError` for none, or one that is not positive."""
-    if not sizes or min(sizes) < 1:
-        raise UserError(f"batch_sizes {tuple(sizes)}, expected numbers of at least 1")
+    if not isinstance(sizes, Sequence) or not sizes or min(sizes) < 1:
+        raise UserError(f"batch_sizes {sizes}, expected numbers of at least 1: (1, 8)")
     return tuple(sorted(sizes))
 
 

@@ -259,6 +259,7 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     roots = existing_roots(config.get("simulation"), sources.data)
     data = Data.open(config, model, dataclasses.replace(sources, data=roots).paths())
     _log.info("%s", data.frames.summary().to_text())
+    _check_bins(config.model, data)
     if config.data.get("validation"):
         _tell_what_is_held_out(data)
         if not config.train.evaluate_every_epochs:
@@ -275,6 +276,22 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
             f"manifest.json in {data.paths.records} says why"
         )
     return data
+
+
+def _check_bins(model: ConfigDict, data: Data) -> None:
+    """`UserError` for a model of another radar, before anything is projected."""
+    grid = data.frames.grid
+    for name, there in [
+        ("doppler", grid.num_doppler),
+        ("elevation", grid.num_elevation),
+    ]:
+        field = f"{name}_bins"
+        if model[field] != there:
+            raise UserError(
+                f"config.model.{field} is {model[field]}, and the radar of "
+                f"{', '.join(data.paths.roots)} has {there}; give "
+                f"--config.model.{field}={there}"
+            )
 
 
 def _tell_what_is_held_out(data: Data) -> None:
@@ -322,9 +339,10 @@ def data_of_run(
         config = config.copy_and_resolve_references()
         if other.label_version is not None:
             config.data.label_version = other.label_version
-        if other.sequences or other.weather or own is None or paths.roots != own.roots:
-            part = {"sequences": other.sequences, "weather": other.weather}
-            config.data.update({name: tuple(of) for name, of in part.items()})
+        is_own = own is not None and paths.roots == own.roots
+        for name in ("sequences", "weather"):
+            if (part := getattr(other, name)) or not is_own:
+                config.data[name] = tuple(part)
         is_blind = models.has_camera(loaded.model) and (
             IMAGE_BACKBONE not in loaded.variables["params"]
         )

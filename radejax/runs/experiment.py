@@ -30,13 +30,13 @@ from radejax.training.start import Plan
 _log = logging.getLogger(__name__)
 
 _CLOSING = """Done in {minutes:.1f} minutes. Everything is in {folder}:
-  evaluation/      metrics.json, metrics.csv, tables, pictures
-  checkpoints/     the trained model
+{report}  checkpoints/     the trained model
   metrics.jsonl    losses by step (tensorboard --logdir {folder})
-Evaluate again:    radejax evaluate --workdir {folder}
-{best}Boxes for a folder of frames:
+{again}{best}Boxes for a folder of frames:
                    radejax detect --workdir {folder} --out boxes FOLDER"""
 
+_REPORT = "  evaluation/      metrics.json, metrics.csv, tables, pictures\n"
+_AGAIN = "Evaluate again:    radejax evaluate --workdir {folder}\n"
 _BEST = """Best on the way:   radejax evaluate --workdir {folder} --checkpoint best
                    chosen on the {split} split: {word}
 """
@@ -100,13 +100,19 @@ def run(
             )
             return folder
         if has_test:
-            evaluate(config, model, result.state.eval_variables, data, folder)
+            weights_now, step = result.state.eval_variables, result.step
+            evaluate(config, model, weights_now, data, folder, step=step)
     minutes = (time.perf_counter() - started) / 60
     place, split, best = files.relative(folder), data.choosing_split, ""
     if config.train.evaluate_every_epochs:
         word = _MAY_BE_REPORTED[split]
         best = _BEST.format(folder=place, split=split, word=word)
-    _log.info(_CLOSING.format(minutes=minutes, folder=place, best=best))
+    report, again = (_REPORT, _AGAIN.format(folder=place)) if has_test else ("", "")
+    _log.info(
+        _CLOSING.format(
+            minutes=minutes, folder=place, best=best, report=report, again=again
+        )
+    )
     return folder
 
 

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
@@ -304,6 +305,17 @@ def color_limits_of(values: np.ndarray) -> tuple[float, float]:
     return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)
 
 
+def picture_format(path: pathlib.Path) -> str:
+    """The format of a picture from its suffix; `UserError` if there is none such."""
+    suffix = path.suffix.lstrip(".").lower()
+    supported = FigureCanvasBase.get_supported_filetypes()
+    if suffix not in supported:
+        raise UserError(
+            f"cannot write a picture as {path.name!r}; suffixes: {sorted(supported)}"
+        )
+    return suffix
+
+
 def save_figure(figure: Figure, path: str | os.PathLike, **kwargs: Any) -> pathlib.Path:
     """Writes a figure completely or not at all.
 
@@ -321,12 +333,7 @@ def save_figure(figure: Figure, path: str | os.PathLike, **kwargs: Any) -> pathl
         UserError: matplotlib cannot write the suffix.
     """
     path = pathlib.Path(path)
-    suffix = path.suffix.lstrip(".").lower()
-    supported = figure.canvas.get_supported_filetypes()
-    if suffix not in supported:
-        raise UserError(
-            f"cannot write a picture as {path.name!r}; suffixes: {sorted(supported)}"
-        )
+    suffix = picture_format(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=suffix, **kwargs)

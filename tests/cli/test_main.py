@@ -53,6 +53,7 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
         (["benchmark", "--config", "x", "--batch-size", "0"], "0 is not in the range"),
         (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),
+        (["demo", "--out", "demo"], "cannot write a picture as 'demo'; suffixes: ["),
         (["overlay", "1", "--data", ".", "--out", "."], "'.' is a directory"),
         (["export", ".", "--out", __file__], "is a file"),
         (["detect", ".", "--model", ".", "--out", __file__], "is a file"),

@@ -31,6 +31,12 @@ def test_the_first_frame_of_a_sequence_is_drawn(
 ) -> None:
     done = _run("1", root, "--out", tmp_path / "first.png")
     assert done.exit_code == 0, done.output
+    (name,) = (path.stem for path in (root / "1").glob("info_label*/*"))
+    half = name.partition("_")[0]  # as files of `radejax detect` are named
+    done = _run(f"1/{half}", root, "--out", tmp_path / "half.png")
+    assert done.exit_code == 0, done.output
+    pictures = [(tmp_path / f"{of}.png").read_bytes() for of in ("first", "half")]
+    assert pictures[0] == pictures[1]
     picture = np.asarray(Image.open(tmp_path / "first.png").convert("RGB"))
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50

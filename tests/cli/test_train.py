@@ -83,6 +83,7 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
             ["--config=nope"],
             "error: no such config file: nope; give a .py file, or one of",
         ),
+        (["--config=radnet:official"], "did you mean radenet?"),
         (["--config=configs_of_mine/radenet.py"], "did you mean radenet?"),
         (["--config=radenet:big"], "unknown config argument 'big'; available:"),
     ],

@@ -325,7 +325,7 @@ def test_images_and_cameras(records, data, tmp_path):
 def test_wrong_sizes(loader, records, data):
     with pytest.raises(UserError, match="12 frames are fewer than one batch"):
         loader(batch_size=13)
-    with pytest.raises(UserError, match="on each of 5 processes"):
+    with pytest.raises(UserError, match=r"of 15 \(3 on each of 5 .*--config\.train"):
         loader(process_count=5)
     with pytest.raises(UserError, match="must be at least 1, got 0"):
         loader(batch_size=0)

@@ -89,6 +89,13 @@ def test_points_past_the_fold_of_the_distortion_stay_outside():
     assert camera.camera().max_radius == pytest.approx(math.sqrt(1 / 0.6))
 
 
+@pytest.mark.parametrize("k1", [0.0, 1e-320, -1e-320, 0.3])
+def test_distortion_that_never_folds_has_a_large_radius(k1: float) -> None:
+    """Coefficients next to nothing overflowed in the division by the first of them."""
+    camera = forward_camera(distortion=(k1, 0, 0, 0, 0))
+    assert camera.camera().max_radius == 1e6
+
+
 def test_projection_of_a_real_frame(shared):
     folder = shared / "data" / "kradar"
     expected = json.loads((folder / "frame_example/projection_check.json").read_text())

@@ -244,6 +244,20 @@ def test_impossible_cells_are_counted_and_told_once(
     assert len(warnings) == 1
 
 
+def test_decibels_are_told(
+    detector: Detector, tesseracts: np.ndarray, projections: np.ndarray, caplog: Any
+) -> None:
+    detector = detector.with_batch_sizes((4,))
+    decibels = 10.0 * np.log10(tesseracts[:2])
+    detector(np.concatenate([decibels, tesseracts[:1]]))
+    assert "2 of 3 frames have cells that are" in caplog.text
+    assert "decibels?" in caplog.text
+    detector(jnp.asarray(184.3 * projections[:3] - 1.2))
+    assert detector.num_impossible == 5
+    detector((255 * projections[:3]).astype(np.uint8))  # as of records
+    assert detector.num_impossible == 5
+
+
 def test_arrays_on_a_device_are_told_of_at_a_later_call(
     detector: Detector, tesseracts: np.ndarray, caplog: Any
 ) -> None:
@@ -278,6 +292,7 @@ def test_arguments_by_name_and_wrong_ones() -> None:
         ({"roi": "middle"}, "roi 'middle', expected narrow, wide or x0"),
         ({"roi": (0, 1)}, r"roi \(0, 1\), expected narrow"),
         ({"device": "abacus"}, "device 'abacus' is not there, found cpu"),
+        ({"batch_sizes": 4}, "batch_sizes 4, expected numbers of at least 1"),
         ({"batch_sizes": (0,)}, r"batch_sizes \(0,\), expected numbers of at least 1"),
         ({"batch_sizes": ()}, r"batch_sizes \(\), expected"),
     ):

@@ -59,6 +59,9 @@ def test_frames_are_projected_beside_their_data_once(
         return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
     config = base_config()
+    with pytest.raises(UserError, match=r"is 64.*give --config.model.doppler_bins=16"):
+        prepare()
+    config.model.update(doppler_bins=16, elevation_bins=9)
     with pytest.raises(UserError, match="2 frames are fewer than one batch"):
         prepare()
     assert not (tmp_path / "sim" / "records").exists()
@@ -136,6 +139,7 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     damaged.projection_path.write_bytes(b"half")
     project_dataset(frames, root / "records", skip_bad=True, progress=False)
     config.train.batch_size = 1
+    config.model.update(doppler_bins=16, elevation_bins=9)
     model, sources = models.build(config.model), Sources(data=(str(root),))
     with caplog.at_level("WARNING", "radejax"):
         data = open_data(config, model, sources)
@@ -156,6 +160,7 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
         (None, {1, 3}),
         (Sources(label_version="v2.1"), {1, 3}),
         (Sources(sequences=(2,)), {2}),
+        (Sources(weather=tuple({frame.weather for frame in frames})), {1, 3}),
         (Sources(data=(str(tmp_path / "copy"),)), {1, 2, 3}),
         (Sources(data=(str(tmp_path / "copy"),), sequences=(3,)), {3}),
     ):

@@ -42,6 +42,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level("INFO", logger="radejax")
     said_before, plans = [], []
 
     def train(*args: Any, **__: Any) -> SimpleNamespace:
@@ -54,6 +55,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     simulation["output"] = "projection"
     root = simulate_dataset(simulation, tmp_path / "data", progress=False)
     config = base_config()
+    config.model.update(doppler_bins=16, elevation_bins=9)
     config.train.batch_size = 2
     config.decode.update(score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False)
     monkeypatch.setattr(loop, "train", train)
@@ -64,6 +66,9 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     )
     assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
+    assert "checkpoints/" in caplog.text
+    assert "radejax detect" in caplog.text
+    assert not {"evaluation/", "Evaluate again:"} & set(caplog.text.split("  "))
     # What NMS chooses for the loss is what decoding finds.
     expected = AfterNms(
         score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False, per_class=False

@@ -163,7 +163,8 @@ def check_dataset(
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
-        UserError: There are neither sequence folders nor labels.
+        UserError: There are neither sequence folders nor labels, or none of the
+            sequences and weathers asked for.
     """
     paths = as_paths(roots)
     findings = Findings(strict=False)
@@ -181,6 +182,8 @@ def check_dataset(
     for frame in frames:
         by_sequence[frame.sequence].append(frame)
     if (sequence_numbers, weather) != (None, None):
+        if not frames:
+            raise UserError("no frames of these sequences and weathers")
         folders = {n: f for n, f in folders.items() if n in by_sequence}
     numbers = sorted({*folders, *by_sequence})
     total = sum(len(f.listing("radar_tesseract")) for f in folders.values())
@@ -218,7 +221,8 @@ def _open(
         return KRadar(paths, labels, version=version, **part)
     except UserError as error:
         if "has the layout of" not in str(error):
-            if labels is None and find_sequences(paths):
+            is_whole = all(chosen is None for chosen in part.values())
+            if labels is None and is_whole and find_sequences(paths):
                 findings.report("labels missing", "labels", str(error))
                 return None
             raise

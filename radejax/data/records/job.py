@@ -11,6 +11,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import hashlib
+import itertools
 import math
 import multiprocessing
 import os
@@ -34,6 +35,7 @@ from radejax.data.records.projections import (
 )
 from radejax.geometry.radar_grid import RadarGrid
 
+_MAX_LISTED = 10
 _SMALL_JOB_CELLS = 3e9  # some 50 of K-Radar's tesseracts, a few seconds
 
 
@@ -72,7 +74,12 @@ class ProjectionReport:
             f"{self.seconds:.1f} s, {rate:.1f} frames/s, "
             f"{100 * self.reading_share:.0f} % of the workers' time in reading",
         ]
-        lines += [f"left out: {key}: {why}" for key, why in self.skipped.items()]
+        lines += [
+            f"left out: {key}: {why}"
+            for key, why in itertools.islice(self.skipped.items(), _MAX_LISTED)
+        ]
+        if (more := len(self.skipped) - _MAX_LISTED) > 0:
+            lines.append(f"... and {more:,} more left out: manifest.json has them all")
         if not self.is_complete:
             lines.append("other shards are not finished: no manifest.json yet")
         return "\n".join(lines)

@@ -84,4 +84,6 @@ def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> An
             for name, result in zip(results, panel, strict=True)
         }
         draw_precision_recall(lines, ax=axis, title=f"{panel[0].cls}, {terms}")
+        if not any(np.any(result.recall) for result in panel if result.is_defined):
+            axis.text(0.5, 0.5, "none found", transform=axis.transAxes, ha="center")
     return figure

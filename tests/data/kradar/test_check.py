@@ -90,6 +90,16 @@ def test_labels_of_another_version_are_read_as_what_they_are(root):
     assert "label version" in report.summary.problem_counts()  # exit code 1
 
 
+def test_a_part_that_is_not_there_is_wrong_use_and_no_clean_bill(root):
+    for part, message in (
+        ({"weather": ["fogg"]}, "unknown weather"),
+        ({"sequence_numbers": [99]}, r"no labels of sequences \[99\]"),
+        ({"weather": ["sleet"]}, "no frames of these sequences and weathers"),
+    ):
+        with pytest.raises(UserError, match=message):
+            check_dataset(root, **part)
+
+
 def test_disk_without_labels(tmp_path):
     write.write_tesseract(
         tmp_path / "3/radar_tesseract/tesseract_00001.mat",

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import os
 import pathlib
@@ -169,6 +170,9 @@ def test_bad_frames_are_named_or_left_out(root, tmp_path, num_workers):
     assert report.num_projected + report.num_found == 10
     assert sorted(report.skipped) == ["1/00005_00002", "2/00009_00006"]
     assert "left out: 2/00009_00006: no tesseract in any root" in report.to_text()
+    many = dataclasses.replace(report, skipped=dict.fromkeys(range(1187), "gone"))
+    assert many.to_text().count("\nleft out: ") == 10
+    assert "... and 1,177 more left out: manifest.json" in many.to_text()
     records = RecordSource(out)
     assert len(records) == 10
     assert records.manifest.skipped == report.skipped

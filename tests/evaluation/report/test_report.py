@@ -315,6 +315,10 @@ def test_panels_of_curves_say_the_protocol_and_none_is_blank():
     assert titles == ["Sedan, exact, bev, IoU 0.3", "Bicycle, exact, bev, IoU 0.3"]
     names = [[line.get_label()[:4] for line in ax.lines] for ax in figure.axes]
     assert names == [["all,", "rain"], ["all,"]]
+    assert not figure.axes[0].texts
+    missed = SimpleNamespace(**vars(result("Bus", True)) | {"recall": np.zeros(2)})
+    (panel,) = plots._precision_recall({"all": [missed]}, "exact").axes
+    assert [text.get_text() for text in panel.texts] == ["none found"]
     # Fog has a colour of its own where it is not drawn: rain's is the third.
     assert figure.axes[0].lines[1].get_color() == SERIES_COLORS[2]
 
