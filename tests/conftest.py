@@ -63,6 +63,8 @@ def pytest_collection_modifyitems(
     config: pytest.Config, items: list[pytest.Item]
 ) -> None:
     if config.getoption("shapes"):
+        if "--shapes" not in config.invocation_params.args:
+            raise pytest.UsageError("--shapes must be on the command line itself")
         skip = pytest.mark.skip(reason="passes what annotations forbid")
         for item in items:
             if item.get_closest_marker("wrong_types"):

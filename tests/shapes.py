@@ -1,10 +1,11 @@
 """Annotations of radejax, shapes of arrays among them, checked while tests run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
 from typing import Any
 
 import beartype
 from jaxtyping import install_import_hook
+from ml_collections import ConfigDict
 
 ROOMS = ("geometry", "losses", "detection", "models")
 """Rooms whose annotations have shapes."""
@@ -23,4 +24,5 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def install() -> Any:
     """Rooms that are imported from now on are checked; ends as a context does."""
+    MutableMapping.register(ConfigDict)  # it has all that one has
     return install_import_hook([f"radejax.{r}" for r in ROOMS], f"{__name__}.check")
