@@ -7,7 +7,14 @@ import beartype
 from jaxtyping import install_import_hook
 from ml_collections import ConfigDict
 
-ROOMS = ("geometry", "losses", "detection", "models")
+ROOMS = (
+    "geometry",
+    "losses",
+    "detection",
+    "models",
+    "evaluation.overlap",
+    "evaluation.matching",
+)
 """Rooms whose annotations have shapes."""
 
 _CHECKED = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))
