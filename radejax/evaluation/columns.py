@@ -216,9 +216,10 @@ def read_columns(
             raise UserError(
                 f"{name}: column {column!r} has shape {values.shape}, expected ({num},)"
             )
+    otherwise = " (or --invalid_sizes false_positive)" if scored else ""
     for bad, first, must in (
         (~(np.abs(box) <= _MOST), 0, f"is {{}}, expected a number up to {_MOST:g}"),
-        (box[:, 3:6] <= 0, 3, "is {:g} m, expected a size above 0"),
+        (box[:, 3:6] <= 0, 3, "is {:g} m, expected a size above 0" + otherwise),
     ):
         if bad.any():
             row, column = np.argwhere(bad)[0] + (0, first)

@@ -224,9 +224,19 @@ def read_packed(folder: str | pathlib.Path) -> LoadedModel:
             "decode_options": decode,
             "camera_options": CameraOptions.of_fields(content["camera"], path),
         },
-        content["training_config"]
-        and ConfigDict(renewed(content["training_config"]), convert_dict=True),
+        _training_config(content["training_config"], path),
     )
+
+
+def _training_config(
+    values: Mapping[str, Any] | None, path: pathlib.Path
+) -> ConfigDict | None:
+    if not values:
+        return None
+    try:
+        return ConfigDict(renewed(values), convert_dict=True)
+    except ValueError as error:  # names with dots
+        raise DataError(f"{path}: training_config: {error}") from None
 
 
 def model_config(model: nn.Module) -> dict[str, Any]:

@@ -280,18 +280,14 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
 
 def _check_bins(model: ConfigDict, data: Data) -> None:
     """`UserError` for a model of another radar, before anything is projected."""
-    grid = data.frames.grid
-    for name, there in [
-        ("doppler", grid.num_doppler),
-        ("elevation", grid.num_elevation),
-    ]:
-        field = f"{name}_bins"
-        if model[field] != there:
-            raise UserError(
-                f"config.model.{field} is {model[field]}, and the radar of "
-                f"{', '.join(data.paths.roots)} has {there}; give "
-                f"--config.model.{field}={there}"
-            )
+    doppler, elevation = data.frames.grid.num_doppler, data.frames.grid.num_elevation
+    if (model.doppler_bins, model.elevation_bins) != (doppler, elevation):
+        raise UserError(
+            f"config.model has {model.doppler_bins} Doppler and {model.elevation_bins} "
+            f"elevation bins, the radar of {', '.join(data.paths.roots)} {doppler} and "
+            f"{elevation}; give --config.model.doppler_bins={doppler} "
+            f"--config.model.elevation_bins={elevation}"
+        )
 
 
 def _tell_what_is_held_out(data: Data) -> None:

@@ -200,6 +200,7 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> Non
         ({"model": {**model, "num_groups": 0}}, "num_groups is 0, expected 1 to"),
         ({"model": {**model, "decoder_width": 16}}, "do not fit config.model"),
         ({"grid": {}}, "grid lacks range_m"),
+        ({"training_config": {"a.b": 1}}, "training_config: .*dots in field names"),
     ):
         path.write_text(json.dumps(content | change))
         with pytest.raises(DataError, match=rf"config\.json: .*{message}"):

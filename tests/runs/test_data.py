@@ -47,7 +47,9 @@ def test_no_list_of_folders_is_an_error(data: object) -> None:
 
 
 def test_frames_are_projected_beside_their_data_once(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     simulation = default_config()
     simulation.update(train_sequences=1, test_sequences=1, frames_per_sequence=2)
@@ -59,7 +61,9 @@ def test_frames_are_projected_beside_their_data_once(
         return open_data(config, models.build(config.model), Sources(data=("sim",)))
 
     config = base_config()
-    with pytest.raises(UserError, match=r"is 64.*give --config.model.doppler_bins=16"):
+    with pytest.raises(
+        UserError, match=r"64 Doppler.*doppler_bins=16 --config.model.elev"
+    ):
         prepare()
     config.model.update(doppler_bins=16, elevation_bins=9)
     with pytest.raises(UserError, match="2 frames are fewer than one batch"):
@@ -78,7 +82,9 @@ def test_frames_are_projected_beside_their_data_once(
         return {p: p.stat().st_mtime_ns for p in files if p.suffix != ".json"}
 
     before = written()
+    assert "project: 100%" in capsys.readouterr().err
     assert prepare().paths == paths
+    assert "project" not in capsys.readouterr().err
     assert written() == before
 
 

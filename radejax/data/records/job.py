@@ -232,7 +232,9 @@ def _run(
 ) -> None:
     """Does the tasks and adds them up in the report."""
     total = sum(len(task.frames) for task in tasks)
-    bar = tqdm(total=total, unit="frame", desc="project", disable=not progress)
+    bar = tqdm(
+        total=total, unit="frame", desc="project", disable=not (progress and total)
+    )
     if num_workers is None:
         cells = sum(
             len(task.frames) * math.prod(task.kind.grid.shape_drea) for task in tasks
