@@ -44,6 +44,33 @@ SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
 GOLDEN = pathlib.Path(__file__).resolve().parent / "golden"
 
 
+def pytest_addoption(
+    parser: pytest.Parser, pluginmanager: pytest.PytestPluginManager
+) -> None:
+    parser.addoption(
+        "--shapes",
+        action="store_true",
+        help="check the annotations of radejax, shapes of arrays among them",
+    )
+    # Here and not when options are read: other conftests import radejax before.
+    if "--shapes" in pluginmanager.getplugin("pytestconfig").invocation_params.args:
+        from . import shapes
+
+        shapes.install()
+
+
+def pytest_collection_modifyitems(
+    config: pytest.Config, items: list[pytest.Item]
+) -> None:
+    if config.getoption("shapes"):
+        if "--shapes" not in config.invocation_params.args:
+            raise pytest.UsageError("--shapes must be on the command line itself")
+        skip = pytest.mark.skip(reason="passes what annotations forbid")
+        for item in items:
+            if item.get_closest_marker("wrong_types"):
+                item.add_marker(skip)
+
+
 @pytest.fixture(autouse=True)
 def _process_as_it_was() -> Iterator[None]:
     """Commands set up log and JAX for their process; here that is every later test."""

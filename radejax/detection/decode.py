@@ -7,6 +7,7 @@ use, and a count of the peaks that found no row.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import chex
@@ -14,12 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Int, Num, Real
 
 from radejax.core.errors import UserError
-from radejax.core.structures import MIN_SIZE_M, DetectionMaps, Detections
+from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
+
+Scalar = float | Float[jax.Array, ""]
+Roi = Real[Array, "6"] | Sequence[Scalar]
 
 
 class Peaks(struct.PyTreeNode):
@@ -47,13 +52,13 @@ def decode(
     grid: RadarGrid,
     *,
     max_detections: int,
-    score_threshold: float | jax.Array,
-    nms_iou: float | jax.Array = 0.3,
+    score_threshold: Scalar,
+    nms_iou: Scalar = 0.3,
     pre_nms: int | None = None,
-    roi: np.ndarray | jax.Array | None = None,
+    roi: Roi | None = None,
     per_class_nms: bool = False,
     threshold_inclusive: bool = False,
-    z0_m: float | jax.Array = 0.0,
+    z0_m: Scalar = 0.0,
     raw_yaw: Literal["nms", "always", "never"] = "nms",
     clip_sizes: bool = True,
 ) -> Detections:
@@ -124,12 +129,12 @@ def decode(
 
 def suppress(
     peaks: Peaks,
-    nms_iou: float | jax.Array,
+    nms_iou: Scalar,
     *,
     per_class: bool = False,
     normalize_yaw: bool = False,
-) -> jax.Array:
-    """`[B, P]` bool: which peaks survive rotated NMS; arguments as for `decode`.
+) -> Bool[jax.Array, "B P"]:
+    """Which peaks survive rotated NMS; arguments as for `decode`.
 
     `normalize_yaw` compares boxes of their regressed size, whatever the length of the
     yaw vector.
@@ -151,10 +156,10 @@ def find_peaks(
     grid: RadarGrid,
     *,
     max_peaks: int,
-    score_threshold: float | jax.Array,
-    roi: np.ndarray | jax.Array | None = None,
+    score_threshold: Scalar,
+    roi: Roi | None = None,
     threshold_inclusive: bool = False,
-    z0_m: float | jax.Array = 0.0,
+    z0_m: Scalar = 0.0,
 ) -> Peaks:
     """The strongest local maxima of the heatmaps with their boxes, before NMS.
 
@@ -201,11 +206,11 @@ def find_peaks(
 
 
 def boxes_at(
-    params: jax.Array,
-    cell: jax.Array,
+    params: Float[jax.Array, "*cells 8"],
+    cell: Int[jax.Array, "*cells 2"],
     grid: RadarGrid,
-    z0_m: float | jax.Array = 0.0,
-) -> jax.Array:
+    z0_m: Scalar = 0.0,
+) -> Float[jax.Array, "*cells 8"]:
     """Boxes described by the parameters of given bins.
 
     Args:
@@ -235,19 +240,23 @@ def boxes_at(
     return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
 
 
-def _with_raw_footprint(boxes: jax.Array) -> jax.Array:
-    """`[..., 8]` boxes, length and width multiplied by the length of the yaw vector."""
+def _with_raw_footprint(
+    boxes: Float[jax.Array, "*batch 8"],
+) -> Float[jax.Array, "*batch 8"]:
+    """Length and width multiplied by the length of the yaw vector."""
     norm = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
     return boxes.at[..., 3:5].multiply(norm)
 
 
-def _with_positive_sizes(boxes: jax.Array) -> jax.Array:
-    """`[..., 8]` boxes, sizes clipped from below."""
+def _with_positive_sizes(
+    boxes: Float[jax.Array, "*batch 8"],
+) -> Float[jax.Array, "*batch 8"]:
+    """Sizes clipped from below."""
     return boxes.at[..., 3:6].max(MIN_SIZE_M)
 
 
-def _max_3x3(values: jax.Array) -> jax.Array:
-    """Maximum over each bin and its neighbours in range and azimuth: `[B, R, A, C]`."""
+def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    """Maximum over each bin and its neighbours in range and azimuth."""
     for axis in (1, 2):
         size = values.shape[axis]
         pad = [(0, 0)] * values.ndim
@@ -259,12 +268,12 @@ def _max_3x3(values: jax.Array) -> jax.Array:
 
 
 def _in_roi(
-    params: jax.Array,
+    params: Float[jax.Array, "B R A 8"],
     grid: RadarGrid,
-    roi: np.ndarray | jax.Array,
-    z0_m: float | jax.Array,
-) -> jax.Array:
-    """`[B, R, A]` bool: the box of a bin has its center in the region."""
+    roi: Roi,
+    z0_m: Scalar,
+) -> Bool[jax.Array, "B R A"]:
+    """The box of a bin has its center in the region."""
     roi = jnp.asarray(roi, jnp.float32)
     if roi.shape != (6,):
         raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
@@ -278,7 +287,9 @@ def _in_roi(
     return inside
 
 
-def _compact(peaks: Peaks, keep: jax.Array, max_detections: int) -> Detections:
+def _compact(
+    peaks: Peaks, keep: Bool[jax.Array, "B P"], max_detections: int
+) -> Detections:
     """The kept peaks moved to the front, in order, as K rows."""
     order = jnp.argsort(~keep, axis=-1, stable=True)[:, :max_detections]
     at = jax.vmap(lambda values, order: values[order])
@@ -316,8 +327,7 @@ def _pad_rows(detections: Detections, count: int) -> Detections:
     )
 
 
-def _flat_cells(values: jax.Array) -> jax.Array:
-    """`[B, R, A, C]` -> `[B, R * A, C]`."""
+def _flat_cells(values: Num[jax.Array, "B R A C"]) -> Num[jax.Array, "B R*A C"]:
     return values.reshape(values.shape[0], -1, values.shape[-1])
 
 

@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Bool, Float
 
 from radejax.geometry.rotated_iou import bev_iou
 
@@ -25,12 +26,12 @@ class Matches(struct.PyTreeNode):
 
 
 def match_boxes(
-    predicted: jax.Array,
-    is_predicted: jax.Array,
-    objects: jax.Array,
-    is_object: jax.Array,
+    predicted: Float[jax.Array, "K _"],
+    is_predicted: Bool[jax.Array, " K"],
+    objects: Float[jax.Array, "N _"],
+    is_object: Bool[jax.Array, " N"],
     *,
-    iou_threshold: float | jax.Array = 0.0,
+    iou_threshold: float | Float[jax.Array, ""] = 0.0,
 ) -> Matches:
     """Matches each prediction with the object it overlaps most on the ground plane.
 

@@ -5,17 +5,18 @@ from __future__ import annotations
 import chex
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
 
 from radejax.geometry.rotated_iou import bev_iou
 
 
 def rotated_nms(
-    boxes: jax.Array,
-    is_valid: jax.Array,
-    iou_threshold: float | jax.Array,
+    boxes: Float[jax.Array, "*batch K _"],
+    is_valid: Bool[jax.Array, "*batch K"],
+    iou_threshold: float | Float[jax.Array, ""],
     *,
-    classes: jax.Array | None = None,
-) -> jax.Array:
+    classes: Int[jax.Array, "*batch K"] | None = None,
+) -> Bool[jax.Array, "*batch K"]:
     """Which boxes survive greedy bird's-eye-view non-maximum suppression.
 
     In order of the rows, a box is kept unless it overlaps a box kept before:
@@ -49,7 +50,9 @@ def rotated_nms(
     return greedy_suppression(overlaps, is_valid)
 
 
-def greedy_suppression(overlaps: jax.Array, is_valid: jax.Array) -> jax.Array:
+def greedy_suppression(
+    overlaps: Bool[jax.Array, "*batch K K"], is_valid: Bool[jax.Array, "*batch K"]
+) -> Bool[jax.Array, "*batch K"]:
     """The greedy choice for a given overlap relation, rows by descending score.
 
     Instead of K steps one after the other, all rows are decided together from the
@@ -73,10 +76,10 @@ def greedy_suppression(overlaps: jax.Array, is_valid: jax.Array) -> jax.Array:
     chex.assert_shape(overlaps, (*is_valid.shape, is_valid.shape[-1]))
     before = jnp.triu(overlaps, 1)  # [i, j]: i would suppress j
 
-    def decide(keep: jax.Array) -> jax.Array:
+    def decide(keep: Bool[jax.Array, "*batch K"]) -> Bool[jax.Array, "*batch K"]:
         return is_valid & ~jnp.any(before & keep[..., :, None], axis=-2)
 
-    def changed(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def changed(state: tuple[jax.Array, jax.Array]) -> Bool[jax.Array, ""]:
         return jnp.any(state[0] != state[1])
 
     keep, _ = jax.lax.while_loop(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import chex
 import numpy as np
+from jaxtyping import Bool, Float, Int, Real, Shaped
 from scipy import sparse
 
 from radejax.evaluation.overlap import ranges
@@ -29,22 +30,22 @@ class Pairs(NamedTuple):
         iou: `[P]` overlap of every pair.
     """
 
-    pred: np.ndarray
-    gt: np.ndarray
-    iou: np.ndarray
+    pred: Int[np.ndarray, " P"]
+    gt: Int[np.ndarray, " P"]
+    iou: Float[np.ndarray, " P"]
 
-    def take(self, index: np.ndarray) -> Pairs:
+    def take(self, index: Int[np.ndarray, " K"] | Bool[np.ndarray, " P"]) -> Pairs:
         """The pairs that `index` (positions or mask) selects."""
         return Pairs(*(column[index] for column in self))
 
 
 def greedy(
-    claimant: np.ndarray,
-    target: np.ndarray,
-    preference: np.ndarray,
-    group: np.ndarray,
+    claimant: Int[np.ndarray, " P"],
+    target: Int[np.ndarray, " P"],
+    preference: Real[np.ndarray, " P"],
+    group: Real[np.ndarray, " P"],
     num_targets: int,
-) -> np.ndarray:
+) -> Int[np.ndarray, " K"]:
     """Claimants take, one after the other, the best target that is still free.
 
     Args:
@@ -86,8 +87,8 @@ def greedy(
     return np.concatenate(chosen)
 
 
-def _is_new(*columns: np.ndarray) -> np.ndarray:
-    """`[K]` bool: entries that differ from the one before in any column."""
+def _is_new(*columns: Shaped[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
+    """Entries that differ from the one before in any column."""
     new = np.zeros(columns[0].size, bool)
     new[:1] = True
     for column in columns:
@@ -107,14 +108,17 @@ class KradarMatches:
         event_delta: `[E]` by how much.
     """
 
-    first_gt: np.ndarray
-    first_pred: np.ndarray
-    event_pred: np.ndarray
-    event_delta: np.ndarray
+    first_gt: Int[np.ndarray, " S"]
+    first_pred: Int[np.ndarray, " S"]
+    event_pred: Int[np.ndarray, " E"]
+    event_delta: Int[np.ndarray, " E"]
 
 
 def match_kradar(
-    pairs: Pairs, score: np.ndarray, gt_group: np.ndarray, threshold: float
+    pairs: Pairs,
+    score: Real[np.ndarray, " M"],
+    gt_group: Real[np.ndarray, " N"],
+    threshold: float,
 ) -> KradarMatches:
     """Both passes of K-Radar's matching.
 
@@ -143,7 +147,9 @@ def match_kradar(
     return KradarMatches(first.gt, first.pred, *_second_pass(pairs, score))
 
 
-def _second_pass(pairs: Pairs, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _second_pass(
+    pairs: Pairs, score: Real[np.ndarray, " M"]
+) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
     """True positives as steps over the score threshold."""
     if pairs.pred.size == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -160,8 +166,10 @@ def _second_pass(pairs: Pairs, score: np.ndarray) -> tuple[np.ndarray, np.ndarra
     )
 
 
-def _components(pred: np.ndarray, gt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Connected parts of the pair graph: `[P]` label, `[labels]` ground truths in it."""
+def _components(
+    pred: Int[np.ndarray, " P"], gt: Int[np.ndarray, " P"]
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " labels"]]:
+    """Connected parts of the pair graph: labels, and ground truths in each."""
     gts, gt_node = np.unique(gt, return_inverse=True)
     preds, pred_node = np.unique(pred, return_inverse=True)
     size = gts.size + preds.size
@@ -173,8 +181,8 @@ def _components(pred: np.ndarray, gt: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _steps(
-    pairs: Pairs, score: np.ndarray, component: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    pairs: Pairs, score: Real[np.ndarray, " M"], component: Int[np.ndarray, " P"]
+) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
     """Second pass where ground truths compete: once per distinct score in a component."""
     if component.size == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -195,13 +203,15 @@ def _steps(
         level, pair = level[enters], pair[enters]
         # Every level is a world of its own: number its predictions anew.
         target = np.unique(level * score.size + pred[pair], return_inverse=True)[1]
-        won = greedy(gt[pair], target, iou[pair], level, target.max() + 1)
+        won = greedy(gt[pair], target, iou[pair], level, int(target.max()) + 1)
         true_positives[low:high] = np.bincount(level[won], minlength=high - low)
     before = np.where(_is_new(level_component), 0, np.roll(true_positives, 1))
     return level_pred, true_positives - before
 
 
-def match_best(pairs: Pairs, score: np.ndarray, threshold: float) -> np.ndarray:
+def match_best(
+    pairs: Pairs, score: Real[np.ndarray, " M"], threshold: float
+) -> Int[np.ndarray, " M"]:
     """RADE-Net's rule: a prediction may only take its own best ground truth.
 
     Args:
@@ -227,11 +237,11 @@ def match_best(pairs: Pairs, score: np.ndarray, threshold: float) -> np.ndarray:
 
 def match_free(
     pairs: Pairs,
-    score: np.ndarray,
-    pred_group: np.ndarray,
+    score: Real[np.ndarray, " M"],
+    pred_group: Real[np.ndarray, " M"],
     num_gt: int,
     threshold: float,
-) -> np.ndarray:
+) -> Int[np.ndarray, " M"]:
     """The plain rule: by falling score, each prediction takes the best free object.
 
     Args:
@@ -257,8 +267,8 @@ def match_free(
     return _matched(pairs.take(chosen), score.size)
 
 
-def _matched(pairs: Pairs, num_pred: int) -> np.ndarray:
-    """`[M]` ground truth of each prediction in the pairs, -1 of all others."""
+def _matched(pairs: Pairs, num_pred: int) -> Int[np.ndarray, " M"]:
+    """Ground truth of each prediction in the pairs, -1 of all others."""
     matched = np.full(num_pred, -1)
     matched[pairs.pred] = pairs.gt
     return matched

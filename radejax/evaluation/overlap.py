@@ -6,6 +6,7 @@ import itertools
 
 import chex
 import numpy as np
+from jaxtyping import Float, Int, Real
 
 from radejax.geometry.rotated_iou import bev_intersection_np
 
@@ -13,8 +14,11 @@ PAIRS_PER_CHUNK = 2_000_000
 
 
 def candidate_pairs(
-    group_a: np.ndarray, group_b: np.ndarray, box_a: np.ndarray, box_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    group_a: Real[np.ndarray, " N"],
+    group_b: Real[np.ndarray, " M"],
+    box_a: Float[np.ndarray, "N 7"],
+    box_b: Float[np.ndarray, "M 7"],
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
     """Pairs (a, b) of one group whose rectangles can possibly touch.
 
     Args:
@@ -54,7 +58,9 @@ def candidate_pairs(
     return np.concatenate(parts_a), np.concatenate(parts_b)
 
 
-def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ranges(
+    first: Int[np.ndarray, " R"], count: Int[np.ndarray, " R"]
+) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
     """Which range, and index, of everything in the ranges [first, first + count).
 
     Examples:
@@ -68,8 +74,8 @@ def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def pair_iou(
-    a: np.ndarray, b: np.ndarray, *, z_center: float = 0.5
-) -> tuple[np.ndarray, np.ndarray]:
+    a: Float[np.ndarray, "P 7"], b: Float[np.ndarray, "P 7"], *, z_center: float = 0.5
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """BEV and 3D intersection over union of boxes, pair by pair.
 
     Args:
@@ -94,8 +100,8 @@ def pair_iou(
 
 
 def _pair_iou(
-    a: np.ndarray, b: np.ndarray, z_center: float
-) -> tuple[np.ndarray, np.ndarray]:
+    a: Float[np.ndarray, "P 7"], b: Float[np.ndarray, "P 7"], z_center: float
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     area = bev_intersection_np(a, b)
     area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
     top = np.minimum(

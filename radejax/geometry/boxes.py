@@ -7,10 +7,16 @@ it. Functions follow the type of their input: NumPy in, NumPy out; else JAX.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Real
+
+ArrayT = TypeVar("ArrayT", bound=np.ndarray | jax.Array)
+"""NumPy's arrays or JAX's, in and out alike."""
 
 # Signs of the half extents at the corners, counter-clockwise from front left.
 _SIGN_LENGTH = (1.0, -1.0, -1.0, 1.0)
@@ -31,7 +37,7 @@ def array_module(*values: Any) -> Any:
     return np if on_host else jnp
 
 
-def boxes8_from_7(boxes: Any) -> Any:
+def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
     """Boxes with sin and cos of yaw: `[..., 7]` -> `[..., 8]`.
 
     Args:
@@ -53,7 +59,7 @@ def boxes8_from_7(boxes: Any) -> Any:
     return xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
 
 
-def boxes7_from_8(boxes: Any) -> Any:
+def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
     """Boxes with the yaw angle: inverse of `boxes8_from_7`.
 
     The length of the (sin, cos) vector does not matter; sin = cos = 0 gives yaw 0.
@@ -77,7 +83,7 @@ def boxes7_from_8(boxes: Any) -> Any:
     return xp.concatenate([boxes[..., :6], yaw], -1)
 
 
-def bev_corners(boxes: Any) -> Any:
+def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
     """Corners of the boxes' footprints, counter-clockwise from front left.
 
     ```
@@ -110,7 +116,7 @@ def bev_corners(boxes: Any) -> Any:
     return xp.stack([x, y], -1)
 
 
-def corners(boxes: Any) -> Any:
+def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
     """Corners of boxes: the footprint's four at the bottom, then at the top.
 
     Args:
@@ -133,7 +139,11 @@ def corners(boxes: Any) -> Any:
     return xp.concatenate([bottom, top], -2)
 
 
-def transform_boxes(boxes: Any, translation_m: Any, yaw_rad: float = 0.0) -> Any:
+def transform_boxes(
+    boxes: Real[ArrayT, "*batch 7"],
+    translation_m: Real[Any, "3"] | Sequence[float],
+    yaw_rad: float = 0.0,
+) -> Float[ArrayT, "*batch 7"]:
     """Boxes in a frame turned and shifted on the ground: rotate, then translate.
 
     Args:

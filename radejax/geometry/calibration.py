@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Real
 
 from radejax.geometry.boxes import corners
 from radejax.geometry.camera import Camera, project, to_camera, to_pixels
@@ -85,15 +86,15 @@ class CameraCalibration:
         rectified: `[4]` fx, fy, cx, cy of the undistorted image.
     """
 
-    intrinsics: np.ndarray
-    distortion: np.ndarray
-    rotation: np.ndarray
-    translation_m: np.ndarray
+    intrinsics: Float[np.ndarray, "4"]
+    distortion: Float[np.ndarray, "5"]
+    rotation: Float[np.ndarray, "3 3"]
+    translation_m: Float[np.ndarray, "3"]
     width: int = 1280
     height: int = 720
     # Arrays like the others once __post_init__ is through.
-    ego_from_lidar_m: np.ndarray = EGO_FROM_LIDAR_M  # type: ignore[assignment]
-    rectified: np.ndarray = KRADAR_RECTIFIED  # type: ignore[assignment]
+    ego_from_lidar_m: Float[np.ndarray, "3"] = EGO_FROM_LIDAR_M  # type: ignore[assignment]
+    rectified: Float[np.ndarray, "4"] = KRADAR_RECTIFIED  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         shapes = {
@@ -253,8 +254,8 @@ class CameraCalibration:
         )
 
     def project_ego(
-        self, points_ego: np.ndarray, image: ImageKind = "raw"
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, points_ego: Real[np.ndarray, "*points 3"], image: ImageKind = "raw"
+    ) -> tuple[Float[np.ndarray, "*points 2"], Float[np.ndarray, "*points"]]:
         """Pixels `[..., 2]` and depth `[...]` in metres of ego-frame points `[..., 3]`.
 
         Pixels mean nothing where the depth is not positive; see `in_image`.
@@ -262,20 +263,27 @@ class CameraCalibration:
         return project(np.asarray(points_ego, np.float64), self.camera(image))
 
     def project_lidar(
-        self, points_lidar: np.ndarray, image: ImageKind = "raw"
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, points_lidar: Real[np.ndarray, "*points 3"], image: ImageKind = "raw"
+    ) -> tuple[Float[np.ndarray, "*points 2"], Float[np.ndarray, "*points"]]:
         """As `project_ego`, for points in the frame of K-Radar's label files."""
         points = np.asarray(points_lidar, np.float64) + self.ego_from_lidar_m
         return self.project_ego(points, image)
 
-    def in_image(self, pixels: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    def in_image(
+        self,
+        pixels: Real[np.ndarray, "*points 2"],
+        depth_m: Real[np.ndarray, "*points"],
+    ) -> Bool[Any, "*points"]:
         """True where projected points lie in front of the camera and in the image."""
         inside = (pixels >= 0) & (pixels < np.array([self.width, self.height]))
         return inside.all(-1) & (depth_m > 0)
 
     def project_boxes(
-        self, boxes: np.ndarray, image: ImageKind = "raw", near_m: float = 0.1
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self,
+        boxes: Real[np.ndarray, "N 7"],
+        image: ImageKind = "raw",
+        near_m: float = 0.1,
+    ) -> tuple[Float[np.ndarray, "N 12 2 2"], Bool[np.ndarray, "N 12"]]:
         """Edges of boxes as line segments on the image, for drawing.
 
         Edges that pass behind the camera are cut at the near plane.
@@ -316,7 +324,7 @@ class CameraCalibration:
         return hash(self._key())
 
 
-def _fold_radius(distortion: np.ndarray) -> float:
+def _fold_radius(distortion: Float[np.ndarray, "5"]) -> float:
     """Smallest radius at which the radial distortion stops growing; large for none."""
     k1, k2, _, _, k3 = distortion
     # In 1 / radius^2: the first coefficient is one, however small the others are.
@@ -325,7 +333,7 @@ def _fold_radius(distortion: np.ndarray) -> float:
     return 1 / math.sqrt(real.max()) if real.size else 1e6
 
 
-def _rotation(axis: int, angle: float) -> np.ndarray:
+def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
     """Right-handed rotation about a coordinate axis (0 x, 1 y, 2 z)."""
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3

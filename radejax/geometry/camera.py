@@ -12,6 +12,7 @@ import chex
 import jax
 import numpy as np
 from flax import struct
+from jaxtyping import Float, Real
 
 from radejax.geometry.boxes import array_module
 
@@ -29,6 +30,7 @@ class Camera(struct.PyTreeNode):
         is_valid: `[...]` bool, False where the frame has no usable image.
     """
 
+    # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
     cam_from_ego: Any
     intrinsics: Any
     distortion: Any
@@ -38,8 +40,8 @@ class Camera(struct.PyTreeNode):
 
 
 def project(
-    points_ego: Any, camera: Camera, *, depth_offset_m: float = 0.0
-) -> tuple[Any, Any]:
+    points_ego: Real[Any, "*points 3"], camera: Camera, *, depth_offset_m: float = 0.0
+) -> tuple[Float[Any, "*points 2"], Float[Any, "*points"]]:
     """Pixels and depth of points in the ego frame.
 
     With `(x, y, z) = cam_from_ego (p, 1)`, the pixel is `fx d(x/z) + cx` and likewise
@@ -90,7 +92,9 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
     return jax.tree.map(stack, *cameras)
 
 
-def to_camera(points: Any, camera: Camera) -> Any:
+def to_camera(
+    points: Real[Any, "*points 3"], camera: Camera
+) -> Float[Any, "*points 3"]:
     """Points `[..., 3]` of the ego frame in the camera frame, metres.
 
     Examples:
@@ -109,7 +113,9 @@ def to_camera(points: Any, camera: Camera) -> Any:
     return xp.sum(rotation * points[..., None, :], -1) + shift
 
 
-def to_pixels(points_cam: Any, camera: Camera, depth_offset_m: float) -> Any:
+def to_pixels(
+    points_cam: Float[Any, "*points 3"], camera: Camera, depth_offset_m: float
+) -> Float[Any, "*points 2"]:
     """Pixels `[..., 2]` of points `[..., 3]` of the camera frame, see `project`.
 
     Examples:

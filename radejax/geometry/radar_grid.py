@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Real
 
 from radejax.geometry.boxes import array_module
 
@@ -23,6 +24,8 @@ _LIMITS = {  # what a radar can have, in the unit of the axis
 }
 
 AzimuthMapping = Literal["true", "stretched"]
+Positions = float | Real[Any, "*#cells"]
+"""One number or an array of them, which broadcast against each other: `[...]`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,10 +52,10 @@ class RadarGrid:
         Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
     """
 
-    range_m: np.ndarray
-    azimuth_rad: np.ndarray
-    elevation_rad: np.ndarray
-    doppler_mps: np.ndarray
+    range_m: Float[np.ndarray, " R"]
+    azimuth_rad: Float[np.ndarray, " A"]
+    elevation_rad: Float[np.ndarray, " E"]
+    doppler_mps: Float[np.ndarray, " D"]
     fov_range_m: float
     fov_azimuth_rad: float
 
@@ -210,7 +213,9 @@ class RadarGrid:
 
     # Bins and metres -----------------------------------------------------------------
 
-    def cell_to_ego(self, range_cell: Any, azimuth_cell: Any) -> Any:
+    def cell_to_ego(
+        self, range_cell: Positions, azimuth_cell: Positions
+    ) -> Float[Any, "*cells 2"]:
         """Positions of range-azimuth cells on the ground plane of the ego frame.
 
         Cell (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da, hence at
@@ -229,7 +234,7 @@ class RadarGrid:
         azimuth = self.azimuth_rad[0] + azimuth_cell * self.azimuth_step_rad
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
 
-    def ego_to_cell(self, x_m: Any, y_m: Any) -> Any:
+    def ego_to_cell(self, x_m: Positions, y_m: Positions) -> Float[Any, "*cells 2"]:
         """Fractional bins of ground positions: inverse of `cell_to_ego`.
 
         Returns:
@@ -249,7 +254,7 @@ class RadarGrid:
         azimuth_cell = azimuth * last_azimuth / azimuth_span + last_azimuth / 2
         return xp.stack([range_cell, azimuth_cell], -1)
 
-    def nearest_cell(self, x_m: Any, y_m: Any) -> Any:
+    def nearest_cell(self, x_m: Positions, y_m: Positions) -> Int[Any, "*cells 2"]:
         """Integer bins nearest to ground positions, clipped to the grid.
 
         Halves round to even, as in the released ground-truth encoding.
@@ -263,13 +268,13 @@ class RadarGrid:
         azimuth_idx = xp.clip(cell[..., 1], 0, self.num_azimuth - 1)
         return xp.stack([range_idx, azimuth_idx], -1).astype(xp.int32)
 
-    def cell_centers_ego(self) -> np.ndarray:
+    def cell_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
         """`[R, A, 2]` float64 x and y of every range-azimuth bin center, metres."""
         return self.cell_to_ego(
             np.arange(self.num_range)[:, None], np.arange(self.num_azimuth)[None, :]
         )
 
-    def in_field_of_view(self, x_m: Any, y_m: Any) -> Any:
+    def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*cells"]:
         """True where the sensor looks: in front, within maximum azimuth and range."""
         xp, x_m, y_m = _as_float(x_m, y_m)
         azimuth = xp.arctan2(y_m, x_m)

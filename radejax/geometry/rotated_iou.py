@@ -25,11 +25,14 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Real
 
 _FAR = 1e6  # metres; stands for infinity along a line, finite so that 0 * _FAR is 0
 
 
-def bev_iou(a: jax.Array, b: jax.Array) -> jax.Array:
+def bev_iou(
+    a: Float[jax.Array, "*batch N _"], b: Float[jax.Array, "*batch M _"]
+) -> Float[jax.Array, "*batch N M"]:
     """Bird's-eye-view IoU of every box of `a` with every box of `b`.
 
     Args:
@@ -55,7 +58,9 @@ def bev_iou(a: jax.Array, b: jax.Array) -> jax.Array:
     return bev_iou_pairs(*_all_pairs(a, b))
 
 
-def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
+def iou_3d(
+    a: Float[jax.Array, "*batch N _"], b: Float[jax.Array, "*batch M _"]
+) -> Float[jax.Array, "*batch N M"]:
     """Volume IoU of every box of `a` with every box of `b`; arguments of `bev_iou`.
 
     Returns:
@@ -69,7 +74,9 @@ def iou_3d(a: jax.Array, b: jax.Array) -> jax.Array:
     return iou_3d_pairs(*_all_pairs(a, b))
 
 
-def bev_iou_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
+def bev_iou_pairs(
+    a: Float[jax.Array, "*#pairs _"], b: Float[jax.Array, "*#pairs _"]
+) -> Float[jax.Array, "*pairs"]:
     """Bird's-eye-view IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`.
 
     Examples:
@@ -80,7 +87,9 @@ def bev_iou_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
     return _bev_iou(jnp, _as_float32(a), _as_float32(b))
 
 
-def iou_3d_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
+def iou_3d_pairs(
+    a: Float[jax.Array, "*#pairs _"], b: Float[jax.Array, "*#pairs _"]
+) -> Float[jax.Array, "*pairs"]:
     """Volume IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`.
 
     Examples:
@@ -93,8 +102,8 @@ def iou_3d_pairs(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def bev_intersection_np(
-    a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16
-) -> np.ndarray:
+    a: Real[np.ndarray, "P _"], b: Real[np.ndarray, "P _"], *, chunk_size: int = 1 << 16
+) -> Float[np.ndarray, " P"]:
     """Footprint overlap of corresponding boxes in float64, without JAX.
 
     Args:
@@ -123,8 +132,8 @@ def bev_intersection_np(
 
 
 def bev_iou_np(
-    a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16
-) -> np.ndarray:
+    a: Real[np.ndarray, "P _"], b: Real[np.ndarray, "P _"], *, chunk_size: int = 1 << 16
+) -> Float[np.ndarray, " P"]:
     """Bird's-eye-view IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`.
 
     Examples:
@@ -136,7 +145,9 @@ def bev_iou_np(
     return _by_chunks(lambda a, b: _bev_iou(np, a, b), a, b, chunk_size)
 
 
-def iou_3d_np(a: np.ndarray, b: np.ndarray, *, chunk_size: int = 1 << 16) -> np.ndarray:
+def iou_3d_np(
+    a: Real[np.ndarray, "P _"], b: Real[np.ndarray, "P _"], *, chunk_size: int = 1 << 16
+) -> Float[np.ndarray, " P"]:
     """Volume IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`.
 
     Examples:

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int, Num
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
@@ -19,18 +20,22 @@ from radejax.losses.focal import Sigma, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
 Matching = Literal["center", "nms"]
-Pairs = tuple[jax.Array, jax.Array, jax.Array]
-"""Predictions and their objects, `[B, N, 8]` each, and where they count, `[B, N]`."""
+Pairs = tuple[
+    Float[jax.Array, "B M 8"], Float[jax.Array, "B M 8"], Bool[jax.Array, "B M"]
+]
+"""Predictions and their objects, and where they count; M objects, or peaks after NMS."""
 
-
-BoxLoss = Callable[[jax.Array, jax.Array], jax.Array]
+BoxLoss = Callable[
+    [Float[jax.Array, "B N 8"], Float[jax.Array, "B N 8"]], Float[jax.Array, "B N"]
+]
 BOX_LOSSES: dict[str, BoxLoss] = {
     "smooth_l1": lambda predicted, wanted: jnp.mean(smooth_l1(predicted - wanted), -1)
 }
 """Losses of predicted boxes and their objects, `[B, N, 8]` each, by name: `[B, N]`. The
 Gaussian Wasserstein distance, which has options, and the focal loss come on top."""
 
-Weights = Mapping[str, float | jax.Array]
+Scalar = float | Num[jax.Array, ""]
+Weights = Mapping[str, Scalar]
 _WEIGHTS: Weights = MappingProxyType({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0})
 
 
@@ -57,9 +62,9 @@ class AfterNms(NamedTuple):
     """
 
     max_peaks: int = 128
-    score_threshold: float | jax.Array = 0.3
-    nms_iou: float | jax.Array = 0.3
-    match_iou: float | jax.Array = 0.0
+    score_threshold: Scalar = 0.3
+    nms_iou: Scalar = 0.3
+    match_iou: Scalar = 0.0
     threshold_inclusive: bool = False
     per_class: bool = False
 
@@ -77,10 +82,10 @@ def detection_loss(
     matching: Matching = "center",
     weights: Weights = _WEIGHTS,
     normalize: bool = True,
-    z0_m: float | jax.Array = 0.0,
-    is_frame_valid: jax.Array | None = None,
+    z0_m: Scalar = 0.0,
+    is_frame_valid: Bool[jax.Array, " B"] | None = None,
     nms: AfterNms = AfterNms(),  # noqa: B008, immutable
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[Float[jax.Array, ""], dict[str, Num[jax.Array, ""]]]:
     """Weighted sum of the losses that `weights` names, and its parts; in float32.
 
     Losses of boxes are means over the matched ones of a frame (0 without any), then over
@@ -147,11 +152,15 @@ def detection_loss(
 
 
 def whole_batch_loss(
-    parts: dict[str, jax.Array],
-    num_bins: int | jax.Array,
+    parts: dict[str, Num[jax.Array, " P"]],
+    num_bins: Scalar,
     weights: Weights = _WEIGHTS,
     normalize: bool = True,
-) -> tuple[dict[str, jax.Array], jax.Array, dict[str, jax.Array]]:
+) -> tuple[
+    dict[str, Float[jax.Array, " P"]],
+    Float[jax.Array, ""],
+    dict[str, Num[jax.Array, ""]],
+]:
     """The loss of a batch from those of its equal parts, and how parts sum to it.
 
     A part divides by its own positive bins and loss values, the batch by those of all.
@@ -190,9 +199,9 @@ def whole_batch_loss(
 
 
 def _objects(
-    batch: Batch, is_frame_valid: jax.Array | None
-) -> tuple[jax.Array, jax.Array]:
-    """Boxes `[B, N, 8]` float32, and `[B, N]` where they are objects."""
+    batch: Batch, is_frame_valid: Bool[jax.Array, " B"] | None
+) -> tuple[Float[jax.Array, "B N 8"], Bool[jax.Array, "B N"]]:
+    """Boxes as float32, and where they are objects."""
     is_valid = jnp.asarray(batch.is_valid)
     if is_frame_valid is not None:
         is_valid &= is_frame_valid[:, None]
@@ -201,7 +210,7 @@ def _objects(
     return boxes, is_valid
 
 
-def smooth_l1(difference: jax.Array) -> jax.Array:
+def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batch"]:
     """Quadratic below 1, linear above: `[...]` -> `[...]`.
 
     `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
@@ -217,10 +226,10 @@ def smooth_l1(difference: jax.Array) -> jax.Array:
 
 def _pairs_at_centers(
     maps: DetectionMaps,
-    boxes: jax.Array,
-    is_valid: jax.Array,
+    boxes: Float[jax.Array, "B N 8"],
+    is_valid: Bool[jax.Array, "B N"],
     grid: RadarGrid,
-    z0_m: float | jax.Array,
+    z0_m: Scalar,
 ) -> Pairs:
     """Predictions at the objects' own bins."""
     cell = grid.nearest_cell(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
@@ -231,10 +240,10 @@ def _pairs_at_centers(
 def _after_nms(
     nms: AfterNms,
     maps: DetectionMaps,
-    boxes: jax.Array,
-    is_valid: jax.Array,
+    boxes: Float[jax.Array, "B N 8"],
+    is_valid: Bool[jax.Array, "B N"],
     grid: RadarGrid,
-    z0_m: float | jax.Array,
+    z0_m: Scalar,
 ) -> Pairs:
     """Predictions that survive NMS, and the objects that they overlap."""
     # Which boxes are compared is a choice, not a function to differentiate.
@@ -257,13 +266,18 @@ def _after_nms(
     return _neutral(predicted, wanted, matches.is_matched)
 
 
-def _params_at(params: jax.Array, cell: jax.Array) -> jax.Array:
-    """`[B, R, A, 8]` at `[B, N, 2]` -> `[B, N, 8]`; one gather per frame, so that a
-    batch axis sharded over devices stays local."""
+def _params_at(
+    params: Float[jax.Array, "B R A 8"], cell: Int[jax.Array, "B N 2"]
+) -> Float[jax.Array, "B N 8"]:
+    """One gather per frame, so that a batch axis sharded over devices stays local."""
     return jax.vmap(lambda params, cell: params[cell[:, 0], cell[:, 1]])(params, cell)
 
 
-def _neutral(predicted: jax.Array, wanted: jax.Array, is_matched: jax.Array) -> Pairs:
+def _neutral(
+    predicted: Float[jax.Array, "B N 8"],
+    wanted: Float[jax.Array, "B N 8"],
+    is_matched: Bool[jax.Array, "B N"],
+) -> Pairs:
     """Both boxes of unmatched rows replaced by one harmless box, without gradient."""
     row = is_matched[..., None]
     return jnp.where(row, predicted, 1.0), jnp.where(row, wanted, 1.0), is_matched
@@ -273,14 +287,14 @@ def _gwd(
     tau: float,
     transform: Transform,
     normalize_yaw: bool,
-    predicted: jax.Array,
-    wanted: jax.Array,
-) -> jax.Array:
+    predicted: Float[jax.Array, "B N 8"],
+    wanted: Float[jax.Array, "B N 8"],
+) -> Float[jax.Array, "B N"]:
     predicted = _with_unit_yaw(predicted) if normalize_yaw else predicted
     return gwd_loss(predicted, wanted, tau, transform)
 
 
-def _with_unit_yaw(boxes: jax.Array) -> jax.Array:
+def _with_unit_yaw(boxes: Float[jax.Array, "B N 8"]) -> Float[jax.Array, "B N 8"]:
     """Yaw vectors scaled to length 1; (0, 0) stays, with a finite gradient."""
     yaw = boxes[..., 6:8]
     square = jnp.sum(yaw * yaw, axis=-1, keepdims=True)
@@ -290,9 +304,11 @@ def _with_unit_yaw(boxes: jax.Array) -> jax.Array:
 
 
 def _mean_of_frames(
-    values: jax.Array, is_counted: jax.Array, is_frame_valid: jax.Array | None
-) -> jax.Array:
-    """Mean over the counted rows of a frame, then over frames: `[B, N]` -> scalar."""
+    values: Float[jax.Array, "B N"],
+    is_counted: Bool[jax.Array, "B N"],
+    is_frame_valid: Bool[jax.Array, " B"] | None,
+) -> Float[jax.Array, ""]:
+    """Mean over the counted rows of a frame, then over frames."""
     total = jnp.sum(jnp.where(is_counted, values, 0.0), axis=1)
     per_frame = total / jnp.maximum(jnp.sum(is_counted, axis=1), 1)
     if is_frame_valid is None:
@@ -302,8 +318,8 @@ def _mean_of_frames(
 
 
 def _weighted_sum(
-    parts: Mapping[str, jax.Array], weights: Weights, normalize: bool
-) -> jax.Array:
+    parts: Mapping[str, Num[jax.Array, ""]], weights: Weights, normalize: bool
+) -> Float[jax.Array, ""]:
     total = jnp.zeros((), jnp.float32)
     for name, weight in weights.items():
         part = parts[name]

@@ -8,6 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from radejax.core.structures import Array
 from radejax.geometry.radar_grid import RadarGrid
@@ -22,15 +23,15 @@ _SMALLEST_SIGMA = 1e-3  # bins; an object of zero size is a single bin
 
 
 def gaussian_heatmap(
-    boxes: jax.Array,
-    classes: Array,
-    is_valid: jax.Array,
+    boxes: Float[jax.Array, "*batch N _"],
+    classes: Int[Array, "*batch N"],
+    is_valid: Bool[jax.Array, "*batch N"],
     grid: RadarGrid,
     *,
     num_classes: int,
     sigma: Sigma = "fixed",
     sigma_cells: float = 3.0,
-) -> jax.Array:
+) -> Float[jax.Array, "*batch R A C"]:
     """Target heatmaps: per class the clipped sum of Gaussians at the objects' bins.
 
     With (i0, j0) the bin nearest to an object's center, bin (i, j) of its class gets
@@ -91,12 +92,12 @@ def gaussian_heatmap(
 
 
 def focal_loss(
-    logits: jax.Array,
-    target: jax.Array,
+    logits: Float[jax.Array, "B R A C"],
+    target: Float[jax.Array, "B R A C"],
     alpha: float = 2,
     gamma: float = 4,
-    is_frame_valid: jax.Array | None = None,
-) -> jax.Array:
+    is_frame_valid: Bool[jax.Array, " B"] | None = None,
+) -> Float[jax.Array, ""]:
     """Center-point focal loss of a batch of heatmaps, averaged over positive bins.
 
     With p the probability: -(1 - p)^alpha log p where the target t is 1, elsewhere
@@ -142,8 +143,11 @@ def focal_loss(
 
 
 def focal_loss_per_bin(
-    logits: jax.Array, target: jax.Array, alpha: float = 2, gamma: float = 4
-) -> jax.Array:
+    logits: Float[jax.Array, "*bins"],
+    target: Float[jax.Array, "*bins"],
+    alpha: float = 2,
+    gamma: float = 4,
+) -> Float[jax.Array, "*bins"]:
     """The terms that `focal_loss` sums: `[...]` and `[...]` -> `[...]` float32.
 
     log p and log(1 - p) are taken from the logits: log(1 - sigmoid(x)) rounds to 0 or
@@ -165,8 +169,8 @@ def focal_loss_per_bin(
 
 
 def _sigmas(
-    boxes: jax.Array, sigma: str, sigma_cells: float
-) -> tuple[jax.Array, jax.Array]:
+    boxes: Float[jax.Array, "*objects _"], sigma: str, sigma_cells: float
+) -> tuple[Float[jax.Array, "*objects"], Float[jax.Array, "*objects"]]:
     """Standard deviations along range and azimuth, in bins: `[..., N]` each."""
     length, width = boxes[..., 3], boxes[..., 4]
     if sigma == "fixed":
@@ -185,7 +189,9 @@ def _sigmas(
     )
 
 
-def _profile(center: jax.Array, sigma: jax.Array, size: int) -> jax.Array:
+def _profile(
+    center: Int[jax.Array, "*objects"], sigma: Float[jax.Array, "*objects"], size: int
+) -> Float[jax.Array, "*objects {size}"]:
     """Unnormalised Gaussians over `size` bins: `[...]` centers -> `[..., size]`."""
     bins = jnp.arange(size, dtype=jnp.float32)
     bins = bins.reshape((1,) * center.ndim + (size,))

@@ -31,6 +31,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 Root = Literal["eigh", "closed_form"]
 Transform = Literal["none", "sqrt", "log1p"]
@@ -40,7 +41,12 @@ _SMALLEST_EIGENVALUE = 1e-12  # as released
 _SMOOTHING_M = 1e-6  # scale below which sqrt(d) is rounded off
 
 
-def gwd(a: jax.Array, b: jax.Array, *, root: Root = "eigh") -> jax.Array:
+def gwd(
+    a: Float[jax.Array, "*#pairs 8"],
+    b: Float[jax.Array, "*#pairs 8"],
+    *,
+    root: Root = "eigh",
+) -> Float[jax.Array, "*pairs"]:
     """Squared 2-Wasserstein distance between the Gaussians of corresponding boxes.
 
     Args:
@@ -73,13 +79,13 @@ def gwd(a: jax.Array, b: jax.Array, *, root: Root = "eigh") -> jax.Array:
 
 
 def gwd_loss(
-    a: jax.Array,
-    b: jax.Array,
+    a: Float[jax.Array, "*#pairs 8"],
+    b: Float[jax.Array, "*#pairs 8"],
     tau: float = 1.65,
     transform: Transform = "sqrt",
     *,
     root: Root = "eigh",
-) -> jax.Array:
+) -> Float[jax.Array, "*pairs"]:
     """1 - 1 / (tau + f(d)) for corresponding boxes, d the distance `gwd`.
 
     Args:
@@ -120,7 +126,9 @@ def gwd_loss(
     return 1 - 1 / (tau + distance)
 
 
-def gaussian_root(boxes: jax.Array) -> jax.Array:
+def gaussian_root(
+    boxes: Float[jax.Array, "*batch 8"],
+) -> Float[jax.Array, "*batch 2 2"]:
     """Square root S of the covariance of boxes: `[..., 8]` -> `[..., 2, 2]`.
 
     Examples:
@@ -131,7 +139,7 @@ def gaussian_root(boxes: jax.Array) -> jax.Array:
     return jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)
 
 
-def _root_entries(boxes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _root_entries(boxes: Float[jax.Array, "*batch 8"]) -> _Matrix:
     """xx, xy and yy of the symmetric S."""
     length, width = boxes[..., 3] / 2, boxes[..., 4] / 2
     sin, cos = boxes[..., 6], boxes[..., 7]
@@ -216,7 +224,11 @@ def _trace_of_root(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @jax.custom_jvp
-def trace_of_root_2x2(xx: jax.Array, xy: jax.Array, yy: jax.Array) -> jax.Array:
+def trace_of_root_2x2(
+    xx: Float[jax.Array, "*batch"],
+    xy: Float[jax.Array, "*batch"],
+    yy: Float[jax.Array, "*batch"],
+) -> Float[jax.Array, "*batch"]:
     """Trace of the symmetric root of [[xx, xy], [xy, yy]], elementwise.
 
     By eigendecomposition, with eigenvalues l clamped at 1e-12. The derivative of the

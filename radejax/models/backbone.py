@@ -11,6 +11,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from radejax.models.cbam import CBAM, CBAMKind
 from radejax.models.layers import (
@@ -41,7 +42,9 @@ class InputStem(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B R A _"]
+    ) -> Float[jax.Array, "B R A {self.features}"]:
         def block(features: int, size: int, name: str) -> ConvGNSiLU:
             return ConvGNSiLU(
                 features,
@@ -88,7 +91,9 @@ class Backbone(nn.Module):
     remat: bool = False
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B R A _"]
+    ) -> Float[jax.Array, "B R A {self.decoder_width}"]:
         wrap = nn.remat if self.remat else lambda module: module
         double_conv, attention = wrap(DoubleConvResidual), wrap(CBAM)
 
@@ -114,7 +119,7 @@ class Backbone(nn.Module):
             x = block(width, f"decoder_{i}")(jnp.concatenate([x, skip], -1))
         return x
 
-    def _start(self, x: jax.Array) -> jax.Array:
+    def _start(self, x: Float[jax.Array, "B R A _"]) -> Float[jax.Array, "B R A _"]:
         width = self.widths[0]
         if self.input_stem:
             return InputStem(

@@ -12,6 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from radejax.models.convolution import product
 from radejax.models.layers import Conv, Dense, uniform_fan_in
@@ -37,7 +38,9 @@ class TransposedConv(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B H W _"]
+    ) -> Float[jax.Array, "B 2*H 2*W {self.features}"]:
         b, height, width, channels = x.shape
         # torch counts the fan-in of a transposed convolution over its outputs.
         init = uniform_fan_in(16 * self.features)
@@ -83,8 +86,12 @@ class CameraNeck(nn.Module):
 
     @nn.compact
     def __call__(
-        self, tokens: jax.Array, has_image: jax.Array, *, train: bool = False
-    ) -> jax.Array:
+        self,
+        tokens: Float[jax.Array, "B h w C"],
+        has_image: Bool[jax.Array, " B"],
+        *,
+        train: bool = False,
+    ) -> Float[jax.Array, "B 4*h 4*w {self.features}"]:
         """Runs the neck.
 
         Args:
@@ -108,8 +115,8 @@ class CameraNeck(nn.Module):
         return x
 
 
-def counted_frames(has_image: jax.Array) -> jax.Array:
-    """`[B, 1, 1, 1]` mask of the frames that enter batch statistics.
+def counted_frames(has_image: Bool[jax.Array, " B"]) -> Bool[jax.Array, "B 1 1 1"]:
+    """Mask of the frames that enter batch statistics.
 
     A batch without any image must not divide by zero; its map is not used.
     """

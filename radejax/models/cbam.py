@@ -11,6 +11,7 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from radejax.models.layers import Conv, ConvGNSiLU, Dense
 
@@ -24,7 +25,7 @@ class ChannelAttention(nn.Module):
     """Scales channels by what a small network makes of their maximum and mean.
 
     The same two-layer network sees the global maximum and the global average; the
-    sigmoid of the sum is the factor. `[B, R, A, C]` -> `[B, R, A, C]`.
+    sigmoid of the sum is the factor.
 
     Attributes:
         reduction: Channels per hidden unit.
@@ -35,7 +36,7 @@ class ChannelAttention(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
         channels = x.shape[-1]
         hidden = max(1, channels // self.reduction)
         squeeze = Dense(hidden, dtype=self.dtype, name="squeeze")
@@ -47,7 +48,7 @@ class ChannelAttention(nn.Module):
 
 
 class SpatialAttention(nn.Module):
-    """Attention of every bin, `[B, R, A, C]` -> `[B, R, A, 1]` in (0, 1).
+    """Attention of every bin, in (0, 1).
 
     A 7x7 convolution over two maps: maximum and mean of the channels.
 
@@ -60,7 +61,7 @@ class SpatialAttention(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A 1"]:
         mean = x.mean(-1, dtype=jnp.float32).astype(self.dtype)
         pooled = [x.max(-1), mean]
         if self.mean_first:
@@ -87,7 +88,7 @@ class CBAM(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
         is_official = self.kind == "official"
         channels = x.shape[-1]
         if is_official:

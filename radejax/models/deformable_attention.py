@@ -20,6 +20,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from radejax.models.deformable_sampling import (
     Sizes,
@@ -53,12 +54,16 @@ class Linear(nn.Module):
         self.kernel = self.param("kernel", self.kernel_init, shape)
         self.bias = self.param("bias", self.bias_init, (self.features,))
 
-    def product(self, x: jax.Array) -> jax.Array:
+    def product(
+        self, x: Float[jax.Array, "*batch {self.features_in}"]
+    ) -> Float[jax.Array, "*batch {self.features}"]:
         """The layer without its bias."""
         x, kernel = x.astype(self.dtype), self.kernel.astype(self.dtype)
         return jnp.matmul(x, kernel, precision=self.precision)
 
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "*batch {self.features_in}"]
+    ) -> Float[jax.Array, "*batch {self.features}"]:
         bias = jnp.expand_dims(self.bias.astype(self.dtype), range(x.ndim - 1))
         return self.product(x) + bias
 
@@ -99,12 +104,12 @@ class DeformableAttention(nn.Module):
 
     def __call__(
         self,
-        query: jax.Array,
-        reference: jax.Array,
-        value: jax.Array,
+        query: Float[jax.Array, "B Q C"],
+        reference: Float[jax.Array, "B Q L _"],
+        value: Float[jax.Array, "B pixels C"],
         sizes: Sizes,
-        is_valid: jax.Array | None = None,
-    ) -> jax.Array:
+        is_valid: Bool[jax.Array, "B pixels"] | None = None,
+    ) -> Float[jax.Array, "B Q C"]:
         """Attention of any queries.
 
         Args:
@@ -130,9 +135,12 @@ class DeformableAttention(nn.Module):
         return self.output_proj(out.reshape(b, queries, -1))
 
     def samples(
-        self, query: jax.Array, reference: jax.Array, sizes: Sizes
-    ) -> tuple[jax.Array, jax.Array]:
-        """Locations `[B, Q, heads, L, P, 2]` and weights `[B, Q, heads, L, P]`."""
+        self,
+        query: Float[jax.Array, "B Q C"],
+        reference: Float[jax.Array, "B Q L _"],
+        sizes: Sizes,
+    ) -> tuple[Float[jax.Array, "B Q heads L P 2"], Float[jax.Array, "B Q heads L P"]]:
+        """Locations and weights."""
         shape = (*query.shape[:2], self.num_heads, self.num_levels, self.num_points)
         offsets = self.sampling_offsets(query).reshape(*shape, 2)
         logits = self.attention_weights(query).reshape(*shape[:3], -1)
@@ -147,12 +155,12 @@ class DeformableAttention(nn.Module):
 
     def lifted(
         self,
-        feature: jax.Array,
-        scale: jax.Array,
-        reference: jax.Array,
-        query_weights: jax.Array,
-        value: jax.Array,
-    ) -> jax.Array:
+        feature: Float[jax.Array, "B N C"],
+        scale: Float[jax.Array, "B N E"],
+        reference: Float[jax.Array, "#B N E 2"],
+        query_weights: Float[jax.Array, "#B N E"],
+        value: Float[jax.Array, "B H W C"],
+    ) -> Float[jax.Array, "B N C"]:
         """Mean attention over the E queries `scale * feature` of each bin.
 
         Args:

@@ -19,6 +19,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 Sizes = Sequence[tuple[int, int]]
 
@@ -27,13 +28,13 @@ _CHUNK_SIZES = {"cpu": 448, "default": 8192}
 
 
 def deformable_attention(
-    value: jax.Array,
+    value: Float[jax.Array, "B pixels heads D"],
     sizes: Sizes,
-    locations: jax.Array,
-    weights: jax.Array,
+    locations: Float[jax.Array, "B Q heads L P 2"],
+    weights: Float[jax.Array, "B Q heads L P"],
     *,
     chunk_size: int = 4096,
-) -> jax.Array:
+) -> Float[jax.Array, "B Q heads*D"]:
     """Weighted sums of bilinear samples, per query and head.
 
     Args:
@@ -89,17 +90,17 @@ def deformable_attention(
 
 
 def lifted_attention(
-    value: jax.Array,
-    offsets: jax.Array,
-    logits: jax.Array,
-    scale: jax.Array,
-    reference: jax.Array,
-    query_weights: jax.Array,
-    offset_bias: jax.Array,
-    logit_bias: jax.Array,
+    value: Float[jax.Array, "B H W heads D"],
+    offsets: Float[jax.Array, "B N heads P 2"],
+    logits: Float[jax.Array, "B N heads P"],
+    scale: Float[jax.Array, "B N E"],
+    reference: Float[jax.Array, "#B N E 2"],
+    query_weights: Float[jax.Array, "#B N E"],
+    offset_bias: Float[jax.Array, "heads P 2"],
+    logit_bias: Float[jax.Array, "heads P"],
     *,
     chunk_size: int,
-) -> jax.Array:
+) -> Float[jax.Array, "B N heads D"]:
     """Weighted mean over a bin's E queries of their attention, per head.
 
     Query e of bin n is `scale[n, e]` times the bin's feature, so its offsets are
@@ -196,7 +197,7 @@ def _head_forward(chunk_size: int, value: jax.Array, *arrays: jax.Array) -> jax.
     *per_bin, offset_bias, logit_bias = arrays
     pixels = value.reshape(-1, value.shape[-1])
 
-    def chunk(parts: tuple[jax.Array, ...]) -> jax.Array:
+    def chunk(parts: Sequence[jax.Array]) -> jax.Array:
         index, share = _lifted_samples(value.shape[:2], parts, offset_bias, logit_bias)
         return _weighted_rows(pixels, index, share)
 
@@ -217,7 +218,7 @@ def _head_backward(chunk_size: int, grad: jax.Array, *saved: jax.Array) -> tuple
     size, bins = value.shape[:2], per_bin[0].shape[0]
     pixels = value.reshape(-1, value.shape[-1])
 
-    def chunk(sums: tuple, arrays: tuple) -> tuple[tuple, tuple]:
+    def chunk(sums: tuple, arrays: tuple) -> tuple[tuple, list[jax.Array]]:
         grad_pixels, grad_offset_bias, grad_logit_bias = sums
         parts, grad = arrays  # grad [n, D]
 
@@ -264,10 +265,10 @@ _lifted_head.defvjp(_lifted_head_forward, _lifted_head_backward)
 def _lifted_samples(
     size: tuple[int, ...],
     parts: Sequence[jax.Array],
-    offset_bias: jax.Array,
-    logit_bias: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Pixel indices and shares `[n, E, P, 4]` of a chunk of n bins."""
+    offset_bias: Float[jax.Array, "P 2"],
+    logit_bias: Float[jax.Array, " P"],
+) -> tuple[Int[jax.Array, "n E P 4"], Float[jax.Array, "n E P 4"]]:
+    """Pixel indices and shares of a chunk of n bins."""
     offsets, logits, scale, reference, query_weights = parts
     height, width = size
     shift = scale[:, :, None, None] * offsets[:, None] + offset_bias[None, None]
@@ -284,8 +285,11 @@ def _lifted_samples(
 
 
 def _corners(
-    x: jax.Array, y: jax.Array, height: int, width: int
-) -> tuple[jax.Array, jax.Array]:
+    x: Float[jax.Array, "*places"],
+    y: Float[jax.Array, "*places"],
+    height: int,
+    width: int,
+) -> tuple[Int[jax.Array, "*places 4"], Float[jax.Array, "*places 4"]]:
     """Row-major indices and bilinear shares `[..., 4]` of the pixels around a place.
 
     Args:
@@ -317,13 +321,19 @@ def wide_dtype(dtype: Any) -> Any:
     return jnp.promote_types(dtype, jnp.float32)
 
 
-def _rows(pixels: jax.Array, index: jax.Array) -> jax.Array:
+def _rows(
+    pixels: Float[jax.Array, "pixels D"], index: Int[jax.Array, "..."]
+) -> Float[jax.Array, "rows D"]:
     # Indices are in the map by construction; not checking them again is faster.
     return pixels.at[index.reshape(-1)].get(mode="promise_in_bounds")
 
 
-def _weighted_rows(pixels: jax.Array, index: jax.Array, share: jax.Array) -> jax.Array:
-    """Sums `[n, D]` of rows of `[pixels, D]` by `[n, ...]` indices and shares."""
+def _weighted_rows(
+    pixels: Float[jax.Array, "pixels D"],
+    index: Int[jax.Array, "n ..."],
+    share: Float[jax.Array, "n ..."],
+) -> Float[jax.Array, "n D"]:
+    """Sums of rows by indices and shares."""
     n = index.shape[0]
     rows = _rows(pixels, index).reshape(n, -1, pixels.shape[-1])
     return jnp.einsum(

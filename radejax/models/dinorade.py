@@ -13,6 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
@@ -85,8 +86,8 @@ class DinoRade(nn.Module):
 
     def __call__(
         self,
-        projection: jax.Array,
-        image: jax.Array | None = None,
+        projection: Float[jax.Array, "B R A DE"],
+        image: Real[jax.Array, "B _ _ _"] | None = None,
         camera: Camera | ReferencePoints | None = None,
         train: bool = False,
     ) -> DetectionMaps:
@@ -127,7 +128,7 @@ class DinoRade(nn.Module):
         maps = self.heads(self.neck(x))
         return radenet.cropped_output(maps, projection, radar)
 
-    def embed(self, image: jax.Array) -> jax.Array:
+    def embed(self, image: Real[jax.Array, "B H W 3"]) -> Float[jax.Array, "B h w C"]:
         """What the image backbone makes of images: `__call__` takes it in their place.
 
         Args:
@@ -180,8 +181,8 @@ class DinoRade(nn.Module):
         return camera
 
     def _camera_map(
-        self, image: jax.Array, reference: ReferencePoints, train: bool
-    ) -> jax.Array:
+        self, image: Real[jax.Array, "B _ _ _"], reference: ReferencePoints, train: bool
+    ) -> Float[jax.Array, "B h w C"]:
         b = image.shape[0]
         is_embedded = tuple(image.shape[1:]) == self.feature_shape
         features = image if is_embedded else self.embed(image)

@@ -12,8 +12,10 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import UserError
+from radejax.core.structures import Array
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.layers import Dense
 from radejax.models.lifting import (
@@ -66,13 +68,13 @@ class Fusion(nn.Module):
     @nn.compact
     def __call__(
         self,
-        radar: jax.Array,
-        elevation: jax.Array,
-        camera: jax.Array | None,
+        radar: Float[jax.Array, "B R A C"],
+        elevation: Float[jax.Array, "B R A D"],
+        camera: Float[jax.Array, "B h w C"] | None,
         reference: ReferencePoints | None,
         *,
         train: bool = False,
-    ) -> jax.Array:
+    ) -> Float[jax.Array, "B R A C"]:
         """Fuses the maps of a batch.
 
         Sows the camera's share of the fused map, averaged over channels, as
@@ -102,7 +104,7 @@ class Fusion(nn.Module):
         scale = weights * reference.is_valid
         mean = query_weights(jnp.asarray(reference.is_valid), self.invalid)
 
-        def per_bin(x: jax.Array) -> jax.Array:
+        def per_bin(x: Real[Array, "_ R A ..."]) -> Real[jax.Array, "_ bins ..."]:
             return jnp.asarray(x).reshape(x.shape[0], r * a, *x.shape[3:])
 
         attention = DeformableAttention(
@@ -128,8 +130,10 @@ class Fusion(nn.Module):
     def _neck(self, name: str) -> DilatedNeck:
         return DilatedNeck(self.num_groups, self.dtype, self.remat, name=name)
 
-    def _camera_share(self, radar: jax.Array, seen: jax.Array) -> jax.Array:
-        """Weight of the camera, `[B, R, A, C or 1]`."""
+    def _camera_share(
+        self, radar: Float[jax.Array, "B R A C"], seen: Float[jax.Array, "B R A C"]
+    ) -> Float[jax.Array, "B R A #C"]:
+        """Weight of the camera, of every channel or of all."""
         c = radar.shape[-1]
         x = jnp.concatenate([radar, seen], -1)
         if self.gate == "bin":
@@ -141,8 +145,10 @@ class Fusion(nn.Module):
             return 1 - gate
         raise UserError(f"gate must be 'channel' or 'bin', got {self.gate!r}")
 
-    def _has_camera(self, reference: ReferencePoints, mean: jax.Array) -> jax.Array:
-        """True `[B or 1, R, A, 1]` where a bin has anything to take from the camera."""
+    def _has_camera(
+        self, reference: ReferencePoints, mean: Float[jax.Array, "B R A E"]
+    ) -> Bool[jax.Array, "_ R A 1"]:
+        """True where a bin has anything to take from the camera."""
         has_camera = mean.sum(-1, keepdims=True) > 0
         if reference.has_image is None:
             return has_camera

@@ -8,6 +8,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError
 
@@ -15,7 +16,9 @@ IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
-def normalize(image: jax.Array, *, standardize: bool = True) -> jax.Array:
+def normalize(
+    image: Real[jax.Array, "B H W 3"], *, standardize: bool = True
+) -> Float[jax.Array, "B H W 3"]:
     """Colours to the scale that ImageNet-trained backbones expect.
 
     Args:

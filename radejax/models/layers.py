@@ -15,7 +15,9 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
+from radejax.core.structures import Array
 from radejax.models.convolution import conv2d, product
 
 Initializer = Callable[..., jax.Array]
@@ -64,7 +66,9 @@ class Conv(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B R A _"]
+    ) -> Float[jax.Array, "B R A {self.features}"]:
         init = uniform_fan_in(self.size**2 * x.shape[-1])
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", init, shape)
@@ -89,7 +93,9 @@ class Dense(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "*batch _"]
+    ) -> Float[jax.Array, "*batch {self.features}"]:
         init = uniform_fan_in(x.shape[-1])
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         bias = self.param("bias", init, (self.features,)).astype(self.dtype)
@@ -112,7 +118,9 @@ class Upsample(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B R A _"]
+    ) -> Float[jax.Array, "B 2*R 2*A {self.features}"]:
         b, r, a, c = x.shape
         # torch counts the fan-in of a transposed convolution over its outputs.
         init = uniform_fan_in(4 * self.features)
@@ -125,8 +133,8 @@ class Upsample(nn.Module):
         return y + jnp.expand_dims(bias, (0, 1, 2))
 
 
-def max_pool(x: jax.Array) -> jax.Array:
-    """Maximum over 2x2 bins, `[B, 2R, 2A, C]` -> `[B, R, A, C]`."""
+def max_pool(x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R//2 A//2 C"]:
+    """Maximum over 2x2 bins."""
     b, r, a, c = x.shape
     return x.reshape(b, r // 2, 2, a // 2, 2, c).max((2, 4))
 
@@ -145,7 +153,7 @@ class GroupNorm(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
         channels = x.shape[-1]
         if channels % self.num_groups:
             raise ValueError(
@@ -159,9 +167,13 @@ class GroupNorm(nn.Module):
 
 
 def group_norm(
-    x: jax.Array, scale: jax.Array, bias: jax.Array, num_groups: int, epsilon: float
-) -> jax.Array:
-    """Group normalisation of `[B, R, A, C]` with scale and bias `[C]`, in float32.
+    x: Float[jax.Array, "B R A C"],
+    scale: Float[Array, " C"],
+    bias: Float[Array, " C"],
+    num_groups: int,
+    epsilon: float,
+) -> Float[jax.Array, "B R A C"]:
+    """Group normalisation with scale and bias, in float32.
 
     Sums run per channel first and are joined into groups after, so that the map is
     read with channels innermost.
@@ -170,9 +182,11 @@ def group_norm(
     x = x.astype(jnp.float32)
     count = r * a * (c // num_groups)
 
-    def over_group(per_channel: jax.Array) -> jax.Array:
+    def over_group(
+        per_channel: Float[jax.Array, "B C"],
+    ) -> Float[jax.Array, "B 1 1 C"]:
         per_group = per_channel.reshape(b, num_groups, -1).sum(-1) / count
-        return jnp.repeat(per_group, c // num_groups, -1)[:, None, None]  # [B,1,1,C]
+        return jnp.repeat(per_group, c // num_groups, -1)[:, None, None]
 
     centered = x - over_group(x.sum((1, 2)))
     variance = over_group(jnp.square(centered).sum((1, 2)))
@@ -200,7 +214,9 @@ class ConvGNSiLU(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B R A _"]
+    ) -> Float[jax.Array, "B R A {self.features}"]:
         x = Conv(
             self.features,
             self.size,
@@ -229,7 +245,9 @@ class DoubleConvResidual(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B R A _"]
+    ) -> Float[jax.Array, "B R A {self.features}"]:
         shortcut = x
         if x.shape[-1] != self.features:
             shortcut = Conv(self.features, 1, dtype=self.dtype, name="shortcut")(x)

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float
 
 from radejax.core.errors import UserError
 from radejax.geometry.calibration import CameraCalibration, ImageKind
@@ -51,6 +52,7 @@ class ReferencePoints(struct.PyTreeNode):
         has_image: `[B]` bool, False for frames without a usable image; None for all.
     """
 
+    # Any leaf passes, see `radejax.geometry.camera.Camera`.
     points: Any
     is_valid: Any
     has_image: Any = None
@@ -100,7 +102,9 @@ class LiftingAxes:
             num_elevation=10,
         )
 
-    def centers_ego(self, num_range: int, num_azimuth: int) -> np.ndarray:
+    def centers_ego(
+        self, num_range: int, num_azimuth: int
+    ) -> Float[np.ndarray, "{num_range} {num_azimuth} {self.num_elevation} 3"]:
         """Query centers `[R, A, E, 3]` in the ego frame, metres."""
         range_m = self.range_m[0] + self.range_m[1] * np.arange(num_range)
         azimuth = np.deg2rad(
@@ -186,8 +190,10 @@ def static_reference_points(
     return reference_points(camera, axes, num_range, num_azimuth, invalid)
 
 
-def query_weights(is_valid: jax.Array, invalid: InvalidRule) -> jax.Array:
-    """Weights `[..., E]` of the mean over a bin's queries.
+def query_weights(
+    is_valid: Bool[jax.Array, "*bins E"], invalid: InvalidRule
+) -> Float[jax.Array, "*bins E"]:
+    """Weights of the mean over a bin's queries.
 
     "drop": equal over the valid ones, all zero where none is. "official": equal over
     all, valid or not.
@@ -219,7 +225,9 @@ class WeightingNetwork(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, elevation: jax.Array) -> jax.Array:
+    def __call__(
+        self, elevation: Float[jax.Array, "B R A D"]
+    ) -> Float[jax.Array, "B R A {self.num_elevation}"]:
         if self.kind == "off":
             return jnp.ones((*elevation.shape[:3], self.num_elevation))
         if self.kind == "mlp":
@@ -237,7 +245,9 @@ class WeightingNetwork(nn.Module):
         return nn.softmax(logits.astype(jnp.float32), -1)
 
 
-def _centers_in_program(axes: LiftingAxes, num_range: int, num_azimuth: int) -> Any:
+def _centers_in_program(
+    axes: LiftingAxes, num_range: int, num_azimuth: int
+) -> Float[Any, "{num_range} {num_azimuth} {axes.num_elevation} 3"]:
     """`centers_ego` as outer products of small tables."""
     unit = dataclasses.replace(axes, range_m=(1.0, 0.0)).centers_ego(1, num_azimuth)
     centers_m = axes.range_m[0] + axes.range_m[1] * np.arange(num_range)

@@ -11,6 +11,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from radejax.models.layers import Conv, ConvGNSiLU, GroupNorm
 
@@ -29,7 +30,7 @@ class DilatedResidual(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
         features = x.shape[-1]
         y = ConvGNSiLU(
             features,
@@ -44,7 +45,7 @@ class DilatedResidual(nn.Module):
 
 
 class Neck(nn.Module):
-    """What every neck has; it keeps shape and width, `[B, R, A, C]` -> `[B, R, A, C]`.
+    """What every neck has; it keeps shape and width.
 
     Attributes:
         num_groups: Groups of the normalisations.
@@ -61,7 +62,7 @@ class DilatedNeck(Neck):
     """Three `DilatedResidual`, of dilation 1, 2 and 3."""
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
         block = nn.remat(DilatedResidual) if self.remat else DilatedResidual
         for i in (1, 2, 3):
             x = block(i, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
@@ -72,7 +73,7 @@ class PlainNeck(Neck):
     """Three `ConvGNSiLU`."""
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
         block, width = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU, x.shape[-1]
         for i in (1, 2, 3):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_type_hints
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from radejax.core import schema
 from radejax.core.errors import DataError, UserError
@@ -71,7 +72,9 @@ class RadeNet(nn.Module):
     heatmap_prior: float = 0.5
 
     @nn.compact
-    def __call__(self, projection: jax.Array, train: bool = False) -> DetectionMaps:
+    def __call__(
+        self, projection: Float[jax.Array, "B R A DE"], train: bool = False
+    ) -> DetectionMaps:
         """Predicts from projections.
 
         Args:
@@ -127,7 +130,9 @@ def check_choices(radar: RadeNet) -> None:
             )
 
 
-def padded_input(projection: jax.Array, radar: RadeNet) -> jax.Array:
+def padded_input(
+    projection: Float[jax.Array, "B R A DE"], radar: RadeNet
+) -> Float[jax.Array, "B Rp Ap DE"]:
     """The projection in the dtype of the computation, padded for the backbone.
 
     Raises:
@@ -145,7 +150,7 @@ def padded_input(projection: jax.Array, radar: RadeNet) -> jax.Array:
 
 
 def cropped_output(
-    maps: DetectionMaps, projection: jax.Array, radar: RadeNet
+    maps: DetectionMaps, projection: Float[jax.Array, "B R A DE"], radar: RadeNet
 ) -> DetectionMaps:
     """The maps, on the projection's bins if `crop_output`."""
     if not radar.crop_output:
@@ -154,8 +159,10 @@ def cropped_output(
     return jax.tree.map(lambda m: m[:, :r, :a], maps)
 
 
-def pad_to_multiple(x: jax.Array, multiple: int) -> jax.Array:
-    """Zero-pads range and azimuth of `[B, R, A, C]` at their ends to a multiple."""
+def pad_to_multiple(
+    x: Float[jax.Array, "B R A C"], multiple: int
+) -> Float[jax.Array, "B Rp Ap C"]:
+    """Zero-pads range and azimuth at their ends to a multiple."""
     pad_range, pad_azimuth = (-x.shape[1] % multiple, -x.shape[2] % multiple)
     return jnp.pad(x, ((0, 0), (0, pad_range), (0, pad_azimuth), (0, 0)))
 

@@ -15,6 +15,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from radejax.models.camera_neck import batch_norm, counted_frames
 from radejax.models.layers import Conv, uniform_fan_in
@@ -37,7 +38,7 @@ class FrozenBatchNorm(nn.Module):
     epsilon: float = 1e-5
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W C"]:
         ones, zeros = nn.initializers.ones, nn.initializers.zeros
         shape = (x.shape[-1],)
         scale, var = self.param("scale", ones, shape), self.param("var", ones, shape)
@@ -65,7 +66,9 @@ class StridedConv(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
+    def __call__(
+        self, x: Float[jax.Array, "B H W _"]
+    ) -> Float[jax.Array, "B h w {self.features}"]:
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", uniform_fan_in(self.size**2 * shape[2]), shape)
         return jax.lax.conv_general_dilated(
@@ -96,8 +99,11 @@ class Bottleneck(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: jax.Array, train: bool, mask: jax.Array | None = None
-    ) -> jax.Array:
+        self,
+        x: Float[jax.Array, "B H W C"],
+        train: bool,
+        mask: Bool[jax.Array, "B 1 1 1"] | None = None,
+    ) -> Float[jax.Array, "B h w {4*self.features}"]:
         def block(x: jax.Array, features: int, size: int, stride: int, name: str):
             x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
             if self.frozen:
@@ -113,7 +119,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNetTrunk(nn.Module):
-    """Stem and first three stages, frozen: `[B, H, W, 3]` -> `[B, H/16, W/16, 1024]`.
+    """Stem and first three stages, frozen: maps of a 16th of the size, rounded up.
 
     Attributes:
         width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
@@ -126,7 +132,9 @@ class ResNetTrunk(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, image: jax.Array) -> jax.Array:
+    def __call__(
+        self, image: Float[jax.Array, "B H W 3"]
+    ) -> Float[jax.Array, "B (H+15)//16 (W+15)//16 {16*self.width}"]:
         x = StridedConv(self.width, 7, 2, self.dtype, name="stem_conv")(image)
         x = nn.relu(FrozenBatchNorm(self.dtype, name="stem_norm")(x))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
@@ -144,7 +152,7 @@ class ResNetTrunk(nn.Module):
 
 
 class ResNetNeck(nn.Module):
-    """Last stage and a 1x1 convolution: `[B, h, w, C]` -> `[B, h/2, w/2, features]`.
+    """Last stage and a 1x1 convolution: maps of half the size, rounded up.
 
     Attributes:
         features: Output channels.
@@ -160,8 +168,12 @@ class ResNetNeck(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: jax.Array, has_image: jax.Array, *, train: bool = False
-    ) -> jax.Array:
+        self,
+        x: Float[jax.Array, "B h w C"],
+        has_image: Bool[jax.Array, " B"],
+        *,
+        train: bool = False,
+    ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
         """As `CameraNeck`: frames without an image do not enter the statistics."""
         mask = counted_frames(has_image)
         for i in range(self.depth):

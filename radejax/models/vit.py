@@ -18,11 +18,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from radejax.core.errors import UserError
 from radejax.models.image import check_image
 
 AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
+
+Rope = tuple[Float[jax.Array, "patches D"], Float[jax.Array, "patches D"]]
+"""Cosines and sines of the rotary embedding, D channels of a head."""
 
 _BLOCK = 256  # queries at a time: the scores of a head stay in cache
 _INIT = nn.initializers.truncated_normal(0.02)
@@ -78,7 +82,9 @@ class ViT(nn.Module):
         return 1 + self.num_registers
 
     @nn.compact
-    def __call__(self, image: jax.Array) -> jax.Array:
+    def __call__(
+        self, image: Float[jax.Array, "B H W 3"]
+    ) -> Float[jax.Array, "B T {self.hidden_size}"]:
         """Tokens of normalised float images `[B, H, W, 3]`, float32."""
         rows, columns = check_image(image.shape, self.patch_size)
         tokens = self._embed(image, rows, columns)
@@ -100,7 +106,9 @@ class ViT(nn.Module):
         tokens, _ = layers(**settings, name="layers")(tokens, rope)
         return _layer_norm(self.epsilon, jnp.float32, "norm")(tokens)
 
-    def _embed(self, image: jax.Array, rows: int, columns: int) -> jax.Array:
+    def _embed(
+        self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
+    ) -> Float[jax.Array, "B T {self.hidden_size}"]:
         """Patches through one linear layer, learned tokens in front."""
         b, size = image.shape[0], self.patch_size
         # Patches do not overlap: the convolution is a product with flat patches.
@@ -133,15 +141,17 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: jax.Array, rope: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, None]:
+        self, x: Float[jax.Array, "B T C"], rope: Rope
+    ) -> tuple[Float[jax.Array, "B T C"], None]:
         y = _layer_norm(self.epsilon, self.dtype, "norm_1")(x)
         x = x + self._scale("scale_1", x) * self._attend(y, rope)
         y = _layer_norm(self.epsilon, self.dtype, "norm_2")(x)
         x = x + self._scale("scale_2", x) * self._mlp(y)
         return x, None
 
-    def _attend(self, x: jax.Array, rope: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def _attend(
+        self, x: Float[jax.Array, "B T C"], rope: Rope
+    ) -> Float[jax.Array, "B T C"]:
         b, t, c = x.shape
         query, key, value = (
             self._dense(c, name, bias)(x).reshape(b, t, self.num_heads, -1)
@@ -152,7 +162,7 @@ class Block(nn.Module):
         y = attend(query, key, value, self.attention).reshape(b, t, c)
         return self._dense(c, "out", self.proj_bias)(y)
 
-    def _mlp(self, x: jax.Array) -> jax.Array:
+    def _mlp(self, x: Float[jax.Array, "B T C"]) -> Float[jax.Array, "B T C"]:
         gelu: Callable = functools.partial(nn.gelu, approximate=False)
         act = {"gelu": gelu, "silu": nn.silu}[self.activation]
         y = self._dense(self.mlp_dim, "up", self.mlp_bias)(x)
@@ -172,7 +182,9 @@ class Block(nn.Module):
             name=name,
         )
 
-    def _scale(self, name: str, x: jax.Array) -> jax.Array:
+    def _scale(
+        self, name: str, x: Float[jax.Array, "B T C"]
+    ) -> Float[jax.Array, "1 1 C"]:
         init = nn.initializers.constant(self.layer_scale)
         scale = self.param(name, init, (x.shape[-1],)).astype(self.dtype)
         return scale[None, None]
@@ -186,9 +198,7 @@ def _layer_norm(epsilon: float, dtype: Any, name: str) -> nn.LayerNorm:
 # Rotary embedding --------------------------------------------------------------------
 
 
-def rotary_angles(
-    rows: int, columns: int, head_dim: int, theta: float = 100.0
-) -> tuple[jax.Array, jax.Array]:
+def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) -> Rope:
     """Cosines and sines of the rotary position embedding of a grid of patches.
 
     The angle of channel i at coordinate p is `2 pi p / theta^(4 i / head_dim)`, with
@@ -235,9 +245,9 @@ def rotary_angles(
 
 
 def rotate(
-    x: jax.Array, rope: tuple[jax.Array, jax.Array], num_prefix: int
-) -> jax.Array:
-    """Turns the patch tokens of `[B, T, heads, head_dim]`; the prefix stays."""
+    x: Float[jax.Array, "B T heads D"], rope: Rope, num_prefix: int
+) -> Float[jax.Array, "B T heads D"]:
+    """Turns the patch tokens; the prefix stays."""
     prefix, patches = x[:, :num_prefix], x[:, num_prefix:]
     cos, sin = (a[None, :, None].astype(jnp.float32) for a in rope)
     wide = patches.astype(jnp.float32)
@@ -250,9 +260,12 @@ def rotate(
 
 
 def attend(
-    query: jax.Array, key: jax.Array, value: jax.Array, kind: AttentionKind = "auto"
-) -> jax.Array:
-    """Softmax attention of `[B, T, heads, head_dim]` arrays, without mask.
+    query: Float[jax.Array, "B T heads D"],
+    key: Float[jax.Array, "B T heads D"],
+    value: Float[jax.Array, "B T heads D"],
+    kind: AttentionKind = "auto",
+) -> Float[jax.Array, "B T heads D"]:
+    """Softmax attention, without mask.
 
     "blocked" takes one head and a block of queries at a time: scores stay in cache,
     six times faster on a CPU than "xla", which is `jax.nn.dot_product_attention` with
@@ -280,7 +293,11 @@ def attend(
     raise UserError(f"attention must be auto, blocked, xla or cudnn, got {kind!r}")
 
 
-def _attend_blocked(query: jax.Array, key: jax.Array, value: jax.Array) -> jax.Array:
+def _attend_blocked(
+    query: Float[jax.Array, "B T heads D"],
+    key: Float[jax.Array, "B T heads D"],
+    value: Float[jax.Array, "B T heads D"],
+) -> Float[jax.Array, "B T heads D"]:
     b, t, heads, d = query.shape
     block = min(_BLOCK, t)
     padding = ((0, 0), (0, -t % block), (0, 0), (0, 0))

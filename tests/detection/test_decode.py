@@ -337,8 +337,6 @@ def test_length_of_the_yaw_vector_scales_boxes_in_nms_only_as_released():
     always = run(raw_yaw="always")
     np.testing.assert_array_equal(always.is_valid, released.is_valid)
     np.testing.assert_allclose(always.boxes[0, 0, 3:5], 6, rtol=1e-6)
-    with pytest.raises(UserError, match=r"decode\.raw_yaw is 'yes', expected"):
-        run(raw_yaw="yes")
 
 
 def test_official_preset_decodes_as_released(case):
@@ -422,6 +420,7 @@ def test_bfloat16_maps_and_saturated_or_missing_numbers():
         assert np.asarray(flat.is_valid).any() == (value > 0)
 
 
+@pytest.mark.wrong_types
 def test_wrong_shapes_are_refused():
     logits, params, _, _ = scattered()
     run = partial(D.decode, max_detections=4, score_threshold=0.3)
@@ -435,6 +434,8 @@ def test_wrong_shapes_are_refused():
         run(maps_of(logits, params), GRID, pre_nms=0)
     with pytest.raises(ValueError, match=r"roi must be \[6\]"):
         run(maps_of(logits, params), GRID, roi=np.zeros(4))
+    with pytest.raises(UserError, match=r"decode\.raw_yaw is 'yes', expected"):
+        run(maps_of(logits, params), GRID, raw_yaw="yes")
 
 
 @pytest.mark.parametrize("raw_yaw", ["nms", "always"])

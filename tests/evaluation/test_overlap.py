@@ -122,7 +122,7 @@ def test_candidates_are_all_overlapping_pairs_of_a_group():
 
 
 def test_no_boxes():
-    none, group = np.zeros((0, 7)), np.zeros(0, int)
+    none, group = np.zeros((0, 7)), np.zeros(1, int)
     one = np.array([[0, 0, 0, 1, 1, 1, 0.0]])
     for a, b in ((none, none), (none, one), (one, none)):
         first, second = overlap.candidate_pairs(group[: len(a)], group[: len(b)], a, b)

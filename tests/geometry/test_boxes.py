@@ -68,6 +68,7 @@ def test_transform_moves_corners_as_points(yaw, x, y):
     np.testing.assert_allclose(moved, B.bev_corners(CAR) @ turn.T + [x, y], atol=1e-9)
 
 
+@pytest.mark.wrong_types
 @pytest.mark.parametrize("function", [B.boxes8_from_7, B.boxes7_from_8, B.bev_corners])
 def test_wrong_width_is_refused(function):
     with pytest.raises(ValueError, match=r"must be \[..., [78]\], got shape \(2, 5\)"):

@@ -225,6 +225,7 @@ def test_calibrations_compare_by_value():
     assert forward_camera() != forward_camera(yaw_deg=89.0)
 
 
+@pytest.mark.wrong_types
 def test_bad_calibrations(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"cam_9\.yml"):
         CameraCalibration.from_kradar(tmp_path / "cam_9.yml")

@@ -168,6 +168,7 @@ def test_bad_axes_are_refused(changes, message):
         dataclasses.replace(KRADAR, **changes)
 
 
+@pytest.mark.wrong_types
 def test_unknown_mapping_is_refused():
     with pytest.raises(ValueError, match="'true' or 'stretched', got 'bent'"):
         KRADAR.padded(8, "bent")

@@ -276,6 +276,7 @@ def test_chunks_do_not_change_the_result():
         assert function(a[:0], b[:0]).shape == (0,)
 
 
+@pytest.mark.wrong_types
 def test_bad_shapes_are_refused():
     with pytest.raises(ValueError, match=r"must be \[..., 7\] or \[..., 8\], got"):
         bev(np.zeros((2, 5)), np.zeros((2, 7)))

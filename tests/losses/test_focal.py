@@ -127,6 +127,7 @@ def test_batches_and_vmap_agree():
     np.testing.assert_allclose(batch, mapped, atol=1e-7)
 
 
+@pytest.mark.wrong_types
 def test_unknown_sigma_is_refused():
     with pytest.raises(ValueError, match="'fixed', 'adaptive' or 'anisotropic', got"):
         F.gaussian_heatmap(
@@ -143,7 +144,7 @@ def test_unknown_sigma_is_refused():
 
 
 def logit(p):
-    return np.log(p) - np.log1p(-np.asarray(p, np.float64))
+    return jnp.asarray(np.log(p) - np.log1p(-np.asarray(p, np.float64)))
 
 
 def naive_focal(p, target, alpha=2, gamma=4):
@@ -186,7 +187,7 @@ def test_batch_is_divided_by_the_number_of_positive_bins():
 def test_without_positive_bins_the_mean_over_all():
     rng = np.random.default_rng(1)
     p, target = rng.uniform(0.01, 0.99, (2, 2, 6, 5, 3))
-    loss = F.focal_loss(logit(p), target)
+    loss = F.focal_loss(logit(p), jnp.asarray(target))
     np.testing.assert_allclose(loss, naive_focal(p, target).mean(), rtol=1e-5)
 
 
@@ -194,7 +195,7 @@ def test_without_positive_bins_the_mean_over_all():
 def test_exponents(alpha, gamma):
     rng = np.random.default_rng(2)
     p, target = rng.uniform(0.01, 0.99, (2, 40))
-    loss = F.focal_loss_per_bin(logit(p), target, alpha, gamma)
+    loss = F.focal_loss_per_bin(logit(p), jnp.asarray(target), alpha, gamma)
     expected = naive_focal(p, target, alpha, gamma)
     np.testing.assert_allclose(loss, expected, rtol=2e-5)
 
@@ -205,10 +206,12 @@ def test_frames_that_fill_up_a_batch_do_not_count(has_positive):
     p, target = rng.uniform(0.01, 0.99, (2, 3, 6, 5, 3)).astype(np.float32)
     target[:, 0, 0, 0] = 1 if has_positive else 0.5
     is_frame_valid = jnp.array([True, True, False])
-    loss = F.focal_loss(logit(p), target, is_frame_valid=is_frame_valid)
-    alone = F.focal_loss(logit(p[:2]), target[:2])
+    loss = F.focal_loss(logit(p), jnp.asarray(target), is_frame_valid=is_frame_valid)
+    alone = F.focal_loss(logit(p[:2]), jnp.asarray(target[:2]))
     np.testing.assert_allclose(loss, alone, rtol=1e-6)
-    none = F.focal_loss(logit(p), target, is_frame_valid=jnp.zeros(3, bool))
+    none = F.focal_loss(
+        logit(p), jnp.asarray(target), is_frame_valid=jnp.zeros(3, bool)
+    )
     assert none == 0
 
 
@@ -232,5 +235,6 @@ def test_gradient_by_finite_differences():
     step = 1e-5
     change = naive_focal(1 / (1 + np.exp(-x - step)), target)
     change -= naive_focal(1 / (1 + np.exp(-x + step)), target)
-    grad = jax.grad(lambda x: F.focal_loss_per_bin(x, target).sum())(x.astype("f4"))
+    wanted = jnp.asarray(target)
+    grad = jax.grad(lambda x: F.focal_loss_per_bin(x, wanted).sum())(x.astype("f4"))
     np.testing.assert_allclose(grad, change / (2 * step), rtol=1e-4, atol=1e-6)

@@ -136,7 +136,9 @@ def test_roots_of_the_released_code(pairs):
     turn = np.array([[0, -1], [1, 0]])
     found = turn @ np.asarray(G.gaussian_root(jnp.asarray(pairs["pred"]))) @ turn.T
     np.testing.assert_allclose(found, pairs["sigma_pred_f64"], atol=1e-4, rtol=1e-5)
-    trace = G.trace_of_root_2x2(*pairs["inner"].reshape(-1, 4).T[[0, 1, 3]])
+    trace = G.trace_of_root_2x2(
+        *jnp.asarray(pairs["inner"].reshape(-1, 4).T[[0, 1, 3]])
+    )
     expected = np.trace(pairs["inner_sqrt_f64"], axis1=1, axis2=2)
     np.testing.assert_allclose(trace, expected, rtol=1e-4, atol=1e-5)
 
@@ -189,8 +191,9 @@ def test_derivative_of_the_trace_of_the_root(matrix):
     root = scipy.linalg.sqrtm(full)
     expected = np.trace(np.linalg.solve(root, change)) / 2
     with jax.enable_x64(True):
-        trace, found = jax.jvp(G.trace_of_root_2x2, matrix, tangent)
-        reverse = jax.grad(G.trace_of_root_2x2, (0, 1, 2))(*matrix)
+        place, step = tuple(jnp.asarray(matrix)), tuple(jnp.asarray(tangent))
+        trace, found = jax.jvp(G.trace_of_root_2x2, place, step)
+        reverse = jax.grad(G.trace_of_root_2x2, (0, 1, 2))(*place)
     np.testing.assert_allclose(trace, np.trace(root))
     np.testing.assert_allclose(found, expected)
     np.testing.assert_allclose(np.dot(reverse, tangent), expected)
@@ -307,6 +310,7 @@ def test_degenerate_boxes_give_finite_values_and_gradients(root, transform, dtyp
     assert np.isfinite(grads).all()
 
 
+@pytest.mark.wrong_types
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -35,7 +35,7 @@ def test_paper_block_is_equations_6_to_9():
     rng = np.random.default_rng(0)
     x = rng.standard_normal((1, 9, 8, 32)).astype(np.float32)
     module = CBAM("paper", 8)
-    variables = module.init(jax.random.key(0), x)
+    variables = module.init(jax.random.key(0), jnp.asarray(x))
     p = jax.tree.map(lambda v: np.asarray(v, np.float64), variables["params"])
 
     def sigmoid(v):
@@ -59,7 +59,8 @@ def test_paper_block_is_equations_6_to_9():
         ]
     )
     expected = y * sigmoid(attention + conv["bias"])[None, ..., None]
-    np.testing.assert_allclose(module.apply(variables, x), expected, atol=1e-5)
+    found = module.apply(variables, jnp.asarray(x))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_paper_block_has_no_convolutions_of_the_map():

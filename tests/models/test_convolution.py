@@ -48,7 +48,8 @@ def test_equals_sum_of_shifted_copies(size, dilation):
 @pytest.mark.parametrize("shape", [(2, 83, 61, 3), (1, 7, 5, 3)])
 @pytest.mark.parametrize(("size", "dilation"), [(1, 1), (3, 1), (3, 3), (7, 1)])
 def test_gradients_equal_those_of_plain_convolution(shape, size, dilation):
-    x, kernel, cotangent = arrays(shape, (size, size, 3, 4), (*shape[:3], 4))
+    shapes = shape, (size, size, 3, 4), (*shape[:3], 4)
+    x, kernel, cotangent = map(jnp.asarray, arrays(*shapes))
 
     def plain(x, kernel):
         p = dilation * (size // 2)
@@ -76,7 +77,9 @@ def test_blocked_kernel_gradient_is_the_sum_over_bins():
         for j in range(3):
             shifted = padded[:, 2 * i : 2 * i + 37, 2 * j : 2 * j + 31]
             expected[i, j] = np.einsum("brac,brad->cd", shifted, grad)
-    actual = blocked_kernel_gradient(x, grad, size=3, dilation=2)
+    actual = blocked_kernel_gradient(
+        jnp.asarray(x), jnp.asarray(grad), size=3, dilation=2
+    )
     np.testing.assert_allclose(actual, expected, atol=5e-4)
 
 
@@ -93,7 +96,7 @@ def test_blocked_kernel_gradient_accumulates_bfloat16_in_float32():
 
 
 def test_vmap_over_kernels_and_gradient_inside():
-    x, kernels = arrays((1, 9, 8, 2), (3, 3, 3, 2, 2))
+    x, kernels = map(jnp.asarray, arrays((1, 9, 8, 2), (3, 3, 3, 2, 2)))
 
     def loss(kernel):
         return jnp.square(conv2d(x, kernel)).sum()

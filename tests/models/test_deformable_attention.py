@@ -165,7 +165,7 @@ def test_reference_module_and_gradients(reference, name, golden):
         layer, kind = key.split(".")
         entry = {"kernel": tensor.T} if kind == "weight" else {"bias": tensor}
         params.setdefault(layer, {}).update(entry)
-    is_valid = ~case["padding_mask"] if info["padding_mask"] else None
+    is_valid = jnp.asarray(~case["padding_mask"]) if info["padding_mask"] else None
 
     def apply(params, query, points, value):
         return module.apply({"params": params}, query, points, value, sizes, is_valid)

@@ -32,7 +32,8 @@ def inputs(seed=0, batch_geometry=True):
     reference = ReferencePoints(
         points=rng.random((n, R, A, E, 2)).astype(np.float32), is_valid=is_valid
     )
-    return normal(B, R, A, C), rng.random((B, R, A, D)), normal(B, H, W, C), reference
+    maps = normal(B, R, A, C), rng.random((B, R, A, D)), normal(B, H, W, C)
+    return (*map(jnp.asarray, maps), reference)
 
 
 def variables_of(module, args):
@@ -41,7 +42,7 @@ def variables_of(module, args):
     rng = np.random.default_rng(1)
     return {
         "params": jax.tree.map(
-            lambda x: 0.4 * rng.standard_normal(x.shape).astype(np.float32),
+            lambda x: jnp.asarray(0.4 * rng.standard_normal(x.shape), jnp.float32),
             shapes["params"],
         )
     }
@@ -50,6 +51,7 @@ def variables_of(module, args):
 def by_the_formulas(module, variables, radar, elevation, camera, reference):
     """Query by query through the plain attention, then the paper's equations."""
     params = jax.tree.map(np.asarray, variables["params"])
+    radar, elevation, camera = map(np.asarray, (radar, elevation, camera))
     dense = lambda x, p: x @ p["kernel"] + p["bias"]  # noqa: E731
     weights = np.ones((B, R, A, E))
     if module.weighting == "mlp":
@@ -63,8 +65,8 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
     attended = attention.apply(
         {"params": params["attention"]},
         jnp.asarray(query.reshape(B, -1, C), jnp.float32),
-        points.reshape(B, -1, 1, 2),
-        camera.reshape(B, H * W, C),
+        jnp.asarray(points.reshape(B, -1, 1, 2)),
+        jnp.asarray(camera.reshape(B, H * W, C)),
         [(H, W)],
     )
     attended = np.asarray(attended).reshape(B, R, A, E, C)

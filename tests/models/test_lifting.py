@@ -159,6 +159,7 @@ def test_a_camera_of_zeros_sees_nothing():
         assert not np.any(reference.is_valid)
 
 
+@pytest.mark.wrong_types
 def test_weights_of_the_mean():
     is_valid = jnp.asarray([[True, False, True, False], [False] * 4])
     np.testing.assert_allclose(
@@ -188,12 +189,12 @@ def test_elevation_weights_sum_to_one(kind):
 def test_mlp_weights_by_formula():
     network = WeightingNetwork(3, "mlp")
     elevation = np.random.default_rng(0).random((1, 2, 2, 5)).astype(np.float32)
-    variables = network.init(jax.random.key(0), elevation)
+    variables = network.init(jax.random.key(0), jnp.asarray(elevation))
     p = jax.tree.map(np.asarray, variables["params"])
     hidden = np.maximum(elevation @ p["hidden"]["kernel"] + p["hidden"]["bias"], 0)
     logits = np.exp(hidden @ p["out"]["kernel"] + p["out"]["bias"])
     np.testing.assert_allclose(
-        network.apply(variables, elevation),
+        network.apply(variables, jnp.asarray(elevation)),
         logits / logits.sum(-1, keepdims=True),
         atol=1e-6,
     )

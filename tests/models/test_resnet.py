@@ -23,10 +23,12 @@ def test_strided_convolution():
     x = np.random.default_rng(0).standard_normal((2, 7, 8, 3)).astype(np.float32)
     for size, stride in ((1, 1), (1, 2), (3, 2), (7, 2)):
         module = resnet.StridedConv(4, size, stride)
-        variables = module.init(jax.random.key(0), x)
+        variables = module.init(jax.random.key(0), jnp.asarray(x))
         kernel = np.asarray(variables["params"]["kernel"])
         np.testing.assert_allclose(
-            module.apply(variables, x), convolved(x, kernel, stride), atol=1e-5
+            module.apply(variables, jnp.asarray(x)),
+            convolved(x, kernel, stride),
+            atol=1e-5,
         )
 
 
@@ -40,7 +42,7 @@ def test_frozen_normalisation_by_its_formula():
     }
     expected = (x - params["mean"]) / np.sqrt(params["var"] + 1e-5)
     expected = expected * params["scale"] + params["bias"]
-    out = resnet.FrozenBatchNorm().apply({"params": params}, x)
+    out = resnet.FrozenBatchNorm().apply({"params": params}, jnp.asarray(x))
     np.testing.assert_allclose(out, expected, atol=1e-6)
 
 
@@ -48,7 +50,7 @@ def test_bottleneck_by_its_parts():
     rng = np.random.default_rng(0)
     x = rng.standard_normal((1, 5, 6, 4)).astype(np.float32)
     block = resnet.Bottleneck(3, stride=2, is_first=True, frozen=True)
-    variables = block.init(jax.random.key(0), x, False)
+    variables = block.init(jax.random.key(0), jnp.asarray(x), False)
     params = jax.tree.map(
         lambda v: np.abs(v + 0.3 * rng.standard_normal(v.shape)).astype(np.float32),
         variables["params"],
@@ -63,7 +65,7 @@ def test_bottleneck_by_its_parts():
     y = np.maximum(part(x, "1"), 0)
     y = np.maximum(part(y, "2", 2), 0)
     expected = np.maximum(part(y, "3") + part(x, "shortcut", 2), 0)
-    out = block.apply({"params": params}, x, False)
+    out = block.apply({"params": params}, jnp.asarray(x), False)
     chex.assert_shape(out, (1, 3, 3, 12))
     np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-4)
 

@@ -63,6 +63,7 @@ def test_blocked_attention_has_the_gradients_of_the_plain_one():
     chex.assert_trees_all_close(blocked, plain, atol=5e-5)
 
 
+@pytest.mark.wrong_types
 def test_unknown_attention_is_refused():
     with pytest.raises(UserError, match="auto, blocked, xla or cudnn"):
         vit.attend(*random_qkv(4), "flash")
@@ -146,6 +147,7 @@ def test_bfloat16_stays_close():
     assert 0 < np.abs(half - exact).max() < 0.1
 
 
+@pytest.mark.wrong_types
 @pytest.mark.parametrize(
     ("shape", "message"),
     [

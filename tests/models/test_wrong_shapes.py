@@ -14,6 +14,8 @@ from radejax.losses.focal import focal_loss, gaussian_heatmap
 from radejax.models.convolution import conv2d
 from radejax.models.deformable_sampling import deformable_attention
 
+pytestmark = pytest.mark.wrong_types
+
 GRID = RadarGrid.reduced(num_doppler=2, num_range=8, num_elevation=2, num_azimuth=4)
 CAMERA = Camera(
     cam_from_ego=jnp.zeros((2, 3, 4)),
