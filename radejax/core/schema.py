@@ -27,10 +27,10 @@ def check(value: Any, hint: Any, where: str, name: str = "") -> Any:
     Args:
         value: Of a JSON file.
         hint: `bool`, `int`, `float`, `str`, `None`, `list[X]`, `tuple[X, ...]`,
-            `dict[str, X]`, `X | Y`, `Literal[...]`, `np.ndarray` (numbers), `Any`; a
-            dataclass: an object with its fields, those with defaults may be missing; a
-            dictionary of hints by key: an object, where keys that end in "?" may be
-            missing and others are left as they are.
+            `dict[str, X]`, `X | Y`, `Literal[...]`, `np.ndarray` (numbers, whose shape
+            is not looked at), `Any`; a dataclass: an object with its fields, those
+            with defaults may be missing; a dictionary of hints by key: an object,
+            where keys that end in "?" may be missing and others are left as they are.
         where: File, for the message; may be empty.
         name: Of the value in it.
 
@@ -61,7 +61,8 @@ def check(value: Any, hint: Any, where: str, name: str = "") -> Any:
             key: check(v, parts[1], where, f"{name}.{key:.40}".removeprefix("."))
             for key, v in value.items()
         }
-    if getattr(hint, "__name__", "") == "ndarray":
+    array = getattr(hint, "array_type", hint)  # of jaxtyping's Float[np.ndarray, "N 7"]
+    if getattr(array, "__name__", "") == "ndarray":
         import numpy as np  # which commands that only check their flags do without
 
         return np.array(check(value, list[float], where, name), np.float64)

@@ -27,7 +27,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 CORPUS = pathlib.Path(__file__).with_name("corpus")
 """Inputs that once broke a reader, `<reader>/<file>...`: read as they are, then damaged."""
 
-MAX_SECONDS = 120.0  # of the wall, on machines with much to do; then the child is killed
+MAX_SECONDS = 120.0  # of the wall, for machines with much to do; then it is killed
 MAX_CPU_SECONDS = 3.0
 MAX_BYTES = 384 << 20  # beyond what the child had: the largest inputs have 4 MiB
 MAX_MESSAGE = 2500  # characters of the one line
