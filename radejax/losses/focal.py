@@ -88,7 +88,9 @@ def gaussian_heatmap(
         columns,
         precision=jax.lax.Precision.HIGHEST,
     )
-    return jnp.minimum(heatmap, 1.0)
+    # Computed once: where compilers join it with what uses it, sums that are nearly one
+    # are positive for one user and not for the next (jax 0.10.0 on CPUs).
+    return jax.lax.optimization_barrier(jnp.minimum(heatmap, 1.0))
 
 
 def focal_loss(
