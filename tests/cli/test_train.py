@@ -69,7 +69,7 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
         ),
         (["--train.batchsize=4"], "did you mean --config.train.batch_size?"),
         (["--learning-rat", "1"], "did you mean --config.train.learning_rate?"),
-        (["--wordkir=a"], "No such option '--wordkir'"),
+        (["--wordkir=a"], "--workdir"),
         (
             ["--config.loss.sigma=foo"],
             "error: config.loss.sigma is 'foo', expected one of 'fixed', 'adaptive'",
