@@ -276,6 +276,7 @@ RULES: dict[str, Rule] = {
     "simulation.label_version": _VERSION,
     "simulation.frames_per_sequence": _COUNT_OR_0,
     "simulation.frame_stride": _COUNT,
+    "simulation.vulnerable_road_users": _number(),
     "simulation.grid": Rule(
         "'kradar' or a mapping of sizes",
         lambda value: value == "kradar" or isinstance(value, Mapping),

@@ -36,8 +36,11 @@ CONDITIONS = (
 )
 
 
-_LATER_FIELDS = {"camera_content": "scene"}
+_LATER_FIELDS = {"camera_content": "scene", "vulnerable_road_users": 1.0}
 """What configs and data sets of earlier versions are without."""
+
+MOST_VULNERABLE = 5.0
+"""Of `vulnerable_road_users`: more would fill the roads with nobody else."""
 
 FULL_SIZE = {
     "grid": "kradar",
@@ -64,6 +67,8 @@ class SimulationConfig:
         label_version: Version of real labels.
         frames_per_sequence: At 10 frames a second; 0 for all of real labels.
         frame_stride: Use every n-th frame of real labels.
+        vulnerable_road_users: Pedestrians, motorcycles and bicycles of procedural scenes,
+            as a multiple of what there is of them on a road of the type.
         grid: Arguments of `RadarGrid.reduced`, or "kradar".
         radar: Fields of `RadarParameters` that differ from its defaults.
         output: "tesseract" for K-Radar's files, "projection" for the projections alone.
@@ -87,6 +92,7 @@ class SimulationConfig:
     label_version: str = "v2.1"
     frames_per_sequence: int = 20
     frame_stride: int = 1
+    vulnerable_road_users: float = 1.0
     grid: str | Mapping[str, Any] = dataclasses.field(
         default_factory=lambda: {
             "num_doppler": 16,
@@ -157,6 +163,11 @@ class SimulationConfig:
                 is_procedural and self.sequences is not None,
                 ".sequences chooses sequences of real labels; procedural ones"
                 " are counted by train_sequences and test_sequences",
+            ),
+            (
+                not 0.0 <= self.vulnerable_road_users <= MOST_VULNERABLE,
+                f".vulnerable_road_users must be from 0 to {MOST_VULNERABLE:g},"
+                f" got {self.vulnerable_road_users!r}",
             ),
             (
                 self.output not in ("tesseract", "projection"),

@@ -79,6 +79,7 @@ class ProceduralSource:
             time=time,
             weather=weather,
             num_frames=self._config.frames_per_sequence,
+            vulnerable_road_users=self._config.vulnerable_road_users,
             rng=np.random.default_rng([self._config.seed, number]),
         )
 

@@ -101,6 +101,7 @@ WRONG = [
     ("simulation.seed", -1),
     ("simulation.output", "video"),
     ("simulation.camera_content", "boxes"),
+    ("simulation.vulnerable_road_users", "many"),
     ("simulation.train_sequences", 2.5),
     ("simulation.label_distance_m", NAN),
     ("simulation.lidar_to_radar_m", [0.0, 0.0]),

@@ -57,6 +57,7 @@ def test_fingerprint_follows_every_change():
         ({"sead": 1}, "unknown simulation field 'sead'"),
         ({"frames_per_sequence": 0}, "frames_per_sequence must be an integer"),
         ({"train_sequences": 2.5}, "train_sequences must be an integer"),
+        ({"vulnerable_road_users": 9.0}, "must be from 0 to 5, got 9.0"),
         ({"train_sequences": 0, "test_sequences": 0}, "no sequences"),
         ({"output": "video"}, "'tesseract' or 'projection', got 'video'"),
         ({"grid": "velodyne"}, "'kradar' or sizes"),

@@ -55,6 +55,11 @@ class Environment:
     trees_per_100m: float = 6.0
     perpendicular: bool = False
 
+    def with_vulnerable(self, times: float) -> Environment:
+        """As many times the pedestrians, motorcycles and bicycles."""
+        names = ("two_wheelers", "pedestrians_per_100m", "bicycles_per_100m")
+        return dataclasses.replace(self, **{n: times * getattr(self, n) for n in names})
+
 
 ENVIRONMENTS = {
     "urban": Environment(

@@ -44,6 +44,7 @@ def make_sequence(
     weather: str,
     num_frames: int,
     rng: np.random.Generator,
+    vulnerable_road_users: float = 1.0,
 ) -> Sequence:
     """A procedural sequence; the same generator state gives the same sequence.
 
@@ -54,8 +55,10 @@ def make_sequence(
         weather: One of K-Radar's seven.
         num_frames: Length at 10 frames a second.
         rng: Source of everything random.
+        vulnerable_road_users: Pedestrians and two-wheelers, as a multiple of the
+            environment's own.
     """
-    law = ENVIRONMENTS[environment]
+    law = ENVIRONMENTS[environment].with_vulnerable(vulnerable_road_users)
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * FRAME_PERIOD_S
     speed = rng.uniform(*law.speed_mps) * _speed_wave(clock, rng)

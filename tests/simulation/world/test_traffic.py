@@ -11,7 +11,7 @@ from radejax.simulation.world.scene import FRAME_PERIOD_S, Road
 from radejax.simulation.world.traffic import make_sequence
 
 
-def sequence(environment="urban", seed=0, num_frames=20):
+def sequence(environment="urban", seed=0, num_frames=20, **options):
     return make_sequence(
         1,
         environment=environment,
@@ -19,6 +19,7 @@ def sequence(environment="urban", seed=0, num_frames=20):
         weather="normal",
         num_frames=num_frames,
         rng=np.random.default_rng(seed),
+        **options,
     )
 
 
@@ -73,6 +74,21 @@ def test_all_classes_and_sedans_everywhere():
             assert 0 in cls
             seen |= cls
     assert seen == set(range(5))
+
+
+def test_vulnerable_road_users_are_as_many_times_more():
+    def counted(times):
+        scenes = [
+            sequence(environment, seed, 1, vulnerable_road_users=times)
+            for environment in ("urban", "university")
+            for seed in range(80)
+        ]
+        return sum(np.bincount(s.tracks.cls, minlength=5) for s in scenes)
+
+    own, more, none = counted(1.0), counted(3.0), counted(0.0)
+    np.testing.assert_allclose(more[2:] / own[2:], 3.0, rtol=0.25)
+    assert own[0] > more[0] > 0.7 * own[0]  # where motorcycles drive no car does
+    assert not none[2:].any()
 
 
 def test_traffic_goes_both_ways_and_parks():
