@@ -33,6 +33,7 @@ ROOMS = (
     "inference.inputs",
     "inference.predict",
     "inference.program",
+    "visualize",
 )
 """Rooms whose annotations have shapes."""
 
