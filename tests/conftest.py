@@ -24,8 +24,6 @@ os.environ.setdefault(
 
 import jax
 
-from radejax.core.config import load_module
-
 # Programs that several tests or processes compile are compiled once in a session; the
 # workers of pytest-xdist inherit the folder.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -93,6 +91,8 @@ def shared() -> pathlib.Path:
 @pytest.fixture(scope="session")
 def make() -> types.ModuleType:
     """Recipes of the radar-camera golden files: seeded weights and inputs."""
+    from radejax.core.config import load_module  # by now --shapes checks its room
+
     return load_module(GOLDEN / "dinorade_make.py")
 
 

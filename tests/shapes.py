@@ -1,19 +1,39 @@
 """Annotations of radejax, shapes of arrays among them, checked while tests run."""
 
+import functools
 from collections.abc import Callable, MutableMapping
 from typing import Any
 
 import beartype
+from flax import linen as nn
+from flax import struct
 from jaxtyping import install_import_hook
 from ml_collections import ConfigDict
 
 ROOMS = (
+    "core.structures",
     "geometry",
     "losses",
     "detection",
     "models",
-    "evaluation.overlap",
-    "evaluation.matching",
+    "evaluation",
+    "data.augment",
+    "data.encoding",
+    "data.frame_table",
+    "data.images",
+    "data.kradar.frame",
+    "data.kradar.write",
+    "data.pipeline",
+    "data.projection",
+    "data.tesseract",
+    "training.sharding",
+    "training.state",
+    "training.step",
+    "simulation",
+    "inference.inputs",
+    "inference.predict",
+    "inference.program",
+    "visualize",
 )
 """Rooms whose annotations have shapes."""
 
@@ -23,10 +43,21 @@ _CHECKED = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function`, which refuses what its annotations do not say.
 
-    Not constructors: JAX rebuilds trees of arrays from shapes, specs and None, and
-    `__post_init__` makes arrays of what it is given.
+    Not constructors of pytrees, which JAX rebuilds from shapes, specs and None, nor
+    those whose `__post_init__` makes arrays of what it is given.
     """
-    return function if function.__name__ == "__init__" else _CHECKED(function)
+    checked = _CHECKED(function)
+    if function.__name__ != "__init__":
+        return checked
+
+    @functools.wraps(function)
+    def init(self: Any, *args: Any, **kwargs: Any) -> Any:
+        is_free = isinstance(self, struct.PyTreeNode | nn.Module) or hasattr(
+            self, "__post_init__"
+        )
+        return (function if is_free else checked)(self, *args, **kwargs)
+
+    return init
 
 
 def install() -> Any:

@@ -3,23 +3,34 @@
 import importlib
 import sys
 import types
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-import radejax.geometry
-
 from . import shapes
+
+Checked = Callable[[str], types.ModuleType]
 
 
 @pytest.fixture
-def boxes(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
-    """`radejax.geometry.boxes`, imported once more, with its annotations checked."""
-    monkeypatch.setattr(radejax.geometry, "boxes", None, raising=False)
-    monkeypatch.delitem(sys.modules, "radejax.geometry.boxes", raising=False)
-    with shapes.install():
-        return importlib.import_module("radejax.geometry.boxes")
+def checked(monkeypatch: pytest.MonkeyPatch) -> Checked:
+    """Imports a module once more, with its annotations checked."""
+
+    def load(name: str) -> types.ModuleType:
+        room, _, last = name.rpartition(".")
+        monkeypatch.setattr(importlib.import_module(room), last, None, raising=False)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        with shapes.install():
+            return importlib.import_module(name)
+
+    return load
+
+
+@pytest.fixture
+def boxes(checked: Checked) -> types.ModuleType:
+    return checked("radejax.geometry.boxes")
 
 
 def test_fitting_arrays_pass(boxes: types.ModuleType) -> None:
@@ -44,3 +55,16 @@ def test_a_wrong_result_is_refused(
     monkeypatch.setattr(boxes, "_checked", lambda boxes, width: boxes[..., 1:])
     with pytest.raises(TypeCheckError, match="return value"):
         boxes.boxes8_from_7(np.zeros((2, 8))[:, :7])
+
+
+def test_a_field_of_a_wrong_shape_is_refused_by_name(checked: Checked) -> None:
+    scene = checked("radejax.simulation.world.scene")
+    flat, kind = np.zeros(2), np.zeros(2, int)
+    assert scene.Reflectors(np.zeros((2, 3)), flat, flat, kind).kind is kind
+    with pytest.raises(TypeCheckError, match="parameter 'kind'"):
+        scene.Reflectors(np.zeros((2, 3)), flat, flat, kind[:1])
+
+
+def test_trees_are_rebuilt_of_any_leaves(checked: Checked) -> None:
+    maps = checked("radejax.core.structures").DetectionMaps(None, "spec")
+    assert maps.box_params == "spec"

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 from flax import struct
+from jaxtyping import Bool, Float, Int, Real, Shaped
 
 Array = jax.Array | np.ndarray
 
@@ -43,21 +44,24 @@ class Batch(struct.PyTreeNode):
     """One batch of frames as the pipeline delivers it and the losses consume it.
 
     Attributes:
-        projection: `[B, R, A, D+E]` normalised projections, Doppler channels first.
-        boxes: `[B, N, 8]` x, y, z, l, w, h, sin yaw, cos yaw; full extents.
-        classes: `[B, N]` int32 class indices; any value where not `is_valid`.
-        is_valid: `[B, N]` bool, True where a box is an object and not padding.
-        frame: `[B]` int32 index of the frame in its data set.
-        image: `[B, H, W, 3]` uint8 left front camera image, or None.
+        projection: Normalised projections as they are stored, D Doppler channels first,
+            then E of elevation.
+        boxes: x, y, z, l, w, h, sin yaw, cos yaw; full extents; float32.
+        classes: int32 class indices; any value where not `is_valid`.
+        is_valid: True where a box is an object and not padding.
+        frame: int32 index of the frame in its data set; -1 where the batch is filled up.
+        image: `[B, H, W, 3]` uint8 left front camera images, or what the image backbone
+            made of them; or None.
         camera: Pytree of `[B, ...]` arrays that describe the camera, or None.
     """
 
-    projection: Array
-    boxes: Array
-    classes: Array
-    is_valid: Array
-    frame: Array
-    image: Array | None = None
+    # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
+    projection: Real[Array, "B R A DE"]
+    boxes: Float[Array, "B N 8"]
+    classes: Int[Array, "B N"]
+    is_valid: Bool[Array, "B N"]
+    frame: Int[Array, " B"]
+    image: Real[Array, "B _ _ _"] | None = None
     camera: object | None = None
 
 
@@ -65,42 +69,44 @@ class DetectionMaps(struct.PyTreeNode):
     """What a detector predicts for every range-azimuth bin.
 
     Attributes:
-        heatmap_logits: `[B, R, A, C]` center-point logits, before the sigmoid.
-        box_params: `[B, R, A, 8]` raw dx, dy, dz, l, w, h, sin yaw, cos yaw.
+        heatmap_logits: Center-point logits, before the sigmoid.
+        box_params: Raw dx, dy, dz, l, w, h, sin yaw, cos yaw.
     """
 
-    heatmap_logits: jax.Array
-    box_params: jax.Array
+    heatmap_logits: Float[jax.Array, "B R A C"]
+    box_params: Float[jax.Array, "B R A 8"]
 
 
 class Detections(struct.PyTreeNode):
     """Boxes of a batch, by descending score, padded to a fixed number K.
 
     Attributes:
-        boxes: `[B, K, 7]` x, y, z, l, w, h, yaw.
-        scores: `[B, K]` in [0, 1]; 0 where not `is_valid`.
-        classes: `[B, K]` int32 class indices; -1 where not `is_valid`.
-        is_valid: `[B, K]` bool, True where a row is a detection.
-        num_cut: `[B]` int32 peaks above the score threshold that did not fit in K.
+        boxes: x, y, z, l, w, h, yaw.
+        scores: In [0, 1]; 0 where not `is_valid`.
+        classes: int32 class indices; -1 where not `is_valid`.
+        is_valid: True where a row is a detection.
+        num_cut: int32 peaks above the score threshold that did not fit in K.
         class_names: Names of the class indices, the detector's; static under `jit`.
             The methods take others in their place.
     """
 
-    boxes: jax.Array
-    scores: jax.Array
-    classes: jax.Array
-    is_valid: jax.Array
-    num_cut: jax.Array
+    boxes: Float[jax.Array, "B K 7"]
+    scores: Float[jax.Array, "B K"]
+    classes: Int[jax.Array, "B K"]
+    is_valid: Bool[jax.Array, "B K"]
+    num_cut: Int[jax.Array, " B"]
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
     @property
-    def num_clipped(self) -> np.ndarray:
-        """`[B]` detections of a size that was regressed below `MIN_SIZE_M`."""
+    def num_clipped(self) -> Int[np.ndarray, " B"]:
+        """Detections of every frame of a size that was regressed below `MIN_SIZE_M`."""
         sizes = np.asarray(self.boxes)[..., 3:6]
         is_clipped = (sizes <= np.float32(MIN_SIZE_M)).any(-1)
         return (is_clipped & np.asarray(self.is_valid)).sum(-1)
 
-    def to_columns(self, classes: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def to_columns(
+        self, classes: Sequence[str] | None = None
+    ) -> dict[str, Shaped[np.ndarray, "N ..."]]:
         """The valid rows of all frames as plain columns, as evaluation takes them.
 
         Returns:

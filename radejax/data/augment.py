@@ -12,10 +12,12 @@ from typing import Any
 
 import chex
 import numpy as np
+from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError
 from radejax.data.encoding import decode, encode
 from radejax.data.projection import LOG_SCALE_DB
+from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 
 Sample = dict[str, Any]
@@ -102,20 +104,17 @@ def mirror(sample: Sample) -> Sample:
     }
 
 
-def mirror_boxes(boxes: np.ndarray) -> np.ndarray:
-    """Boxes `[..., 8]` on the other side: y and sin yaw change sign."""
+def mirror_boxes(boxes: Float[np.ndarray, "*batch 8"]) -> Float[np.ndarray, "*batch 8"]:
+    """Boxes on the other side: y and sin yaw change sign."""
     chex.assert_axis_dimension(boxes, -1, 8)
     return boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype)
 
 
-def mirror_camera(camera: Any) -> Any:
+def mirror_camera(camera: Camera) -> Camera:
     """The camera that sees a mirrored world as the mirrored image.
 
     With M = diag(-1, 1, 1) on camera axes: p_cam' = M [R | t] (x, -y, z, 1), and
     u' = W - u. The lens term p2 is odd in x.
-
-    Args:
-        camera: `geometry.camera.Camera` of one frame.
     """
     cam_from_ego = np.array(camera.cam_from_ego)
     cam_from_ego[..., 0, :] *= -1
@@ -130,18 +129,21 @@ def mirror_camera(camera: Any) -> Any:
 
 
 def add_range_gain(
-    projection: np.ndarray, grid: RadarGrid, gain_db: float, slope_db: float
-) -> np.ndarray:
+    projection: Real[np.ndarray, "R A DE"],
+    grid: RadarGrid,
+    gain_db: float,
+    slope_db: float,
+) -> Real[np.ndarray, "R A DE"]:
     """A projection received with another gain: gain + slope * range / largest range.
 
     Args:
-        projection: `[R, A, D+E]` in the type of the records.
+        projection: In the type of the records.
         grid: Its sensor axes.
         gain_db: At all ranges, decibels of power.
         slope_db: At the last range, in addition.
 
     Returns:
-        `[R, A, D+E]` in the same type; 8-bit values are clipped to their scale.
+        In the same type; 8-bit values are clipped to their scale.
     """
     chex.assert_shape(projection, grid.projection_shape)
     db = gain_db + slope_db * grid.range_m / grid.range_m[-1]

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Int, Real
 
 from radejax.core import schema
 from radejax.core.errors import UserError
@@ -86,8 +87,7 @@ class CameraInputs:
         options: That they were made with.
         features: What an image backbone made of the images, in their place, or None.
         image_paths: Front image of every frame, None where it is missing.
-        feature_record: `[F]` index of each frame's features, -1 where it has none; or
-            None.
+        feature_record: Index of each frame's features, -1 where it has none; or None.
     """
 
     cameras: tuple[Camera, ...]
@@ -95,15 +95,15 @@ class CameraInputs:
     options: CameraOptions
     features: ArrayRecords | None
     image_paths: tuple[pathlib.Path | None, ...]
-    feature_record: np.ndarray | None
+    feature_record: Int[np.ndarray, " F"] | None
 
-    def empty_images(self, count: int) -> np.ndarray:
+    def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
         """Black images `[count, H, W, 3]` uint8, or zero features."""
         if self.features is not None:
             return np.zeros((count, *self.features.shape), self.features.dtype)
         return np.zeros((count, *self.image_size, 3), np.uint8)
 
-    def image(self, index: int) -> np.ndarray:
+    def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
         """Image (or features) of a frame, black where it is missing."""
         record, path = self.feature_record, self.image_paths[index]
         if self.features is None and path is not None:
@@ -195,7 +195,7 @@ def camera_inputs(
 
 
 def _check_embedded(
-    frames: FrameSequence, record: np.ndarray, features: ArrayRecords
+    frames: FrameSequence, record: Int[np.ndarray, " F"], features: ArrayRecords
 ) -> None:
     """`UserError` for frames whose image is there but was not embedded."""
     forgotten = [

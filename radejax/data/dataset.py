@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from radejax.core.errors import UserError
 from radejax.data.kradar.dataset import KRadar
@@ -19,6 +20,7 @@ from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 
+@runtime_checkable
 class LabelledFrame(Protocol):
     """One frame, a dataclass; to be pickled, as other processes project it.
 
@@ -26,8 +28,8 @@ class LabelledFrame(Protocol):
         key: Name that is unique in the data set; of `sequence` and `name`.
         environment, time, weather: Conditions, by which results are tabulated.
         is_simulated: Nothing of it was measured.
-        boxes: `[N, 7]` x, y, z, l, w, h, yaw in the radar frame: metres, radians.
-        classes: `[N]` class names of `boxes`.
+        boxes: x, y, z, l, w, h, yaw in the radar frame: metres, radians.
+        classes: Class names of `boxes`.
         radar_path: File of the radar tensor; None where it is missing.
         camera_path: Picture of the (left) front camera; None where there is none.
         camera_calibration_path: Its calibration, or None.
@@ -51,9 +53,9 @@ class LabelledFrame(Protocol):
     @property
     def is_simulated(self) -> bool: ...
     @property
-    def boxes(self) -> np.ndarray: ...
+    def boxes(self) -> Float[np.ndarray, "N 7"]: ...
     @property
-    def classes(self) -> np.ndarray: ...
+    def classes(self) -> Shaped[np.ndarray, " N"]: ...
     @property
     def radar_path(self) -> pathlib.Path | None: ...
     @property
@@ -67,8 +69,8 @@ class LabelledFrame(Protocol):
 
     def read_projection(
         self, grid: RadarGrid, timings: dict[str, float] | None = None
-    ) -> np.ndarray:
-        """`[R, A, D+E]` projection; seconds of reading are added to "reading"."""
+    ) -> Float[np.ndarray, "R A DE"]:
+        """Projection; seconds of reading are added to "reading"."""
 
     def read_calibration(
         self, ego_from_lidar_m: tuple[float, ...] | None = None
@@ -76,6 +78,7 @@ class LabelledFrame(Protocol):
         """Of the camera; `radar_from_lidar_m` stands where no offset is given."""
 
 
+@runtime_checkable
 class LabelledFrames(Protocol):
     """Frames in a fixed order.
 

@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Array, Batch
@@ -32,7 +33,9 @@ def check_encoding(name: str) -> str:
     return str(name)
 
 
-def encode(projection: np.ndarray, encoding: str) -> np.ndarray:
+def encode(
+    projection: Float[np.ndarray, "*axes"], encoding: str
+) -> Real[np.ndarray, "*axes"]:
     """A float projection in the type of the records.
 
     uint8 stores round(255 p) of p clipped to [0, 1]: 0 dB is where power is 0.76, far
@@ -43,31 +46,28 @@ def encode(projection: np.ndarray, encoding: str) -> np.ndarray:
     return projection.astype(encoding)
 
 
-def num_clipped(projection: np.ndarray, encoding: str) -> int:
+def num_clipped(projection: Float[np.ndarray, "..."], encoding: str) -> int:
     """Number of values that an encoding cannot represent and clips."""
     if encoding != "uint8":
         return 0
     return int(((projection < 0.0) | (projection > 1.0)).sum())
 
 
-def decode(stored: np.ndarray) -> np.ndarray:
+def decode(stored: Real[np.ndarray, "*axes"]) -> Float[np.ndarray, "*axes"]:
     """Inverse of `encode` on the host: float32."""
     if stored.dtype == np.uint8:
         return stored.astype(np.float32) / np.float32(255.0)
     return stored.astype(np.float32)
 
 
-def to_float(projection: Array) -> jax.Array:
+def to_float(projection: Real[Array, "*axes"]) -> Float[jax.Array, "*axes"]:
     """`decode` on the device: stored values of a batch to float32 network input.
 
     Batches travel in the type of the records (a quarter to a half of the bytes); the
     jitted train step starts with this cast.
 
     Args:
-        projection: `[...]` uint8 (p = q / 255), float16, bfloat16 or float32.
-
-    Returns:
-        `[...]` float32.
+        projection: uint8 (p = q / 255), float16, bfloat16 or float32.
     """
     values = jnp.asarray(projection).astype(jnp.float32)
     return values / 255.0 if projection.dtype == jnp.uint8 else values

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import chex
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
@@ -22,16 +23,16 @@ class FrameTable:
 
     Attributes:
         records: Projections, of these frames at least.
-        record: `[F]` int64 index of each frame's record.
-        boxes: `[F, N, 8]` float32 x, y, z, l, w, h, sin yaw, cos yaw; zeros as padding.
-        classes: `[F, N]` int32 class indices; -1 as padding.
+        record: int64 index of each frame's record.
+        boxes: float32 x, y, z, l, w, h, sin yaw, cos yaw; zeros as padding.
+        classes: int32 class indices; -1 as padding.
         images: Images and cameras of the frames, or None for the radar alone.
     """
 
     records: RecordSource
-    record: np.ndarray
-    boxes: np.ndarray
-    classes: np.ndarray
+    record: Int[np.ndarray, " F"]
+    boxes: Float[np.ndarray, "F N 8"]
+    classes: Int[np.ndarray, "F N"]
     images: CameraInputs | None = None
 
     def __post_init__(self) -> None:
@@ -44,8 +45,8 @@ class FrameTable:
         return len(self.record)
 
     @property
-    def is_valid(self) -> np.ndarray:
-        """`[F, N]` bool, True where a row is an object."""
+    def is_valid(self) -> Bool[np.ndarray, "F N"]:
+        """True where a row is an object."""
         return self.classes >= 0
 
 

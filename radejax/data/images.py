@@ -6,6 +6,7 @@ import io
 import pathlib
 
 import numpy as np
+from jaxtyping import UInt8
 
 from radejax.core.errors import DataError
 from radejax.data.dataset import LabelledFrame
@@ -19,8 +20,8 @@ IMAGE_SIZE = (720, 1280)
 
 def read_left_image(
     path: pathlib.Path, size: tuple[int, int] = IMAGE_SIZE, *, resize: bool = False
-) -> np.ndarray:
-    """`[H, W, 3]` uint8 left half of a front image (a stereo pair, or left only).
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Left half of a front image (a stereo pair, or left only).
 
     Args:
         path: Of the picture file. More than twice as wide as high: a stereo pair.
@@ -61,8 +62,8 @@ def read_left_image(
 
 def front_view(
     frame: LabelledFrame,
-) -> tuple[np.ndarray | None, CameraCalibration | None]:
-    """Left front image `[H, W, 3]` uint8 of a frame and its calibration, to draw.
+) -> tuple[UInt8[np.ndarray, "H W 3"] | None, CameraCalibration | None]:
+    """Left front image of a frame and its calibration, to draw.
 
     Images of another size than the calibration's are resized to it. None where there is
     none.

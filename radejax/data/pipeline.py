@@ -12,6 +12,7 @@ from typing import Any
 import grain
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
@@ -135,8 +136,8 @@ def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
 
 def _make_order(
     num_frames: int, options: LoaderOptions
-) -> grain.MapDataset[np.ndarray]:
-    """Batches of `[B, 2]` frame index and augmentation seed of one process.
+) -> grain.MapDataset[Int[np.ndarray, "B 2"]]:
+    """Batches of frame index and augmentation seed of one process.
 
     Frame indices from `num_frames` on are padding.
     """
@@ -169,7 +170,9 @@ def _make_order(
 class _AddSeed(grain.transforms.RandomMap):
     """Gives every drawn frame a seed of its own for augmentation."""
 
-    def random_map(self, element: int, rng: np.random.Generator) -> np.ndarray:
+    def random_map(
+        self, element: int, rng: np.random.Generator
+    ) -> Int[np.ndarray, "2"]:
         return np.array([element, rng.integers(2**62)], np.int64)
 
 
@@ -182,7 +185,7 @@ class _Share(grain.transforms.Map):
     def __repr__(self) -> str:
         return "_Share()"
 
-    def map(self, element: np.ndarray) -> np.ndarray:
+    def map(self, element: Int[np.ndarray, "B 2"]) -> Int[np.ndarray, "b 2"]:
         return np.array_split(element, self._count)[self._index]
 
 
@@ -197,16 +200,16 @@ class _LoadBatch(grain.transforms.Map):
     def __repr__(self) -> str:
         return "_LoadBatch()"
 
-    def map(self, element: np.ndarray) -> Batch:
+    def map(self, element: Int[np.ndarray, "B 2"]) -> Batch:
         cameras: list[Camera] = []
         batch = self._empty(len(element))
-        for row, (index, seed) in enumerate(element):
+        for row, (index, seed) in enumerate(element.tolist()):
             if index >= len(self._table):
                 cameras.append(self._no_camera)
                 continue
             sample = self._sample(index)
             if self._augment is not None:
-                sample = self._augment(sample, np.random.default_rng(int(seed)))
+                sample = self._augment(sample, np.random.default_rng(seed))
             batch.projection[row] = sample["projection"]
             batch.boxes[row] = sample["boxes"]
             batch.classes[row] = self._table.classes[index]

@@ -15,6 +15,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError
 
@@ -27,7 +28,9 @@ MAX_LEVEL = 100.0
 """Beyond any projection: float64's largest power is at 17, the floor at -0.54."""
 
 
-def project(tesseract: np.ndarray, *, dtype: Any = np.float32) -> np.ndarray:
+def project(
+    tesseract: Real[np.ndarray, "D R E A"], *, dtype: Any = np.float32
+) -> Float[np.ndarray, "R A D+E"]:
     """Tensor max projection of one tesseract, in one pass over its memory.
 
     Channels are the maximum over elevation of every Doppler bin, then the maximum over
@@ -35,13 +38,13 @@ def project(tesseract: np.ndarray, *, dtype: Any = np.float32) -> np.ndarray:
     p = (10 log10(power + 1e-10) + 1.2) / 184.3.
 
     Args:
-        tesseract: `[D, R, E, A]` linear power; any real dtype and memory order, read
+        tesseract: Linear power; any real dtype and memory order, read
             fastest as `scipy.io.loadmat` lays it out (column-major) or C-contiguous.
         dtype: Of the result. The logarithm is computed in float32, or in float64 for
             float64 input.
 
     Returns:
-        `[R, A, D+E]` projection.
+        The projection.
 
     Raises:
         UserError: The tesseract does not have four axes of at least one bin.
@@ -71,24 +74,23 @@ def project(tesseract: np.ndarray, *, dtype: Any = np.float32) -> np.ndarray:
 
 
 def project_columns(
-    columns: Iterable[np.ndarray], *, dtype: Any = np.float32
-) -> np.ndarray:
+    columns: Iterable[Float[np.ndarray, "E R D"]], *, dtype: Any = np.float32
+) -> Float[np.ndarray, "R A DE"]:
     """`project` for a tesseract that arrives column by column, as files store it.
 
     Args:
-        columns: For every azimuth a C-contiguous `[E, R, D]` slab of linear power.
+        columns: For every azimuth a C-contiguous slab of linear power.
             A slab is used up before the next is asked for: the buffer may be the same.
         dtype: Of the result.
-
-    Returns:
-        `[R, A, D+E]` projection.
     """
     levels = [_project_slab(column, _column_maxima) for column in columns]
     return np.stack(levels, axis=1).astype(dtype, order="C", copy=False)
 
 
-def _project_slab(slab: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.ndarray:
-    """`[.., D+E]` projection of one azimuth or one range, in the slab's precision.
+def _project_slab(
+    slab: Float[np.ndarray, "_ _ _"], reduce: Callable[..., np.ndarray]
+) -> Float[np.ndarray, "_ DE"]:
+    """Projection of one azimuth or one range, in the slab's precision.
 
     Non-negative floats order like the unsigned integers of the same bits, which NumPy
     reduces twice as fast, as it need not watch for NaN; a NaN is the largest either
@@ -102,8 +104,8 @@ def _project_slab(slab: np.ndarray, reduce: Callable[..., np.ndarray]) -> np.nda
     return to_log_scale(power.view(slab.dtype))
 
 
-def _column_maxima(column: np.ndarray) -> np.ndarray:
-    """`[R, D+E]` maxima of one azimuth, a C-contiguous `[E, R, D]` slab."""
+def _column_maxima(column: Real[np.ndarray, "E R D"]) -> Real[np.ndarray, "R D+E"]:
+    """Maxima of one azimuth, a C-contiguous slab."""
     elevation, range_, doppler = column.shape
     # For many short contiguous rows reduceat has a fraction of reduce's overhead.
     starts = np.arange(elevation * range_) * doppler
@@ -112,12 +114,12 @@ def _column_maxima(column: np.ndarray) -> np.ndarray:
     return np.concatenate([column.max(axis=0), over_doppler.T], axis=-1)
 
 
-def _row_maxima(row: np.ndarray) -> np.ndarray:
-    """`[A, D+E]` maxima of one range, a `[D, E, A]` slab in any memory order."""
+def _row_maxima(row: Real[np.ndarray, "D E A"]) -> Real[np.ndarray, "A D+E"]:
+    """Maxima of one range, a slab in any memory order."""
     return np.concatenate([row.max(axis=1).T, row.max(axis=0).T], axis=-1)
 
 
-def to_log_scale(power: np.ndarray) -> np.ndarray:
+def to_log_scale(power: Float[np.ndarray, "*cells"]) -> Float[np.ndarray, "*cells"]:
     """Linear power to the normalised decibels that the networks see."""
     level = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
@@ -125,7 +127,9 @@ def to_log_scale(power: np.ndarray) -> np.ndarray:
     return level
 
 
-def project_plain(tesseract: np.ndarray) -> np.ndarray:
+def project_plain(
+    tesseract: Real[np.ndarray, "D R E A"],
+) -> Float[np.ndarray, "R A D+E"]:
     """The formula as released: logarithm of every cell, transpose, two maxima.
 
     Slow; the reference that `project` is tested and timed against.
@@ -136,8 +140,10 @@ def project_plain(tesseract: np.ndarray) -> np.ndarray:
 
 
 @jax.jit
-def project_jax(tesseract: jax.Array) -> jax.Array:
-    """`project` for accelerators: `[..., D, R, E, A]` to `[..., R, A, D+E]`, float32.
+def project_jax(
+    tesseract: Real[jax.Array, "*frames D R E A"],
+) -> Float[jax.Array, "*frames R A D+E"]:
+    """`project` for accelerators, float32.
 
     Leading axes are frames. Jit-compiled; maxima first, as on the host.
     """

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
+from jaxtyping import Float, Real
 
 from radejax.core.archives import DEFLATE_RATIO, read_npy
 from radejax.core.errors import DataError
@@ -25,8 +26,8 @@ VARIABLE = "arrDREA"
 
 def read_tesseract(
     path: str | os.PathLike, *, shape_drea: tuple[int, ...] | None = None
-) -> np.ndarray:
-    """A tesseract as it is stored: `[D, R, E, A]` linear power, column-major.
+) -> Real[np.ndarray, "D R E A"]:
+    """A tesseract as it is stored: linear power, column-major.
 
     Args:
         path: `tesseract_*.mat` with the variable `arrDREA`.
@@ -56,7 +57,7 @@ def project_file(
     shape_drea: tuple[int, ...] | None = None,
     dtype: Any = np.float32,
     timings: dict[str, float] | None = None,
-) -> np.ndarray:
+) -> Float[np.ndarray, "R A DE"]:
     """`projection.project` of a file; arguments and errors as in `read_tesseract`.
 
     An uncompressed MATLAB v5 file is streamed: every azimuth is reduced while it is in
@@ -64,9 +65,6 @@ def project_file(
     disk sector would kill the process instead of raising an error.)
 
     `timings["reading"]`, if given, grows by the seconds that reading took.
-
-    Returns:
-        `[R, A, D+E]` projection.
     """
     timings = {"reading": 0.0} if timings is None else timings
     with _open(path) as file, _damage_named(path):
@@ -89,8 +87,11 @@ def project_file(
 
 
 def _read_slabs(
-    file: io.FileIO, slab: np.ndarray, count: int, timings: dict[str, float]
-) -> Iterator[np.ndarray]:
+    file: io.FileIO,
+    slab: Real[np.ndarray, "E R D"],
+    count: int,
+    timings: dict[str, float],
+) -> Iterator[Real[np.ndarray, "E R D"]]:
     """The next `count` slabs of a file, all in the same buffer."""
     view = slab.data.cast("B")
     for i in range(count):
@@ -173,7 +174,7 @@ def check_tesseract(
 
 def read_projection_npy(
     path: str | os.PathLike, *, projection_shape: tuple[int, ...] | None = None
-) -> np.ndarray:
+) -> Float[np.ndarray, "R A DE"]:
     """A projection as the released code writes it, channels moved last.
 
     Args:
@@ -181,7 +182,7 @@ def read_projection_npy(
         projection_shape: `(R, A, D+E)` that the sensor's grid demands; None: any.
 
     Returns:
-        `[R, A, D+E]` array in the type of the file.
+        The array in the type of the file.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -215,8 +216,8 @@ def read_projection_npy(
 
 def read_frame(
     path: str | pathlib.Path, grid: RadarGrid, timings: dict[str, float] | None = None
-) -> np.ndarray:
-    """`[R, A, D+E]` float32 projection of a tesseract file or a released projection.
+) -> Float[np.ndarray, "R A DE"]:
+    """float32 projection of a tesseract file or a released projection.
 
     Args:
         path: Of the file.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from radejax.core.structures import CLASSES
-from radejax.evaluation.columns import Columns
+from radejax.evaluation.columns import AnyColumns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT, PROTOCOLS, RECOMMENDED
 from radejax.evaluation.result import SPACES, Result, mean_ap
@@ -27,13 +27,13 @@ __all__ = [
 
 
 def evaluate(
-    ground_truth: Columns,
-    predictions: Columns,
+    ground_truth: AnyColumns,
+    predictions: AnyColumns,
     *,
     classes: Sequence[str] = CLASSES,
     iou_thresholds: Sequence[float] | float = (0.3,),
     protocol: str = "kradar_r40",
-    frames: Columns | None = None,
+    frames: AnyColumns | None = None,
     skip_empty: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
     roi: str | Sequence[float] | None = None,

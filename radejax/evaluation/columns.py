@@ -11,6 +11,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Real, Shaped
+from numpy.typing import ArrayLike
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS
@@ -22,6 +24,9 @@ KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 
 Columns = Mapping[str, np.ndarray]
 """A table: frames, ground truth or predictions by the name of the column."""
+
+AnyColumns = Mapping[str, ArrayLike]
+"""The same as users hold it: lists will do."""
 
 
 _LONGEST_NAME = 200
@@ -54,23 +59,23 @@ class Objects:
     """Boxes of many frames, sorted by frame, then class, then the caller's order.
 
     Attributes:
-        frame: `[N]` index into the frame table.
-        box: `[N, 7]` x, y, z, l, w, h, yaw in metres and radians, ego frame.
-        cls: `[N]` index into the evaluated classes.
-        score: `[N]`, zeros for ground truth.
-        row: `[N]` row in the caller's table.
+        frame: Index into the frame table.
+        box: x, y, z, l, w, h, yaw in metres and radians, ego frame.
+        cls: Index into the evaluated classes.
+        score: Zeros for ground truth.
+        row: Row in the caller's table.
     """
 
-    frame: np.ndarray
-    box: np.ndarray
-    cls: np.ndarray
-    score: np.ndarray
-    row: np.ndarray
+    frame: Int[np.ndarray, " N"]
+    box: Float[np.ndarray, "N 7"]
+    cls: Int[np.ndarray, " N"]
+    score: Float[np.ndarray, " N"]
+    row: Int[np.ndarray, " N"]
 
     def __len__(self) -> int:
         return self.frame.size
 
-    def take(self, index: np.ndarray) -> Objects:
+    def take(self, index: Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]) -> Objects:
         """The rows that `index` (positions or mask) selects."""
         return Objects(
             *(getattr(self, field.name)[index] for field in dataclasses.fields(self))
@@ -101,8 +106,10 @@ def roi_bounds(roi: str | Sequence[float] | None) -> tuple[float, ...] | None:
     return tuple(bounds.tolist())
 
 
-def in_roi(box: np.ndarray, roi: str | Sequence[float] | None) -> np.ndarray:
-    """`[N]` bool: box centers inside the region, bounds included.
+def in_roi(
+    box: Real[np.ndarray, "N 7"], roi: str | Sequence[float] | None
+) -> Bool[np.ndarray, " N"]:
+    """True for boxes whose centers are inside the region, bounds included.
 
     Examples:
         >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [20.0, 40, 0, 4, 2, 1.5, 0]])
@@ -132,8 +139,8 @@ def roi_name(roi: str | Sequence[float] | None) -> str:
     return names.get(bounds) or ",".join(f"{value:g}" for value in bounds)
 
 
-def frame_ids(frames: Columns) -> np.ndarray:
-    """`[F]` ids of a frame table, checked to be integers without repetition.
+def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
+    """Ids of a frame table, checked to be integers without repetition.
 
     Examples:
         >>> frame_ids({"frame": np.array([7, 9])}).tolist()
@@ -156,7 +163,7 @@ def frame_ids(frames: Columns) -> np.ndarray:
     return ids
 
 
-def are_simulated(frames: Columns | None) -> bool:
+def are_simulated(frames: AnyColumns | None) -> bool:
     """Whether a frame table says that frames of it are simulated.
 
     Examples:
@@ -177,9 +184,14 @@ def wanted_columns(scored: bool) -> tuple[str, ...]:
 
 
 def read_columns(
-    table: Columns, *, name: str, scored: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frame `[N]`, box `[N, 7]`, class name `[N]`, score `[N]` of a column table.
+    table: AnyColumns, *, name: str, scored: bool
+) -> tuple[
+    Int[np.ndarray, " N"],
+    Float[np.ndarray, "N 7"],
+    Shaped[np.ndarray, " N"],
+    Float[np.ndarray, " N"],
+]:
+    """Frame, box, class name and score of every row of a column table.
 
     Raises:
         UserError: A column is missing or has the wrong shape or type.
@@ -236,7 +248,7 @@ def read_columns(
     return frame, box, cls, score
 
 
-def _integers(column: np.ndarray, name: str) -> np.ndarray:
+def _integers(column: ArrayLike, name: str) -> Int[np.ndarray, " N"]:
     """A column of frame ids as int64."""
     values = np.asarray(column)
     if values.ndim != 1:
@@ -255,9 +267,13 @@ def _integers(column: np.ndarray, name: str) -> np.ndarray:
 
 
 def class_indices(
-    cls: np.ndarray, frame: np.ndarray, classes: Sequence[str], *, name: str
-) -> np.ndarray:
-    """`[N]` index into `classes`, -1 for known classes that were not asked for.
+    cls: Shaped[np.ndarray, " N"],
+    frame: Int[np.ndarray, " N"],
+    classes: Sequence[str],
+    *,
+    name: str,
+) -> Int[np.ndarray, " N"]:
+    """Index into `classes`, -1 for known classes that were not asked for.
 
     Raises:
         DataError: A class name that is neither asked for nor one of K-Radar's.
@@ -280,8 +296,10 @@ def class_indices(
     return index
 
 
-def dense_frames(frame: np.ndarray, ids: np.ndarray, *, name: str) -> np.ndarray:
-    """`[N]` positions of `frame` in the table of ids.
+def dense_frames(
+    frame: Int[np.ndarray, " N"], ids: Int[np.ndarray, " F"], *, name: str
+) -> Int[np.ndarray, " N"]:
+    """Positions of `frame` in the table of ids.
 
     Raises:
         DataError: A frame that the table does not have.

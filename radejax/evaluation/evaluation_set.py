@@ -8,21 +8,26 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation import columns, matching, overlap, protocols
-from radejax.evaluation.columns import Columns
+from radejax.evaluation.columns import AnyColumns
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT, Curve, Protocol
 from radejax.evaluation.result import SPACES, Result
 
 MOST_PAIRS = 1_000_000
 """Of predictions and ground truths of a class in a frame; 100 and 20 are many."""
 
-Matches = matching.KradarMatches | np.ndarray
+Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
-# Scores [K], falling; frames [K]; how many true positives (or matches) each adds [K].
-Falling = tuple[np.ndarray, np.ndarray, np.ndarray]
+# Scores, falling; frames; how many true positives (or matches) each adds.
+Falling = tuple[
+    Float[np.ndarray, " K"],
+    Int[np.ndarray, " K"],
+    Int[np.ndarray, " K"] | Bool[np.ndarray, " K"],
+]
 
 
 class Terms(NamedTuple):
@@ -50,11 +55,11 @@ class EvaluationSet:
 
     def __init__(
         self,
-        ground_truth: Columns,
-        predictions: Columns,
+        ground_truth: AnyColumns,
+        predictions: AnyColumns,
         *,
         classes: Sequence[str] = CLASSES,
-        frames: Columns | None = None,
+        frames: AnyColumns | None = None,
         roi: str | Sequence[float] | None = None,
         label_version: str | None = None,
     ) -> None:
@@ -123,13 +128,17 @@ class EvaluationSet:
 
     # Shared work ---------------------------------------------------------------------
 
-    def overlaps(self, geometry: str) -> tuple[np.ndarray, np.ndarray]:
+    def overlaps(
+        self, geometry: str
+    ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
         """BEV and 3D IoU of the candidate pairs under a protocol's geometry."""
         if geometry not in self._overlaps:
             self._overlaps[geometry] = self._overlap(geometry)
         return self._overlaps[geometry]
 
-    def _overlap(self, geometry: str) -> tuple[np.ndarray, np.ndarray]:
+    def _overlap(
+        self, geometry: str
+    ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
         truth, found = self.gt.box, self.pred.box
         if geometry == "plain":
             return overlap.pair_iou(found[self.pair_pred], truth[self.pair_gt])
@@ -147,7 +156,7 @@ class EvaluationSet:
         return bev, iou_3d
 
     def match(self, protocol: Protocol, space: str, iou: float) -> Matches:
-        """Matches of all frames and classes: `KradarMatches` or `[M]` object or -1."""
+        """Matches of all frames and classes: `KradarMatches` or each one's object or -1."""
         geometry = protocol.geometry
         if geometry == "exchanged_top" and space == "bev":
             geometry = "exchanged"  # z plays no part
@@ -169,7 +178,7 @@ class EvaluationSet:
         return self._matches[key]
 
     @functools.cached_property
-    def by_score(self) -> list[np.ndarray]:
+    def by_score(self) -> list[Int[np.ndarray, " _"]]:
         """Predictions of every class by falling score, ties by the caller's row."""
         order = np.lexsort((self.pred.row, -self.pred.score))
         return [order[self.pred.cls[order] == c] for c in range(len(self.classes))]
@@ -177,9 +186,9 @@ class EvaluationSet:
     # Results -------------------------------------------------------------------------
 
     def frame_weights(
-        self, skip_empty: str | None, weights: np.ndarray | None = None
-    ) -> np.ndarray:
-        """`[F, C]` integer weights of the frames after the frame rule."""
+        self, skip_empty: str | None, weights: Shaped[np.ndarray, " F"] | None = None
+    ) -> Int[np.ndarray, "F C"]:
+        """Weights of the frames for every class, after the frame rule."""
         if weights is None:
             weights = np.ones(self.frame.size, np.int64)
         weights = np.asarray(weights).astype(np.int64)[:, None]
@@ -201,7 +210,7 @@ class EvaluationSet:
         skip_empty: str | None = PROTOCOL_DEFAULT,
         score_threshold: float = 0.0,
         spaces: Sequence[str] = SPACES,
-        weights: np.ndarray | None = None,
+        weights: Shaped[np.ndarray, " F"] | None = None,
         curves: bool = True,
     ) -> list[Result]:
         """Results in one protocol, over all frames or over weighted ones.
@@ -212,7 +221,7 @@ class EvaluationSet:
             skip_empty: As in `evaluate`.
             score_threshold: As in `evaluate`.
             spaces: As in `evaluate`.
-            weights: `[F]` bool or int weight of every frame; a condition is a mask.
+            weights: bool or int weight of every frame; a condition is a mask.
             curves: Keep the precision, recall and score arrays.
         """
         chosen = protocols.get_protocol(protocol)
@@ -250,12 +259,12 @@ class EvaluationSet:
         self,
         terms: Terms,
         cls: int,
-        weight: np.ndarray,
-        among: np.ndarray | None = None,
+        weight: Int[np.ndarray, " F"],
+        among: Bool[np.ndarray, " F"] | None = None,
     ) -> Curve:
-        """Curve and AP of one class over frames with integer weights `[F]`.
+        """Curve and AP of one class over weighted frames.
 
-        `among` is a `[F]` mask outside which all weights are zero: many questions about
+        `among` is a mask of frames outside which all weights are zero: many questions about
         few frames (resamples of a condition) are answered faster with it.
         """
         (score, frame, is_tp), *steps = self._falling(terms, cls, among)
@@ -270,7 +279,7 @@ class EvaluationSet:
         )
 
     def _falling(
-        self, terms: Terms, cls: int, among: np.ndarray | None
+        self, terms: Terms, cls: int, among: Bool[np.ndarray, " F"] | None
     ) -> list[Falling]:
         """What a curve of one class needs by falling score, for any weights.
 
@@ -300,7 +309,11 @@ class EvaluationSet:
         return parts
 
     def _sorted(
-        self, pred: np.ndarray, count: np.ndarray, cls: int, cut: float
+        self,
+        pred: Int[np.ndarray, " P"],
+        count: Shaped[np.ndarray, " P"],
+        cls: int,
+        cut: float,
     ) -> Falling:
         """Counts at predictions of a class above the score cut, by falling score."""
         keep = (self.pred.cls[pred] == cls) & (self.pred.score[pred] > cut)

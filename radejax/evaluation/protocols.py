@@ -10,6 +10,7 @@ import dataclasses
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import UserError
 
@@ -120,22 +121,22 @@ class Curve:
             K-Radar's protocols give 0 then.
         num_gt: Objects counted.
         num_det: Predictions counted.
-        precision: `[K]` precision at each sample (K-Radar: made monotone; others: raw).
-        recall: `[K]` recall at each sample.
-        score: `[K]` score threshold of each sample.
+        precision: Precision at each sample (K-Radar: made monotone; others: raw).
+        recall: Recall at each sample.
+        score: Score threshold of each sample.
     """
 
     ap: float
     num_gt: int
     num_det: int
-    precision: np.ndarray
-    recall: np.ndarray
-    score: np.ndarray
+    precision: Float[np.ndarray, " K"]
+    recall: Float[np.ndarray, " K"]
+    score: Float[np.ndarray, " K"]
 
 
 def score_thresholds(
-    sampled: np.ndarray, weight: np.ndarray, num_gt: int
-) -> np.ndarray:
+    sampled: Float[np.ndarray, " S"], weight: Real[np.ndarray, " S"], num_gt: int
+) -> Float[np.ndarray, " K"]:
     """K-Radar's at most 41 score thresholds at recall steps of 1/40.
 
     Walking down the matched scores with c = 0, the i-th score is skipped while
@@ -145,12 +146,12 @@ def score_thresholds(
     the one after the (k-1)-th.
 
     Args:
-        sampled: `[S]` scores of the matched predictions, falling.
-        weight: `[S]` how often each counts.
+        sampled: Scores of the matched predictions, falling.
+        weight: How often each counts.
         num_gt: Number of ground truths n.
 
     Returns:
-        `[K]` thresholds, falling, K <= 41. Empty without matches.
+        Thresholds, falling, K <= 41. Empty without matches.
 
     References:
         K-Radar, utils/kitti_eval/eval_revised.py: get_thresholds.
@@ -178,21 +179,20 @@ def score_thresholds(
 
 
 def kradar_curve(
-    matched: tuple[np.ndarray, np.ndarray],
-    events: tuple[np.ndarray, np.ndarray],
-    detections: tuple[np.ndarray, np.ndarray],
+    matched: tuple[Float[np.ndarray, " S"], Real[np.ndarray, " S"]],
+    events: tuple[Float[np.ndarray, " E"], Real[np.ndarray, " E"]],
+    detections: tuple[Float[np.ndarray, " M"], Real[np.ndarray, " M"]],
     num_gt: int,
     samples: CurveKind,
 ) -> Curve:
     """AP in K-Radar's protocol from the steps of `matching.match_kradar`.
 
     Args:
-        matched: `[S]` scores matched in the first pass, falling, and the weights of
-            their frames.
-        events: `[E]` scores at which true positives appear, falling, and how many,
-            times the weight of the frame.
-        detections: `[M]` scores of all predictions, falling, and the weights of their
+        matched: Scores matched in the first pass, falling, and the weights of their
             frames.
+        events: Scores at which true positives appear, falling, and how many, times the
+            weight of the frame.
+        detections: Scores of all predictions, falling, and the weights of their frames.
         num_gt: Number of ground truths.
         samples: "r40" all 41 precision samples, "r11" every fourth.
 
@@ -219,21 +219,30 @@ def kradar_curve(
     )
 
 
-def _sum_at_least(score: np.ndarray, value: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _sum_at_least(
+    score: Float[np.ndarray, " E"],
+    value: Real[np.ndarray, " E"],
+    at: Float[np.ndarray, " K"],
+) -> Real[np.ndarray, " K"]:
     """Sum of `value` over entries with score >= at; scores fall."""
     total = np.concatenate([[0], np.cumsum(value)])
     return total[np.searchsorted(-score, -at, side="right")]
 
 
 def pooled_curve(
-    *, score: np.ndarray, is_tp: np.ndarray, weight: np.ndarray, num_gt: int, curve: str
+    *,
+    score: Float[np.ndarray, " M"],
+    is_tp: Bool[np.ndarray, " M"],
+    weight: Real[np.ndarray, " M"],
+    num_gt: int,
+    curve: str,
 ) -> Curve:
     """AP from all predictions sorted by falling score.
 
     Args:
-        score: `[M]` scores, falling.
-        is_tp: `[M]` bool, True for true positives.
-        weight: `[M]` weights of their frames.
+        score: Of the predictions, falling.
+        is_tp: True for true positives.
+        weight: Weights of their frames.
         num_gt: Number of ground truths.
         curve: "voc11", "recall41", "coco101", "auc" (RADE-Net) or "exact".
 
@@ -265,7 +274,9 @@ def pooled_curve(
     return Curve(ap, int(num_gt), num_det, precision, recall, score)
 
 
-def _pooled_ap(precision: np.ndarray, recall: np.ndarray, curve: str) -> float:
+def _pooled_ap(
+    precision: Float[np.ndarray, " K"], recall: Float[np.ndarray, " K"], curve: str
+) -> float:
     """One number in [0, 1] for a curve of rising recall."""
     if curve == "exact":
         height = np.maximum.accumulate(precision[::-1])[::-1]

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 SPACES = ("bev", "3d")
 
@@ -28,9 +29,9 @@ class Result:
         skip_empty: Frame rule that was used.
         roi: Name of the region of interest.
         label_version: Label revision of the ground truth, if known.
-        precision: `[K]` precision along the curve (K-Radar: after making it monotone).
-        recall: `[K]` recall along the curve.
-        score: `[K]` score threshold along the curve, falling.
+        precision: Precision along the curve (K-Radar: after making it monotone).
+        recall: Recall along the curve.
+        score: Score threshold along the curve, falling.
         is_simulated: The frames are simulated.
     """
 
@@ -46,9 +47,9 @@ class Result:
     skip_empty: str | None
     roi: str
     label_version: str | None
-    precision: np.ndarray = dataclasses.field(repr=False)
-    recall: np.ndarray = dataclasses.field(repr=False)
-    score: np.ndarray = dataclasses.field(repr=False)
+    precision: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    recall: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    score: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
     is_simulated: bool = False
 
     @property

@@ -15,9 +15,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Real, Shaped, UInt8
 
 from radejax.core.errors import UserError
-from radejax.core.structures import ROIS
+from radejax.core.structures import ROIS, Array
 from radejax.data.cameras import CameraOptions, no_camera
 from radejax.data.images import read_left_image
 from radejax.data.projection import MAX_LEVEL
@@ -36,7 +37,7 @@ _log = logging.getLogger(__name__)
 PathLike = str | pathlib.Path
 
 
-def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
+def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bool]:
     """Radar frames as one array with a leading axis of B.
 
     Args:
@@ -70,7 +71,7 @@ def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Any, bool]:
 _MAX_DECIBELS = 300.0
 
 
-def _num_impossible(frames: Any, is_tesseract: bool) -> Any:
+def _num_impossible(frames: Real[Array, "B ..."], is_tesseract: bool) -> Any:
     """Number of frames that are no linear power (a tesseract), or no level of it.
 
     Decibels are neither: noise alone spans more than they do, with cells below 1.
@@ -99,7 +100,7 @@ class ImpossibleFrames:
         self._lock = threading.Lock()
         self._total, self._started = 0, list[tuple[Any, int]]()
 
-    def look(self, frames: Any, is_tesseract: bool) -> None:
+    def look(self, frames: Real[Any, "B ..."], is_tesseract: bool) -> None:
         """Looks at the frames of `radar_batch`; traced ones (`jit`) have no values."""
         if frames.dtype == np.uint8:  # of records: every value is a level
             return
@@ -135,7 +136,9 @@ class ImpossibleFrames:
             return self._total
 
 
-def _stack_frames(frames: Sequence[Any], grid: RadarGrid) -> np.ndarray:
+def _stack_frames(
+    frames: Sequence[Any], grid: RadarGrid
+) -> Shaped[np.ndarray, "B ..."]:
     """One array of the frames of a list: paths or arrays."""
     arrays = [
         read_frame(frame, grid) if isinstance(frame, PathLike) else np.asarray(frame)
@@ -159,7 +162,7 @@ def prepare(
     num_frames: int,
     model: Any,
     options: CameraOptions,
-) -> tuple[Any, Any, int]:
+) -> tuple[Real[Array, "B _ _ _"] | None, Camera | ReferencePoints | None, int]:
     """Arrays for a radar-camera model, and how many frames have no image.
 
     Args:
@@ -198,13 +201,17 @@ def prepare(
     return image, camera, int((~has_image).sum())
 
 
-def placeholder(num_frames: int, model: Any) -> tuple[np.ndarray, Camera]:
+def placeholder(
+    num_frames: int, model: Any
+) -> tuple[UInt8[np.ndarray, "{num_frames} H W 3"], Camera]:
     """Black images and a camera that looks nowhere, of the shapes of real ones."""
     image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
     return image, stack_cameras([no_camera(model.image_size)] * num_frames)
 
 
-def check_backbone(image: Any, variables: Mapping[str, Any]) -> None:
+def check_backbone(
+    image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
+) -> None:
     """`UserError` for images themselves where variables lack the backbone's weights.
 
     Args:
@@ -219,7 +226,7 @@ def check_backbone(image: Any, variables: Mapping[str, Any]) -> None:
         )
 
 
-def _check_missing(is_missing: np.ndarray, options: CameraOptions) -> None:
+def _check_missing(is_missing: Bool[np.ndarray, " B"], options: CameraOptions) -> None:
     if is_missing.any() and not options.allow_missing:
         raise UserError(
             f"{int(is_missing.sum())} of {is_missing.size} frames have no image or "
@@ -228,8 +235,8 @@ def _check_missing(is_missing: np.ndarray, options: CameraOptions) -> None:
         )
 
 
-def _host(mask: Any, num_frames: int) -> np.ndarray:
-    """`[B]` bool on the host; None is True for all."""
+def _host(mask: Any, num_frames: int) -> Bool[np.ndarray, " {num_frames}"]:
+    """A mask on the host; None is True for all."""
     if mask is None:
         return np.ones(num_frames, bool)
     return np.asarray(mask, bool).reshape(num_frames)
@@ -237,7 +244,7 @@ def _host(mask: Any, num_frames: int) -> np.ndarray:
 
 def _images(
     image: Any, num_frames: int, model: Any, resize: bool
-) -> tuple[Any, np.ndarray]:
+) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
     has_image = np.ones(num_frames, bool)
     if isinstance(image, PathLike):
         image = [image]
@@ -352,7 +359,7 @@ def checked_sizes(sizes: Sequence[int]) -> tuple[int, ...]:
     return tuple(sorted(sizes))
 
 
-def pad_batch(x: Any, size: int) -> Any:
+def pad_batch(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
     """Repeats the last frame up to a batch size."""
     missing = size - x.shape[0]
     if missing == 0:

@@ -9,6 +9,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 import tqdm
+from jaxtyping import Int, Shaped
 
 from radejax import models
 from radejax.core.errors import UserError
@@ -23,6 +24,8 @@ from radejax.inference.detector import Detector
 from radejax.inference.inputs import check_backbone
 from radejax.inference.program import detect
 from radejax.training import processes, sharding
+
+Found = tuple[Detections, Int[Array, " B"]]
 
 
 class Predictor:
@@ -54,7 +57,7 @@ class Predictor:
         self.update(None)
         map_grid = models.map_grid(grid, model, azimuth_mapping)
 
-        def predict(variables: Any, batch: Batch) -> tuple[Detections, Array]:
+        def predict(variables: Any, batch: Batch) -> Found:
             inputs = batch.projection, batch.image, batch.camera
             return detect(model, map_grid, decode, variables, *inputs), batch.frame
 
@@ -70,14 +73,14 @@ class Predictor:
         devices = self.mesh.devices.size
         return -(-batch_size // devices) * devices // jax.process_count()
 
-    def __call__(self, batch: Batch) -> tuple[Detections, Array]:
+    def __call__(self, batch: Batch) -> Found:
         """Detections of a global batch, of which each process gives its rows.
 
         Args:
             batch: NumPy arrays `[rows, ...]`.
 
         Returns:
-            Detections and `[B]` int32 `Batch.frame`, of the rows of all processes.
+            Detections and int32 `Batch.frame`, of the rows of all processes.
 
         Raises:
             UserError: Images are given, and the variables are without the weights of
@@ -105,7 +108,7 @@ def predict_dataset(
     images: CameraInputs | None = None,
     progress: bool = True,
     should_stop: Callable[[], bool] | None = None,
-) -> dict[str, np.ndarray]:
+) -> dict[str, Shaped[np.ndarray, "N ..."]]:
     """Detections on every frame of a data set; the same on every process.
 
     Args:
@@ -148,7 +151,7 @@ def predict_dataset(
     )
     loader = make_loader(table, options)
 
-    def start(batch: Batch) -> tuple[Detections, Array]:
+    def start(batch: Batch) -> Found:
         if isinstance(detector, Predictor):
             return detector(batch)
         return detector(batch.projection, batch.image, batch.camera), batch.frame
@@ -160,7 +163,7 @@ def predict_dataset(
         unit="frame",
         disable=not (progress and processes.is_main()),
     ) as bar:
-        pending: tuple[Detections, Array] | None = None
+        pending: Found | None = None
         for batch in loader:
             if should_stop is not None and should_stop():
                 raise processes.Stopped
@@ -180,7 +183,7 @@ def predict_dataset(
 def _collect(
     parts: list[dict[str, np.ndarray]],
     detections: Detections,
-    frames: Array,
+    frames: Int[Array, " B"],
     classes: Sequence[str],
 ) -> int:
     """Adds the columns of a batch; returns its number of real frames."""

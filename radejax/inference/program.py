@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
+from jaxtyping import Real
 
 from radejax.core.structures import Array, Detections
 from radejax.data.encoding import to_float
@@ -19,8 +20,8 @@ def detect(
     grid: RadarGrid,
     options: Mapping[str, Any],
     variables: Any,
-    frames: Array,
-    image: Any = None,
+    frames: Real[Array, "B R A DE"] | Real[Array, "B D R E A"],
+    image: Real[Array, "B _ _ _"] | None = None,
     camera: Any = None,
     *,
     is_tesseract: bool = False,
@@ -32,10 +33,10 @@ def detect(
         grid: Of its maps, see `models.map_grid`.
         options: Keyword arguments of `radejax.detection.decode.decode`.
         variables: Of the model.
-        frames: Projections `[B, R, A, D+E]` as they are stored, or tesseracts.
+        frames: Projections as they are stored, or tesseracts.
         image: Of a radar-camera model, or None for the radar alone.
         camera: Likewise.
-        is_tesseract: `frames` are `[B, D, R, E, A]`, linear power.
+        is_tesseract: `frames` are tesseracts, linear power.
     """
     if is_tesseract:
         frames = project_jax(frames)

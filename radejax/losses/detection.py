@@ -153,7 +153,7 @@ def detection_loss(
 
 def whole_batch_loss(
     parts: dict[str, Num[jax.Array, " P"]],
-    num_bins: Scalar,
+    num_bins: Scalar | Int[jax.Array, " P"],
     weights: Weights = _WEIGHTS,
     normalize: bool = True,
 ) -> tuple[
@@ -167,7 +167,8 @@ def whole_batch_loss(
 
     Args:
         parts: `[P]` each, what `detection_loss` gives beside the total for every part.
-        num_bins: Of the heatmaps of one part; counts where it has no positive bin.
+        num_bins: Of the heatmaps of one part, as many in all; counts where it has no
+            positive bin.
         weights: As for `detection_loss`.
         normalize: Likewise.
 

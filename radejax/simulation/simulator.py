@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Bool, Float, UInt32
 
 from radejax.data.kradar.labels import Label
 from radejax.geometry.radar_grid import RadarGrid
@@ -24,17 +25,17 @@ class RadarInput:
 
     Attributes:
         scatterers: Point targets.
-        noise_power: `[R, D]` mean noise power.
+        noise_power: Mean noise power.
         key: Seed of the noise.
-        snr_db: `[N]` power of each box's scatterers over the receiver noise.
-        lit: `[N]` part of each box's power that no other box blocks.
+        snr_db: Power of each box's scatterers over the receiver noise.
+        lit: Part of each box's power that no other box blocks.
     """
 
     scatterers: tensor.Scatterers
-    noise_power: np.ndarray
-    key: np.ndarray
-    snr_db: np.ndarray
-    lit: np.ndarray
+    noise_power: Float[np.ndarray, "R D"]
+    key: UInt32[np.ndarray, "2"]
+    snr_db: Float[np.ndarray, " N"]
+    lit: Float[np.ndarray, " N"]
 
 
 class SequenceSimulator:
@@ -93,9 +94,9 @@ class SequenceSimulator:
         )
 
     def _on_the_way(
-        self, found: scattering.FrameScattering, is_mirrored: np.ndarray
+        self, found: scattering.FrameScattering, is_mirrored: Bool[np.ndarray, " S"]
     ) -> scattering.FrameScattering:
-        """Scatterers with what air and, where `is_mirrored [S]`, road do to them."""
+        """Scatterers with what air and, where `is_mirrored`, road do to them."""
         sequence = self.sequence
         bounce = two_ray.bounce(
             found.position_m,
@@ -115,7 +116,7 @@ class SequenceSimulator:
         self,
         given: RadarInput,
         output: tensor.Output = "projection",
-    ) -> np.ndarray:
+    ) -> Float[np.ndarray, "..."]:
         """The radar frame of an input; see `tensor.simulate`.
 
         A tesseract comes as a view of the rows that the device made, without a copy.
@@ -134,8 +135,10 @@ class SequenceSimulator:
             return result.transpose(tensor.TESSERACT_OF_ROWS)
         return result
 
-    def is_radar_visible(self, frame: SceneFrame, given: RadarInput) -> np.ndarray:
-        """`[N]` bool: in the field of view, strong enough, and not hidden."""
+    def is_radar_visible(
+        self, frame: SceneFrame, given: RadarInput
+    ) -> Bool[np.ndarray, " N"]:
+        """True for boxes in the field of view, strong enough, and not hidden."""
         inside = self.grid.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
         return inside & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
 

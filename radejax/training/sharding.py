@@ -12,6 +12,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree, Shaped
 
 from radejax.core.errors import UserError
 
@@ -78,15 +79,17 @@ def check_batch_size(
         )
 
 
-def put_batch(batch: Any, mesh: Mesh) -> Any:
+def put_batch(
+    batch: PyTree[Shaped[np.ndarray, "b ..."]], mesh: Mesh
+) -> PyTree[Shaped[jax.Array, "B ..."]]:
     """Puts this process's share of a global batch onto the mesh.
 
     Args:
-        batch: Pytree of NumPy arrays `[B / processes, ...]`.
+        batch: Frames of this process, `b = B / processes`.
         mesh: From `make_mesh`.
 
     Returns:
-        The same pytree of global arrays `[B, ...]`, split along the batch.
+        The same pytree of global arrays, split along the batch.
     """
     sharding = batch_sharding(mesh)
     return jax.tree.map(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from jax.typing import ArrayLike
+from jaxtyping import Float, Int
 
 from radejax.core.errors import UserError
 
@@ -28,20 +29,20 @@ class TrainState(struct.PyTreeNode):
         num_skipped: Steps skipped in all because loss or gradient was not finite.
         num_skipped_in_row: The same, since the last step that was taken.
         most_skipped_in_row: The most that this has been.
-        skipped_frames: `[B]` int32 frames of the last skipped batch; -1 at first.
+        skipped_frames: int32 frames of the last skipped batch; -1 at first.
         frozen: Parameters that are not trained: in no gradient, optimizer or average,
             and in no checkpoint, as they are known from where they came.
     """
 
-    step: jax.Array
+    step: Int[jax.Array, ""]
     params: Any
     model_state: Any
     opt_state: Any
     ema_params: Any
-    num_skipped: jax.Array
-    num_skipped_in_row: jax.Array
-    most_skipped_in_row: jax.Array
-    skipped_frames: jax.Array
+    num_skipped: Int[jax.Array, ""]
+    num_skipped_in_row: Int[jax.Array, ""]
+    most_skipped_in_row: Int[jax.Array, ""]
+    skipped_frames: Int[jax.Array, " B"]
     frozen: Any = dataclasses.field(default_factory=dict)
 
     @property
@@ -116,7 +117,7 @@ def _cyclic_cosine(peak: float, floor: float, half_period: int) -> optax.Schedul
     where it is small and after any number of epochs.
     """
 
-    def rate(step: ArrayLike) -> jax.Array:
+    def rate(step: ArrayLike) -> Float[jax.Array, "..."]:
         from_floor = jnp.abs(jnp.mod(step, 2 * half_period) - half_period)
         angle = jnp.asarray(from_floor, jnp.float32) * (jnp.pi / (2 * half_period))
         return floor + (peak - floor) * jnp.square(jnp.sin(angle))

@@ -10,6 +10,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Bool, Float, Int, Num
 
 from radejax.core.structures import Array, Batch
 from radejax.data.encoding import model_inputs
@@ -17,7 +18,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss, whole_batch_loss
 from radejax.training.state import TrainState, merge_parameters
 
-Metrics = dict[str, jax.Array]
+Metrics = dict[str, Num[jax.Array, ""]]
 
 
 def make_train_step(
@@ -56,7 +57,7 @@ def make_train_step(
         part: Batch,
         rng: jax.Array,
         **changed: Any,
-    ) -> tuple[jax.Array, tuple[Any, Metrics, int]]:
+    ) -> tuple[Float[jax.Array, ""], tuple[Any, Metrics, int]]:
         maps, updates = model.apply(
             {"params": merge_parameters(params, state.frozen), **model_state},
             *model_inputs(part),
@@ -145,7 +146,10 @@ def _accumulate(
 
 
 def _taken_if(
-    is_finite: jax.Array, state: TrainState, frames: Array, **changed: Any
+    is_finite: Bool[jax.Array, ""],
+    state: TrainState,
+    frames: Int[Array, " B"],
+    **changed: Any,
 ) -> TrainState:
     """The state with what a step changed, or the step counted as skipped."""
     kept = {name: getattr(state, name) for name in changed}

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 import tensorboardX
 import tqdm
+from jaxtyping import UInt8
 from tensorboardX import summary
 
 # Protobuf makes them when it is imported.
@@ -33,7 +34,7 @@ from radejax.training.clock import StepClock, seconds_since_start
 _log = logging.getLogger(__name__)
 
 Values = Mapping[str, float]
-Pictures = Mapping[str, np.ndarray]
+Pictures = Mapping[str, UInt8[np.ndarray, "_ _ 3"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Scores:
     Attributes:
         values: Metrics; the name of each tells its protocol.
         best: The one that decides which checkpoint is best; None where undefined.
-        pictures: `[H, W, 3]` uint8 by name, on the main process.
+        pictures: Images `[H, W, 3]` by name, on the main process.
     """
 
     values: Values

@@ -13,6 +13,7 @@ import subprocess
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from jaxtyping import UInt8
 from matplotlib.animation import FFMpegWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
@@ -27,8 +28,8 @@ _LINE_COLORS = ("black", GROUND_TRUTH.color, PREDICTION.color, PREDICTION.text_c
 _MAP_COLORS = 32
 
 
-def render(figure: Figure) -> np.ndarray:
-    """Pixels of a figure at its own resolution, `[H, W, 3]` uint8."""
+def render(figure: Figure) -> UInt8[np.ndarray, "H W 3"]:
+    """Pixels of a figure at its own resolution."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

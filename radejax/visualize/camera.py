@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 
@@ -113,8 +114,8 @@ def _draw_boxes(
     objects: Objects,
     kind: ImageKind,
     style: Style,
-) -> dict[int, np.ndarray]:
-    """Draws what is in front of the camera; points `[P, 2]` by index of the box."""
+) -> dict[int, Float[np.ndarray, "_ 2"]]:
+    """Draws what is in front of the camera; points by index of the box."""
     segments, is_visible = calibration.project_boxes(objects.boxes, kind, _NEAR_M)
     segments = segments - 0.5
     # Wild pixels far outside the image confuse the renderer's clipping.

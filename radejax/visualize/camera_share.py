@@ -9,6 +9,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from radejax.core.files import write_json
@@ -17,18 +18,18 @@ from radejax.visualize.canvas import new_figure, save_figure
 
 
 def average_by_group(
-    shares: Iterable[tuple[str, np.ndarray]],
-) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    shares: Iterable[tuple[str, Float[np.ndarray, "R A"]]],
+) -> tuple[dict[str, Float[np.ndarray, "R A"]], dict[str, int]]:
     """Mean maps of groups, "all" first, over what the camera sees.
 
     A bin that no query sees in the image has share 0, which says nothing of the gate:
     every bin is averaged over the frames that have it in view.
 
     Args:
-        shares: Group and `[R, A]` share of every frame.
+        shares: Group and share of every frame.
 
     Returns:
-        `[R, A]` means by group, 0 in bins that no frame has in view, and the numbers of
+        Means by group, 0 in bins that no frame has in view, and the numbers of
         frames with anything in view, that is, with an image.
     """
     sums: dict[str, Any] = {}
@@ -43,8 +44,8 @@ def average_by_group(
     return {name: sums[name] / np.maximum(seen[name], 1) for name in sums}, counts
 
 
-def mean_share(share: np.ndarray, grid: RadarGrid) -> float:
-    """Mean of a map `[R, A]` over the bins in view, those above 0; NaN without any.
+def mean_share(share: Float[np.ndarray, "R A"], grid: RadarGrid) -> float:
+    """Mean of a map over the bins in view, those above 0; NaN without any.
 
     Bins beyond the grid are padding and do not count.
     """
@@ -53,7 +54,7 @@ def mean_share(share: np.ndarray, grid: RadarGrid) -> float:
 
 
 def draw_camera_share(
-    maps: Mapping[str, np.ndarray],
+    maps: Mapping[str, Float[np.ndarray, "R A"]],
     grid: RadarGrid,
     *,
     counts: Mapping[str, int] | None = None,
@@ -62,7 +63,7 @@ def draw_camera_share(
     """One range-azimuth panel per condition, all on one scale.
 
     Args:
-        maps: `[R, A]` mean share of the camera by condition, 0 (radar alone) to 1.
+        maps: Mean share of the camera by condition, 0 (radar alone) to 1.
         grid: Axes of the maps; more bins than the grid has are padding and cut.
         counts: Frames with an image per condition, for the titles.
         columns: Panels side by side.

@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.colors import LinearSegmentedColormap
@@ -74,14 +75,14 @@ class Objects(NamedTuple):
     """Boxes of one frame, ready to draw.
 
     Attributes:
-        boxes: `[N, 7]` x, y, z, l, w, h, yaw in the ego frame.
+        boxes: x, y, z, l, w, h, yaw in the ego frame.
         names: N class names.
-        scores: `[N]` or None for ground truth.
+        scores: None for ground truth.
     """
 
-    boxes: np.ndarray
+    boxes: Float[np.ndarray, "N 7"]
     names: tuple[str, ...]
-    scores: np.ndarray | None = None
+    scores: Float[np.ndarray, " N"] | None = None
 
 
 def as_objects(
@@ -230,16 +231,18 @@ def label_texts(objects: Objects) -> list[str]:
     ]
 
 
-def footprints(boxes: np.ndarray, points_per_edge: int = 1) -> np.ndarray:
+def footprints(
+    boxes: Float[np.ndarray, "N 7"], points_per_edge: int = 1
+) -> Float[np.ndarray, "N {4*points_per_edge+1} 2"]:
     """Outlines of boxes on the ground, starting at the front left corner.
 
     Args:
-        boxes: `[N, 7]`.
+        boxes: In the ego frame.
         points_per_edge: Points on each edge; more than 1 where edges bend, as in a
             polar view.
 
     Returns:
-        `[N, 4 * points_per_edge + 1, 2]` x and y, closed, counter-clockwise.
+        x and y, closed, counter-clockwise.
     """
     corners = bev_corners(boxes)
     following = np.roll(corners, -1, axis=1)
@@ -249,8 +252,8 @@ def footprints(boxes: np.ndarray, points_per_edge: int = 1) -> np.ndarray:
     return np.concatenate([points, corners[:, :1]], 1)
 
 
-def heading_marks(boxes: np.ndarray) -> np.ndarray:
-    """`[N, 2, 2]` segments that stick out of the middle of each front edge.
+def heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:
+    """Segments that stick out of the middle of each front edge.
 
     Outwards, so that the echo inside the box stays visible.
     """
@@ -260,9 +263,9 @@ def heading_marks(boxes: np.ndarray) -> np.ndarray:
 
 def draw_tiles(
     ax: Axes,
-    edges_x: np.ndarray,
-    edges_y: np.ndarray,
-    values: np.ndarray,
+    edges_x: Float[np.ndarray, "*edges_x"],
+    edges_y: Float[np.ndarray, "*edges_y"],
+    values: Float[np.ndarray, "rows columns"],
     color_limits: tuple[float, float] | None = None,
     cmap: Any = COLOR_MAP,
 ) -> Any:

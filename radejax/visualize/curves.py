@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -179,8 +180,8 @@ def draw_training(
     return figure
 
 
-def moving_mean(values: np.ndarray, width: int) -> np.ndarray:
-    """Mean over the last `width` finite values, fewer at the start; `[N]`."""
+def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray, " N"]:
+    """Mean over the last `width` finite values, fewer at the start."""
     is_finite = np.isfinite(values)
     total = np.cumsum(np.where(is_finite, values, 0.0))
     count = np.cumsum(is_finite)
@@ -193,7 +194,11 @@ def moving_mean(values: np.ndarray, width: int) -> np.ndarray:
 
 def calibration_bins(
     scores: Any, is_match: Any, num_bins: int = 10
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[
+    Float[np.ndarray, " {num_bins}"],
+    Float[np.ndarray, " {num_bins}"],
+    Int[np.ndarray, " {num_bins}"],
+]:
     """Mean score, share of matches and number of detections in equal score bins.
 
     Args:
@@ -202,7 +207,7 @@ def calibration_bins(
         num_bins: Of equal width over [0, 1].
 
     Returns:
-        `[num_bins]` each; mean score and share are NaN in empty bins.
+        Of each bin; mean score and share are NaN in empty ones.
     """
     scores, is_match = np.asarray(scores, float), np.asarray(is_match, bool)
     if scores.shape != is_match.shape or scores.ndim != 1:

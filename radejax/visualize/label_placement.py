@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 
 from radejax.visualize.canvas import Side, halo
@@ -20,27 +21,27 @@ class Label(NamedTuple):
     """A text beside an outline.
 
     Attributes:
-        outline: `[P, 2]` points in data coordinates.
+        outline: Points in data coordinates.
         text: One line.
         color: Of text and leader.
         side: Where the text should stand.
     """
 
-    outline: np.ndarray
+    outline: Float[np.ndarray, "P 2"]
     text: str
     color: str
     side: Side
 
 
 def place_labels(
-    obstacles: np.ndarray,
-    anchors: np.ndarray,
-    sizes: np.ndarray,
+    obstacles: Float[np.ndarray, "M 4"],
+    anchors: Float[np.ndarray, "N 4"],
+    sizes: Float[np.ndarray, "N 2"],
     prefer: Sequence[Side],
-    frame: np.ndarray,
+    frame: Float[np.ndarray, "4"],
     *,
     gap: float,
-) -> np.ndarray:
+) -> Float[np.ndarray, "N 2"]:
     """Lower left corners of labels beside their boxes, clear of what is there already.
 
     Greedy: labels are placed in the given order, each at the nearest of a fan of
@@ -48,15 +49,15 @@ def place_labels(
     overlaps the least.
 
     Args:
-        obstacles: `[M, 4]` rectangles x0, y0, x1, y1 to keep clear.
-        anchors: `[N, 4]` rectangle of the box that each label belongs to.
-        sizes: `[N, 2]` width and height of each label.
+        obstacles: Rectangles x0, y0, x1, y1 to keep clear.
+        anchors: Rectangle of the box that each label belongs to.
+        sizes: Width and height of each label.
         prefer: N sides where the labels should stand.
-        frame: `[4]` rectangle that labels should not leave.
+        frame: Rectangle that labels should not leave.
         gap: Distance between box and label.
 
     Returns:
-        `[N, 2]` corners, in the unit of the input (pixels, y up).
+        Corners, in the unit of the input (pixels, y up).
     """
     taken = [np.asarray(r, float) for r in obstacles]
     corners = np.zeros((len(anchors), 2))
@@ -75,9 +76,9 @@ def place_labels(
 
 
 def _candidates(
-    box: np.ndarray, size: np.ndarray, prefer: Side, gap: float
-) -> np.ndarray:
-    """`[P, 2]` lower left corners around a box, the most wanted first."""
+    box: Float[np.ndarray, "4"], size: Float[np.ndarray, "2"], prefer: Side, gap: float
+) -> Float[np.ndarray, "P 2"]:
+    """Lower left corners around a box, the most wanted first."""
     width, height = size
     if prefer == "above":
         shifts = 0.5 * height * np.arange(20)
@@ -94,8 +95,10 @@ def _candidates(
     return np.stack([x, y], -1)
 
 
-def _overlap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """`[N, M]` areas shared by rectangles `[N, 4]` and `[M, 4]`."""
+def _overlap(
+    a: Float[np.ndarray, "N 4"], b: Float[np.ndarray, "M 4"]
+) -> Float[np.ndarray, "N M"]:
+    """Areas shared by rectangles."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     return np.clip(high - low, 0, None).prod(-1)
@@ -150,8 +153,8 @@ def draw_labels(
         _draw_label(ax, shown[i], anchors[i], corners[i], sizes[i], font_size)
 
 
-def _is_free(places: np.ndarray) -> np.ndarray:
-    """`[N]` True for rectangles `[N, 4]` that those before them do not cover."""
+def _is_free(places: Float[np.ndarray, "N 4"]) -> Bool[np.ndarray, " N"]:
+    """True for rectangles that those before them do not cover."""
     areas = (places[:, 2:] - places[:, :2]).prod(-1)
     covered = _overlap(places, places)
     is_free = np.ones(len(places), bool)
@@ -163,9 +166,9 @@ def _is_free(places: np.ndarray) -> np.ndarray:
 def _draw_label(
     ax: Axes,
     label: Label,
-    anchor: np.ndarray,
-    corner: np.ndarray,
-    size: np.ndarray,
+    anchor: Float[np.ndarray, "4"],
+    corner: Float[np.ndarray, "2"],
+    size: Float[np.ndarray, "2"],
     font_size: float,
 ) -> None:
     """One text, aligned with the nearest point of its box, with a leader if it moved."""

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Real
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
@@ -155,7 +156,7 @@ def _bins_shown(grid: RadarGrid, extent: Sequence[float]) -> tuple[slice, slice]
 # Over maps ---------------------------------------------------------------------------
 
 
-def draw_roi(ax: Axes, outline: np.ndarray) -> None:
+def draw_roi(ax: Axes, outline: Real[np.ndarray, "P 2"]) -> None:
     """Dashed black line with a white rim: visible on dark and on bright ground."""
     ax.plot(
         *outline.T,
@@ -212,7 +213,7 @@ def draw_objects(
         draw_labels(ax, labels)
 
 
-def _thickness(ax: Axes, boxes: np.ndarray, to_axes: Callable) -> float:
+def _thickness(ax: Axes, boxes: Float[np.ndarray, "N 7"], to_axes: Callable) -> float:
     """Factor on line widths, so that outlines of small boxes do not become blobs."""
     points = ax.transData.transform(to_axes(footprints(boxes)).reshape(-1, 2))
     edges = np.diff(points.reshape(-1, 5, 2), axis=1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -57,7 +58,9 @@ def check_projection(projection: Any, grid: RadarGrid) -> np.ndarray:
     return values
 
 
-def to_units(values: np.ndarray, units: Units) -> np.ndarray:
+def to_units(
+    values: Float[np.ndarray, "*bins"], units: Units
+) -> Float[np.ndarray, "*bins"]:
     """Normalised log power as it is, or in decibels."""
     _check_choice("units", units, _UNIT_LABELS)
     return values if units == "normalized" else values * DB_PER_UNIT - DB_OFFSET
@@ -70,7 +73,7 @@ def range_azimuth(
     channels: Channels = "all",
     reduce: Reduce = "max",
     units: Units = "normalized",
-) -> np.ndarray:
+) -> Float[np.ndarray, "R A"]:
     """One value per range-azimuth bin.
 
     Args:
@@ -80,9 +83,6 @@ def range_azimuth(
         reduce: "max" or "mean" over them. The maximum over either group is the
             maximum over the whole tensor; the mean shows extended targets more calmly.
         units: "normalized" or "db".
-
-    Returns:
-        `[R, A]` float32.
     """
     values = check_projection(projection, grid)
     _check_choice("channels", channels, _CHANNEL_LABELS)
@@ -101,8 +101,8 @@ def range_doppler(
     *,
     azimuth_idx: int | None = None,
     units: Units = "normalized",
-) -> np.ndarray:
-    """`[R, D]` at one azimuth bin, or the maximum over all of them (None)."""
+) -> Float[np.ndarray, "R D"]:
+    """Values at one azimuth bin, or the maximum over all of them (None)."""
     values = check_projection(projection, grid)[..., : grid.num_doppler]
     return to_units(_slice_or_max(values, azimuth_idx, 1, "azimuth_idx"), units)
 
@@ -113,8 +113,8 @@ def azimuth_elevation(
     *,
     range_idx: int | None = None,
     units: Units = "normalized",
-) -> np.ndarray:
-    """`[A, E]` at one range bin, or the maximum over all of them (None)."""
+) -> Float[np.ndarray, "A E"]:
+    """Values at one range bin, or the maximum over all of them (None)."""
     values = check_projection(projection, grid)[..., grid.num_doppler :]
     return to_units(_slice_or_max(values, range_idx, 0, "range_idx"), units)
 
@@ -126,8 +126,8 @@ def color_label(
     return f"{_UNIT_LABELS[units]}, {reduce} over {_CHANNEL_LABELS[channels]}"
 
 
-def bin_edges(centers: np.ndarray) -> np.ndarray:
-    """`[n + 1]` edges of a uniform axis of `n` bin centers, half a step outside."""
+def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
+    """Edges of a uniform axis of `n` bin centers, half a step outside."""
     step = (centers[-1] - centers[0]) / (centers.size - 1)
     return centers[0] + step * (np.arange(centers.size + 1) - 0.5)
 
@@ -239,8 +239,10 @@ def draw_slices(
     return figure
 
 
-def _outlines(boxes: np.ndarray, left: float) -> tuple[list[np.ndarray], ...]:
-    """Lines of boxes `[N, 7]` in the three slices, each `[P, 2]`.
+def _outlines(
+    boxes: Float[np.ndarray, "N 7"], left: float
+) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
+    """Lines of boxes in the three slices.
 
     Args:
         boxes: In the ego frame.
@@ -261,15 +263,15 @@ def _outlines(boxes: np.ndarray, left: float) -> tuple[list[np.ndarray], ...]:
     return azimuth_range, bars, azimuth_elevation
 
 
-def to_polar(points: np.ndarray) -> np.ndarray:
-    """Azimuth in degrees, right positive, and range of ground positions `[..., 2]`."""
+def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
+    """Azimuth in degrees, right positive, and range of ground positions."""
     x, y = points[..., 0], points[..., 1]
     return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
 def _slice_or_max(
-    values: np.ndarray, index: int | None, axis: int, name: str
-) -> np.ndarray:
+    values: Float[np.ndarray, "_ _ _"], index: int | None, axis: int, name: str
+) -> Float[np.ndarray, "_ _"]:
     """One bin of an axis, or the maximum over it."""
     if index is None:
         return values.max(axis)
@@ -278,7 +280,7 @@ def _slice_or_max(
     return values.take(index, axis)
 
 
-def _at(axis: np.ndarray, index: int, unit: str) -> str:
+def _at(axis: Float[np.ndarray, " n"], index: int, unit: str) -> str:
     """ "at 23.1 m" for a title."""
     return f"at {axis[index]:.1f}{unit}"
 

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
 from matplotlib.colors import to_rgb
 
 from radejax.core.errors import UserError
@@ -104,7 +105,7 @@ def echo_points(
     num_points: int = 3000,
     *,
     elevation_sign: int = 1,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Float[np.ndarray, "P 3"], Float[np.ndarray, " P"]]:
     """The strongest range-azimuth bins as points in space.
 
     Range weakens echoes, and near clutter would take all the points: strength is
@@ -119,7 +120,7 @@ def echo_points(
             code bases disagree about K-Radar's axis; check it against data.
 
     Returns:
-        Points `[P, 3]` in the ego frame and their strength `[P]` above the median.
+        Points in the ego frame and their strength above the median.
     """
     if elevation_sign not in (-1, 1):
         raise UserError(f"elevation_sign must be 1 or -1, got {elevation_sign}")
@@ -144,8 +145,10 @@ def echo_points(
     return points, strength.ravel()[flat]
 
 
-def ground_mesh(grid: RadarGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices `[R * A, 3]` at bin centers on z = -2 m and triangles `[T, 3]`."""
+def ground_mesh(
+    grid: RadarGrid,
+) -> tuple[Float[np.ndarray, "bins 3"], Int[np.ndarray, "T 3"]]:
+    """Vertices at bin centers on z = -2 m and triangles."""
     centers = grid.cell_centers_ego().reshape(-1, 2)
     vertices = np.concatenate([centers, np.full((len(centers), 1), -2.0)], 1)
     first = (
@@ -240,8 +243,8 @@ def _boxes(objects: Objects, style: Style) -> Any:
     )
 
 
-def yaw_quaternions(yaw_rad: np.ndarray) -> np.ndarray:
-    """`[N, 4]` x, y, z, w of rotations about z."""
+def yaw_quaternions(yaw_rad: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
+    """x, y, z, w of rotations about z."""
     zero = np.zeros_like(yaw_rad)
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], -1)
 
@@ -278,6 +281,6 @@ def _rgb(style: Style) -> tuple[int, ...]:
     return tuple(round(255 * share) for share in to_rgb(style.color))
 
 
-def _colors(values: np.ndarray) -> np.ndarray:
-    """`[N, 3]` uint8 colours of values in [0, 1]."""
+def _colors(values: Float[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
+    """Colours of values in [0, 1]."""
     return np.round(255 * COLOR_MAP(np.clip(values, 0, 1))[:, :3]).astype(np.uint8)

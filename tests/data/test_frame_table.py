@@ -30,6 +30,7 @@ def records(keys, skipped=()):
 BOX = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, np.pi / 6]
 
 
+@pytest.mark.wrong_types
 def test_table_by_hand():
     frames = [
         frame("1/b", [BOX, BOX], ["Bicycle", "Sedan"]),
@@ -51,6 +52,7 @@ def test_table_by_hand():
     assert not table.boxes[1:].any()
 
 
+@pytest.mark.wrong_types
 def test_too_many_objects_says_how_many_would_do():
     frames = [
         frame("1/a", [BOX] * 2, ["Sedan"] * 2),
@@ -62,6 +64,7 @@ def test_too_many_objects_says_how_many_would_do():
     make_table(records(["1/a", "1/b"]), frames, max_objects=0, classes=("Bicycle",))
 
 
+@pytest.mark.wrong_types
 def test_frames_without_records():
     frames = [frame("1/a"), frame("1/b")]
     source = records(["1/a"], {"1/b": "t.mat: truncated"})
@@ -89,6 +92,7 @@ def test_labels_can_be_exchanged_between_frames(kradar_root, tmp_path):
     assert ((mixed.classes >= 0) == mixed.is_valid).all()
 
 
+@pytest.mark.wrong_types
 def test_cameras_are_of_the_same_frames():
     frames = [frame("1/a"), frame("1/b")]
     for one in frames:

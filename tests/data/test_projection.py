@@ -128,6 +128,7 @@ def test_jax_on_one_frame_and_on_batches():
     np.testing.assert_allclose(mapped, wanted, atol=1e-6, rtol=0)
 
 
+@pytest.mark.wrong_types
 @pytest.mark.parametrize(
     "tesseract",
     [np.ones((2, 3, 4)), np.ones((2, 0, 3, 4)), np.ones(SHAPE, complex), "text"],

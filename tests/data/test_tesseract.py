@@ -323,6 +323,7 @@ class Dribble(io.BytesIO):
         return super().readinto(memoryview(buffer)[:7])
 
 
+@pytest.mark.wrong_types
 def test_slabs_of_a_file_that_returns_parts(tesseract):
     content = np.asfortranarray(tesseract).tobytes(order="F")
     slab = np.empty(SHAPE[2::-1], np.float32)

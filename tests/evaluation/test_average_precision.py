@@ -280,7 +280,9 @@ def test_golden_scenes(golden):
                 ap = [
                     result.ap
                     for result in shared_set.results(
-                        protocol, iou_thresholds=data["ious"], score_threshold=cut
+                        protocol,
+                        iou_thresholds=data["ious"].tolist(),
+                        score_threshold=cut,
                     )
                 ]
                 expected = data[f"{scene}_ap"][p, c].reshape(-1)

@@ -48,7 +48,9 @@ def test_class_indices():
     cls = np.array(["Bicycle", "Sedan", "Bicycle Group"])
     index = columns.class_indices(cls, np.arange(3), ("Sedan", "Bicycle"), name="x")
     assert index.tolist() == [1, 0, -1]
-    own = columns.class_indices(np.array(["Tram"]), np.zeros(1), ("Tram",), name="x")
+    own = columns.class_indices(
+        np.array(["Tram"]), np.zeros(1, int), ("Tram",), name="x"
+    )
     assert own.tolist() == [0]
     with pytest.raises(DataError, match="frame 4, row 0: unknown class 'sedan'"):
         columns.class_indices(np.array(["sedan"]), np.array([4]), ("Sedan",), name="x")

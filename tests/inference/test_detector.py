@@ -274,6 +274,7 @@ def test_arrays_on_a_device_are_told_of_at_a_later_call(
     assert detector.num_impossible == 1
 
 
+@pytest.mark.wrong_types
 def test_arguments_by_name_and_wrong_ones() -> None:
     detector = small.detector(roi="narrow", device="cpu")
     assert tuple(detector.roi) == tuple(NARROW_ROI)

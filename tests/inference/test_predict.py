@@ -97,6 +97,7 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(
     _assert_same(alone, expected)
 
 
+@pytest.mark.wrong_types
 def test_an_empty_split_is_said(setup: SimpleNamespace) -> None:
     with pytest.raises(UserError, match="no frames to detect objects in"):
         predict_dataset(None, setup.records, setup.frames[:0])

@@ -83,7 +83,7 @@ class TestTree:
     def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
         cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras
         shift = small_config()["lidar_to_radar_m"]
-        drawn = stereo_calibration(shift, 64, 36)[0].camera()
+        drawn = stereo_calibration(tuple(shift), 64, 36)[0].camera()
         np.testing.assert_allclose(
             cameras[0].cam_from_ego, drawn.cam_from_ego, atol=1e-12
         )

@@ -49,9 +49,10 @@ def test_fsdp_splits_the_widest_axis_that_divides() -> None:
             lambda: sharding.check_batch_size(8, sharding.make_mesh(4), "b", 0),
             "num_accumulate must be at least 1, got 0",
         ),
-        (
+        pytest.param(
             lambda: sharding.state_sharding({}, sharding.make_mesh(1), "sharded"),
             "'replicated' or 'fsdp', got 'sharded'",
+            marks=pytest.mark.wrong_types,
         ),
     ],
 )

@@ -73,6 +73,7 @@ def test_cyclic_cosine_begins_after_the_warm_up() -> None:
     np.testing.assert_allclose(rates, [0, 5e-4, 1e-3, 1e-5, 1e-3], rtol=1e-6)
 
 
+@pytest.mark.wrong_types
 def test_unknown_schedule_is_refused() -> None:
     with pytest.raises(UserError, match=r"train.schedule must be .* got 'step'"):
         make_schedule(

@@ -136,6 +136,7 @@ def test_padded_maps_need_the_padded_grid():
     bev.draw_map(values, GRID.padded(8), color_limits=(0, 1), label="gate")
 
 
+@pytest.mark.wrong_types
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -68,7 +68,11 @@ def test_slice_bounds_are_the_axes():
     [
         (lambda: projections.range_doppler(PROJECTION, GRID, azimuth_idx=5), "0..4"),
         (lambda: projections.azimuth_elevation(PROJECTION, GRID, range_idx=-1), "0..5"),
-        (lambda: projections.draw_slice("bev", PROJECTION, GRID), "range_doppler"),
+        pytest.param(
+            lambda: projections.draw_slice("bev", PROJECTION, GRID),
+            "range_doppler",
+            marks=pytest.mark.wrong_types,
+        ),
         (lambda: projections.range_azimuth(PROJECTION[:5], GRID), r"\(6, 5, 7\)"),
     ],
 )

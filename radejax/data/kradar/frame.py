@@ -6,6 +6,7 @@ import dataclasses
 import pathlib
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.data.tesseract import read_frame
@@ -23,10 +24,10 @@ class Frame:
         header: Frame numbers of all sensors and the time stamp.
         environment, time, weather: Conditions of the sequence.
         labels: Every object of the file, in the LiDAR frame, unfiltered.
-        boxes: `[N, 7]` float64 x, y, z, l, w, h, yaw in the radar frame, of the
+        boxes: float64 x, y, z, l, w, h, yaw in the radar frame, of the
             objects that the filters of the data set keep.
-        classes: `[N]` class names of `boxes`.
-        visibility: `[N]` availability flags of `boxes`.
+        classes: Class names of `boxes`.
+        visibility: Availability flags of `boxes`.
         radar_from_lidar_m: Offset that was added to LiDAR positions: x, y, z.
         tesseract_path: The tesseract, None where it is missing.
         projection_path: An official `.npy` projection, None where there is none.
@@ -44,9 +45,9 @@ class Frame:
     time: str
     weather: str
     labels: tuple[Label, ...]
-    boxes: np.ndarray
-    classes: np.ndarray
-    visibility: np.ndarray
+    boxes: Float[np.ndarray, "N 7"]
+    classes: Shaped[np.ndarray, " N"]
+    visibility: Shaped[np.ndarray, " N"]
     radar_from_lidar_m: tuple[float, float, float]
     tesseract_path: pathlib.Path | None
     projection_path: pathlib.Path | None
@@ -67,8 +68,8 @@ class Frame:
 
     def read_projection(
         self, grid: RadarGrid, timings: dict[str, float] | None = None
-    ) -> np.ndarray:
-        """`[R, A, D+E]` float32 projection; see `tesseract.read_frame`.
+    ) -> Float[np.ndarray, "R A DE"]:
+        """float32 projection; see `tesseract.read_frame`.
 
         Raises:
             FileNotFoundError: There is no file of the radar.

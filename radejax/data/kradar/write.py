@@ -13,6 +13,7 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from jaxtyping import Real
 
 from radejax.core.errors import UserError
 from radejax.core.files import atomic_write, write_text
@@ -89,7 +90,10 @@ def write_splits(
 
 
 def write_tesseract(
-    path: str | os.PathLike, tesseract: np.ndarray, *, compress: bool = False
+    path: str | os.PathLike,
+    tesseract: Real[np.ndarray, "D R E A"],
+    *,
+    compress: bool = False,
 ) -> None:
     """Writes a tesseract as K-Radar does: MATLAB v5, `arrDREA`, column-major.
 
@@ -97,7 +101,7 @@ def write_tesseract(
 
     Args:
         path: `radar_tesseract/tesseract_<radar index>.mat`.
-        tesseract: `[D, R, E, A]` linear power; float32 stays float32.
+        tesseract: Linear power; float32 stays float32.
         compress: zlib-compress, 10 times slower to read.
     """
     import scipy.io  # loads slowly, and label writers do not need it

@@ -23,6 +23,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from jaxtyping import Int
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
@@ -136,7 +137,7 @@ def prediction_texts(
 
 
 def _lines(
-    table: Columns, rows: Iterable[int], *, scored: bool
+    table: Columns, rows: range | Int[np.ndarray, " K"], *, scored: bool
 ) -> dict[int, list[str]]:
     """Lines of chosen rows by frame, as ground truth or as predictions."""
     header = PRED_HEADER if scored else GT_HEADER

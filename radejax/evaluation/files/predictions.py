@@ -21,7 +21,7 @@ from radejax.core import files, schema
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import BOX_FIELDS
-from radejax.evaluation.columns import Columns, read_name, wanted_columns
+from radejax.evaluation.columns import AnyColumns, Columns, read_name, wanted_columns
 
 _SCORED = wanted_columns(scored=True)
 
@@ -261,7 +261,7 @@ def _number(text: str | None, name: str, path: pathlib.Path, line: int) -> float
 
 
 def write_table(
-    path: str | pathlib.Path, table: Columns, frames: Columns | None = None
+    path: str | pathlib.Path, table: AnyColumns, frames: Columns | None = None
 ) -> None:
     """Writes columns as .npz, .json or .csv; `read_table` gives the same back.
 

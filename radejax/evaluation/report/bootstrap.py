@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
@@ -23,11 +24,13 @@ from radejax.evaluation.result import SPACES
 LEVEL = 0.95
 
 
-def sequence_weights(sequence: np.ndarray, *, resamples: int, seed: int) -> np.ndarray:
-    """`[B, F]` int16: how often each frame counts in each resample.
+def sequence_weights(
+    sequence: Shaped[np.ndarray, " F"], *, resamples: int, seed: int
+) -> Int[np.ndarray, "B F"]:
+    """How often each frame counts in each resample; int16.
 
     Args:
-        sequence: `[F]` sequence of every frame.
+        sequence: Sequence of every frame.
         resamples: Number of resamples B.
         seed: Of the drawing; the same seed draws the same sequences.
 
@@ -46,14 +49,14 @@ def sequence_weights(sequence: np.ndarray, *, resamples: int, seed: int) -> np.n
 
 def resample(
     data: EvaluationSet,
-    weights: np.ndarray,
+    weights: Int[np.ndarray, "B F"],
     protocol: str,
     space: str,
     iou: float,
     *,
     skip_empty: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
-) -> np.ndarray:
+) -> Float[np.ndarray, "B _"]:
     """`[B, C + 1]` AP of every class, then their mean, in every resample.
 
     NaN where a resample has no object of a class; the mean is over classes that occur.
@@ -75,8 +78,10 @@ def resample(
     return ap
 
 
-def interval(samples: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
-    """Percentile interval of `[B]` samples; NaN if fewer than half of them exist."""
+def interval(
+    samples: Float[np.ndarray, " B"], level: float = LEVEL
+) -> tuple[float, float]:
+    """Percentile interval of samples; NaN if fewer than half of them exist."""
     samples = samples[~np.isnan(samples)]
     if samples.size < 1:
         return float("nan"), float("nan")
@@ -120,7 +125,7 @@ class Comparison:
 def compare(
     data_a: EvaluationSet,
     data_b: EvaluationSet,
-    sequence: np.ndarray,
+    sequence: Shaped[np.ndarray, " F"],
     *,
     protocol_names: Sequence[str] = (protocols.RECOMMENDED, "kradar_r40"),
     iou_thresholds: Sequence[float] = (0.3,),
@@ -134,7 +139,7 @@ def compare(
     Args:
         data_a: Run A.
         data_b: Run B on the same ground truth and frames.
-        sequence: `[F]` sequence of every frame.
+        sequence: Sequence of every frame.
         protocol_names: Protocols to compare in.
         iou_thresholds: IoU thresholds.
         spaces: "bev", "3d".
@@ -229,7 +234,7 @@ def add_intervals(
     *,
     resamples: int,
     seed: int,
-    masks: Mapping[str, np.ndarray] | None = None,
+    masks: Mapping[str, Bool[np.ndarray, " F"]] | None = None,
     skip_empty: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
 ) -> dict[tuple[str, str, str, str, float], tuple[float, float]]:
@@ -241,7 +246,7 @@ def add_intervals(
         terms: (protocol, space, IoU) to resample.
         resamples: Number of resamples.
         seed: Of the resampling.
-        masks: `[F]` masks by condition, resampled within the condition's sequences.
+        masks: Of frames by condition, resampled within the condition's sequences.
             Conditions of a single sequence get no interval.
         skip_empty: Frame rule.
         score_threshold: Score cut.

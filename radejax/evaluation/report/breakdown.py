@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool, Int, Shaped
 
 from radejax.evaluation import matching, overlap, protocols
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -39,8 +40,10 @@ class Slice:
     num_det: int
 
 
-def matched_objects(data: EvaluationSet, space: str, iou: float) -> np.ndarray:
-    """`[M]` ground truth that each prediction found, or -1 (recommended protocol)."""
+def matched_objects(
+    data: EvaluationSet, space: str, iou: float
+) -> Int[np.ndarray, " M"]:
+    """Ground truth that each prediction found, or -1 (recommended protocol)."""
     match = data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
     assert isinstance(match, np.ndarray)  # the recommended protocol is not K-Radar's
     return match
@@ -73,13 +76,13 @@ def by_distance(
 
 def by_condition(
     data: EvaluationSet,
-    conditions: Mapping[str, np.ndarray],
+    conditions: Mapping[str, Bool[np.ndarray, " F"]],
     space: str,
     iou: float,
     *,
     operating_score: float = 0.3,
 ) -> dict[tuple[str, str], Slice]:
-    """Numbers by (condition, class); a condition is a `[F]` mask of frames."""
+    """Numbers by (condition, class); a condition is a mask of frames."""
     masks = {
         name: (mask[data.gt.frame], mask[data.pred.frame])
         for name, mask in conditions.items()
@@ -90,8 +93,8 @@ def by_condition(
 
 def _by_slice(
     data: EvaluationSet,
-    masks: Mapping[str, Sequence[np.ndarray]],
-    match: np.ndarray,
+    masks: Mapping[str, Sequence[Bool[np.ndarray, " _"]]],
+    match: Int[np.ndarray, " M"],
     operating_score: float,
 ) -> dict[tuple[str, str], Slice]:
     """Numbers by (slice, class).
@@ -99,7 +102,7 @@ def _by_slice(
     Args:
         data: The evaluation set.
         masks: `[N]` objects and `[M]` predictions in each slice.
-        match: `[M]` from `matched_objects`.
+        match: From `matched_objects`.
         operating_score: Precision and recall are of predictions above this score.
     """
     result = {}
@@ -197,14 +200,16 @@ def box_errors(
     return result
 
 
-def _or_nan(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+def _or_nan(
+    statistic: Callable[[np.ndarray], float], values: Shaped[np.ndarray, " K"]
+) -> float:
     return float(statistic(values)) if values.size else math.nan
 
 
 def confusion(
     data: EvaluationSet, space: str, iou: float, *, operating_score: float = 0.3
-) -> np.ndarray:
-    """`[C + 1, C + 1]` counts: true class by predicted class, last row and column "none".
+) -> Int[np.ndarray, "true predicted"]:
+    """Counts: C + 1 true classes by as many predicted, last row and column "none".
 
     Predictions above the operating score are matched to objects of any class, by falling
     score to the best free object. Row C counts predictions on nothing, column C objects

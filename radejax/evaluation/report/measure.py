@@ -9,12 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, MIN_SIZE_M, RARE_SHARE
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation import protocols
-from radejax.evaluation.columns import Columns, are_simulated, in_roi
+from radejax.evaluation.columns import AnyColumns, Columns, are_simulated, in_roi
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOL_DEFAULT
 from radejax.evaluation.report import published
@@ -186,8 +187,8 @@ class Origin:
         return cls(np.size(frames["frame"]), split, are_simulated(frames))
 
 
-def condition_masks(frames: Columns, kind: str) -> dict[str, np.ndarray]:
-    """`[F]` masks by value of a column of the frame table, K-Radar's values first."""
+def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray, " F"]]:
+    """Masks of frames by value of a column of the frame table, K-Radar's values first."""
     if kind not in frames:
         return {}
     column = np.asarray(frames[kind]).astype(str)

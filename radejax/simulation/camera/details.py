@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 FRONT, REAR, LEFT, RIGHT, TOP = range(5)
 """Faces of a block, in the order of `shapes`."""
@@ -121,17 +122,20 @@ DETAILS: dict[str, tuple[Detail, ...]] = {
 }
 
 
-def on_faces(faces: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def on_faces(
+    faces: Float[np.ndarray, "F 4 3"],
+    u: Float[np.ndarray, "F 2"],
+    v: Float[np.ndarray, "F 2"],
+) -> Float[np.ndarray, "F 4 3"]:
     """Rectangles on quadrilaterals.
 
     Args:
-        faces: `[F, 4, 3]` corners: below first, below second, above second, above
-            first.
-        u: `[F, 2]` from and to along the lower edge.
-        v: `[F, 2]` from and to upward.
+        faces: Corners: below first, below second, above second, above first.
+        u: From and to along the lower edge.
+        v: From and to upward.
 
     Returns:
-        `[F, 4, 3]` corners in the same order, bilinear between those of the face.
+        Corners in the same order, bilinear between those of the face.
     """
     u, v = u[:, [0, 1, 1, 0], None], v[:, [0, 0, 1, 1], None]  # [F, 4, 1]
     a, b, c, d = (faces[:, None, i] for i in range(4))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 
@@ -69,9 +70,12 @@ def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
 
 
 def haze(
-    color: np.ndarray, depth_m: np.ndarray, veil: np.ndarray, extinction_per_m: float
-) -> np.ndarray:
-    """Colours `[..., 3]` at distances `[...]` seen through a veil of a colour `[3]`."""
+    color: Float[np.ndarray, "*points 3"],
+    depth_m: Float[np.ndarray, "*points"],
+    veil: Float[np.ndarray, "3"],
+    extinction_per_m: float,
+) -> Float[np.ndarray, "*points 3"]:
+    """Colours at distances seen through a veil of a colour."""
     clear = np.exp(-extinction_per_m * depth_m)[..., None]
     return color * clear + veil * (1.0 - clear)
 

@@ -7,6 +7,7 @@ radar map shows.
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame
 
@@ -17,20 +18,24 @@ _TREES = np.array([(58, 84, 48), (70, 92, 52), (48, 74, 50)], float)
 _SNOWY = np.array([206, 210, 214.0])
 _FAR_M = 110.0
 
+Panels = tuple[
+    Float[np.ndarray, "P 4 3"], Float[np.ndarray, " P"], Float[np.ndarray, "P 3"]
+]
+
 
 def make_panels(
-    frame: SceneFrame, origin: np.ndarray, ground_m: float, white: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    frame: SceneFrame, origin: Float[np.ndarray, "3"], ground_m: float, white: float
+) -> Panels:
     """Upright rectangles of the surroundings of a frame.
 
     Args:
         frame: Its reflectors are drawn.
-        origin: `[3]` camera position; trees and poles turn their face to it.
+        origin: Camera position; trees and poles turn their face to it.
         ground_m: Height of the ground.
         white: Snow on everything, 0 to 1.
 
     Returns:
-        Corners `[P, 4, 3]`, distances `[P]` and colours `[P, 3]`.
+        Corners, distances and colours.
     """
     fixed = frame.reflectors
     near = np.hypot(fixed.position_m[:, 0], fixed.position_m[:, 1]) < _FAR_M
@@ -60,8 +65,13 @@ def make_panels(
     return corners, depth, np.concatenate(colors)
 
 
-def _upright(center, side, low: float, high: float) -> np.ndarray:
-    """`[P, 4, 3]` rectangles around ground points `[P, 2]`."""
+def _upright(
+    center: Float[np.ndarray, "P 2"],
+    side: Float[np.ndarray, "P 2"],
+    low: float,
+    high: float,
+) -> Float[np.ndarray, "P 4 3"]:
+    """Rectangles around ground points."""
     a, b = center - side, center + side
     flat = np.stack([a, b, b, a], 1)
     height = np.broadcast_to([[low], [low], [high], [high]], (len(center), 4, 1))

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 
 import numpy as np
+from jaxtyping import Bool, Float, Int32, UInt8
 from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
@@ -72,18 +73,18 @@ class Ground:
     """Viewing rays of a camera where they meet the ground.
 
     Attributes:
-        hits: `[H, W]` bool, pixels that show ground; P of them.
-        x_m: `[P]` forward in the radar's frame.
-        y_m: `[P]` left.
-        depth_m: `[P]` distance.
-        up: `[H, W]` vertical component of the unit ray (the sky's gradient).
+        hits: Pixels that show ground; P of them.
+        x_m: Forward in the radar's frame.
+        y_m: Left.
+        depth_m: Distance.
+        up: Vertical component of the unit ray (the sky's gradient).
     """
 
-    hits: np.ndarray
-    x_m: np.ndarray
-    y_m: np.ndarray
-    depth_m: np.ndarray
-    up: np.ndarray
+    hits: Bool[np.ndarray, "H W"]
+    x_m: Float[np.ndarray, " P"]
+    y_m: Float[np.ndarray, " P"]
+    depth_m: Float[np.ndarray, " P"]
+    up: Float[np.ndarray, "H W"]
 
 
 @functools.lru_cache(maxsize=4)  # of a data set's cameras, for all its sequences
@@ -111,7 +112,9 @@ def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
     )
 
 
-def undistort(seen: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+def undistort(
+    seen: Float[np.ndarray, "*points 2"], distortion: Float[np.ndarray, "5"]
+) -> Float[np.ndarray, "*points 2"]:
     """Inverse of the lens model by fixed-point iteration; normalised coordinates."""
     k1, k2, p1, p2, k3 = distortion
     ideal = seen.copy()
@@ -162,12 +165,12 @@ class CameraRenderer:
             headlights=is_night,
         )
 
-    def render(self, frame: SceneFrame) -> np.ndarray:
-        """`[H, 2 W, 3]` uint8 image of the pair, left half first."""
+    def render(self, frame: SceneFrame) -> UInt8[np.ndarray, "H W2 3"]:
+        """Image of the pair, left half first."""
         return np.concatenate([self.view(frame, side) for side in (0, 1)], axis=1)
 
-    def view(self, frame: SceneFrame, side: int) -> np.ndarray:
-        """`[H, W, 3]` image of one camera."""
+    def view(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Image of one camera."""
         if self.content == "objects":
             return self.silhouettes(frame, side)
         calibration = self.calibrations[side]
@@ -188,8 +191,8 @@ class CameraRenderer:
             canvas = lens.cover_lens(canvas, level, air.is_snow, brightness, rng)
         return np.asarray(canvas)
 
-    def silhouettes(self, frame: SceneFrame, side: int) -> np.ndarray:
-        """`[H, W, 3]` uint8: objects in the colour of their class on black.
+    def silhouettes(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Objects in the colour of their class on black.
 
         The nearer the brighter, half as bright at 20 m, near ones before far ones, in
         any weather and light: what a camera that knows classes and distances would see.
@@ -204,8 +207,8 @@ class CameraRenderer:
                 draw.polygon(polygon.points, fill=tuple(color.astype(int).tolist()))
         return np.asarray(canvas)
 
-    def shown_boxes(self, frame: SceneFrame, side: int) -> np.ndarray:
-        """`[H, W]` int32 index of the box of the frame that a pixel shows, -1 for none.
+    def shown_boxes(self, frame: SceneFrame, side: int) -> Int32[np.ndarray, "H W"]:
+        """Index of the box of the frame that a pixel shows, -1 for none.
 
         As if air and lens were clear; what the roadside hides is not shown.
         """
@@ -246,15 +249,19 @@ class CameraRenderer:
             u, v = pixels[i].tolist()
             draw.ellipse((u - radius, v - radius, u + radius, v + radius), fill=color)
 
-    def _background(self, frame: SceneFrame, ground: Ground) -> np.ndarray:
-        """`[H, W, 3]` uint8 ground, road with markings, and sky."""
+    def _background(
+        self, frame: SceneFrame, ground: Ground
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """Ground, road with markings, and sky."""
         fade = np.clip(ground.up * 2.5, 0.0, 1.0)[..., None]
         image = self.sky * (1.0 - 0.35 * fade)
         image[ground.hits] = self._ground_color(frame, ground)
         return np.clip(image, 0, 255).astype(np.uint8)
 
-    def _ground_color(self, frame: SceneFrame, ground: Ground) -> np.ndarray:
-        """`[P, 3]` colours of the pixels that show ground."""
+    def _ground_color(
+        self, frame: SceneFrame, ground: Ground
+    ) -> Float[np.ndarray, "P 3"]:
+        """Colours of the pixels that show ground."""
         sequence, lanes = self.sequence, self.sequence.lanes_m
         x, y, depth = ground.x_m, ground.y_m, ground.depth_m
         verge = _VERGE.get(sequence.environment, _GRASS)
@@ -283,8 +290,10 @@ class CameraRenderer:
         return self.light.apply(color, x, y, depth)
 
 
-def _hash_noise(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Uniform numbers in [0, 1) that depend on two integers only."""
+def _hash_noise(
+    i: Float[np.ndarray, "*all"], j: Float[np.ndarray, "*all"]
+) -> Float[np.ndarray, "*all"]:
+    """Uniform numbers in [0, 1) that depend on two whole numbers only."""
     bits = (
         i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
     ) & 0xFFFFFFFF

@@ -6,10 +6,12 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import project
 from radejax.simulation.camera import details, lens
+from radejax.simulation.camera.panels import Panels
 
 # A block in units of the half extents: x, y, z ranges; colour role; share kept of the
 # length and width at its top (a taper).
@@ -96,8 +98,10 @@ class Polygon:
     box: int
 
 
-def object_colors(cls: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """`[N, 2, 3]` body colour and second colour (legs) of objects by class index."""
+def object_colors(
+    cls: Int[np.ndarray, " N"], rng: np.random.Generator
+) -> Float[np.ndarray, "N 2 3"]:
+    """Body colour and second colour (legs) of objects by class index."""
     paint = _PAINT[rng.integers(len(_PAINT), size=len(cls))]
     clothes = _CLOTHES[rng.integers(len(_CLOTHES), size=len(cls))]
     paint = paint * rng.uniform(0.82, 1.08, (len(cls), 1))
@@ -105,8 +109,8 @@ def object_colors(cls: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.stack([np.where(is_person, clothes, paint), clothes * 0.7], 1)
 
 
-def blocks_of(cls: str) -> np.ndarray:
-    """`[K, 8, 3]` corners of a class's blocks in half extents: 4 below, 4 above."""
+def blocks_of(cls: str) -> Float[np.ndarray, "K 8 3"]:
+    """Corners of a class's blocks in half extents: 4 below, 4 above."""
     corners = []
     for (x0, x1), (y0, y1), (z0, z1), _, (keep_x, keep_y) in BLOCKS[cls]:
         cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
@@ -124,18 +128,24 @@ class Light:
 
     Attributes:
         ambient: Brightness, 1 by day.
-        veil: `[3]` colour of the haze.
+        veil: Colour of the haze.
         extinction_per_m: Density of the haze.
         headlights: True if the ego vehicle lights up what is ahead.
     """
 
     ambient: float
-    veil: np.ndarray
+    veil: Float[np.ndarray, "3"]
     extinction_per_m: float
     headlights: bool
 
-    def apply(self, color: np.ndarray, x_m, y_m, depth_m) -> np.ndarray:
-        """Colours `[N, 3]` of surfaces at positions as they appear."""
+    def apply(
+        self,
+        color: Float[np.ndarray, "N 3"],
+        x_m: Float[np.ndarray, " N"],
+        y_m: Float[np.ndarray, " N"],
+        depth_m: Float[np.ndarray, " N"],
+    ) -> Float[np.ndarray, "N 3"]:
+        """Colours of surfaces at positions as they appear."""
         brightness = np.full(np.shape(depth_m), self.ambient)
         if self.headlights:
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
@@ -146,22 +156,22 @@ class Light:
 
 
 def visible_polygons(
-    boxes: np.ndarray,
+    boxes: Float[np.ndarray, "N 7"],
     classes: list[str],
-    colors: np.ndarray,
+    colors: Float[np.ndarray, "N 2 3"],
     calibration: CameraCalibration,
     light: Light,
-    panels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    panels: Panels | None = None,
 ) -> list[Polygon]:
     """Faces that look at the camera, far objects first.
 
     Args:
-        boxes: `[N, 7]` in the radar's frame.
+        boxes: In the radar's frame.
         classes: Names, one a box.
-        colors: `[N, 2, 3]` of `object_colors`.
+        colors: Of `object_colors`.
         calibration: The camera.
         light: Brightness and haze.
-        panels: Surroundings of `panels.make_panels`.
+        panels: Surroundings, of `make_panels`.
     """
     faces = _object_faces(boxes, classes, colors, camera_position(calibration))
     if panels is not None:
@@ -182,8 +192,8 @@ def visible_polygons(
     return [Polygon(points, tuple(rgb), *rest) for points, rgb, *rest in rows if points]
 
 
-def camera_position(calibration: CameraCalibration) -> np.ndarray:
-    """`[3]` of the camera in the radar's frame."""
+def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
+    """Of the camera in the radar's frame."""
     return calibration.ego_from_lidar_m - (
         calibration.rotation.T @ calibration.translation_m
     )
@@ -193,18 +203,18 @@ class Faces(NamedTuple):
     """Quadrilaterals in the radar's frame.
 
     Attributes:
-        corners: `[F, 4, 3]`.
-        color: `[F, 3]` red, green, blue in white light.
-        depth_m: `[F]` distance of the object.
-        block_depth_m: `[F]` distance of the block.
-        box: `[F]` index of the box, -1 for none.
+        corners: x, y, z.
+        color: Red, green, blue in white light.
+        depth_m: Distance of the object.
+        block_depth_m: Distance of the block.
+        box: Index of the box, -1 for none.
     """
 
-    corners: np.ndarray
-    color: np.ndarray
-    depth_m: np.ndarray
-    block_depth_m: np.ndarray
-    box: np.ndarray
+    corners: Float[np.ndarray, "F 4 3"]
+    color: Float[np.ndarray, "F 3"]
+    depth_m: Float[np.ndarray, " F"]
+    block_depth_m: Float[np.ndarray, " F"]
+    box: Int[np.ndarray, " F"]
 
 
 def _object_faces(boxes, classes, colors, origin) -> Faces:
@@ -241,9 +251,9 @@ def _object_faces(boxes, classes, colors, origin) -> Faces:
 
 
 def _project_faces(
-    faces: np.ndarray, calibration: CameraCalibration
+    faces: Float[np.ndarray, "F 4 3"], calibration: CameraCalibration
 ) -> list[list[tuple[float, ...]]]:
-    """Pixels of faces `[F, 4, 3]` cut at the near plane; edges bend with the lens.
+    """Pixels of faces cut at the near plane; edges bend with the lens.
 
     A face wholly nearer than the plane, or off the image, gives an empty list.
     """
@@ -268,8 +278,10 @@ def _project_faces(
     return result
 
 
-def _on_image(points: np.ndarray, size: np.ndarray) -> list[tuple[float, ...]]:
-    """Pixels `[P, 2]` of a face, not too far off an image of a size; or none."""
+def _on_image(
+    points: Float[np.ndarray, "P 2"], size: Float[np.ndarray, "2"]
+) -> list[tuple[float, ...]]:
+    """Pixels of a face, not too far off an image of a size; or none."""
     is_off = (points.max(0) < 0).any() or (points.min(0) > size).any()
     points = np.clip(points, -2.0 * size, 3.0 * size)
     return [] if is_off else list(map(tuple, points.tolist()))

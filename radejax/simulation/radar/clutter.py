@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from radejax.simulation.radar.scattering import (
     OCCLUDED_DB,
@@ -19,14 +20,14 @@ from radejax.simulation.world.scene import SceneFrame, is_blocked
 
 def scatter_surroundings(
     frame: SceneFrame,
-    phase_rad: np.ndarray,
+    phase_rad: Float[np.ndarray, " M"],
     parameters: RadarParameters,
 ) -> FrameScattering:
     """Scatterers of the static surroundings: ground, rails, walls, poles, trees.
 
     Args:
         frame: Its reflectors are used.
-        phase_rad: `[M]` phases of all reflectors of its sequence.
+        phase_rad: Phases of all reflectors of its sequence.
         parameters: The sensor.
     """
     fixed = frame.reflectors

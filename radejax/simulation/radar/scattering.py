@@ -28,6 +28,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
@@ -76,34 +77,36 @@ class ObjectScatterers(NamedTuple):
     """Scattering centers of all objects of a sequence, in the frames of their boxes.
 
     Attributes:
-        track: `[S]` which object each belongs to, ascending.
-        position: `[S, 3]` in units of the box's half extents.
-        normal: `[S, 3]` unit normal of the face.
-        power_m2: `[S]` radar cross-section seen along the normal, without glint.
-        glint: `[S]` relative power of the flash.
-        phase_rad: `[S]` phase of the reflection.
-        micro: `[S]` velocity swing relative to the object's speed, 0 for the body.
-        micro_phase_rad: `[S]` phase of that swing at time 0.
+        track: Which object each belongs to, ascending.
+        position: In units of the box's half extents.
+        normal: Unit normal of the face.
+        power_m2: Radar cross-section seen along the normal, without glint.
+        glint: Relative power of the flash.
+        phase_rad: Phase of the reflection.
+        micro: Velocity swing relative to the object's speed, 0 for the body.
+        micro_phase_rad: Phase of that swing at time 0.
     """
 
-    track: np.ndarray
-    position: np.ndarray
-    normal: np.ndarray
-    power_m2: np.ndarray
-    glint: np.ndarray
-    phase_rad: np.ndarray
-    micro: np.ndarray
-    micro_phase_rad: np.ndarray
+    track: Int[np.ndarray, " S"]
+    position: Float[np.ndarray, "S 3"]
+    normal: Float[np.ndarray, "S 3"]
+    power_m2: Float[np.ndarray, " S"]
+    glint: Float[np.ndarray, " S"]
+    phase_rad: Float[np.ndarray, " S"]
+    micro: Float[np.ndarray, " S"]
+    micro_phase_rad: Float[np.ndarray, " S"]
 
 
 def make_object_scatterers(
-    cls: np.ndarray, size_m: np.ndarray, rng: np.random.Generator
+    cls: Int[np.ndarray, " N"],
+    size_m: Float[np.ndarray, "N 3"],
+    rng: np.random.Generator,
 ) -> ObjectScatterers:
     """Scattering centers of objects.
 
     Args:
-        cls: `[N]` class indices.
-        size_m: `[N, 3]` length, width, height.
+        cls: Class indices.
+        size_m: Length, width, height.
         rng: Source of the random placement and of the objects' cross-sections.
 
     Returns:
@@ -120,7 +123,7 @@ def make_object_scatterers(
 
 
 def _one_object(
-    index: int, cls: str, size_m: np.ndarray, rng: np.random.Generator
+    index: int, cls: str, size_m: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> ObjectScatterers:
     """Scattering centers of one object."""
     law = CLASS_SCATTERING[cls]
@@ -163,14 +166,20 @@ def _one_object(
     )
 
 
-def _aspect_mean(normal: np.ndarray, weight: np.ndarray, glint: np.ndarray) -> float:
+def _aspect_mean(
+    normal: Float[np.ndarray, "S 3"],
+    weight: Float[np.ndarray, " S"],
+    glint: Float[np.ndarray, " S"],
+) -> float:
     """Mean total cross-section over all horizontal aspects of weights of 1 m2."""
     angle = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
     cosine = normal[:, :2] @ np.stack([np.cos(angle), np.sin(angle)])  # [S, aspects]
     return float((weight[:, None] * face_gain(cosine, glint[:, None])).sum(0).mean())
 
 
-def face_gain(cosine: np.ndarray, glint: np.ndarray | float) -> np.ndarray:
+def face_gain(
+    cosine: Float[np.ndarray, "*faces"], glint: Float[np.ndarray, "*#faces"] | float
+) -> Float[np.ndarray, "*faces"]:
     """Power of a scatterer on a face seen under an angle to its normal.
 
     Diffuse part `cos^2`, a Gaussian flash near the normal, and a small rest from
@@ -179,9 +188,6 @@ def face_gain(cosine: np.ndarray, glint: np.ndarray | float) -> np.ndarray:
     Args:
         cosine: Cosine between normal and the direction to the radar.
         glint: Power of the flash relative to the diffuse part at normal incidence.
-
-    Returns:
-        Gains, shape of `cosine`.
     """
     facing = np.clip(cosine, 0.0, 1.0)
     off_normal = np.arccos(facing)
@@ -193,18 +199,18 @@ class FrameScattering(NamedTuple):
     """Scatterers of a frame before phases: positions, velocities and powers.
 
     Attributes:
-        position_m: `[S, 3]` in the radar's frame.
-        velocity_mps: `[S, 2]` over ground.
-        power: `[S]` linear received power.
-        phase_rad: `[S]` phase of the reflection, without the way there and back.
-        owner: `[S]` index into the frame's boxes, -1 for surroundings.
+        position_m: In the radar's frame.
+        velocity_mps: Over ground.
+        power: Linear received power.
+        phase_rad: Phase of the reflection, without the way there and back.
+        owner: Index into the frame's boxes, -1 for surroundings.
     """
 
-    position_m: np.ndarray
-    velocity_mps: np.ndarray
-    power: np.ndarray
-    phase_rad: np.ndarray
-    owner: np.ndarray
+    position_m: Float[np.ndarray, "S 3"]
+    velocity_mps: Float[np.ndarray, "S 2"]
+    power: Float[np.ndarray, " S"]
+    phase_rad: Float[np.ndarray, " S"]
+    owner: Int[np.ndarray, " S"]
 
 
 def join(parts: Iterable[FrameScattering]) -> FrameScattering:
@@ -218,11 +224,11 @@ def join(parts: Iterable[FrameScattering]) -> FrameScattering:
 
 def scatter_objects(
     frame: SceneFrame, centers: ObjectScatterers, parameters: RadarParameters
-) -> tuple[FrameScattering, np.ndarray]:
+) -> tuple[FrameScattering, Float[np.ndarray, " N"]]:
     """Scatterers of the objects of a frame.
 
     Returns:
-        The scatterers, and `[N]` the fraction of each box's power that is not
+        The scatterers, and the fraction of each box's power that is not
         occluded by other boxes.
     """
     boxes = frame.boxes
@@ -232,7 +238,7 @@ def scatter_objects(
     owner = owner_of_track[centers.track[used]]
     box = boxes[owner]  # [S, 7]
 
-    def turn(v: np.ndarray) -> np.ndarray:
+    def turn(v: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 3"]:
         return np.stack([*rotate(v[:, 0], v[:, 1], box[:, 6]), v[:, 2]], 1)
 
     position = box[:, :3] + turn(centers.position[used] * box[:, 3:6] / 2.0)
@@ -263,9 +269,11 @@ _ON_FOOT = [CLASSES.index("Pedestrian")]
 
 
 def received_power(
-    position_m: np.ndarray, rcs_m2: np.ndarray, parameters: RadarParameters
-) -> np.ndarray:
-    """Radar equation: gain x cross-section x pattern / R^4, linear power `[S]`."""
+    position_m: Float[np.ndarray, "S 3"],
+    rcs_m2: Float[np.ndarray, " S"],
+    parameters: RadarParameters,
+) -> Float[np.ndarray, " S"]:
+    """Radar equation: gain x cross-section x pattern / R^4, linear power."""
     distance = np.maximum(np.linalg.norm(position_m, axis=1), 1.0)
     forward = np.clip(position_m[:, 0] / distance, 0.0, 1.0)
     pattern = forward**parameters.pattern_exponent
@@ -277,13 +285,15 @@ CAPACITY_STEP = 512
 
 
 def to_scatterers(
-    found: FrameScattering, ego_velocity_mps: np.ndarray, wavelength_m: float
+    found: FrameScattering,
+    ego_velocity_mps: Float[np.ndarray, "2"],
+    wavelength_m: float,
 ) -> Scatterers:
     """What the radar measures of scatterers: polar positions, range rate, amplitude.
 
     Args:
         found: Objects, surroundings, ghosts.
-        ego_velocity_mps: `[2]` of the radar over ground.
+        ego_velocity_mps: Of the radar over ground.
         wavelength_m: Of the sensor.
 
     Returns:

@@ -19,7 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
+from jaxtyping import Float, UInt32
 
+from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -64,24 +66,25 @@ class Scatterers(struct.PyTreeNode):
     """Point targets of one frame as the radar sees them; a JAX pytree.
 
     Attributes:
-        range_m: `[S]` distance from the radar.
-        azimuth_rad: `[S]` positive to the right.
-        elevation_rad: `[S]` positive upward.
-        velocity_mps: `[S]` rate of change of range, not aliased.
-        amplitude: `[S, 2]` float32 real and imaginary part; power is the sum of
-            squares. Zero for padding.
+        range_m: Distance from the radar.
+        azimuth_rad: Positive to the right.
+        elevation_rad: Positive upward.
+        velocity_mps: Rate of change of range, not aliased.
+        amplitude: float32 real and imaginary part; power is the sum of squares. Zero for
+            padding.
     """
 
-    range_m: Any
-    azimuth_rad: Any
-    elevation_rad: Any
-    velocity_mps: Any
-    amplitude: Any
+    # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
+    range_m: Float[Array, " S"]
+    azimuth_rad: Float[Array, " S"]
+    elevation_rad: Float[Array, " S"]
+    velocity_mps: Float[Array, " S"]
+    amplitude: Float[Array, "S 2"]
 
 
 def window_response(
-    x: jax.Array | np.ndarray, pedestal: float, num_samples: float = 0.0
-) -> jax.Array:
+    x: Float[Array, "*bins"], pedestal: float, num_samples: float = 0.0
+) -> Float[jax.Array, "*bins"]:
     """Zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
 
     With D the transform of the uniform window (the Dirichlet kernel of `num_samples`
@@ -90,15 +93,15 @@ def window_response(
     Pedestal 0 is the Hann window: first sidelobe -31.5 dB, zeros from 2 bins on.
 
     Args:
-        x: Distance from the peak in bins (cells of the unpadded FFT), any shape.
+        x: Distance from the peak in bins (cells of the unpadded FFT).
         pedestal: p, in [0, 1]; 1 is the uniform window.
         num_samples: Period in bins for axes that wrap around; 0 means no period.
 
     Returns:
-        Real amplitudes, shape of `x`.
+        Real amplitudes.
     """
 
-    def dirichlet(t: jax.Array | np.ndarray) -> jax.Array:
+    def dirichlet(t: Float[Array, "*bins"]) -> Float[jax.Array, "*bins"]:
         if not num_samples:
             return jnp.sinc(t)
         small = jnp.sin(jnp.pi * t / num_samples)
@@ -113,8 +116,10 @@ def window_response(
     return dirichlet(x) + side / center * (dirichlet(x - 1.0) + dirichlet(x + 1.0))
 
 
-def doppler_response(velocity_mps: jax.Array, grid: RadarGrid) -> jax.Array:
-    """`[D, S]` amplitudes on the Doppler axis; velocities alias by its period."""
+def doppler_response(
+    velocity_mps: Float[Array, " S"], grid: RadarGrid
+) -> Float[jax.Array, "D S"]:
+    """Amplitudes on the Doppler axis; velocities alias by its period."""
     step = float(grid.doppler_mps[1] - grid.doppler_mps[0])
     cell = (velocity_mps[None] - grid.doppler_mps[0]) / step
     offset = np.arange(grid.num_doppler, dtype=np.float32)[:, None] - cell
@@ -122,18 +127,21 @@ def doppler_response(velocity_mps: jax.Array, grid: RadarGrid) -> jax.Array:
 
 
 def range_response(
-    range_m: jax.Array, grid: RadarGrid, parameters: RadarParameters
-) -> jax.Array:
-    """`[R, S]` amplitudes on the range axis."""
+    range_m: Float[Array, " S"], grid: RadarGrid, parameters: RadarParameters
+) -> Float[jax.Array, "R S"]:
+    """Amplitudes on the range axis."""
     resolution = parameters.range_resolution_m or grid.range_step_m
     axis = grid.range_m.astype(np.float32)[:, None]
     return window_response((axis - range_m[None]) / resolution, 0.0)
 
 
 def angle_response(
-    axis_rad: np.ndarray, angle_rad: jax.Array, elements: float, pedestal: float
-) -> jax.Array:
-    """`[bins, S]` array pattern of a linear array with half-wavelength spacing.
+    axis_rad: Float[np.ndarray, " bins"],
+    angle_rad: Float[Array, " S"],
+    elements: float,
+    pedestal: float,
+) -> Float[jax.Array, "bins S"]:
+    """Pattern of a linear array with half-wavelength spacing.
 
     The pattern depends on the difference of sines, so beams widen away from boresight.
     """
@@ -148,21 +156,21 @@ def angle_response(
 )
 def simulate(
     scatterers: Scatterers,
-    noise_power: jax.Array,
-    key: jax.Array,
+    noise_power: Float[Array, "R D"],
+    key: UInt32[Array, "2"],
     *,
     grid: RadarGrid,
     parameters: RadarParameters = RadarParameters(),
     output: Output = "projection",
     rows_per_step: int = 0,
-) -> jax.Array:
+) -> Float[jax.Array, "..."]:
     """One radar frame, jitted; map it over frames with `jax.vmap`.
 
     Args:
-        scatterers: Point targets, `[S]` each; pad with zero amplitude.
-        noise_power: `[R, D]` mean power of noise (and of weather's backscatter, which
+        scatterers: Point targets; pad with zero amplitude.
+        noise_power: Mean power of noise (and of weather's backscatter, which
             has the same statistics); zero for none.
-        key: `uint32 [2]` seed of the noise of this frame.
+        key: Seed of the noise of this frame.
         grid: Axes of the tensor.
         parameters: The sensor.
         output: "tesseract" for `[D, R, E, A]` linear power, "rows" for the same as it is
@@ -216,16 +224,16 @@ def simulate(
     return jnp.transpose(result, TESSERACT_OF_ROWS) if output == "tesseract" else result
 
 
-def _project_row(power: jax.Array) -> jax.Array:
-    """`[A, D+E]` normalised maxima of one range row `[E, D, A]`."""
+def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:
+    """Normalised maxima of one range row."""
     maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
     return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
 
 def array_noise_basis(
-    axis_rad: np.ndarray, elements: float, pedestal: float
-) -> np.ndarray:
-    """`[bins, N]` real matrix B that gives white noise the correlation of array bins.
+    axis_rad: Float[np.ndarray, " bins"], elements: float, pedestal: float
+) -> Float[np.ndarray, "bins N"]:
+    """Real matrix B that gives white noise the correlation of array bins.
 
     Noise of the N elements of an array is independent, so after weights `w_n` and the
     Fourier transform two bins correlate by `sum_n w_n^2 cos(pi n (sin a - sin b))`,
@@ -246,13 +254,13 @@ def array_noise_basis(
 
 
 def _noise_field(
-    power: jax.Array,
-    key: jax.Array,
-    row_idx: jax.Array,
-    elevation_basis: np.ndarray,
-    azimuth_basis: np.ndarray,
-) -> jax.Array:
-    """`[E, D, 2, A]` complex Gaussian noise of one range row, mean power `[D]`.
+    power: Float[jax.Array, " D"],
+    key: UInt32[Array, "2"],
+    row_idx: UInt32[jax.Array, ""],
+    elevation_basis: Float[np.ndarray, "E M"],
+    azimuth_basis: Float[np.ndarray, "A N"],
+) -> Float[jax.Array, "E D 2 A"]:
+    """Complex Gaussian noise of one range row of a mean power.
 
     White noise of every Doppler bin and pair of elements goes through the Hann window
     of the Doppler axis (in bins: 1/2, 1, 1/2) and through both arrays.
@@ -271,8 +279,10 @@ def _noise_field(
     )
 
 
-def _white_noise(count: int, key: jax.Array, row_idx: jax.Array) -> jax.Array:
-    """`[count]` independent Gaussian numbers of mean square 1/2.
+def _white_noise(
+    count: int, key: UInt32[Array, "2"], row_idx: UInt32[jax.Array, ""]
+) -> Float[jax.Array, " {count}"]:
+    """Independent Gaussian numbers of mean square 1/2.
 
     Neighbours are the real and imaginary part of one complex number, made of one
     32-bit number: 20 bits for its power, which is exponential, 12 for its phase.
@@ -285,7 +295,7 @@ def _white_noise(count: int, key: jax.Array, row_idx: jax.Array) -> jax.Array:
     return jnp.sqrt(-jnp.log(uniform)) * _sine_of_turn(bits + quarter)
 
 
-def _sine_of_turn(bits: jax.Array) -> jax.Array:
+def _sine_of_turn(bits: UInt32[jax.Array, "*all"]) -> Float[jax.Array, "*all"]:
     """Sine of the angle whose 4096th parts of a turn are the 12 lowest bits.
 
     Two parabolas, wrong by 0.1 % at most: ample for noise, and the library's sine would
@@ -296,7 +306,9 @@ def _sine_of_turn(bits: jax.Array) -> jax.Array:
     return rough * (0.775 + 0.225 * jnp.abs(rough))
 
 
-def _hash(x: jax.Array, key: jax.Array) -> jax.Array:
+def _hash(
+    x: UInt32[jax.Array, "*all"], key: UInt32[Array, ""]
+) -> UInt32[jax.Array, "*all"]:
     """A 32-bit integer hash of a number under a key (multiply and xor-shift).
 
     Cheaper than threefry by far, and the same bits on every platform. The key enters
@@ -308,6 +320,6 @@ def _hash(x: jax.Array, key: jax.Array) -> jax.Array:
     return x ^ (x >> 16)
 
 
-def frame_key(*numbers: int) -> np.ndarray:
-    """`uint32 [2]` noise key of a frame from any integers, well mixed."""
+def frame_key(*numbers: int) -> UInt32[np.ndarray, "2"]:
+    """Noise key of a frame from any integers, well mixed."""
     return np.random.SeedSequence([n & 0xFFFFFFFF for n in numbers]).generate_state(2)

@@ -19,8 +19,10 @@ References:
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
+from jaxtyping import Complex, Float, Inexact
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,12 +56,16 @@ the asphalt's pores in rain and sleet, loose snow."""
 
 
 def reflection(
-    sine: np.ndarray, surface: Surface, wavelength_m: float, *, vertical: bool = False
-) -> np.ndarray:
+    sine: float | Float[np.ndarray, "*targets"],
+    surface: Surface,
+    wavelength_m: float,
+    *,
+    vertical: bool = False,
+) -> Inexact[Any, "*targets"]:
     """Complex reflection coefficient of the mean field.
 
     Args:
-        sine: Sine of the grazing angle, any shape.
+        sine: Sine of the grazing angle.
         surface: What reflects.
         wavelength_m: Wavelength.
         vertical: Polarisation; the coefficient is -1 at grazing incidence for both.
@@ -73,15 +79,18 @@ def reflection(
 
 
 def bounce(
-    position_m: np.ndarray, ground_m: float, surface: Surface, wavelength_m: float
-) -> np.ndarray:
-    """`[S]` complex factor on the amplitude of targets over a flat road, two-way.
+    position_m: Float[np.ndarray, "S 3"],
+    ground_m: float,
+    surface: Surface,
+    wavelength_m: float,
+) -> Complex[np.ndarray, " S"]:
+    """Factor on the amplitude of targets over a flat road, two-way.
 
     `(1 + rho exp(i 2 pi d / wavelength))^2`: direct and bounced on the way there times
     the same on the way back; d is how much longer the bounced way is.
 
     Args:
-        position_m: `[S, 3]` in the radar's frame.
+        position_m: In the radar's frame.
         ground_m: Height of the road in that frame (negative). Targets lower than it
             count as lying on it.
         surface: What covers the road.

@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
@@ -54,7 +55,9 @@ WEATHERS = {
 """K-Radar's seven weathers."""
 
 
-def attenuation(weather: str, distance_m: np.ndarray) -> np.ndarray:
+def attenuation(
+    weather: str, distance_m: Float[np.ndarray, "*cells"]
+) -> Float[np.ndarray, "*cells"]:
     """Factor on received power at distances: the way there and back, and the radome."""
     law = WEATHERS[weather]
     loss_db = 2.0 * law.attenuation_db_per_km * distance_m / 1000.0 + law.radome_db
@@ -65,8 +68,8 @@ def noise_profile(
     weather: str,
     grid: RadarGrid,
     parameters: RadarParameters,
-    ego_velocity_mps: np.ndarray,
-) -> np.ndarray:
+    ego_velocity_mps: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "R D"]:
     """Mean noise power of range and Doppler cells: receiver plus backscatter.
 
     Many drops in one cell add up to a complex Gaussian, like noise, so they need no
@@ -75,7 +78,7 @@ def noise_profile(
     minus the ego speed, plus a spread, on an axis that wraps around.
 
     Returns:
-        `[R, D]` float32 linear power.
+        float32 linear power.
     """
     law = WEATHERS[weather]
     beam = (2.4 / parameters.azimuth_elements) * (2.4 / parameters.elevation_elements)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from radejax.data.kradar import Frame
 from radejax.simulation.world.environments import (
@@ -118,8 +119,10 @@ def collect_tracks(
     )
 
 
-def relative_velocity(tracks: Tracks, clock: np.ndarray) -> np.ndarray:
-    """`[F, N, 2]` velocities in the radar's frame from the labels' motion.
+def relative_velocity(
+    tracks: Tracks, clock: Float[np.ndarray, " F"]
+) -> Float[np.ndarray, "F N 2"]:
+    """Velocities in the radar's frame from the labels' motion.
 
     Central differences over neighbouring frames where the track is present on both
     sides, one-sided at its ends, zero for tracks of one frame. Labels jitter by some
@@ -152,9 +155,9 @@ def relative_velocity(tracks: Tracks, clock: np.ndarray) -> np.ndarray:
 
 
 def infer_ego_speed(
-    tracks: Tracks, relative: np.ndarray, prior_mps: tuple[float, float]
-) -> np.ndarray:
-    """`[F]` speed of the ego vehicle that the tracks suggest.
+    tracks: Tracks, relative: Float[np.ndarray, "F N 2"], prior_mps: tuple[float, float]
+) -> Float[np.ndarray, " F"]:
+    """Speed of the ego vehicle that the tracks suggest.
 
     Traffic of our direction never drives backward, so the ego is at least as fast as
     the fastest approach of a vehicle that heads our way (parked ones reach the bound),

@@ -13,6 +13,7 @@ import functools
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from radejax.core.structures import CLASSES
 
@@ -47,23 +48,23 @@ class Tracks:
     """Every object of a sequence at every frame, in the world frame.
 
     Attributes:
-        position_m: `[F, N, 3]` box centers.
-        yaw_rad: `[F, N]` headings.
-        velocity_mps: `[F, N, 2]` over ground.
-        is_present: `[F, N]` bool.
-        size_m: `[F, N, 3]` length, width, height.
-        cls: `[N]` index into `CLASSES`.
-        track_id: `[N]` identity written to the labels.
+        position_m: Box centers.
+        yaw_rad: Headings.
+        velocity_mps: Over ground.
+        is_present: True where an object is there.
+        size_m: Length, width, height.
+        cls: Index into `CLASSES`.
+        track_id: Identity written to the labels.
         label_cls: Class names written to the labels.
     """
 
-    position_m: np.ndarray
-    yaw_rad: np.ndarray
-    velocity_mps: np.ndarray
-    is_present: np.ndarray
-    size_m: np.ndarray
-    cls: np.ndarray
-    track_id: np.ndarray
+    position_m: Float[np.ndarray, "F N 3"]
+    yaw_rad: Float[np.ndarray, "F N"]
+    velocity_mps: Float[np.ndarray, "F N 2"]
+    is_present: Bool[np.ndarray, "F N"]
+    size_m: Float[np.ndarray, "F N 3"]
+    cls: Int[np.ndarray, " N"]
+    track_id: Int[np.ndarray, " N"]
     label_cls: tuple[str, ...]
 
 
@@ -72,17 +73,17 @@ class Reflectors:
     """Static scatterers of the surroundings in the world frame.
 
     Attributes:
-        position_m: `[M, 3]`.
-        rcs_dbsm: `[M]`.
-        normal_rad: `[M]` direction of the surface's normal in the ground plane, NaN
+        position_m: x, y, z.
+        rcs_dbsm: Radar cross-section.
+        normal_rad: Direction of the surface's normal in the ground plane, NaN
             where the reflector looks the same from everywhere.
-        kind: `[M]` index into `REFLECTOR_KINDS`.
+        kind: Index into `REFLECTOR_KINDS`.
     """
 
-    position_m: np.ndarray
-    rcs_dbsm: np.ndarray
-    normal_rad: np.ndarray
-    kind: np.ndarray
+    position_m: Float[np.ndarray, "M 3"]
+    rcs_dbsm: Float[np.ndarray, " M"]
+    normal_rad: Float[np.ndarray, " M"]
+    kind: Int[np.ndarray, " M"]
 
 
 REFLECTOR_KINDS = ("ground", "rail", "wall", "pole", "tree")
@@ -93,27 +94,27 @@ class SceneFrame:
     """One instant, seen from the radar: x forward, y left, z up from the radar.
 
     Attributes:
-        boxes: `[N, 7]` x, y, z, l, w, h, yaw.
-        velocity_mps: `[N, 2]` over ground, along the ego axes.
-        cls: `[N]` index into `CLASSES`.
-        track: `[N]` index into the tracks of the sequence.
-        track_id: `[N]` identity written to the labels.
-        ego_velocity_mps: `[2]` of the radar over ground, along its own axes.
+        boxes: x, y, z, l, w, h, yaw.
+        velocity_mps: Over ground, along the ego axes.
+        cls: Index into `CLASSES`.
+        track: Index into the tracks of the sequence.
+        track_id: Identity written to the labels.
+        ego_velocity_mps: Of the radar over ground, along its own axes.
         reflectors: Static surroundings near the ego, in this frame.
-        reflector_idx: `[M]` which reflectors of the sequence these are.
+        reflector_idx: Which reflectors of the sequence these are.
         index: Of the frame in its sequence.
         time_s: Since the start of the sequence.
         ego_along_m: Position of the ego along its road (for drawing the road).
     """
 
-    boxes: np.ndarray
-    velocity_mps: np.ndarray
-    cls: np.ndarray
-    track: np.ndarray
-    track_id: np.ndarray
-    ego_velocity_mps: np.ndarray
+    boxes: Float[np.ndarray, "N 7"]
+    velocity_mps: Float[np.ndarray, "N 2"]
+    cls: Int[np.ndarray, " N"]
+    track: Int[np.ndarray, " N"]
+    track_id: Int[np.ndarray, " N"]
+    ego_velocity_mps: Float[np.ndarray, "2"]
     reflectors: Reflectors
-    reflector_idx: np.ndarray
+    reflector_idx: Int[np.ndarray, " M"]
     index: int
     time_s: float
     ego_along_m: float
@@ -128,8 +129,8 @@ class Sequence:
         environment: K-Radar's road type.
         time: "day" or "night".
         weather: One of K-Radar's seven.
-        ego_along_m: `[F]` position of the radar along the road's centerline.
-        ego_speed_mps: `[F]` straight ahead.
+        ego_along_m: Position of the radar along the road's centerline.
+        ego_speed_mps: Straight ahead.
         tracks: Objects.
         reflectors: Static surroundings.
         road: Centerline, on which the ego drives.
@@ -143,8 +144,8 @@ class Sequence:
     environment: str
     time: str
     weather: str
-    ego_along_m: np.ndarray
-    ego_speed_mps: np.ndarray
+    ego_along_m: Float[np.ndarray, " F"]
+    ego_speed_mps: Float[np.ndarray, " F"]
     tracks: Tracks
     reflectors: Reflectors
     road: Road
@@ -153,8 +154,8 @@ class Sequence:
     mirrors_m: tuple[float, ...] = ()
 
     @functools.cached_property
-    def ego_pose(self) -> np.ndarray:
-        """`[F, 3]` world x, y and heading of the radar."""
+    def ego_pose(self) -> Float[np.ndarray, "F 3"]:
+        """World x, y and heading of the radar."""
         return np.stack(self.road.position(self.ego_along_m, 0.0), 1)
 
     def frame(self, index: int, max_distance_m: float = 150.0) -> SceneFrame:
@@ -194,8 +195,11 @@ class Sequence:
         )
 
 
-def travelled(speed_mps: np.ndarray, period_s: Any = FRAME_PERIOD_S) -> np.ndarray:
-    """`[F]` metres since the first frame at speeds `[F]`, held for a period each."""
+def travelled(
+    speed_mps: Float[np.ndarray, " F"],
+    period_s: float | Float[np.ndarray, " F"] = FRAME_PERIOD_S,
+) -> Float[np.ndarray, " F"]:
+    """Metres since the first frame at speeds that are held for a period each."""
     return np.concatenate([[0.0], np.cumsum((speed_mps * period_s)[:-1])])
 
 
@@ -211,19 +215,20 @@ def class_index(name: str) -> int:
     return CLASSES.index(single)
 
 
-def is_blocked(targets: np.ndarray, boxes: np.ndarray, owner: np.ndarray) -> np.ndarray:
+def is_blocked(
+    targets: Float[np.ndarray, "S 3"],
+    boxes: Float[np.ndarray, "N 7"],
+    owner: Int[np.ndarray, " S"],
+) -> Bool[np.ndarray, " S"]:
     """True where the straight way from the origin to a point crosses a box.
 
     Args:
-        targets: `[S, 3]` points.
-        boxes: `[N, 7]` obstacles.
-        owner: `[S]` index of a box that does not block (the point's own), or -1.
-
-    Returns:
-        `[S]` bool.
+        targets: Points.
+        boxes: Obstacles.
+        owner: Index of a box that does not block (the point's own), or -1.
     """
 
-    def into_boxes(p: np.ndarray) -> np.ndarray:  # [S, 3] -> [S, N, 3]
+    def into_boxes(p: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S N 3"]:
         x, y, z = np.moveaxis(p[:, None] - boxes[None, :, :3], -1, 0)
         return np.stack([*rotate(x, y, -boxes[:, 6]), z], -1)
 
@@ -250,7 +255,9 @@ def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
     return cos * x - sin * y, sin * x + cos * y
 
 
-def _to_ego(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """`[N, 3]` world points in the frame of the radar at `pose` (x, y, heading)."""
+def _to_ego(
+    points: Float[np.ndarray, "N 3"], pose: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "N 3"]:
+    """World points in the frame of the radar at `pose` (x, y, heading)."""
     x, y, z = points.T
     return np.stack([*rotate(x - pose[0], y - pose[1], -pose[2]), z], 1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from radejax.simulation.world.environments import (
     ENVIRONMENTS,
@@ -84,7 +85,9 @@ def make_sequence(
     )
 
 
-def _speed_wave(clock: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _speed_wave(
+    clock: Float[np.ndarray, " F"], rng: np.random.Generator
+) -> Float[np.ndarray, " F"]:
     """Slow rise and fall of traffic's speed around 1."""
     period = rng.uniform(8.0, 25.0)
     return 1.0 + 0.12 * np.sin(2 * np.pi * (clock / period + rng.random()))
@@ -96,9 +99,9 @@ class _Traffic:
 
     law: Environment
     road: Road
-    clock: np.ndarray
-    ego_along: np.ndarray
-    ego_speed: np.ndarray
+    clock: Float[np.ndarray, " F"]
+    ego_along: Float[np.ndarray, " F"]
+    ego_speed: Float[np.ndarray, " F"]
     rng: np.random.Generator
     # (cls, size, along [F], left [F], speed [F], turn)
     paths: list[tuple] = dataclasses.field(default_factory=list)
@@ -136,12 +139,14 @@ class _Traffic:
         self._cyclists(right + 0.5)
         return right - pavement - 1.0, left + pavement + 1.0
 
-    def _add(self, cls: str, size: np.ndarray, along, left, speed, turn: float) -> None:
+    def _add(
+        self, cls: str, size: Float[np.ndarray, "3"], along, left, speed, turn: float
+    ) -> None:
         """An object whose places and speeds are one number or one a frame."""
         path = (np.broadcast_to(v, self.clock.shape) for v in (along, left, speed))
         self.paths.append((cls, size, *path, turn))
 
-    def _size(self, cls: str) -> np.ndarray:
+    def _size(self, cls: str) -> Float[np.ndarray, "3"]:
         mean, deviation = SIZES[cls]
         return mean + np.array(deviation) * self.rng.normal(size=3).clip(-2, 2)
 

@@ -118,6 +118,7 @@ def test_full_disk_is_the_users_to_mend(tmp_path):
     assert not files.is_no_space(OSError(errno.EIO, "Input/output error"))
 
 
+@pytest.mark.wrong_types
 def test_wrong_arguments(tmp_path):
     with pytest.raises(UserError, match="five frame numbers, got"):
         write.write_labels(tmp_path / "a.txt", (1, 2), 0.0, [])

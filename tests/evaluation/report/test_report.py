@@ -300,6 +300,7 @@ def test_matplotlib_waits_until_something_is_drawn():
     assert b"matplotlib" not in done.stdout
 
 
+@pytest.mark.wrong_types
 def test_panels_of_curves_say_the_protocol_and_none_is_blank():
     def result(cls, is_defined):
         line = np.array([0.0, 1.0])

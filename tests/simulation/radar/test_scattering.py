@@ -27,7 +27,7 @@ def make_frame(boxes, cls, velocity=None, *, ego=(0.0, 0.0), time_s=0.0, tracks=
     return SceneFrame(
         boxes=boxes,
         velocity_mps=np.zeros((count, 2)) if velocity is None else np.array(velocity),
-        cls=np.array([CLASSES.index(c) for c in cls]),
+        cls=np.array([CLASSES.index(c) for c in cls], int),
         track=np.arange(count) if tracks is None else np.array(tracks),
         track_id=np.arange(count),
         ego_velocity_mps=np.array(ego, float),
