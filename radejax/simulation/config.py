@@ -39,7 +39,7 @@ CONDITIONS = (
 _LATER_FIELDS = {"camera_content": "scene", "vulnerable_road_users": 1.0}
 """What configs and data sets of earlier versions are without."""
 
-MOST_VULNERABLE = 5.0
+_MOST_VULNERABLE = 5.0
 """Of `vulnerable_road_users`: more would fill the roads with nobody else."""
 
 FULL_SIZE = {
@@ -165,9 +165,16 @@ class SimulationConfig:
                 " are counted by train_sequences and test_sequences",
             ),
             (
-                not 0.0 <= self.vulnerable_road_users <= MOST_VULNERABLE,
-                f".vulnerable_road_users must be from 0 to {MOST_VULNERABLE:g},"
-                f" got {self.vulnerable_road_users!r}",
+                not isinstance(self.vulnerable_road_users, int | float)
+                or not 0.0 <= self.vulnerable_road_users <= _MOST_VULNERABLE,
+                ".vulnerable_road_users must be a number from 0 to"
+                f" {_MOST_VULNERABLE:g}, got {self.vulnerable_road_users!r}",
+            ),
+            (
+                not is_procedural and self.vulnerable_road_users != 1.0,
+                ".vulnerable_road_users is of procedural scenes; those of real labels"
+                " have what the labels say: leave it at 1, not"
+                f" {self.vulnerable_road_users!r}",
             ),
             (
                 self.output not in ("tesseract", "projection"),
