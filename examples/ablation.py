@@ -8,7 +8,8 @@ Table 3 is RADE-Net's (attention, heads, neck, stem, decoder), 4 DinoRADE's (rad
 elevation weights, backbone), sigma the spread of the heatmap's targets. Every cell is an
 ordinary run of a config, trained on scenes of its seed and evaluated on other ones, which
 all cells share. The same command goes on where an earlier one ended or was killed, also
-within a run. `--table_only` writes the tables of what is there.
+within a run. `--table_only` writes the tables of what is there. Given several times at
+once it works on as many seeds, best one a core (`taskset -c 0 python ...`).
 
 AP is BEV at IoU 0.3, protocol `exact`, mean over seeds; intervals are of 95 %, paired,
 over resampled sequences of the scenes to evaluate on. A claim is shown where the interval
@@ -17,6 +18,7 @@ lies above 0 (and the difference reaches what is claimed), refuted where it ends
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -33,17 +35,18 @@ import fusion_by_lens
 import numpy as np
 import pretrain_backbone
 from ablation_studies import CONFIGS, STUDIES, Cell, Study
+from ablation_tables import tables
 from ml_collections import ConfigDict
 
 from radejax.cli import entry
 from radejax.core import files
 from radejax.core.config import load_config
+from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import Source, load
 from radejax.evaluation.report import bootstrap
 from radejax.evaluation.report.measure import repair_sizes
-from radejax.evaluation.report.tables import Table, number
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import Sources
@@ -113,14 +116,20 @@ class Work:
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
         return str(simulate_dataset(simulation, self.root(cell, seed)))
 
+    def alone(self) -> contextlib.AbstractContextManager[None]:
+        """Keeps other processes from what all seeds share, until they may."""
+        return files.lock(self.out / "shared.lock")
+
     def image_backbone(self, cell: Cell) -> str | None:
         """Folder of the frozen backbone that a cell needs; pretrained if missing."""
         config = self.config(cell, 0)
         if "image" not in config.model or not config.model.image.freeze:
             return None
         folder = self.backbone or self.out / "backbone"
-        if self.backbone is None and not (folder / pretrain_backbone.REPORT).exists():
-            pretrain_backbone.pretrain(config, folder)
+        if self.backbone is None:
+            with self.alone():
+                if not (folder / pretrain_backbone.REPORT).exists():
+                    pretrain_backbone.pretrain(config, folder)
         return str(folder)
 
     def command(self, name: str, seed: int) -> str:
@@ -152,15 +161,16 @@ class Work:
             )
         if not trained.exists():
             return False
-        evaluate_run(
-            folder,
-            split="all",
-            out=self.report(name, seed),
-            image_backbone=backbone,
-            exchange_images=0 if cell.exchanges else None,
-            other=Sources(data=(self.data(cell, None),)),
-            num_pictures=0,
-        )
+        with self.alone():  # the held-out scenes are simulated and projected once
+            evaluate_run(
+                folder,
+                split="all",
+                out=self.report(name, seed),
+                image_backbone=backbone,
+                exchange_images=0 if cell.exchanges else None,
+                other=Sources(data=(self.data(cell, None),)),
+                num_pictures=0,
+            )
         minutes = (time.perf_counter() - started) / 60
         content = {"minutes": minutes, "command": self.command(name, seed)}
         files.write_json(self.report(name, seed) / "cell.json", content)
@@ -276,52 +286,6 @@ class Comparer:
             yield dataclasses.asdict(claim) | found | {"seeds": seeds, "verdict": word}
 
 
-def interval_text(row: Mapping[str, Any]) -> str:
-    """A difference as "+1.2 (0.3 to 2.1)"."""
-    if "difference" not in row:
-        return "-"
-    low, high = (number(row[name], digits=1) for name in ("low", "high"))
-    return f"{number(row['difference'], signed=True, digits=1)} ({low} to {high})"
-
-
-def tables(study: Study, rows: list[dict], claims: list[dict]) -> list[Table]:
-    """One table of APs, one of differences a condition, one of claims."""
-    terms = "AP BEV at IoU 0.3, exact, mean over seeds"
-    by = {(row["condition"], row["cell"], row["cls"]): row for row in rows}
-    columns, cells = (
-        (*CLASSES, "mean"),
-        [c for c in study.cells if ("all", c, "mean") in by],
-    )
-    body = [
-        [c, ", ".join(map(str, by["all", c, "mean"]["seeds"]))]
-        + [number(by["all", c, cls]["ap"], digits=1) for cls in columns]
-        for c in cells
-    ]
-    result = [Table(f"{study.title}: {terms}", ["Cell", "Seeds", *columns], body)]
-    for condition in dict.fromkeys(row["condition"] for row in rows):
-        body = [
-            [c, *(interval_text(by[condition, c, cls]) for cls in columns)]
-            for c in cells
-            if c != study.base
-        ]
-        title = f"{study.title}: difference to {study.base}, {condition}, 95 %"
-        result.append(Table(title, ["Cell", *columns], body))
-    body = [
-        [
-            *(claim[name] for name in ("text", "a", "b", "cls")),
-            interval_text(claim),
-            ", ".join(map(str, claim["seeds"])),
-            claim["verdict"],
-        ]
-        for claim in claims
-    ]
-    head = ["Claim", "A", "B", "Class", "A - B", "Seeds", "Verdict"]
-    return [
-        table.of_simulated()
-        for table in [*result, Table(f"{study.title}: claims", head, body)]
-    ]
-
-
 def write_tables(
     work: Work, table: str, seeds: tuple[int, ...], resamples: int
 ) -> None:
@@ -369,19 +333,34 @@ def main(table, seeds, out, minutes, backbone, resamples, table_only):
         seeds = entry.numbers("--seeds", [seeds])
         work = Work(STUDIES[table], out.absolute(), backbone)
         every = list(itertools.product(seeds, work.study.cells))
+
+        def left(*of: int) -> list[tuple[str, int]]:
+            return [(n, s) for s, n in every if s in of and not work.is_done(n, s)]
+
         if minutes is not None:  # the training under way saves a checkpoint
             alarm = threading.Timer(
                 60 * minutes, os.kill, (os.getpid(), signal.SIGTERM)
             )
             alarm.daemon = True
             alarm.start()
-        goes_on = True
-        while goes_on:
-            left = [(name, s) for s, name in every if not work.is_done(name, s)]
-            if len(left) < len(every):
+
+        def tell() -> None:
+            if len(left(*seeds)) < len(every):
                 write_tables(work, table, seeds, resamples)
-            click.echo(told(work, left, len(every)))
-            goes_on = bool(left) and not table_only and work.make(*left[0])
+            click.echo(told(work, left(*seeds), len(every)))
+
+        tell()
+        for seed in () if table_only else seeds:
+            with contextlib.ExitStack() as held:
+                try:
+                    held.enter_context(files.lock(out / f"seed{seed}.lock", "busy"))
+                except UserError:
+                    click.echo(f"seed {seed}: another process is at it")
+                    continue
+                while todo := left(seed):
+                    if not work.make(*todo[0]):
+                        return
+                    tell()
 
 
 if __name__ == "__main__":

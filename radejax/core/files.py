@@ -325,14 +325,14 @@ def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
 
 
 @contextlib.contextmanager
-def lock(path: str | os.PathLike[str], message: str) -> Iterator[None]:
+def lock(path: str | os.PathLike[str], message: str | None = None) -> Iterator[None]:
     """Keeps other processes out of a block while one is in it.
 
     The system releases the lock however the process ends.
 
     Args:
         path: File that is locked; made with its folder if missing, and left there.
-        message: Of the error.
+        message: Of the error; without one the process waits until it is let in.
 
     Raises:
         UserError: Another process holds it.
@@ -341,7 +341,7 @@ def lock(path: str | os.PathLike[str], message: str) -> Iterator[None]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | (fcntl.LOCK_NB if message else 0))
         except BlockingIOError:
             raise UserError(message) from None
         except OSError as error:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.structures import CLASSES
 from radejax.evaluation.report.report import write_report
@@ -109,6 +110,17 @@ def test_what_is_missing_is_run_and_judged(
     command = ["--table", "3", "--seeds", "0", "--resamples", "40"]
     CliRunner().invoke(ablation.main, [*command, "--out", str(tmp_path)])
     assert len(runs.trained) == before + 6  # not model, not the exchanged labels
+
+
+def test_each_of_several_processes_has_seeds_of_its_own(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = _Runs(monkeypatch)
+    with files.lock(tmp_path / "seed0.lock", "of another"):
+        text = _call(tmp_path, "--seeds", "0,4")
+    assert "seed 0: another process is at it" in text
+    assert {config.seed for _, config, _ in runs.trained} == {4}
+    assert "12 of 12 cells are done" in _call(tmp_path, "--seeds", "0,4")
 
 
 @pytest.mark.parametrize(
