@@ -67,8 +67,9 @@ class SimulationConfig:
         label_version: Version of real labels.
         frames_per_sequence: At 10 frames a second; 0 for all of real labels.
         frame_stride: Use every n-th frame of real labels.
-        vulnerable_road_users: Pedestrians, motorcycles and bicycles of procedural scenes,
-            as a multiple of what there is of them on a road of the type.
+        vulnerable_road_users: Pedestrians, motorcycles and bicycles of procedural
+            training scenes, as a multiple of what there is of them on a road of the
+            type. Test scenes have what there is.
         grid: Arguments of `RadarGrid.reduced`, or "kradar".
         radar: Fields of `RadarParameters` that differ from its defaults.
         output: "tesseract" for K-Radar's files, "projection" for the projections alone.

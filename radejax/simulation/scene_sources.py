@@ -58,7 +58,7 @@ class ProceduralSource:
         config = self._config
         rng = np.random.default_rng([config.seed, number, 3])
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
-        split = "train" if number <= config.train_sequences else "test"
+        split = "train" if self._is_training(number) else "test"
         start = _FIRST_TIMESTAMP_S + 1000.0 * number
         return [
             FrameSpec(
@@ -70,16 +70,20 @@ class ProceduralSource:
             for i, n in enumerate(range(1, config.frames_per_sequence + 1))
         ]
 
+    def _is_training(self, number: int) -> bool:
+        return number <= self._config.train_sequences
+
     def make(self, number: int) -> Sequence:
         """The scene of a sequence."""
         environment, time, weather = self.conditions(number)
+        times = self._config.vulnerable_road_users if self._is_training(number) else 1.0
         return make_sequence(
             number,
             environment=environment,
             time=time,
             weather=weather,
             num_frames=self._config.frames_per_sequence,
-            vulnerable_road_users=self._config.vulnerable_road_users,
+            vulnerable_road_users=times,
             rng=np.random.default_rng([self._config.seed, number]),
         )
 

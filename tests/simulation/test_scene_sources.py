@@ -1,5 +1,6 @@
 """Which sequences and frames a data set has."""
 
+import numpy as np
 import pytest
 
 from radejax.simulation.config import SimulationConfig, default_config
@@ -28,3 +29,21 @@ def test_sensors_count_their_own_frames(source):
     assert first.name == f"{first.indices[0]:05d}_00001"
     offsets = {source.frames(n)[0].indices[0] for n in source.numbers}
     assert len(offsets) > 1
+
+
+def test_vulnerable_road_users_are_added_to_training_scenes_alone():
+    values = default_config() | {"train_sequences": 6, "test_sequences": 6}
+    natural, added = (
+        make_source(
+            SimulationConfig.from_mapping(values | {"vulnerable_road_users": n})
+        )
+        for n in (1.0, 4.0)
+    )
+
+    def classes(source, numbers):
+        return np.concatenate([source.make(n).tracks.cls for n in numbers])
+
+    train, test = range(1, 7), range(7, 13)
+    few, many = ((classes(source, train) >= 2).sum() for source in (natural, added))
+    assert many > 2 * few
+    np.testing.assert_array_equal(classes(natural, test), classes(added, test))
