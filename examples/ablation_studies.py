@@ -90,7 +90,7 @@ STUDIES = {
             Claim("with a narrow decoder it is better (64.06 to 63.12)", "model", "expand"),
             Claim("control: labels teach", "model", "labels exchanged"),
         ),
-        512,
+        1024,
     ),
     "sigma": Study(
         "spread of the heatmap's targets",
@@ -111,7 +111,7 @@ STUDIES = {
             ),
             Claim("control: labels teach", "model", "labels exchanged"),
         ),
-        512,
+        1024,
     ),
     "4": Study(
         "DinoRADE's Table 4",

@@ -137,6 +137,7 @@ class SimulationConfig:
     def __post_init__(self) -> None:
         is_procedural = self.scenes == "procedural"
         for name, least in (
+            ("seed", 0),
             ("train_sequences", 0),
             ("test_sequences", 0),
             ("frames_per_sequence", 1 if is_procedural else 0),

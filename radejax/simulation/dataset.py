@@ -150,21 +150,34 @@ def _write_frames(
     num_threads: int,
     progress: bool,
 ) -> None:
-    """Every frame that is not there yet."""
+    """Every frame that is not there yet; next sequences start before one has ended."""
     total = sum(len(source.frames(n)) for n in source.numbers)
     bar = tqdm(total=total, unit="frame", desc="simulate", disable=not progress)
-    with bar, concurrent.futures.ThreadPoolExecutor(max(num_threads, 1)) as pool:
-        for number in source.numbers:
-            writer = _SequenceWriter(root / str(number), config, source, number)
-            bar.update(len(source.frames(number)) - len(writer.missing))
-            futures = [pool.submit(writer.write, spec) for spec in writer.missing]
-            try:
-                for future in concurrent.futures.as_completed(futures):
-                    future.result()
-                    bar.update()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+    num_threads = max(num_threads, 1)
+    running: set[concurrent.futures.Future[None]] = set()
+
+    def wait(at_most: int) -> None:
+        nonlocal running
+        while len(running) > at_most:
+            done, running = concurrent.futures.wait(
+                running, return_when=concurrent.futures.FIRST_COMPLETED
+            )
+            for future in done:
+                future.result()
+                bar.update()
+
+    with bar, concurrent.futures.ThreadPoolExecutor(num_threads) as pool:
+        try:
+            for number in source.numbers:
+                writer = _SequenceWriter(root / str(number), config, source, number)
+                bar.update(len(source.frames(number)) - len(writer.missing))
+                for spec in writer.missing:
+                    running.add(pool.submit(writer.write, spec))
+                    wait(2 * num_threads)
+            wait(0)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 class _SequenceWriter:

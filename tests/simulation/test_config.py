@@ -56,6 +56,7 @@ def test_fingerprint_follows_every_change():
     [
         ({"sead": 1}, "unknown simulation field 'sead'"),
         ({"frames_per_sequence": 0}, "frames_per_sequence must be an integer"),
+        ({"seed": "one"}, "seed must be an integer of at least 0, got 'one'"),
         ({"train_sequences": 2.5}, "train_sequences must be an integer"),
         ({"vulnerable_road_users": 9.0}, "must be a number from 0 to 5, got 9.0"),
         ({"vulnerable_road_users": "many"}, "number from 0 to 5, got 'many'"),
