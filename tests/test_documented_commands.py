@@ -60,6 +60,8 @@ RUN_IN = {
     "::test_cfar_baseline_fits_detects_and_reports",
     "examples/fusion_by_lens.py": "tests/test_fusion_run.py"
     "::test_example_compares_fusion_and_radar_by_the_lens",
+    "examples/echo_accuracy.py": "tests/examples/test_echo_accuracy.py"
+    "::test_scenes_are_measured",
     "examples/silhouettes.py": "tests/examples/test_silhouettes.py"
     "::test_both_runs_see_the_same_scenes_and_the_bar_decides",
     "examples/ablation.py": "tests/examples/test_ablation.py"
