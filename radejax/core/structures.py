@@ -52,7 +52,7 @@ class Batch(struct.PyTreeNode):
         frame: int32 index of the frame in its data set; -1 where the batch is filled up.
         image: `[B, H, W, 3]` uint8 left front camera images, or what the image backbone
             made of them; or None.
-        camera: Pytree of `[B, ...]` arrays that describe the camera, or None.
+        camera: `Camera` or `ReferencePoints` of rooms above, `[B, ...]`; or None.
     """
 
     # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
@@ -62,7 +62,7 @@ class Batch(struct.PyTreeNode):
     is_valid: Bool[Array, "B N"]
     frame: Int[Array, " B"]
     image: Real[Array, "B _ _ _"] | None = None
-    camera: object | None = None
+    camera: Any = None
 
 
 class DetectionMaps(struct.PyTreeNode):

@@ -15,8 +15,9 @@ import numpy as np
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES, Batch, Detections
+from radejax.core.structures import CLASSES, Array, Batch, Detections
 from radejax.data.cameras import CameraOptions
+from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.open import (
@@ -28,6 +29,7 @@ from radejax.inference.open import (
     settings_of_config,
 )
 from radejax.inference.program import detect
+from radejax.models.lifting import ReferencePoints
 
 EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
@@ -220,9 +222,9 @@ class Detector:
 
     def __call__(
         self,
-        frames: Any,
-        image: Any = None,
-        camera: Any = None,
+        frames: detector_inputs.Frames | Batch,
+        image: detector_inputs.Images | None = None,
+        camera: detector_inputs.Calibrations | None = None,
         *,
         score_threshold: float | None = None,
         nms_iou: float | None = None,
@@ -255,13 +257,14 @@ class Detector:
                 says what was expected.
         """
         if isinstance(frames, Batch):
-            frames, image, camera = frames.projection, frames.image, frames.camera
-        frames, is_tesseract = detector_inputs.radar_batch(frames, self.grid)
-        num_frames = frames.shape[0]
+            image, camera = frames.image, frames.camera
+            frames = frames.projection
+        radar, is_tesseract = detector_inputs.radar_batch(frames, self.grid)
+        num_frames = radar.shape[0]
         if num_frames == 0:
             raise UserError("no frames: the batch is empty")
-        self._impossible.look(frames, is_tesseract)
-        image, camera = self._camera_inputs(image, camera, num_frames)
+        self._impossible.look(radar, is_tesseract)
+        given = radar, *self._camera_inputs(image, camera, num_frames)
         roi = self.roi if roi is None else detector_inputs.named_region(roi)
         settings = (
             np.float32(
@@ -273,9 +276,7 @@ class Detector:
         largest = self._batch_sizes[-1]
         parts = []
         for start in range(0, num_frames, largest):
-            chunk = jax.tree.map(
-                lambda x, s=start: x[s : s + largest], (frames, image, camera)
-            )
+            chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], given)
             count = chunk[0].shape[0]
             size = next(s for s in self._batch_sizes if s >= count)
             chunk = jax.tree.map(
@@ -346,10 +347,10 @@ class Detector:
         grid = models.map_grid(self.grid, self.model, self.azimuth_mapping)
 
         def function(
-            variables: Any,
+            variables: Mapping[str, Any],
             frames: jax.Array,
-            image: Any,
-            camera: Any,
+            image: jax.Array | None,
+            camera: Camera | ReferencePoints | None,
             score_threshold: jax.Array,
             nms_iou: jax.Array,
             roi: jax.Array,
@@ -366,7 +367,12 @@ class Detector:
 
         return function
 
-    def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
+    def _camera_inputs(
+        self,
+        image: detector_inputs.Images | None,
+        camera: detector_inputs.Calibrations | None,
+        num_frames: int,
+    ) -> tuple[Array | None, Camera | ReferencePoints | None]:
         """Images and cameras as arrays; counts the frames without."""
         if not self.takes_camera:
             if image is None and camera is None:

@@ -35,9 +35,13 @@ from radejax.models.lifting import ReferencePoints
 _log = logging.getLogger(__name__)
 
 PathLike = str | pathlib.Path
+Frames = Array | PathLike | Sequence[Array | PathLike]
+Images = Array | Sequence[Array | PathLike | None]
+Calibration = CameraCalibration | Camera | PathLike
+Calibrations = Calibration | ReferencePoints | Sequence[Calibration | None]
 
 
-def radar_batch(frames: Any, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bool]:
+def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bool]:
     """Radar frames as one array with a leading axis of B.
 
     Args:
@@ -157,8 +161,8 @@ def _stack_frames(
 
 
 def prepare(
-    image: Any,
-    camera: Any,
+    image: Images | None,
+    camera: Calibrations | None,
     num_frames: int,
     model: Any,
     options: CameraOptions,
