@@ -69,14 +69,22 @@ def pytest_collection_modifyitems(
                 item.add_marker(skip)
 
 
+def _reset_log() -> None:
+    log = logging.getLogger("radejax")
+    log.handlers.clear()
+    log.propagate = True
+    log.setLevel(logging.NOTSET)
+
+
 @pytest.fixture(autouse=True)
 def _process_as_it_was() -> Iterator[None]:
-    """Commands set up log and JAX for their process; here that is every later test."""
-    log = logging.getLogger("radejax")
-    before = log.handlers[:], log.level, log.propagate
+    """Commands set up log and JAX for their process; here that is every later test.
+
+    Before a test as well: fixtures of a module come first, and may be commands.
+    """
+    _reset_log()
     yield
-    log.handlers[:], log.propagate = before[0], before[2]
-    log.setLevel(before[1])
+    _reset_log()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM_SECS)
 
 

@@ -151,6 +151,8 @@ def serve(fd: int, folder: str) -> None:
                 cases[name] = Case(name, READERS[name], place)
             _limit_memory()
             warnings.simplefilter("error")  # a warning is more than one line
+            others = "(?!radejax)"  # what they give up concerns no user
+            warnings.filterwarnings("ignore", "", DeprecationWarning, others)
             most = _memory() + MAX_BYTES
             for number in range(start, start + count):
                 outcome = cases[name].judge(number)
