@@ -3,13 +3,13 @@
     python examples/echo_accuracy.py
     python examples/echo_accuracy.py --range-bins 164
 
-The best that a detector can do on a sensor, about: in simulated scenes of the quickstart's
-radar the Doppler bin of a pedestrian's body is taken as known, the strongest cell beside
-their own is found, and its place between the bins by a parabola through three cells in
-decibels, along and across. The mean distance of the echo to the center, a part of the
-body's size, is taken off. The share of boxes of the right size and heading that would
-overlap the true one by 0.3 bounds the recall; with as many wrong boxes as right ones of
-one a pedestrian, the AP is about the share's square.
+A yardstick for detectors, no bound: in simulated scenes of the quickstart's radar the
+Doppler bin of a pedestrian's body is taken as known, the strongest cell beside their own
+is found, and its place between the bins by a parabola through three cells in decibels,
+along and across. The mean distance of the echo to the center, a part of the body's size,
+is taken off. Told is the share of boxes of the right size and heading that would overlap
+the true one by 0.3; of one such box a pedestrian, in no order, the AP would be about the
+share's square. A network sees more cells than three, and is not told the Doppler.
 """
 
 from collections.abc import Iterator
@@ -19,6 +19,7 @@ import click
 import numpy as np
 
 from radejax.cli import entry
+from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.evaluation.columns import in_roi
 from radejax.evaluation.report.tables import Table, number
@@ -87,12 +88,18 @@ def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndar
 
 def table(config: SimulationConfig) -> Table:
     """Errors and share of overlapping boxes by distance."""
-    boxes, along, across = map(np.array, zip(*measured(config), strict=True))
+    found = np.array([[*box, *errors] for box, *errors in measured(config)])
+    boxes, along, across = np.split(found.reshape(-1, 9), (7, 8), axis=1)
     distance, rows = np.hypot(boxes[:, 0], boxes[:, 1]), []
     for low, high in DISTANCES_M:
         at = (low <= distance) & (distance < high)
+        if not at.any():
+            raise UserError(
+                f"{config.train_sequences} scenes have no pedestrian that the radar sees"
+                f" at {low:g} to {high:g} m: give more --scenes"
+            )
         center = np.mean(along[at])
-        left, right = along[at] - center, across[at] - np.mean(across[at])
+        left, right = along[at, 0] - center, across[at, 0] - np.mean(across[at])
         share = np.mean(overlap(boxes[at], left, right) > 0.3)
         values = (center, np.median(np.abs(left)), np.median(np.abs(right)))
         texts = [number(value, digits=2) for value in values]

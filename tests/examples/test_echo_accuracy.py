@@ -38,6 +38,13 @@ def test_boxes_are_moved_along_and_across_the_line_of_sight() -> None:
     np.testing.assert_allclose(echo_accuracy.overlap(boxes, none, half), 1 / 3)
 
 
+def test_scenes_without_pedestrians_are_told() -> None:
+    result = CliRunner().invoke(echo_accuracy.main, ["--scenes", "1"])
+    assert result.exit_code == 2
+    assert "1 scenes have no pedestrian" in result.output
+    assert "give more --scenes" in result.output
+
+
 def test_scenes_are_measured() -> None:
     arguments = ["--scenes", "16", "--range-bins", "32"]
     result = CliRunner().invoke(echo_accuracy.main, arguments)
