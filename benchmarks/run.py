@@ -33,6 +33,8 @@ import page
 import rival
 from cases import BENCHMARKS
 
+from radejax.core import memory
+
 MAX_REPEATS = 20
 SECONDS_A_CASE = 15.0
 
@@ -49,6 +51,7 @@ def main():
     arguments = parser.parse_args()
     is_whole = True
     if not arguments.tables:
+        memory.keep_freed()  # as every command does; torch's process is left as it is
         jax.config.update("jax_enable_compilation_cache", False)
         chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
         result = run(
