@@ -12,7 +12,7 @@ from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
 
-SIMULATOR_VERSION = 3
+SIMULATOR_VERSION = 4
 """Raised whenever the same config gives other files than before."""
 
 # Environment, time and weather of the procedural sequences, in turn.

@@ -135,22 +135,6 @@ def range_response(
     return window_response((axis - range_m[None]) / resolution, 0.0)
 
 
-def angle_response(
-    axis_rad: Float[np.ndarray, " bins"],
-    angle_rad: Float[Array, " S"],
-    elements: float,
-    pedestal: float,
-) -> Float[jax.Array, "bins S"]:
-    """Pattern of a linear array with half-wavelength spacing.
-
-    The pattern depends on the difference of sines, so beams widen away from boresight.
-    """
-    sine = np.sin(axis_rad).astype(np.float32)[:, None]
-    return window_response(
-        (sine - jnp.sin(angle_rad)[None]) * elements / 2.0, pedestal, elements
-    )
-
-
 @functools.partial(
     jax.jit, static_argnames=("grid", "parameters", "output", "rows_per_step")
 )
@@ -188,8 +172,10 @@ def simulate(
         (grid.elevation_rad, scatterers.elevation_rad, parameters.elevation_elements),
         (grid.azimuth_rad, scatterers.azimuth_rad, parameters.azimuth_elements),
     )
-    elevation, azimuth = (angle_response(*a, pedestal) for a in arrays)  # [E S], [A S]
-    noise_bases = [array_noise_basis(axis, n, pedestal) for axis, _, n in arrays]
+    bases = [array_basis(axis, n, pedestal) for axis, _, n in arrays]
+    elevation, azimuth = (  # [M, S], [N, S]
+        array_signal(angle, n, pedestal) for _, angle, n in arrays
+    )
     doppler = doppler_response(scatterers.velocity_mps, grid)  # [D, S]
     in_range = range_response(scatterers.range_m, grid, parameters)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
@@ -199,15 +185,13 @@ def simulate(
     def row(inputs):
         index, weight, noise, row_idx = inputs
         amplitude = scatterers.amplitude[index] * weight[index][:, None]  # [K, 2]
-        left = elevation[:, None, index] * doppler[None, :, index]
+        left = doppler[:, None, index] * elevation[None, :, index]
         right = jnp.concatenate(
             [azimuth[:, index].T * amplitude[:, i : i + 1] for i in (0, 1)], axis=1
-        )  # [K, 2 A]
-        field = jnp.dot(
-            left.reshape(-1, num_kept), right, precision=lax.Precision.HIGHEST
-        ).reshape(grid.num_elevation, grid.num_doppler, 2, -1)
-        field += _noise_field(noise, key, row_idx, *noise_bases)
-        power = jnp.square(field).sum(axis=2)  # [E, D, A]
+        )  # [K, 2 N]
+        received = _product(left.reshape(-1, num_kept), right)
+        received += _noise(noise, key, row_idx, received.size).reshape(received.shape)
+        power = jnp.square(_beams(received, *bases)).sum(axis=2)  # [E, D, A]
         return _project_row(power) if output == "projection" else power
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
@@ -230,22 +214,18 @@ def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:
     return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
 
-def array_noise_basis(
+def array_basis(
     axis_rad: Float[np.ndarray, " bins"], elements: float, pedestal: float
 ) -> Float[np.ndarray, "bins N"]:
-    """Real matrix B that gives white noise the correlation of array bins.
+    """Real matrix B that makes array bins of what the array's elements receive.
 
-    Noise of the N elements of an array is independent, so after weights `w_n` and the
-    Fourier transform two bins correlate by `sum_n w_n^2 cos(pi n (sin a - sin b))`,
-    their own beam pattern with squared weights. That is `B B^T`, with a column
-    `sqrt(2) w_n cos(pi n sin a)` and one with the sine for each pair of elements.
-    Rows have length 1: every bin has the power of the white noise.
+    A bin is the sum of the N elements with weights `w_n` and the phases of its angle; with
+    elements placed about zero, those of a pair are a column
+    `w_n cos(pi n sin a)` and one with the sine. Rows have length 1: of independent noise
+    every bin has the power of one column, and two bins correlate by
+    `sum_n w_n^2 cos(pi n (sin a - sin b))`.
     """
-    count = max(round(elements), 1)
-    place = np.arange(count) - (count - 1) / 2
-    place = place[place >= 0]
-    weight = pedestal + (1.0 - pedestal) * np.cos(np.pi * place / count) ** 2
-    weight = np.where(place > 0, weight, weight / np.sqrt(2.0))
+    place, weight = _pairs(elements, pedestal)
     turn = np.pi * np.sin(axis_rad)[:, None] * place
     basis = np.concatenate(
         [weight * np.cos(turn), (weight * np.sin(turn))[:, place > 0]], axis=1
@@ -253,30 +233,69 @@ def array_noise_basis(
     return (basis / np.linalg.norm(basis, axis=1, keepdims=True)).astype(np.float32)
 
 
-def _noise_field(
-    power: Float[jax.Array, " D"],
-    key: UInt32[Array, "2"],
-    row_idx: UInt32[jax.Array, ""],
+def array_signal(
+    angle_rad: Float[Array, " S"], elements: float, pedestal: float
+) -> Float[jax.Array, "N S"]:
+    """What the columns of `array_basis` receive of points, 1 in the bin at their angle.
+
+    The product of both is the pattern of the array with weights `w_n`, which depends on
+    the difference of sines: beams widen away from boresight.
+    """
+    place, weight = _pairs(elements, pedestal)
+    turn = jnp.pi * place.astype(np.float32)[:, None] * jnp.sin(angle_rad)[None]
+    both = jnp.concatenate([jnp.cos(turn), jnp.sin(turn)[place > 0]])
+    pairs = np.where(place > 0, 1.0, np.sqrt(0.5))  # the middle element has no partner
+    scale = np.concatenate([pairs, pairs[place > 0]]) * (
+        np.linalg.norm(weight) / np.sum(weight * pairs)
+    )
+    return scale.astype(np.float32)[:, None] * both
+
+
+def _pairs(
+    elements: float, pedestal: float
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    """Places in half wavelengths and weights of one element of each pair."""
+    count = max(round(elements), 1)
+    place = np.arange(count) - (count - 1) / 2
+    place = place[place >= 0]
+    weight = pedestal + (1.0 - pedestal) * np.cos(np.pi * place / count) ** 2
+    return place, np.where(place > 0, weight, weight / np.sqrt(2.0))
+
+
+def _beams(
+    received: Float[jax.Array, "DM N2"],
     elevation_basis: Float[np.ndarray, "E M"],
     azimuth_basis: Float[np.ndarray, "A N"],
 ) -> Float[jax.Array, "E D 2 A"]:
-    """Complex Gaussian noise of one range row of a mean power.
+    """Real and imaginary part of every bin, of what both arrays receive."""
+    (num_elevation, m), (_, n) = elevation_basis.shape, azimuth_basis.shape
+    rows = _product(received.reshape(-1, n), azimuth_basis.T)  # [D M 2, A]
+    rows = rows.reshape(received.shape[0] // m, m, -1).transpose(1, 0, 2)
+    beams = _product(elevation_basis, rows.reshape(m, -1))
+    return beams.reshape(num_elevation, rows.shape[1], 2, -1)
+
+
+_product = functools.partial(jnp.dot, precision=lax.Precision.HIGHEST)
+"""Weak echoes beside strong ones: 80 dB of power are 1e-4 of the amplitude."""
+
+
+def _noise(
+    power: Float[jax.Array, " D"],
+    key: UInt32[Array, "2"],
+    row_idx: UInt32[jax.Array, ""],
+    count: int,
+) -> Float[jax.Array, "D columns"]:
+    """Complex Gaussian noise of one range row of a mean power, as the arrays receive it.
 
     White noise of every Doppler bin and pair of elements goes through the Hann window
-    of the Doppler axis (in bins: 1/2, 1, 1/2) and through both arrays.
+    of the Doppler axis (in bins: 1/2, 1, 1/2).
     """
     num_doppler = power.shape[0]
-    (_, m), (_, n) = elevation_basis.shape, azimuth_basis.shape
     one = np.eye(num_doppler, dtype=np.float32)
     window = one + 0.5 * (np.roll(one, 1, axis=0) + np.roll(one, -1, axis=0))
     window = window / np.linalg.norm(window, axis=1, keepdims=True)
-    white = _white_noise(num_doppler * m * 2 * n, key, row_idx)
-    rows = (jnp.sqrt(power)[:, None] * window) @ white.reshape(num_doppler, -1)
-    rows = rows.reshape(-1, n) @ azimuth_basis.T  # [D M 2, A]
-    rows = rows.reshape(num_doppler, m, -1).transpose(1, 0, 2)  # [M, D, 2 A]
-    return (elevation_basis @ rows.reshape(m, -1)).reshape(
-        elevation_basis.shape[0], num_doppler, 2, -1
-    )
+    white = _white_noise(count, key, row_idx)
+    return (jnp.sqrt(power)[:, None] * window) @ white.reshape(num_doppler, -1)
 
 
 def _white_noise(

@@ -141,10 +141,22 @@ class TestPointTarget:
         fine = np.linspace(-0.9, 0.9, 3601)
 
         def width(angle):
-            beam = tensor.angle_response(fine, np.float32([angle]), 40.0, 0.2)[:, 0]
+            basis = tensor.array_basis(fine, 40.0, 0.2)
+            beam = basis @ tensor.array_signal(np.float32([angle]), 40.0, 0.2)[:, 0]
             return np.count_nonzero(np.square(beam) > 0.5)
 
         assert width(0.7) / width(0.0) == pytest.approx(1.0 / np.cos(0.7), rel=0.02)
+
+    @pytest.mark.parametrize("elements", [3.0, 12.0, 21.0, 48.0])
+    @pytest.mark.parametrize("pedestal", [0.0, 0.2, 1.0])
+    def test_beams_are_the_windows_transform(self, elements, pedestal):
+        beams = np.linspace(-0.45, 0.45, 61)
+        angle = np.linspace(-0.5, 0.5, 41).astype(np.float32)
+        basis = tensor.array_basis(beams, elements, pedestal)
+        pattern = basis @ tensor.array_signal(angle, elements, pedestal)
+        x = (np.sin(beams)[:, None] - np.sin(angle)) * elements / 2.0
+        expected = tensor.window_response(x.astype(np.float32), pedestal, elements)
+        np.testing.assert_allclose(pattern, expected, atol=5e-6)
 
 
 class TestPhysics:
@@ -279,7 +291,7 @@ class TestNoise:
         return [np.corrcoef(x.ravel(), y.ravel())[0, 1] for x, y in pairs]
 
     def test_power_of_every_angle_bin_is_the_same(self):
-        rows = tensor.array_noise_basis(GRID.azimuth_rad, 21.0, 0.2)
+        rows = tensor.array_basis(GRID.azimuth_rad, 21.0, 0.2)
         assert rows.shape == (24, 21)
         np.testing.assert_allclose(np.square(rows).sum(1), 1.0, rtol=1e-6)
 
