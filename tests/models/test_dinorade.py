@@ -17,6 +17,8 @@ from radejax.models import build, dinorade, lifting
 from radejax.models.lifting import ReferencePoints
 from radejax.models.radenet import RadeNet
 
+from ..small_models import drawn
+
 B, R, A, SIZE = 2, 6, 7, (32, 48)
 
 
@@ -110,15 +112,9 @@ def batch(*, valid=(True, True), yaws=(90.0, 80.0)):
 
 @functools.cache
 def model_and_variables():
+    """Away from the initial values, at which attention does not depend on the query."""
     model = small()
-    variables = jax.jit(model.init)(jax.random.key(0), *batch())
-    # Away from the initial values, at which attention does not depend on the query.
-    rng = np.random.default_rng(1)
-    params = jax.tree.map(
-        lambda x: x + 0.1 * rng.standard_normal(x.shape).astype(np.float32),
-        variables["params"],
-    )
-    return model, variables | {"params": params}
+    return model, drawn(model, *batch())
 
 
 @functools.cache
