@@ -24,6 +24,7 @@ import functools
 import itertools
 import os
 import pathlib
+import re
 import signal
 import threading
 import time
@@ -69,12 +70,10 @@ class Work:
     Attributes:
         study: What is compared.
         out: Folder of all.
-        backbone: Pretrained image backbone; made below `out` if None.
     """
 
     study: Study
     out: pathlib.Path
-    backbone: pathlib.Path | None = None
 
     def fields(self, cell: Cell, seed: int) -> dict[str, Any]:
         """Fields of the config of a run, by their dotted names."""
@@ -120,30 +119,38 @@ class Work:
         """Keeps other processes from what all seeds share, until they may."""
         return files.lock(self.out / "shared.lock")
 
+    def backbone(self, cell: Cell) -> pathlib.Path | None:
+        """Where the frozen image backbone is that a cell needs."""
+        _, *words = re.split("[:,]", cell.config)
+        if "resnet50" in words:
+            return self.out / "backbone_resnet50" / pretrain_backbone.RESNET_FILE
+        return self.out / "backbone" if "pretrained" in words else None
+
     def image_backbone(self, cell: Cell) -> str | None:
-        """Folder of the frozen backbone that a cell needs; pretrained if missing."""
-        config = self.config(cell, 0)
-        if "image" not in config.model or not config.model.image.freeze:
+        """The same, pretrained if missing."""
+        if (path := self.backbone(cell)) is None:
             return None
-        folder = self.backbone or self.out / "backbone"
-        if self.backbone is None:
-            with self.alone():
-                if not (folder / pretrain_backbone.REPORT).exists():
-                    pretrain_backbone.pretrain(config, folder)
-        return str(folder)
+        folder = path.parent if path.suffix else path
+        with self.alone():
+            if not (folder / pretrain_backbone.REPORT).exists():
+                pretrain_backbone.pretrain(self.config(cell, 0), folder)
+        return str(path)
 
     def command(self, name: str, seed: int) -> str:
         """What makes a cell's run anew and evaluates it, with the data of `out`."""
         cell = self.study.cells[name]
         file, _, words = cell.config.partition(":")
         fields = self.fields(cell, seed).items()
+        # Of the current folder: a committed table names no one's home.
+        data, held = map(
+            os.path.relpath, (self.root(cell, seed), self.root(cell, None))
+        )
         parts = [f"python train.py --config configs/{file}.py{words and f':{words}'}"]
         parts += [f"--config.{key}={value}" for key, value in fields]
-        parts.append(f"--data {self.root(cell, seed)} --workdir RUN")
-        if "pretrained" in words:
-            parts.append(f"--image_backbone {self.backbone or self.out / 'backbone'}")
-        parts.append("&& python evaluate.py --workdir RUN --split all")
-        parts.append(f"--data {self.root(cell, None)}")
+        parts.append(f"--data {data} --workdir RUN")
+        if backbone := self.backbone(cell):
+            parts.append(f"--image_backbone {os.path.relpath(backbone)}")
+        parts.append(f"&& python evaluate.py --workdir RUN --split all --data {held}")
         return " ".join([*parts, *["--exchange_images 0"] * bool(cell.exchanges)])
 
     def make(self, name: str, seed: int) -> bool:
@@ -318,21 +325,31 @@ def told(work: Work, left: list[tuple[str, int]], num_all: int) -> str:
     return f"{num_all - len(left)} of {num_all} cells are done{about}{names}"
 
 
+def chosen(study: Study, cells: str | None) -> list[str]:
+    """Cells by the names that were given; all without."""
+    names = [name.strip() for name in cells.split(",")] if cells else [*study.cells]
+    if unknown := [name for name in names if name not in study.cells]:
+        raise UserError(
+            f"--cells: no cell {unknown[0]!r}; cells: {', '.join(study.cells)}"
+        )
+    return names
+
+
 @click.command()
 @click.option("--table", type=click.Choice(sorted(STUDIES)), required=True)
 @click.option("--seeds", default="0,1,2", show_default=True)
+@click.option("--cells", help="Train only these, by name, with commas between.")
 @click.option("--out", default="runs/ablation", type=click.Path(path_type=pathlib.Path))
 @click.option("--minutes", type=click.FloatRange(0), help="Then save and stop.")
-@click.option("--backbone", type=click.Path(exists=True, path_type=pathlib.Path))
 @click.option("--resamples", default=1000, show_default=True, type=click.IntRange(1))
 @click.option("--table_only", is_flag=True, help="Train nothing.")
-def main(table, seeds, out, minutes, backbone, resamples, table_only):
+def main(table, seeds, cells, out, minutes, resamples, table_only):
     """Trains what is missing of a table, and writes it."""
     entry.set_up_jax()
     with entry.exit_codes():
         seeds = entry.numbers("--seeds", [seeds])
-        work = Work(STUDIES[table], out.absolute(), backbone)
-        every = list(itertools.product(seeds, work.study.cells))
+        work = Work(STUDIES[table], out.absolute())
+        every = list(itertools.product(seeds, chosen(work.study, cells)))
 
         def left(*of: int) -> list[tuple[str, int]]:
             return [(n, s) for s, n in every if s in of and not work.is_done(n, s)]

@@ -1,4 +1,4 @@
-"""Trains the small image transformer on simulated images, to be used frozen.
+"""Trains a small image backbone on simulated images, to be used frozen.
 
     python examples/pretrain_backbone.py --out backbones/small
     python train.py --config configs/quickstart_fusion.py:pretrained \\
@@ -8,8 +8,9 @@ What DINOv3 is for K-Radar, this is for simulated data: a backbone that knows im
 before the detector is trained, and stays as it is. It learns from images alone, of
 scenes of another seed than the data set's, what of each class every patch shows and how
 near it is, which the renderer knows; no detection label enters. The folder is one of
-Hugging Face's DINOv3 format. Average precision by class tells, on scenes of a third
-seed, how well patches that show an object are told from the others.
+Hugging Face's DINOv3 format; with `--config configs/quickstart_fusion.py:resnet50` it has
+a `resnet50.pth` with torchvision's names. Average precision by class tells, on scenes of a
+third seed, how well patches that show an object are told from the others.
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.interop import dinov3_hf
+from radejax.interop import dinov3_hf, resnet_torch
 from radejax.models.image import normalize
+from radejax.models.resnet import STRIDE, ResNetTrunk, frozen_params
 from radejax.models.vit import ViT
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.camera.shapes import camera_position
@@ -53,7 +55,7 @@ CONFIG = (
 SEEDS = (2_000_003, 3_000_017)
 """Added to the seed of the data: of scenes to learn from, of those to be tested on."""
 
-REPORT = "pretraining.json"
+REPORT, RESNET_FILE = "pretraining.json", "resnet50.pth"
 PIXELS_SHOWN = 4
 """From so many pixels of a class on, a patch shows it."""
 NEAR_M = 10.0
@@ -144,14 +146,19 @@ def draw(
 class Patches(nn.Module):
     """A backbone with a linear layer: `[B, h, w, K + 1]` logits and nearness."""
 
-    backbone: ViT
+    backbone: ViT | ResNetTrunk
 
     @nn.compact
-    def __call__(self, image: jax.Array) -> jax.Array:
-        size = self.backbone.patch_size
-        shape = (len(image), image.shape[1] // size, image.shape[2] // size, -1)
-        tokens = self.backbone(normalize(image))[:, self.backbone.num_prefix :]
-        return nn.Dense(len(CLASSES) + 1)(tokens).reshape(shape)
+    def __call__(self, image: jax.Array, train: bool = False) -> jax.Array:
+        features = normalize(image)
+        if isinstance(self.backbone, ViT):
+            size = self.backbone.patch_size
+            shape = (len(image), image.shape[1] // size, image.shape[2] // size, -1)
+            tokens = self.backbone(features)[:, self.backbone.num_prefix :]
+            features = tokens.reshape(shape)
+        else:
+            features = self.backbone(features, train)
+        return nn.Dense(len(CLASSES) + 1)(features)
 
 
 def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
@@ -167,24 +174,32 @@ def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
 def train(
     model: Patches, data: Images, *, epochs: int, seed: int, batch_size: int = 16
 ) -> Any:
-    """Parameters after so many epochs: AdamW, a cosine, mirrored at random."""
+    """Variables after so many epochs: AdamW, a cosine, mirrored at random."""
     steps = epochs * (len(data.image) // batch_size)
     schedule = optax.warmup_cosine_decay_schedule(0.0, 1.5e-3, steps // 20, steps)
     optimizer = optax.chain(
         optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=0.01)
     )
-    params = jax.jit(model.init)(jax.random.key(seed), data.image[:1])
-    state = optimizer.init(params)
+    variables = jax.jit(model.init)(jax.random.key(seed), data.image[:1])
+    state = optimizer.init(variables["params"])
 
     @functools.partial(jax.jit, donate_argnums=(0, 1))
-    def step(params: Any, state: Any, batch: Images) -> tuple[Any, Any, jax.Array]:
-        def total(params: Any) -> jax.Array:
-            found = model.apply(params, batch.image)
-            return loss(found, batch.pixels.astype(jnp.float32), batch.nearness)
+    def step(variables: Any, state: Any, batch: Images) -> tuple[Any, Any, jax.Array]:
+        def total(params: Any) -> tuple[jax.Array, Any]:
+            found, stats = model.apply(
+                {**variables, "params": params},
+                batch.image,
+                train=True,
+                mutable=["batch_stats"],
+            )
+            value = loss(found, batch.pixels.astype(jnp.float32), batch.nearness)
+            return value, stats
 
-        value, gradient = jax.value_and_grad(total)(params)
+        params = variables["params"]
+        (value, stats), gradient = jax.value_and_grad(total, has_aux=True)(params)
         updates, state = optimizer.update(gradient, state, params)
-        return optax.apply_updates(params, updates), state, value
+        params = optax.apply_updates(params, updates)
+        return {**variables, **stats, "params": params}, state, value
 
     rng, started = np.random.default_rng(seed), time.perf_counter()
     for epoch in range(epochs):
@@ -193,12 +208,12 @@ def train(
             chosen = order[start : start + batch_size]
             turn = slice(None, None, -1 if rng.random() < 0.5 else 1)
             batch = Images(*(part[chosen][:, :, turn] for part in data))
-            params, state, value = step(params, state, batch)
+            variables, state, value = step(variables, state, batch)
             values.append(value)
         minutes = (time.perf_counter() - started) / 60
         mean = float(np.mean(values))
         click.echo(f"epoch {epoch + 1}: loss {mean:.4f}, {minutes:.1f} minutes")
-    return params
+    return variables
 
 
 def average_precision(score: np.ndarray, is_shown: np.ndarray) -> float:
@@ -208,17 +223,27 @@ def average_precision(score: np.ndarray, is_shown: np.ndarray) -> float:
     return float(precision[right].mean()) if right.any() else float("nan")
 
 
-def patch_ap(model: Patches, params: Any, data: Images) -> dict[str, float]:
+def patch_ap(model: Patches, variables: Any, data: Images) -> dict[str, float]:
     """Average precision of patches by class: do they show so many pixels of it?"""
     predict = jax.jit(model.apply)
     found = [
-        predict(params, data.image[i : i + 32]) for i in range(0, len(data[0]), 32)
+        predict(variables, data.image[i : i + 32]) for i in range(0, len(data[0]), 32)
     ]
     found = np.concatenate(found)
     return {
         cls: average_precision(found[..., k], data.pixels[..., k] >= PIXELS_SHOWN)
         for k, cls in enumerate(CLASSES)
     }
+
+
+def save(backbone: ViT | ResNetTrunk, variables: Any, out: pathlib.Path) -> None:
+    """Writes what `--image_backbone` reads."""
+    own = {name: part["backbone"] for name, part in variables.items()}
+    if isinstance(backbone, ViT):
+        dinov3_hf.save(backbone, own["params"], out)
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        resnet_torch.save(frozen_params(own), out / RESNET_FILE)
 
 
 def pretrain(
@@ -234,35 +259,34 @@ def pretrain(
 
     Args:
         config: Of a radar-camera model, with a `simulation` section.
-        out: Folder in Hugging Face's DINOv3 format.
+        out: Folder; Hugging Face's DINOv3 format, or `resnet50.pth`.
         images: To learn from.
         held_out: Images to be tested on.
         epochs: Times that each is seen.
         seed: Of weights and order, and added to that of the scenes.
 
     Raises:
-        UserError: The config has no simulated images, or no ViT.
+        UserError: The config has no simulated images.
     """
     simulation = plain(config.get("simulation") or {})
     if not simulation or "image" not in config.model:
         raise UserError("the config has no simulated images, or its model no camera")
-    if (vit := models.build(config.model).vit) is None:
-        raise UserError(
-            f"config.model.image.kind is {config.model.image.kind!r}, expected 'vit'"
-        )
+    detector = models.build(config.model)
+    vit = detector.vit
+    patch = STRIDE if vit is None else vit.patch_size
     started, base = time.perf_counter(), simulation["seed"] + seed
     learnt, tested = (
-        draw(simulation, vit.patch_size, count, base + offset, share)
+        draw(simulation, patch, count, base + offset, share)
         for count, offset, share in zip(
             (images, held_out), SEEDS, (SHARE_TURNED, 0.0), strict=True
         )
     )
     seconds = time.perf_counter() - started
     click.echo(f"{images + held_out} images drawn in {seconds:.0f} s")
-    model = Patches(vit)
-    params = train(model, learnt, epochs=epochs, seed=seed)
-    found = patch_ap(model, params, tested)
-    dinov3_hf.save(vit, params["params"]["backbone"], out)
+    model = Patches(vit or ResNetTrunk(detector.resnet_width, frozen=False))
+    variables = train(model, learnt, epochs=epochs, seed=seed)
+    found = patch_ap(model, variables, tested)
+    save(model.backbone, variables, out)
     minutes = (time.perf_counter() - started) / 60
     report = {"images": images, "epochs": epochs, "seed": seed, "minutes": minutes}
     files.write_json(out / REPORT, report | {"patch_ap": found})

@@ -67,7 +67,7 @@ def load_image_backbone(
             )
         return None
     if model.vit is None:
-        part = resnet_torch.load(path)
+        part = resnet_torch.load(path, model.resnet_width)
     else:
         part = {"params": {IMAGE_BACKBONE: _load_dinov3(path, model.vit)}}
     if embeddings is not None:

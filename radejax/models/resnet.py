@@ -10,9 +10,11 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
@@ -80,6 +82,19 @@ class StridedConv(nn.Module):
         )
 
 
+def _normalized(
+    x: jax.Array,
+    name: str,
+    frozen: bool,
+    dtype: Any,
+    train: bool,
+    mask: jax.Array | None = None,
+) -> jax.Array:
+    if frozen:
+        return FrozenBatchNorm(dtype, name=name)(x)
+    return batch_norm(name, dtype, train)(x, mask=mask)
+
+
 class Bottleneck(nn.Module):
     """1x1, 3x3, 1x1 convolutions plus the input; the 3x3 one has the stride.
 
@@ -106,9 +121,7 @@ class Bottleneck(nn.Module):
     ) -> Float[jax.Array, "B h w {4*self.features}"]:
         def block(x: jax.Array, features: int, size: int, stride: int, name: str):
             x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
-            if self.frozen:
-                return FrozenBatchNorm(self.dtype, name=f"norm_{name}")(x)
-            return batch_norm(f"norm_{name}", self.dtype, train)(x, mask=mask)
+            return _normalized(x, f"norm_{name}", self.frozen, self.dtype, train, mask)
 
         y = nn.relu(block(x, self.features, 1, 1, "1"))
         y = nn.relu(block(y, self.features, 3, self.stride, "2"))
@@ -119,24 +132,27 @@ class Bottleneck(nn.Module):
 
 
 class ResNetTrunk(nn.Module):
-    """Stem and first three stages, frozen: maps of a 16th of the size, rounded up.
+    """Stem and first three stages: maps of a 16th of the size, rounded up.
 
     Attributes:
         width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
         depths: Blocks of the three stages.
+        frozen: Fixed statistics, as in a detector; else batch normalisation, to learn
+            the weights of such a trunk (`frozen_params`).
         dtype: Dtype of the computation; the output is float32.
     """
 
     width: int = 64
     depths: tuple[int, int, int] = (3, 4, 6)
+    frozen: bool = True
     dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(
-        self, image: Float[jax.Array, "B H W 3"]
+        self, image: Float[jax.Array, "B H W 3"], train: bool = False
     ) -> Float[jax.Array, "B (H+15)//16 (W+15)//16 {16*self.width}"]:
         x = StridedConv(self.width, 7, 2, self.dtype, name="stem_conv")(image)
-        x = nn.relu(FrozenBatchNorm(self.dtype, name="stem_norm")(x))
+        x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
         for stage, depth in enumerate(self.depths, 1):
             for i in range(depth):
@@ -144,11 +160,18 @@ class ResNetTrunk(nn.Module):
                     self.width * 2 ** (stage - 1),
                     stride=2 if stage > 1 and i == 0 else 1,
                     is_first=i == 0,
-                    frozen=True,
+                    frozen=self.frozen,
                     dtype=self.dtype,
                     name=f"stage_{stage}_block_{i + 1}",
-                )(x, False)
+                )(x, train)
         return x.astype(jnp.float32)
+
+
+def frozen_params(variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a frozen trunk from the variables of one that is not."""
+    flat = flax.traverse_util.flatten_dict(dict(variables["params"]))
+    stats = flax.traverse_util.flatten_dict(dict(variables["batch_stats"]))
+    return flax.traverse_util.unflatten_dict(flat | stats)
 
 
 class ResNetNeck(nn.Module):

@@ -12,17 +12,19 @@ from radejax import models
 from radejax.core.config import load_config
 from radejax.core.structures import CLASSES
 from radejax.interop.image_backbone import load_image_backbone
+from radejax.models.resnet import ResNetTrunk
 from radejax.simulation.config import plain
 
 from .. import small_models as small
 
 
-def _config():
-    config = load_config(str(small.CONFIGS / "quickstart_fusion.py") + ":pretrained")
+def _config(word="pretrained"):
+    config = load_config(str(small.CONFIGS / f"quickstart_fusion.py:{word}"))
     config.simulation.update(image_width=128, image_height=32, cover_lens=False)
     config.model.image.update(
         size=(32, 128), hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16
     )
+    config.model.image.resnet_width = 4
     return config
 
 
@@ -67,26 +69,27 @@ def test_average_precision_by_hand():
 
 
 @pytest.mark.slow  # compiles a training
-def test_it_learns_and_its_folder_is_a_frozen_backbone(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("word", ["pretrained", "resnet50"])
+def test_it_learns_and_what_it_writes_is_a_frozen_backbone(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, word: str
 ) -> None:
-    monkeypatch.setattr(pretraining, "load_config", lambda _: _config())
-    options = ["--images", "64", "--held-out", "32", "--epochs", "8"]
+    monkeypatch.setattr(pretraining, "load_config", lambda _: _config(word))
+    options = ["--images", "64", "--held-out", "32", "--epochs", "12"]
     command = [*options, "--out", str(tmp_path / "backbone")]
     result = CliRunner().invoke(pretraining.main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    losses = [float(line.split()[3][:-1]) for line in result.output.splitlines()[1:9]]
+    losses = [float(line.split()[3][:-1]) for line in result.output.splitlines()[1:13]]
     assert losses[-1] < 0.6 * losses[0]
     (line,) = (row for row in result.output.splitlines() if "Sedan" in row)
     shown = pretraining.draw(plain(_config().simulation), 16, 32, pretraining.SEEDS[1])
     chance = (shown.pixels[..., 0] >= pretraining.PIXELS_SHOWN).mean()
     assert float(line.split("Sedan ")[1].split(",")[0]) > chance + 0.2
-    model = models.build(_config().model)
+    model = models.build(_config(word).model)
     assert model.freeze
-    params = load_image_backbone(tmp_path / "backbone", model)["params"]
-    shapes = jax.eval_shape(
-        model.vit.init, jax.random.key(0), np.zeros((1, 32, 128, 3))
-    )
+    file = {"pretrained": "", "resnet50": pretraining.RESNET_FILE}[word]
+    params = load_image_backbone(tmp_path / "backbone" / file, model)["params"]
+    backbone = model.vit or ResNetTrunk(model.resnet_width)
+    shapes = jax.eval_shape(backbone.init, jax.random.key(0), np.zeros((1, 32, 128, 3)))
     assert jax.tree.map(np.shape, params["image_backbone"]) == jax.tree.map(
         lambda leaf: leaf.shape, shapes["params"]
     )

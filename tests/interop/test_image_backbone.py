@@ -23,7 +23,7 @@ def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
         "params": {"image_backbone": TRUNK, "image_neck": STAGE},
         "batch_stats": {"image_neck": STAGE},
     }
-    monkeypatch.setattr(resnet_torch, "load", lambda path: part)
+    monkeypatch.setattr(resnet_torch, "load", lambda path, width: part)
     return build(load_config(f"{CONFIG}:rcw_resnet50").model)
 
 

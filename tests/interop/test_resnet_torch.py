@@ -1,5 +1,6 @@
 """Tests of radejax.interop.resnet_torch."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,3 +144,26 @@ def test_files_and_their_problems(tensors, tmp_path):
     assert set(resnet_torch.load(path)) == {"params", "batch_stats"}
     with pytest.raises(FileNotFoundError):
         resnet_torch.load(tmp_path / "nothing.pth")
+
+
+def test_a_trunk_alone_is_written_and_read(tmp_path):
+    trunk = ResNetTrunk(width=4)
+    shapes = jax.eval_shape(trunk.init, jax.random.key(0), jnp.zeros((1, 16, 16, 3)))
+    rng = np.random.default_rng(2)
+    params = jax.tree.map(
+        lambda leaf: rng.standard_normal(leaf.shape).astype(np.float32),
+        shapes["params"],
+    )
+    path = tmp_path / "resnet50.pth"
+    resnet_torch.save(params, path)
+    loaded = resnet_torch.load(path, width=4)
+    assert loaded.keys() == {"params"}
+    chex.assert_trees_all_equal(loaded["params"], {"image_backbone": params})
+    # Its names are torchvision's: what another program would look for.
+    tensors = torch_file.read(path)
+    wanted = {
+        n for n in torchvision_shapes() if n.split(".")[0] not in ("layer4", "fc")
+    }
+    assert set(tensors) == {n for n in wanted if not n.endswith("num_batches_tracked")}
+    with pytest.raises(DataError, match=r"conv1.weight is .4, 3, 7, 7., expected .64"):
+        resnet_torch.load(path)

@@ -89,3 +89,28 @@ def test_full_size_shapes():
         if path[-1].key in ("mean", "var")
     )
     assert sum(sizes) - statistics - 2048 * 128 == 23508032
+
+
+def test_a_trained_trunk_is_the_frozen_one_of_its_statistics():
+    trained, frozen = (
+        resnet.ResNetTrunk(4, (1, 2, 1), frozen=f) for f in (False, True)
+    )
+    image = jax.random.normal(jax.random.key(1), (2, 32, 48, 3))
+
+    @jax.jit
+    def both(image):
+        variables = trained.init(jax.random.key(0), image)
+        _, stats = trained.apply(variables, image, True, mutable=["batch_stats"])
+        variables = {**variables, **stats}
+        params = resnet.frozen_params(variables)
+        expected = trained.apply(variables, image)
+        return expected, frozen.apply({"params": params}, image), params
+
+    expected, found, params = both(image)
+    chex.assert_shape(found, (2, 2, 3, 64))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert float(jnp.std(found)) > 0
+    shapes = jax.eval_shape(frozen.init, jax.random.key(0), image)["params"]
+    chex.assert_trees_all_equal_shapes(params, shapes)
+    # The statistics are those of the images, not those to start with.
+    assert float(jnp.abs(params["stem_norm"]["mean"]).min()) > 0
