@@ -125,6 +125,19 @@ class Command(click.Command):
             )
         )
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            is_argument = any(
+                param.name == "roots" and isinstance(param, click.Argument)
+                for param in self.params
+            )
+            if error.option_name == "--data" and is_argument:
+                text = f"folders are given without --data: {ctx.command_path} FOLDER"
+                raise click.UsageError(text, ctx) from None
+            raise
+
     def invoke(self, ctx: click.Context) -> Any:
         debug = any(c.params.get("debug") for c in (ctx, ctx.find_root()))
         with entry.exit_codes(debug=debug):

@@ -97,6 +97,18 @@ class Detections(struct.PyTreeNode):
     num_cut: Int[jax.Array, " B"]
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
+    def __repr__(self) -> str:
+        """What is found, by class; the shape alone while traced, or of no batch."""
+        valid = self.is_valid
+        is_known = isinstance(valid, Array) and not isinstance(valid, jax.core.Tracer)
+        if not is_known or valid.ndim != 2:
+            return f"Detections(boxes {getattr(self.boxes, 'shape', self.boxes)})"
+        frames, places = valid.shape
+        names = self.to_columns()["cls"].tolist()
+        counts = [f"{n} {cls}" for cls in self.class_names if (n := names.count(cls))]
+        found = ", ".join(counts) or "none"
+        return f"Detections({frames} frames of {places} places: {found})"
+
     @property
     def num_clipped(self) -> Int[np.ndarray, " B"]:
         """Detections of every frame of a size that was regressed below `MIN_SIZE_M`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -70,7 +71,7 @@ def save(params: Mapping[str, Any], path: PathLike) -> None:
                 kernel, fixed = block[f"conv_{key}"]["kernel"], block[f"norm_{key}"]
                 put(f"{name}.{i}.{conv}", f"{name}.{i}.{norm}", kernel, fixed)
     contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
-    torch_file.write(path, contiguous)
+    torch_file.write(pathlib.Path(path), contiguous)
 
 
 def read_trunk(

@@ -42,6 +42,19 @@ _LATER_FIELDS = {"camera_content": "scene", "vulnerable_road_users": 1.0}
 _MOST_VULNERABLE = 5.0
 """Of `vulnerable_road_users`: more would fill the roads with nobody else."""
 
+_RADAR_LIMITS = {
+    "gain_db": (-1e3, 1e3),
+    "noise_db": (-1e3, 1e3),
+    "wavelength_m": (1e-4, 1.0),
+    "azimuth_elements": (1.0, 512.0),
+    "elevation_elements": (1.0, 512.0),
+    "array_pedestal": (0.0, 1.0),
+    "range_resolution_m": (0.0, 100.0),
+    "pattern_exponent": (0.0, 100.0),
+    "max_scatterers_per_row": (1, 4096),
+}
+"""Of the fields of `RadarParameters`; an integer where the least is one."""
+
 FULL_SIZE = {
     "grid": "kradar",
     "radar": {},
@@ -131,7 +144,9 @@ class SimulationConfig:
         for name in names:
             if name not in values:
                 raise UserError(f"simulation field {name!r} is missing")
-        offset = tuple(map(float, values["lidar_to_radar_m"]))
+        offset = values["lidar_to_radar_m"]
+        if isinstance(offset, list) and all(map(_is_number, offset)):
+            offset = tuple(map(float, offset))
         return cls(**dict(values, lidar_to_radar_m=offset))
 
     def __post_init__(self) -> None:
@@ -188,8 +203,13 @@ class SimulationConfig:
                 f"{self.camera_content!r}",
             ),
             (
-                len(self.lidar_to_radar_m) != 3,
-                ".lidar_to_radar_m must be three numbers",
+                not _is_number(self.label_distance_m) or not self.label_distance_m > 0,
+                f".label_distance_m must be a number above 0, got {self.label_distance_m!r}",
+            ),
+            (
+                not isinstance(self.lidar_to_radar_m, tuple)
+                or len(self.lidar_to_radar_m) != 3,
+                f".lidar_to_radar_m must be three numbers, got {self.lidar_to_radar_m!r}",
             ),
         ):
             if is_wrong:
@@ -212,14 +232,21 @@ class SimulationConfig:
 
     def make_parameters(self) -> RadarParameters:
         """The rest of the radar."""
-        try:
-            return RadarParameters(**self.radar)
-        except TypeError:
-            names = [f.name for f in dataclasses.fields(RadarParameters)]
-            raise UserError(
-                f"simulation.radar: unknown field in {sorted(self.radar)};"
-                f" fields: {', '.join(names)}"
-            ) from None
+        for name, value in self.radar.items():
+            if name not in _RADAR_LIMITS:
+                raise UserError(
+                    f"simulation.radar: unknown field {name!r};"
+                    f" fields: {', '.join(_RADAR_LIMITS)}"
+                )
+            least, most = _RADAR_LIMITS[name]
+            kind = type(least)
+            if not _is_number(value, kind) or not least <= value <= most:
+                word = "an integer" if kind is int else "a number"
+                raise UserError(
+                    f"simulation.radar.{name} must be {word} from {least:g} to {most:g},"
+                    f" got {value!r}"
+                )
+        return RadarParameters(**self.radar)
 
     def to_json(self) -> str:
         """Canonical text: equal configs give equal text, also that of earlier versions."""
@@ -234,6 +261,11 @@ class SimulationConfig:
     def conditions(self, number: int) -> tuple[str, str, str]:
         """Environment, time and weather of sequence `number` (from 1)."""
         return CONDITIONS[(number - 1) % len(CONDITIONS)]
+
+
+def _is_number(value: Any, kind: type = float) -> bool:
+    kinds = (int,) if kind is int else (int, float)
+    return isinstance(value, kinds) and not isinstance(value, bool)
 
 
 def without_later_fields(values: dict[str, Any]) -> dict[str, Any]:

@@ -58,6 +58,11 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["export", ".", "--out", __file__], "is a file"),
         (["detect", ".", "--model", ".", "--out", __file__], "is a file"),
         (
+            ["detect", "--data", ".", "--model", ".", "--out", "x"],
+            "folders are given without --data: radejax detect FOLDER",
+        ),
+        (["detect", "--dat", ".", "--model", "."], "No such option '--dat'"),
+        (
             ["detect", ".", "--model", ".", "--out", "x", "--step", "last"],
             "'last' is neither a number nor \"best\"",
         ),

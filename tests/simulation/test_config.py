@@ -1,5 +1,6 @@
 """Checks on the values a simulation depends on."""
 
+import dataclasses
 import json
 
 import ml_collections
@@ -11,6 +12,7 @@ from radejax.simulation.config import (
     SimulationConfig,
     default_config,
 )
+from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.radar.weather import WEATHERS
 from radejax.simulation.world.environments import ENVIRONMENTS
 
@@ -66,13 +68,32 @@ def test_fingerprint_follows_every_change():
         ({"grid": "velodyne"}, "'kradar' or sizes"),
         ({"grid": {"num_range": 3}}, "simulation.grid"),
         ({"radar": {"power": 3}}, "simulation.radar: unknown field"),
+        (
+            {"radar": {"azimuth_elements": -3}},
+            "simulation.radar.azimuth_elements must be a number from 1 to 512, got -3",
+        ),
+        ({"radar": {"gain_db": float("nan")}}, "radar.gain_db must be a number"),
+        ({"radar": {"noise_db": "loud"}}, "radar.noise_db must be a number"),
+        ({"radar": {"array_pedestal": 1.5}}, "array_pedestal .* from 0 to 1, got 1.5"),
+        ({"radar": {"max_scatterers_per_row": 9.5}}, "must be an integer from 1 to"),
+        ({"label_distance_m": "far"}, "label_distance_m must be a number above 0"),
+        ({"label_distance_m": 0}, "label_distance_m must be a number above 0, got 0"),
+        ({"label_distance_m": float("nan")}, "label_distance_m must be a number above"),
         ({"lidar_to_radar_m": [0.0]}, "three numbers"),
+        ({"lidar_to_radar_m": "here"}, "three numbers, got 'here'"),
+        ({"lidar_to_radar_m": [0, "a", 1]}, "three numbers"),
         ({"sequences": [5]}, "chooses sequences of real labels"),
     ],
 )
 def test_wrong_values(change, message):
     with pytest.raises(UserError, match=message):
         SimulationConfig.from_mapping(default_config() | change)
+
+
+def test_every_field_of_the_radar_has_limits_that_its_default_keeps():
+    parameters = dataclasses.asdict(RadarParameters())
+    config = SimulationConfig.from_mapping(default_config() | {"radar": parameters})
+    assert config.make_parameters() == RadarParameters()
 
 
 def test_missing_field():
