@@ -59,7 +59,7 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["detect", ".", "--model", ".", "--out", __file__], "is a file"),
         (
             ["detect", "--data", ".", "--model", ".", "--out", "x"],
-            "folders are given without --data: radejax detect FOLDER",
+            "folders are given without --data: main detect FOLDER",
         ),
         (["detect", "--dat", ".", "--model", "."], "No such option '--dat'"),
         (
