@@ -194,10 +194,7 @@ def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
     base = work.study.cells[work.study.base]
     if base.config.startswith("quickstart_fusion"):
         lens = fusion_by_lens.lens_of_frames(work.data(base, None), frames)
-        found |= {str(name): weather == name for name in np.unique(weather)}
-        for name, rule in fusion_by_lens.GROUPS.items():
-            rows = zip(weather, lens, strict=True)
-            found[name] = np.array([rule(*row) for row in rows])
+        found = fusion_by_lens.conditions(weather, lens)
     sequence = np.asarray(frames["sequence"])
     return {n: mask for n, mask in found.items() if len(set(sequence[mask])) > 1}
 

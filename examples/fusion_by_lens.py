@@ -6,8 +6,8 @@
 
 Compares two runs on the same simulated test frames, by weather and by the state of the
 lens, which the simulator knows: AP of both, their difference with an interval from
-resampled sequences, and the camera's share in the fused map. Writes a table and a
-picture into OUT. `--data ROOT` takes another simulated data set, on which both were
+resampled sequences, and the camera's share in the fused map with the same. Writes
+tables and a picture into OUT. `--data ROOT` takes another simulated data set, on which both were
 evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same `--split`.
 """
 
@@ -29,13 +29,16 @@ from radejax.evaluation.report import bootstrap
 from radejax.evaluation.report.measure import repair_sizes
 from radejax.inference.open import load as open_model
 from radejax.runs.data import data_of_run
-from radejax.runs.pictures import camera_share
+from radejax.runs.pictures import frame_shares
 from radejax.runs.sources import Sources
 from radejax.simulation.camera.lens import cover_level
-from radejax.visualize.camera_share import mean_share, write_camera_share
+from radejax.visualize.camera_share import (
+    average_by_group,
+    mean_share,
+    write_camera_share,
+)
 
 GROUPS = {
-    "all": lambda weather, lens: True,
     "normal, overcast": lambda weather, lens: weather in ("normal", "overcast"),
     "other weather, lens clear": lambda weather, lens: (
         lens == "clear" and weather not in ("normal", "overcast")
@@ -43,6 +46,15 @@ GROUPS = {
     "lens partly covered": lambda weather, lens: lens == "partial",
     "lens heavily or fully covered": lambda weather, lens: lens in ("heavy", "full"),
 }
+
+
+def conditions(weather, lens):
+    """Masks of frames by condition: all, every weather, `GROUPS`."""
+    found = {"all": np.ones(len(weather), bool)}
+    found |= {str(name): np.asarray(weather) == name for name in np.unique(weather)}
+    for name, rule in GROUPS.items():
+        found[name] = np.array([rule(*row) for row in zip(weather, lens, strict=True)])
+    return found
 
 
 def lens_of_frames(root, frames):
@@ -81,7 +93,33 @@ def evaluation_set(report, classes, roi, chosen):
     return data, frames["sequence"]
 
 
-def rows_of_group(name, reports, config, chosen, shares, resamples):
+def share_rows(share, sequence, groups, resamples):
+    """The camera's share by condition, and that less the share in all frames.
+
+    Args:
+        share: `[F]` mean over a frame's bins in view; NaN without an image.
+        sequence: `[F]`.
+        groups: `[F]` masks by condition.
+        resamples: Of sequences, for intervals of 95 %.
+    """
+    counts = bootstrap.sequence_weights(sequence, resamples=resamples, seed=0)
+    counts = np.concatenate([np.ones((1, len(share))), counts])
+    counts[:, np.isnan(share)] = 0.0
+    share = np.nan_to_num(share)
+    with np.errstate(invalid="ignore"):  # a resample may have no frame of a condition
+        means = {
+            name: counts[:, chosen] @ share[chosen] / counts[:, chosen].sum(-1)
+            for name, chosen in groups.items()
+        }
+    for name, values in means.items():
+        row = {"condition": name, "frames": int(counts[0, groups[name]].sum())}
+        for what, sample in (("share", values), ("difference", values - means["all"])):
+            low, high = bootstrap.interval(sample[1:])
+            row |= {what: float(sample[0]), f"{what} low": low, f"{what} high": high}
+        yield row
+
+
+def rows_of_group(name, reports, config, chosen, resamples):
     """One row for Sedan, one for the mean of the classes that occur."""
     options = config.evaluation
     fusion, radar = (
@@ -107,7 +145,6 @@ def rows_of_group(name, reports, config, chosen, shares, resamples):
             "difference": row.difference,
             "low": row.low,
             "high": row.high,
-            "camera share": shares.get(name),
         }
         for row in found
         if row.cls in ("Sedan", "mean")
@@ -142,32 +179,21 @@ def main(fusion, radar, out, data, split, resamples):
                     f"{opened.paths.roots[0]}: evaluate both runs on it first"
                 )
         lens = lens_of_frames(opened.paths.roots[0], frames)
-        groups = {
-            name: np.array(
-                [
-                    rule(w, level)
-                    for w, level in zip(frames["weather"], lens, strict=True)
-                ]
-            )
-            for name, rule in GROUPS.items()
-        }
+        groups = conditions(frames["weather"], lens)
         level_of = {f.key: level for f, level in zip(dataset, lens, strict=True)}
-        maps, counts = camera_share(
-            run.model,
-            run.variables,
-            opened,
-            list(dataset),
-            group=lambda frame: next(
-                name
-                for name, rule in reversed(GROUPS.items())
-                if rule(frame.weather, level_of[frame.key])
-            ),
-            max_frames=len(dataset),
-        )
+        means = []
+
+        def by_lens():
+            found = frame_shares(run.model, run.variables, opened, list(dataset))
+            for frame, share in found:
+                means.append(mean_share(share, run.grid))
+                place = frame.weather, level_of[frame.key]
+                yield next(n for n, rule in GROUPS.items() if rule(*place)), share
+
+        maps, counts = average_by_group(by_lens())
         out.mkdir(parents=True, exist_ok=True)
-        ordered = {name: maps[name] for name in GROUPS if name in maps}
+        ordered = {name: maps[name] for name in ("all", *GROUPS) if name in maps}
         write_camera_share(out, ordered, counts, run.grid)
-        shares = {name: mean_share(share, run.grid) for name, share in ordered.items()}
         sequences = np.asarray(frames["sequence"])
         # Intervals come from resampled sequences: one alone has none.
         is_small = {
@@ -180,12 +206,21 @@ def main(fusion, radar, out, data, split, resamples):
             row
             for name, chosen in groups.items()
             if not is_small[name]
-            for row in rows_of_group(name, reports, config, chosen, shares, resamples)
+            for row in rows_of_group(name, reports, config, chosen, resamples)
         ]
-        files.write_json(out / "by_lens.json", rows)
-        text = tabulate(rows, headers="keys", floatfmt=".2f")
+        kept = {name: chosen for name, chosen in groups.items() if not is_small[name]}
+        shares = [*share_rows(np.array(means), sequences, kept, resamples)]
+        files.write_json(out / "by_lens.json", {"ap": rows, "share": shares})
+        text = "\n\n".join(
+            [
+                "AP BEV, IoU 0.3, protocol exact",
+                tabulate(rows, headers="keys", floatfmt=".2f"),
+                "Share of the camera in the fused map, and that less its share in all",
+                tabulate(shares, headers="keys", floatfmt=".4f"),
+            ]
+        )
         files.write_text(out / "by_lens.txt", text + "\n")
-        click.echo(f"AP BEV, IoU 0.3, protocol exact\n\n{text}\n\nWritten to {out}")
+        click.echo(f"{text}\n\nWritten to {out}")
 
 
 if __name__ == "__main__":

@@ -50,8 +50,9 @@ def small_config():
     config.model.update(doppler_bins=4, elevation_bins=3, widths=(8, 8), num_groups=4)
     config.model.update(decoder_width=8, neck="plain", heads="default", pad_multiple=4)
     config.model.image.update(
-        size=(32, 96), freeze=True, hidden_size=96, num_registers=4, mlp_dim=192
+        size=(32, 96), freeze=True, hidden_size=96, num_layers=3, num_registers=4
     )
+    config.model.image.mlp_dim = 192
     config.model.fusion.update(num_heads=2, num_elevation=3, necks=False)
     config.data.mirror_probability = 0.0
     config.train.update(batch_size=8, num_epochs=2, log_every_steps=1)
@@ -353,7 +354,8 @@ def test_example_compares_fusion_and_radar_by_the_lens(
     # The run with itself: nothing gained, on all frames and by the lens.
     text = _example("fusion_by_lens", run, run, "--out", out, "--resamples", 10)
     assert (out / "by_lens.txt").read_text() in text
-    rows = json.loads((out / "by_lens.json").read_text())
+    content = json.loads((out / "by_lens.json").read_text())
+    rows = content["ap"]
     whole = [row for row in rows if row["condition"] == "all"]
     assert {row["frames"] for row in whole} == {12}
     assert {row["difference"] for row in rows} == {0.0}
@@ -362,11 +364,15 @@ def test_example_compares_fusion_and_radar_by_the_lens(
     assert sum(shares[name]["frames"] for name in parts) == 12
     # Three sequences in other weathers: a condition of one has no interval.
     alone = {n for n in parts if f"left out: {n} (4 frames" in text}
-    assert parts - alone == {row["condition"] for row in rows} - {"all"}
-    for row in rows:
-        assert row["camera share"] == shares[row["condition"]]["mean"]
-        assert shares[row["condition"]]["frames"] == row["frames"]
-        assert 0 < row["camera share"] < 1
+    told = {row["condition"]: row for row in content["share"]}
+    assert told.keys() == {row["condition"] for row in rows}
+    assert parts - alone == told.keys() - {"all"}
+    for name, row in told.items():
+        # Of frames here, of bins there: the padded bins' share is the same.
+        assert row["share"] == pytest.approx(shares[name]["mean"], abs=0.02)
+        assert row["frames"] == shares[name]["frames"]
+        assert 0 < row["share low"] <= row["share"] <= row["share high"] < 1
+    assert told["all"]["difference"] == 0
 
 
 def test_example_compares_on_another_data_set(
@@ -383,7 +389,7 @@ def test_example_compares_on_another_data_set(
     for name in ("by_lens", "by_lens_other"):
         results.append((run / name / "by_lens.json").read_text())
     assert results[0] == results[1]
-    assert len(json.loads(results[0])) > 1
+    assert len(json.loads(results[0])["ap"]) > 1
     evaluate_run(run, num_pictures=0, split="train")
     with pytest.raises(AssertionError, match="other frames than split test"):
         _example("fusion_by_lens", run, run)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -157,27 +157,40 @@ def camera_share(
     data: Data,
     frames: FrameSequence,
     *,
-    group: Callable[[LabelledFrame], str] = lambda frame: frame.weather,
     max_frames: int = 256,
-    batch_size: int = 8,
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Mean share of the camera in the fused map by group of frames, "all" first.
+    """Mean share of the camera in the fused map by weather, "all" first.
 
     Args:
         model: Radar-camera detector.
         variables: Of the model.
         data: Of the run, or others.
         frames: Of them; evenly spread ones where there are more than `max_frames`.
-        group: Names the group of a frame.
         max_frames: Limit of frames.
-        batch_size: Frames at once.
 
     Returns:
-        `[R, A]` means by group, and how many frames with an image each is of; see
+        `[R, A]` means by weather, and how many frames with an image each is of; see
         `average_by_group`.
     """
     spread = np.linspace(0, len(frames) - 1, min(max_frames, len(frames)))
     frames = [frames[int(i)] for i in np.round(spread)]
+    found = frame_shares(model, variables, data, frames)
+    return average_by_group((frame.weather, share) for frame, share in found)
+
+
+def frame_shares(
+    model: nn.Module,
+    variables: Mapping[str, Any],
+    data: Data,
+    frames: FrameSequence,
+    *,
+    batch_size: int = 8,
+) -> Iterator[tuple[LabelledFrame, np.ndarray]]:
+    """Every frame with its `[R, A]` share of the camera in the fused map, in [0, 1].
+
+    0 in bins that no query sees in the image, and everywhere without an image. The maps
+    are padded as the model's are. Arguments as of `camera_share`.
+    """
     table = make_table(
         data.records,
         frames,
@@ -201,11 +214,8 @@ def camera_share(
 
     variables = jax.device_put(dict(variables))
 
-    def shares() -> Iterator[tuple[str, np.ndarray]]:
-        for batch in make_loader(table, options):
-            found = np.asarray(share_of(variables, model_inputs(batch)), np.float64)
-            for index, share in zip(batch.frame, found, strict=True):
-                if index >= 0:
-                    yield group(frames[index]), share
-
-    return average_by_group(shares())
+    for batch in make_loader(table, options):
+        found = np.asarray(share_of(variables, model_inputs(batch)), np.float64)
+        for index, share in zip(batch.frame, found, strict=True):
+            if index >= 0:
+                yield frames[index], share
