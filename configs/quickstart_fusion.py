@@ -1,11 +1,15 @@
 """A small radar-camera model on simulated radar and images, in minutes on a CPU.
 
-    python train.py --config configs/quickstart_fusion.py
+    python examples/pretrain_backbone.py --out backbones/small
+    python train.py --config configs/quickstart_fusion.py:pretrained \\
+        --image_backbone backbones/small
     python train.py --config configs/quickstart_fusion.py:radar
 
-The first trains a narrow DinoRADE with a small image transformer from scratch, the
-second the same model without its camera, on the same simulated data: the difference is
-what the camera adds. `docs/radar_camera.md` has the numbers to expect.
+The second trains a narrow DinoRADE with the small image transformer of the first,
+frozen, the third the same model without its camera, on the same simulated data: the
+difference is what the camera adds. `docs/radar_camera.md` has the numbers to expect.
+Without a word the transformer is trained with the rest, from scratch, which is too
+little to learn it by.
 
 Words: `radar` for the model without the camera; `silhouettes` for images of the objects
 alone, in the colour of their class and brighter when nearer, a control of what a perfect

@@ -150,7 +150,7 @@ def test_nothing_is_written_or_built_for_a_wrong_config(tmp_path: pathlib.Path) 
 
 def test_a_batch_that_does_not_divide_is_refused_first(tmp_path: pathlib.Path) -> None:
     config = _with("train.num_accumulate", 3)
-    with pytest.raises(UserError, match=r"config.train.batch_size=4 does not divide"):
+    with pytest.raises(UserError, match=r"config.train.batch_size=2 does not divide"):
         experiment.run(config, name="x", workdir=tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
