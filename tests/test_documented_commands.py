@@ -67,7 +67,7 @@ RUN_IN = {
     "examples/ablation.py": "tests/examples/test_ablation.py"
     "::test_what_is_missing_is_run_and_judged",
     "examples/pretrain_backbone.py": "tests/examples/test_pretrain_backbone.py"
-    "::test_it_learns_and_its_folder_is_a_frozen_backbone",
+    "::test_it_learns_and_what_it_writes_is_a_frozen_backbone",
     "examples/online_training.py": "tests/examples/test_online_training.py"
     "::test_fresh_frames_train_a_model_and_a_stop_changes_nothing",
     "examples/reference_points.py": "tests/test_fusion_run.py"
