@@ -220,11 +220,12 @@ def resampled(
             sequence[mask], resamples=resamples, seed=0
         )
         cut = config.evaluation.score_threshold
-        result[condition] = bootstrap.resample(
+        aps = bootstrap.resample(
             data, weights, "exact", "bev", 0.3, score_threshold=cut
         )
+        result[condition] = aps.astype(np.float32)
     with files.atomic_write(path) as file:
-        np.savez(file, **result)
+        np.savez_compressed(file, **result)
     return result
 
 
