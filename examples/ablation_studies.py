@@ -130,7 +130,7 @@ STUDIES = {
             Claim("the same in the mean", "R+C+W", "R", "mean", 4.0),
             Claim("elevation weights help (71.38 to 69.61)", "R+C+W", "R+C"),
             Claim("a transformer beats a ResNet (71.38 to 68.43)", "R+C+W", "R+C+W ResNet"),
-            Claim("the same in the mean", "R+C+W", "R+C+W ResNet", "mean"),
+            Claim("a transformer does in the mean", "R+C+W", "R+C+W ResNet", "mean"),
             Claim("control: its own images count", "R+C+W", "images exchanged"),
             Claim("control: labels teach", "R+C+W", "labels exchanged"),
         ),

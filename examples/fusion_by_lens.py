@@ -7,8 +7,9 @@
 Compares two runs on the same simulated test frames, by weather and by the state of the
 lens, which the simulator knows: AP of both, their difference with an interval from
 resampled sequences, and the camera's share in the fused map with the same. Writes
-tables and a picture into OUT. `--data ROOT` takes another simulated data set, on which both were
-evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same `--split`.
+tables and a picture into OUT. `--data ROOT` takes another simulated data set, on which
+both were evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same
+`--split`.
 """
 
 import collections

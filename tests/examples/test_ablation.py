@@ -265,3 +265,23 @@ def test_killed_within_a_run_it_goes_on_and_ends_with_the_same_digits(
     tables = [(out / "table_sigma.json").read_text() for out in (killed, whole)]
     assert json.loads(tables[0])["rows"] == json.loads(tables[1])["rows"]
     assert "2 of 2 cells are done" in _ended(_start(killed))  # nothing left to do
+
+
+def test_documented_numbers_are_those_of_the_table_that_lies_beside() -> None:
+    docs = ablation.CONFIGS.parent / "docs"
+    content = json.loads((docs / "ablations" / "table_4.json").read_text())
+    page = (docs / "results.md").read_text()
+    rows = {
+        (r["cell"], r["cls"]): r for r in content["rows"] if r["condition"] == "all"
+    }
+    for cell in ablation.STUDIES["4"].cells:
+        assert rows[cell, "mean"]["seeds"] == [0, 1, 2]
+        aps = [f"{rows[cell, cls]['ap']:.1f}" for cls in (*CLASSES, "mean")]
+        assert f"| {' | '.join([cell, '0, 1, 2', *aps])} |" in page
+    for claim in content["claims"]:
+        gap = "{difference:+.1f} ({low:.1f} to {high:.1f})".format(**claim)
+        words = claim["text"], f"{claim['a']} - {claim['b']}", claim["cls"], gap
+        assert f"| {' | '.join(words)} | {claim['verdict']} |" in page
+        assert claim["text"] in (docs / "ablations" / "table_4.md").read_text()
+    assert len(content["commands"]) == 18
+    assert not any(" /" in command for command in content["commands"].values())
