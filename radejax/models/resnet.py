@@ -76,11 +76,12 @@ class StridedConv(nn.Module):
         kernel = self.param("kernel", uniform_fan_in(self.size**2 * shape[2]), shape)
         if self.size == 1:  # a stride only leaves out
             x = x[:, :: self.stride, :: self.stride]
+        x, kernel = jnp.asarray(x, self.dtype), jnp.asarray(kernel, self.dtype)
         if self.size == 1 or self.stride == 1:
-            return conv2d(x.astype(self.dtype), kernel.astype(self.dtype))
+            return conv2d(x, kernel)
         return jax.lax.conv_general_dilated(
-            x.astype(self.dtype),
-            kernel.astype(self.dtype),
+            x,
+            kernel,
             window_strides=(self.stride, self.stride),
             padding=((self.size // 2,) * 2,) * 2,
             dimension_numbers=("NHWC", "HWIO", "NHWC"),
