@@ -243,7 +243,8 @@ def test_accumulated_gradients_are_those_of_the_undivided_batch(
         for new in (after, expected)
     ]
     largest = max(float(abs(g).max()) for g in jax.tree.leaves(gradients[1]))
-    chex.assert_trees_all_close(*gradients, rtol=1e-5, atol=2e-6 * largest)
+    # Sums in another order, read from parameters' differences: 2.4e-6 on an AMD EPYC.
+    chex.assert_trees_all_close(*gradients, rtol=1e-5, atol=1e-5 * largest)
     chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-5)
     assert int(metrics["num_objects"]) == is_valid.sum()
 
