@@ -1,15 +1,17 @@
-"""How well the echo of a pedestrian alone says where they are.
+"""How well the echo of a small road user alone says where they are.
 
     python examples/echo_accuracy.py
-    python examples/echo_accuracy.py --range-bins 164
+    python examples/echo_accuracy.py --cls Bicycle --range-bins 164
+    python examples/echo_accuracy.py --cls Motorcycle --full-size
 
-A yardstick for detectors, no bound: in simulated scenes of the quickstart's radar the
-Doppler bin of a pedestrian's body is taken as known, the strongest cell beside their own
-is found, and its place between the bins by a parabola through three cells in decibels,
-along and across. The mean distance of the echo to the center, a part of the body's size,
-is taken off. Told is the share of boxes of the right size and heading that would overlap
-the true one by 0.3; of one such box a pedestrian, in no order, the AP would be about the
-share's square. A network sees more cells than three, and is not told the Doppler.
+A yardstick for detectors, no bound: in simulated scenes of the quickstart's radar, or of
+K-Radar's own, the Doppler bin of an object's body is taken as known, the strongest cell
+beside its own is found, and its place between the bins by a parabola through three cells
+in decibels, along and across. The mean distance of the echo to the center, a part of the
+body's size, is taken off. Told is the share of boxes of the right size and heading that
+would overlap the true one by 0.3; of one such box an object, in no order, the AP would
+be about the share's square. A network sees more cells than three, and is not told the
+Doppler.
 """
 
 from collections.abc import Iterator
@@ -24,12 +26,11 @@ from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.evaluation.columns import in_roi
 from radejax.evaluation.report.tables import Table, number
 from radejax.geometry.rotated_iou import bev_iou_np
-from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
 from radejax.simulation.scene_sources import make_source
 from radejax.simulation.simulator import SequenceSimulator
 
 DISTANCES_M = ((5.0, 20.0), (20.0, 40.0))
-PEDESTRIAN = CLASSES.index("Pedestrian")
 
 
 def between(values: np.ndarray) -> float:
@@ -50,8 +51,10 @@ def locate(power_db: np.ndarray, cell: np.ndarray) -> np.ndarray:
     return np.array([row + along, column + across])
 
 
-def measured(config: SimulationConfig) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Box, error along [m] and across [m] of every visible pedestrian."""
+def measured(
+    config: SimulationConfig, cls: str
+) -> Iterator[tuple[np.ndarray, float, float]]:
+    """Box, error along [m] and across [m] of every visible object of a class."""
     grid, source = config.make_grid(), make_source(config)
     doppler_step = grid.doppler_mps[1] - grid.doppler_mps[0]
     for name in source.numbers:
@@ -62,7 +65,7 @@ def measured(config: SimulationConfig) -> Iterator[tuple[np.ndarray, float, floa
         given = simulator.radar_input(frame)
         doppler = simulator.run(given, "projection")[..., : grid.num_doppler]
         visible = simulator.is_radar_visible(frame, given)
-        visible &= (frame.cls == PEDESTRIAN) & in_roi(frame.boxes, NARROW_ROI)
+        visible &= (frame.cls == CLASSES.index(cls)) & in_roi(frame.boxes, NARROW_ROI)
         for i in np.flatnonzero(visible):
             x, y = frame.boxes[i, :2]
             distance = np.hypot(x, y)
@@ -86,16 +89,16 @@ def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndar
     return bev_iou_np(moved, boxes)
 
 
-def table(config: SimulationConfig) -> Table:
+def table(config: SimulationConfig, cls: str) -> Table:
     """Errors and share of overlapping boxes by distance."""
-    found = np.array([[*box, *errors] for box, *errors in measured(config)])
+    found = np.array([[*box, *errors] for box, *errors in measured(config, cls)])
     boxes, along, across = np.split(found.reshape(-1, 9), (7, 8), axis=1)
     distance, rows = np.hypot(boxes[:, 0], boxes[:, 1]), []
     for low, high in DISTANCES_M:
         at = (low <= distance) & (distance < high)
         if not at.any():
             raise UserError(
-                f"{config.train_sequences} scenes have no pedestrian that the radar sees"
+                f"{config.train_sequences} scenes have no {cls} that the radar sees"
                 f" at {low:g} to {high:g} m: give more --scenes"
             )
         center = np.mean(along[at])
@@ -106,18 +109,22 @@ def table(config: SimulationConfig) -> Table:
         rows.append(
             [f"{low:g}-{high:g} m", int(at.sum()), *texts, f"{100 * share:.0f} %"]
         )
-    title = (
-        f"where the echo of a pedestrian is, {config.make_grid().num_range} range bins"
-    )
-    head = ["Distance", "Pedestrians", "Echo - center m", "Along m", "Across m"]
+    title = f"where the echo of a {cls} is, {config.make_grid().num_range} range bins"
+    head = ["Distance", "Objects", "Echo - center m", "Along m", "Across m"]
     return Table(title, [*head, "IoU > 0.3"], rows).of_simulated()
 
 
 @click.command()
 @click.option("--scenes", default=300, show_default=True, type=click.IntRange(1))
+@click.option(
+    "--cls", default="Pedestrian", show_default=True, type=click.Choice(CLASSES)
+)
 @click.option("--range-bins", default=64, show_default=True, type=click.IntRange(8))
+@click.option(
+    "--full-size", is_flag=True, help="K-Radar's grid; in place of --range-bins."
+)
 @click.option("--seed", default=500, show_default=True, type=click.IntRange(0))
-def main(scenes: int, range_bins: int, seed: int) -> None:
+def main(scenes: int, cls: str, range_bins: int, full_size: bool, seed: int) -> None:
     """Errors of the echo's place by distance, medians, and how many boxes overlap."""
     entry.set_up_jax()
     with entry.exit_codes():
@@ -125,7 +132,8 @@ def main(scenes: int, range_bins: int, seed: int) -> None:
         values["grid"]["num_range"] = range_bins
         values |= {"seed": seed, "train_sequences": scenes, "test_sequences": 0}
         values |= {"frames_per_sequence": 1, "vulnerable_road_users": 5.0}
-        click.echo(table(SimulationConfig.from_mapping(values)).render())
+        values |= FULL_SIZE if full_size else {}
+        click.echo(table(SimulationConfig.from_mapping(values), cls).render())
 
 
 if __name__ == "__main__":

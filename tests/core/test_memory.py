@@ -16,8 +16,8 @@ libc.free.argtypes = libc.memset.argtypes = None
 faults = []
 def take():
     for _ in range(4):
-        block = ctypes.c_void_p(libc.malloc(100 << 20))
-        libc.memset(block, 1, ctypes.c_size_t(100 << 20))
+        block = ctypes.c_void_p(libc.malloc(400 << 20))
+        libc.memset(block, 1, ctypes.c_size_t(400 << 20))
         libc.free(block)
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
 thread = threading.Thread(target=take)  # as JAX's steps do
@@ -40,6 +40,6 @@ def test_freed_memory_is_taken_again_without_new_pages(is_said: bool) -> None:
         text=True,
         check=True,
     )
-    pages = 3 * (100 << 20) // os.sysconf("SC_PAGE_SIZE")
+    pages = 3 * (400 << 20) // os.sysconf("SC_PAGE_SIZE")
     taken = int(done.stdout)
     assert taken < 0.01 * pages if not is_said else taken > 0.5 * pages

@@ -35,7 +35,7 @@ ALL = [
     *(("radenet", words) for words in ("sigma0.75", "adaptive", "anisotropic")),
     *(("dinorade", words) for words in ("", "paper", "official", "rc", "r")),
     *(("dinorade", words) for words in ("rcw_resnet50", "sedan", "sigma3")),
-    *((name, "") for name in ("quickstart", "quickstart_fusion")),
+    *((name, "") for name in ("quickstart", "quickstart_fusion", "full_grid")),
     ("simulate_real_scenes", ""),
 ]
 
