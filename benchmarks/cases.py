@@ -17,6 +17,7 @@ import jax
 import networks
 import numpy as np
 import scipy.io
+import start
 from case import Case, compiled, difference, timed, waiting
 
 from radejax.core.config import load_config
@@ -225,6 +226,7 @@ BENCHMARKS = {
     "feeding": (networks.feeding, 60),
     "deploy": (deploy, 150),
     "records": (compress, 40),
+    "start": (start.start, 240),
 }
 """Function, and seconds that it takes on two cores, by name for `--only`, in the order in
 which they are run: what matters most comes first."""

@@ -105,10 +105,13 @@ STUDIES = {
         },
         (
             Claim("0.75 is best for all classes", "sigma 0.75", "sigma 3", "mean"),
+            Claim("0.75 is better than 1", "sigma 0.75", "model", "mean"),
             *(
                 Claim(f"0.75 helps {cls}", "sigma 0.75", "sigma 3", cls)
                 for cls in CLASSES[2:]
             ),
+            Claim("a spread of the box's size is better than 1", "adaptive", "model", "mean"),
+            Claim("a spread of its shape is better than 1", "anisotropic", "model", "mean"),
             Claim("control: labels teach", "model", "labels exchanged"),
         ),
         1024,

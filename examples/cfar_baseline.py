@@ -4,8 +4,8 @@
 
 DATA is a K-Radar folder, simulated (`train.py` leaves one under data/) or real, with its
 projected records in DATA/records. Steps between the classes are fitted on the training
-split, the detector runs on the test split, and OUT gets the same report as a network's
-(`report.txt`, `metrics.json`, `tables.md`, ...).
+split (of another folder with `--fit-data`), the detector runs on the test split, and OUT
+gets the same report as a network's (`report.txt`, `metrics.json`, `tables.md`, ...).
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ def run_baseline(
     score_threshold: float = 0.05,
     bootstrap: int = 0,
     balanced: bool = False,
+    fit_data: str | pathlib.Path | None = None,
 ) -> Report:
     """Fits on the training split, detects on the test split, writes the report.
 
@@ -53,13 +54,17 @@ def run_baseline(
         score_threshold: As in the config of the network to compare with.
         bootstrap: Resamples of sequences for intervals.
         balanced: Rare classes count as much as frequent ones in the fit.
+        fit_data: Folder with the training split, where it is not `data`.
     """
-    data = pathlib.Path(data)
-    records = RecordSource(data / "records")
-    settings = fit(records, KRadar(data, split="train"), balanced=balanced)
+    data, fit_data = pathlib.Path(data), pathlib.Path(fit_data or data)
+    settings = fit(
+        RecordSource(fit_data / "records"),
+        KRadar(fit_data, split="train"),
+        balanced=balanced,
+    )
     for name, least in settings.rcs_steps:
         print(f"{name} from {least:.1f} dBsm")
-    frames = KRadar(data, split="test")
+    records, frames = RecordSource(data / "records"), KRadar(data, split="test")
     predictions = predict(records, frames, settings)
     ground_truth, table = tables_from_frames(frames, "test")
     return write_report(
@@ -120,6 +125,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", required=True, help="K-Radar folder with records/")
+    parser.add_argument("--fit-data", help="folder to fit on, where not DATA")
     parser.add_argument("--out", required=True, help="folder of the report")
     parser.add_argument("--score-threshold", type=float, default=0.05)
     parser.add_argument("--bootstrap", type=int, default=0)
@@ -133,6 +139,7 @@ def main() -> None:
         score_threshold=arguments.score_threshold,
         bootstrap=arguments.bootstrap,
         balanced=arguments.balanced,
+        fit_data=arguments.fit_data,
     )
     print(report.text)
 

@@ -102,6 +102,20 @@ def test_a_run_that_is_stopped_keeps_what_it_measured(modules: Any) -> None:
     assert [row["benchmark"] for row in kept[-1]["rows"]] == ["one"]
 
 
+def test_a_process_is_timed_until_it_says_so(
+    modules: Any, tmp_path: pathlib.Path
+) -> None:
+    import start
+
+    words = "import os, time; sum(range(10**7)); print(os.getcwd(), 'there'); time.sleep(60)"
+    wall, processor = start.until("there", ["-c", words], tmp_path, tmp_path / "kept")
+    assert 0.01 < processor < 50
+    assert wall < 50  # it was ended
+    text = "import os; raise SystemExit([k for k in os.environ if k[:8] == 'JAX_COMP'])"
+    with pytest.raises(RuntimeError, match=r"no 'there'.*JAX_COMP"):
+        start.until("there", ["-c", text], tmp_path, tmp_path / "kept")
+
+
 def test_what_is_stored_is_on_the_page(
     modules: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
 ) -> None:

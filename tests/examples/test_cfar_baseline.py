@@ -40,6 +40,11 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     assert sedan["num_det"] > 0
     assert 0.0 < sedan["ap"] < 95.0
 
+    # The same fit, named: as from another folder.
+    again = module.run_baseline(
+        data, tmp_path / "again", protocols=("exact",), fit_data=data
+    )
+    assert again.text == report.text
     # Fitted on training frames; each frame's predictions are those of the detector.
     records = RecordSource(data / "records")
     settings = module.fit(records, KRadar(data, split="train"))

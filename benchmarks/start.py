@@ -1,0 +1,96 @@
+"""How long a command takes to its first step, and a detector to its first boxes.
+
+Each time is of a process of its own. "radejax" finds the compiled programs of an earlier
+start, "first start" none.
+"""
+
+import functools
+import itertools
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+import time
+
+from case import Case
+
+_ROOT = pathlib.Path(__file__).resolve().parents[1]
+_FIRST_STEP = "after the start"  # of the line that training writes then
+_DETECT = """
+import numpy as np
+from radejax.core.config import load_config
+from radejax.inference.benchmark import untrained
+found = untrained(load_config("radenet"), batch_sizes=(1,), score_threshold=0.0)
+x = np.zeros((1, *found.grid.projection_shape), np.float32)
+print("found:", np.asarray(found(x).scores).shape)
+"""
+
+
+def start(machine):
+    """From the command to the first step; from `import radejax` to the first boxes."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name)
+        numbers = itertools.count()
+
+        def train(programs):
+            words = [str(_ROOT / "train.py"), "--config", "quickstart:short"]
+            words += ["--workdir", str(folder / f"run{next(numbers)}")]
+            return until(_FIRST_STEP, words, folder, programs)
+
+        def detect(programs):
+            return until("found:", ["-c", _DETECT], folder, programs)
+
+        def anew(run):
+            return run(folder / f"programs{next(numbers)}")
+
+        for what, run in (
+            ("train.py, quickstart:short, to its first step", train),
+            ("detector of RADE-Net, to its first boxes", detect),
+        ):
+            kept = folder / f"programs{next(numbers)}"
+            run(kept)  # also simulates and projects the data
+            yield Case(
+                name=what,
+                columns={
+                    "radejax": functools.partial(run, kept),
+                    "first start": functools.partial(anew, run),
+                },
+                note="of a whole process; data and records are there",
+            )
+
+
+def until(text, words, folder, programs):
+    """Wall and processor seconds of a Python process until it writes a text.
+
+    Args:
+        text: Part of the line that ends the time; the process is ended then.
+        words: Arguments of the interpreter.
+        folder: Where it runs.
+        programs: Folder of its compiled programs.
+
+    Raises:
+        RuntimeError: It ended without that text.
+    """
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(programs)}
+    began = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-u", *words],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if text in line:
+            seconds = time.perf_counter() - began
+            process.kill()
+            _, process.returncode, usage = os.wait4(process.pid, 0)
+            process.stdout.close()
+            return seconds, usage.ru_utime + usage.ru_stime
+    process.wait()
+    process.stdout.close()
+    raise RuntimeError(f"no {text!r} from {words}: {''.join(lines)[-2000:]}")
