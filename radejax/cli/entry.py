@@ -189,4 +189,5 @@ def set_up_jax(*, cache: bool = True) -> None:
         "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(home) / "radejax" / "jax")
     )
     jax.config.update("jax_compilation_cache_dir", folder)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    # Every program: the fifty small ones of a start take a second and 200 kB.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

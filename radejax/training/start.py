@@ -136,18 +136,23 @@ def initial(
     return jax.tree_util.Partial(to_start_from, first, *given), create
 
 
-def _evaluated(function: Callable[[], Any]) -> Any:
-    """NumPy arrays of what it returns, one operation after the other, needless ones not.
+def _traced(function: Callable[[], Any]) -> tuple[Any, Callable[[], Any]]:
+    """Shapes of what it returns, and a function that returns it as NumPy arrays.
 
-    Equal operations share a compiled program. In one program each of a hundred random
+    It is traced once for both, and done one operation after the other, needless ones not:
+    equal operations share a compiled program. In one program each of a hundred random
     generators is compiled on its own, which takes as long as half a training step.
     """
     traced, shape = jax.make_jaxpr(lambda f: f(), return_shape=True)(function)
-    is_result = [True] * len(traced.jaxpr.outvars)
-    needed, is_used = partial_eval.dce_jaxpr(traced.jaxpr, is_result)
-    given = itertools.compress(jax.tree.leaves(function), is_used)
-    leaves = jax.core.eval_jaxpr(needed, traced.consts, *given)
-    return jax.tree.unflatten(jax.tree.structure(shape), map(np.asarray, leaves))
+
+    def evaluated() -> Any:
+        is_result = [True] * len(traced.jaxpr.outvars)
+        needed, is_used = partial_eval.dce_jaxpr(traced.jaxpr, is_result)
+        given = itertools.compress(jax.tree.leaves(function), is_used)
+        leaves = jax.core.eval_jaxpr(needed, traced.consts, *given)
+        return jax.tree.unflatten(jax.tree.structure(shape), map(np.asarray, leaves))
+
+    return shape, evaluated
 
 
 def _first_batch(loader: Any) -> Batch:
@@ -179,7 +184,8 @@ def restore(
         DataError: No checkpoint restores.
     """
     variables, create = init
-    abstract = jax.eval_shape(lambda: create(variables()))
+    shapes, drawn = _traced(variables)
+    abstract = jax.eval_shape(create, shapes)
     how = plan.options.parameter_sharding
     placement = sharding.state_sharding(abstract, mesh, how)
     # Frozen parameters are not in a checkpoint: they come from where they came from.
@@ -196,8 +202,8 @@ def restore(
         _log.info("continuing from step %d of %d", step, plan.num_steps)
         if not abstract.frozen:
             return state, step
-    drawn = jax.jit(create, out_shardings=placement)(_evaluated(variables))
-    return drawn if state is None else state.replace(frozen=drawn.frozen), step
+    new = jax.jit(create, out_shardings=placement)(drawn())
+    return new if state is None else state.replace(frozen=new.frozen), step
 
 
 def compile_step(
