@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from radejax.cli import options
 from radejax.cli.benchmark import benchmark
 from radejax.cli.data import data, project
 from radejax.cli.demo import demo
@@ -18,6 +19,7 @@ from radejax.cli.view import view
 
 
 @click.group(
+    cls=options.Group,
     commands=[
         demo,
         simulate,

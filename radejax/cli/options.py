@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from radejax.cli import entry
+from radejax.core import memory
 from radejax.core.errors import UserError
 
 COUNT = click.IntRange(1)
@@ -108,7 +109,21 @@ class Step(click.ParamType):
 STEP = Step()
 
 
-class Command(click.Command):
+class Program(click.Command):
+    """What may be a program of its own, and then asks for its memory first."""
+
+    def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
+        """Runs it with some arguments, by default those of this process."""
+        if args is None:
+            memory.restart_with_huge_pages()
+        return super().main(args, *others, **options)
+
+
+class Group(Program, click.Group):
+    """Commands of one program."""
+
+
+class Command(Program):
     """A command with `--json`, whose user's errors are one line and an exit code.
 
     `--with_underscores` is understood as `--with-hyphens` is. `--debug`, of the command

@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import sys
 from types import SimpleNamespace
 
 import click.testing
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 
 from radejax.cli import main
+from radejax.cli.train import train
+from radejax.core import memory
 from radejax.core.errors import UserError
 from radejax.data.kradar import write
 from radejax.data.kradar.labels import Label
@@ -275,3 +278,16 @@ def test_a_part_of_the_data_is_chosen(
     wrong = _run("data", "check", tmp_path, "--sequences", "1-5")
     assert wrong.exit_code == 2
     assert "'1-5' is no number, expected 1,5,58" in wrong.output
+
+
+def test_a_program_asks_for_its_memory_and_a_call_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = []
+    monkeypatch.setattr(memory, "restart_with_huge_pages", lambda: asked.append(1))
+    monkeypatch.setattr(sys, "argv", ["radejax", "--help"])
+    for program in (main.main, train):
+        program.main(["--help"], standalone_mode=False)
+        assert not asked
+        program.main(standalone_mode=False, prog_name="radejax")
+        assert asked.pop()

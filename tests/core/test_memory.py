@@ -1,15 +1,20 @@
 """Memory that is freed and taken again."""
 
 import os
+import pathlib
+import platform
 import subprocess
 import sys
 
 import pytest
 
+from radejax.core import memory
+
 PROGRAM = """
 import ctypes, resource, threading
+import sys
 from radejax.core import memory
-memory.keep_freed()
+getattr(memory, sys.argv[1])()
 libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
 libc.free.argtypes = libc.memset.argtypes = None
@@ -27,19 +32,78 @@ print(faults[-1] - faults[0])
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="glibc's allocator")
-@pytest.mark.parametrize("is_said", [False, True])
-def test_freed_memory_is_taken_again_without_new_pages(is_said: bool) -> None:
-    said = {"MALLOC_TOP_PAD_": "131072"} if is_said else {}
+def _taken(how: str, **said: str) -> float:
+    """Share of the pages of three blocks that were new."""
     theirs = ("MALLOC_", "GLIBC_TUNABLES")
     others = {k: v for k, v in os.environ.items() if not k.startswith(theirs)}
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
+        [sys.executable, "-c", PROGRAM, how],
         env=others | said,
         capture_output=True,
         text=True,
         check=True,
     )
-    pages = 3 * (400 << 20) // os.sysconf("SC_PAGE_SIZE")
-    taken = int(done.stdout)
-    assert taken < 0.01 * pages if not is_said else taken > 0.5 * pages
+    return int(done.stdout) / (3 * (400 << 20) // os.sysconf("SC_PAGE_SIZE"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc's allocator")
+def test_freed_memory_is_taken_again_without_new_pages() -> None:
+    assert _taken("keep_freed") < 0.01
+    assert _taken("keep_freed", MALLOC_TOP_PAD_="131072") > 0.5  # left as it is
+
+
+def _is_asked() -> bool:
+    name, version = platform.libc_ver()
+    pages = pathlib.Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    return (
+        (name, tuple(map(int, version.split(".")))) >= ("glibc", (2, 35))
+        and pages.exists()
+        and "[madvise]" in pages.read_text()
+    )
+
+
+@pytest.mark.skipif(not _is_asked(), reason="this system decides on huge pages itself")
+def test_pages_are_huge_after_a_restart() -> None:
+    assert _taken("restart_with_huge_pages") < 0.05
+    assert _taken("restart_with_huge_pages", MALLOC_TOP_PAD_="131072") > 0.5
+
+
+@pytest.mark.parametrize(
+    ("mode", "said", "is_restarted"),
+    [
+        ("always [madvise] never", {}, True),
+        ("[always] madvise never", {}, False),
+        ("always madvise [never]", {}, False),
+        ("always [madvise] never", {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}, False),
+        ("always [madvise] never", {"MALLOC_ARENA_MAX": "1"}, False),
+        (None, {}, False),
+    ],
+)
+def test_a_program_is_restarted_once_and_with_its_own_words(
+    mode: str | None,
+    said: dict[str, str],
+    is_restarted: bool,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = []
+    pages = tmp_path / "enabled"
+    if mode is not None:
+        pages.write_text(mode)
+    monkeypatch.setattr(memory, "_PAGES", pages)
+    monkeypatch.setattr(platform, "libc_ver", lambda: ("glibc", "2.36"))
+    monkeypatch.setattr(os, "environ", {"HOME": "/h"} | said)
+    monkeypatch.setattr(os, "execve", lambda *given: calls.append(given))
+    monkeypatch.setattr(
+        sys, "orig_argv", ["python", "-u", "train.py", "--config", "a b"]
+    )
+    memory.restart_with_huge_pages()
+    assert len(calls) == is_restarted
+    if is_restarted:
+        program, words, environment = calls[0]
+        assert (program, words[0]) == (sys.executable, sys.executable)
+        assert words[1:] == ["-u", "train.py", "--config", "a b"]
+        assert environment["HOME"] == "/h"
+        monkeypatch.setattr(os, "environ", environment)
+        memory.restart_with_huge_pages()
+        assert len(calls) == 1
