@@ -23,6 +23,8 @@ from cfar import (
 )
 from tqdm import tqdm
 
+from radejax.cli import entry
+from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
@@ -57,11 +59,12 @@ def run_baseline(
         fit_data: Folder with the training split, where it is not `data`.
     """
     data, fit_data = pathlib.Path(data), pathlib.Path(fit_data or data)
-    settings = fit(
-        RecordSource(fit_data / "records"),
-        KRadar(fit_data, split="train"),
-        balanced=balanced,
-    )
+    to_fit = KRadar(fit_data, split="train")
+    if not len(to_fit):
+        raise UserError(
+            f"{fit_data}: no training frames to fit on; --fit-data names a folder with some"
+        )
+    settings = fit(RecordSource(fit_data / "records"), to_fit, balanced=balanced)
     for name, least in settings.rcs_steps:
         print(f"{name} from {least:.1f} dBsm")
     records, frames = RecordSource(data / "records"), KRadar(data, split="test")
@@ -133,15 +136,16 @@ def main() -> None:
         "--balanced", action="store_true", help="rare classes weigh as much as others"
     )
     arguments = parser.parse_args()
-    report = run_baseline(
-        arguments.data,
-        arguments.out,
-        score_threshold=arguments.score_threshold,
-        bootstrap=arguments.bootstrap,
-        balanced=arguments.balanced,
-        fit_data=arguments.fit_data,
-    )
-    print(report.text)
+    with entry.exit_codes():
+        report = run_baseline(
+            arguments.data,
+            arguments.out,
+            score_threshold=arguments.score_threshold,
+            bootstrap=arguments.bootstrap,
+            balanced=arguments.balanced,
+            fit_data=arguments.fit_data,
+        )
+        print(report.text)
 
 
 if __name__ == "__main__":

@@ -119,17 +119,19 @@ def table(config: SimulationConfig, cls: str) -> Table:
 @click.option(
     "--cls", default="Pedestrian", show_default=True, type=click.Choice(CLASSES)
 )
-@click.option("--range-bins", default=64, show_default=True, type=click.IntRange(8))
-@click.option(
-    "--full-size", is_flag=True, help="K-Radar's grid; in place of --range-bins."
-)
+@click.option("--range-bins", type=click.IntRange(8), help="[default: 64]")
+@click.option("--full-size", is_flag=True, help="K-Radar's grid; without --range-bins.")
 @click.option("--seed", default=500, show_default=True, type=click.IntRange(0))
-def main(scenes: int, cls: str, range_bins: int, full_size: bool, seed: int) -> None:
+def main(
+    scenes: int, cls: str, range_bins: int | None, full_size: bool, seed: int
+) -> None:
     """Errors of the echo's place by distance, medians, and how many boxes overlap."""
     entry.set_up_jax()
     with entry.exit_codes():
         values: dict[str, Any] = default_config()
-        values["grid"]["num_range"] = range_bins
+        if full_size and range_bins:
+            raise UserError("--full-size has 256 range bins: give it or --range-bins")
+        values["grid"]["num_range"] = range_bins or 64
         values |= {"seed": seed, "train_sequences": scenes, "test_sequences": 0}
         values |= {"frames_per_sequence": 1, "vulnerable_road_users": 5.0}
         values |= FULL_SIZE if full_size else {}

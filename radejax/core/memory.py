@@ -27,10 +27,10 @@ def restart_with_huge_pages() -> None:
 
     What a step takes is then mapped in few large pieces, and what is freed stays for the
     next one, up to blocks of 4 GiB: on a CPU a training step of DinoRADE takes two
-    thirds of the time that it takes with `keep_freed`, RADE-Net's 0.6 of its memory. glibc (2.35)
-    reads the wish from the environment when a process begins, so this must be called
-    before anything else, by a program's own first lines. Where the system decides for all
-    programs, or the environment says how to allocate, nothing is done.
+    thirds of the time that it takes with `keep_freed`, RADE-Net's 0.6 of its memory.
+    glibc (2.35) reads the wish from the environment when a process begins, so this must
+    be called before anything else, by a program's own first lines. Where the system
+    decides for all programs, or the environment says how to allocate, nothing is done.
     """
     name, version = platform.libc_ver()
     can_ask = name == "glibc" and [*map(int, version.split(".")[:2])] >= [2, 35]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from cfar import detect
 
+from radejax.core.errors import UserError
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
 from radejax.data.records.job import project_dataset
@@ -57,3 +58,13 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     expected = detect(projection, records.grid, module.PARAMETERS, settings)
     assert len(expected["score"]) > 0
     np.testing.assert_array_equal(found["box"][found["frame"] == last], expected["box"])
+
+
+def test_data_without_a_training_split_are_told(tmp_path: pathlib.Path) -> None:
+    config = default_config() | {"train_sequences": 0, "test_sequences": 1}
+    config |= {"frames_per_sequence": 1, "image_width": 0, "output": "projection"}
+    simulate_dataset(config, tmp_path / "data", progress=False)
+    with pytest.raises(
+        UserError, match="data: no training frames to fit on; --fit-data"
+    ):
+        module.run_baseline(tmp_path / "data", tmp_path / "out")

@@ -45,6 +45,13 @@ def test_scenes_without_pedestrians_are_told() -> None:
     assert "give more --scenes" in result.output
 
 
+def test_two_sensors_at_once_are_told() -> None:
+    arguments = ["--full-size", "--range-bins", "100"]
+    result = CliRunner().invoke(echo_accuracy.main, arguments)
+    assert result.exit_code == 2
+    assert "--full-size has 256 range bins" in result.output
+
+
 @pytest.mark.parametrize("cls", ["Pedestrian", "Bicycle"])
 def test_scenes_are_measured(cls: str) -> None:
     arguments = ["--scenes", "16", "--range-bins", "32", "--cls", cls]
