@@ -173,6 +173,9 @@ def _model() -> ConfigDict:
             "dtype": "float32",  # of the computation; parameters are float32
             "remat": "none",  # "blocks", "full": less memory, more time
             "heatmap_prior": 0.5,  # confidence of an untrained model, as released
+            # The network sees (projection - center) * scale; as released, the projection.
+            "input_center": 0.0,
+            "input_scale": 1.0,
         }
     )
 

@@ -80,12 +80,19 @@ def save(
         NumPy arrays by official name.
 
     Raises:
-        UserError: `cbam="paper"` has no official counterpart, or the file's ending
-            is unknown.
+        UserError: `cbam="paper"`, or a center or scale of the input, has no official
+            counterpart, or the file's ending is unknown.
     """
     if model.cbam == "paper":
         raise UserError(
             'the official code has no cbam="paper"; it knows "official" and None'
+        )
+    if (model.input_center, model.input_scale) != (0.0, 1.0):
+        # Not to be put into the first weights either: maps are padded with zeros.
+        raise UserError(
+            f"the official code's network sees the projection as it is; this model's has "
+            f"input_center={model.input_center} and input_scale={model.input_scale}: "
+            "train with 0 and 1 to save it for that code"
         )
     path = None if path is None else pathlib.Path(path)
     if path is not None and path.suffix not in _WRITERS:

@@ -66,8 +66,7 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
     Raises:
         UserError: A key is missing or unknown, or a value is not possible.
     """
-    # Models of before the field have that backbone.
-    fields = {"backbone": "unet"} | {k: config[k] for k in config if k != "name"}
+    fields = radenet.BEFORE | {k: config[k] for k in config if k != "name"}
     radenet.check_keys(fields, FIELDS, "model")
     sections = {"image": IMAGE_FIELDS, "fusion": FUSION_FIELDS, "axes": AXES_FIELDS}
     for name, keys in sections.items():

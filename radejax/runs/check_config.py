@@ -157,6 +157,8 @@ RULES: dict[str, Rule] = {
     "model.heatmap_prior": _number(
         "a number between 0 and 1, without the two", lambda value: 0 < value < 1
     ),
+    "model.input_center": _number(),
+    "model.input_scale": _POSITIVE,
     "model.image.kind": _one_of("vit", "resnet50"),
     "model.image.size": _several(_COUNT, 2),
     "model.image.freeze": _BOOL,

@@ -85,15 +85,15 @@ def test_what_is_missing_is_run_and_judged(
     # Scenes are those of the seed, the same for all cells; no cell is trained on those
     # that it is evaluated on.
     assert sorted({name for name, _ in runs.simulated}) == [
+        "quickstart-640-seed0",
+        "quickstart-640-seed4",
         "quickstart-held",
-        "quickstart-seed0",
-        "quickstart-seed4",
     ]
     assert len(runs.simulated) == 3
     seeds = {n: json.loads(text)["seed"] for n, text in runs.simulated}
     assert len(set(seeds.values())) == 3
     for _, config, sources in runs.trained:
-        assert sources.data[0].endswith(f"quickstart-seed{config.seed}")
+        assert sources.data[0].endswith(f"quickstart-640-seed{config.seed}")
         assert config.simulation.seed == config.seed
 
     content = json.loads((tmp_path / "table_sigma.json").read_text())

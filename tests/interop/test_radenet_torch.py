@@ -82,6 +82,14 @@ def test_save_is_the_inverse_of_load(small_state):
     chex.assert_trees_all_equal(radenet_torch.save(listed, variables), small_state)
 
 
+def test_an_input_that_the_official_code_would_not_see_is_not_saved(small_state):
+    model, variables = radenet_torch.load(
+        small_state, **OVERRIDES | {"input_center": 0.545, "input_scale": 25.0}
+    )
+    with pytest.raises(UserError, match=r"input_center=0\.545 and input_scale=25\.0"):
+        radenet_torch.save(model, variables)
+
+
 @pytest.mark.parametrize("ending", [".pth", ".pt", ".npz", ".safetensors"])
 def test_files_of_every_kind_come_back(small_state, tmp_path, ending):
     model, variables = radenet_torch.load(small_state, **OVERRIDES)

@@ -10,7 +10,7 @@ from ml_collections import ConfigDict
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.models.radenet import FIELDS, pad_to_multiple
+from radejax.models.radenet import BEFORE, FIELDS, pad_to_multiple, padded_input
 
 from ..small_models import drawn
 
@@ -84,6 +84,22 @@ def test_cropped_maps_are_the_padded_ones_cut(small, variables, apply):
     chex.assert_trees_all_close(cropped, expected, atol=1e-5)
 
 
+def test_center_and_scale_are_those_of_the_input(small, variables, apply):
+    """Before padding, which then adds the center; in bfloat16 before the cast."""
+    x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13), minval=0.5, maxval=0.6)
+    fields = {"input_center": 0.545, "input_scale": 25.0}
+    maps = jax.jit(models.build(small | fields).apply)(variables, x)
+    expected = apply(variables, (x - 0.545) * 25.0)
+    chex.assert_trees_all_close(maps, expected, atol=1e-5)
+    narrow = models.build(small | fields | {"dtype": "bfloat16"})
+    noise = x.astype(jnp.bfloat16).astype(jnp.float32) - x
+    assert jnp.abs(noise).max() > 1e-3  # what a cast before it would lose
+    seen = narrow.apply(variables, x, method=lambda m, x: padded_input(x, m))
+    np.testing.assert_allclose(
+        seen[:, :21, :14].astype(np.float32), (x - 0.545) * 25.0, rtol=2**-8
+    )
+
+
 def test_frames_do_not_touch_each_other(variables, apply):
     x = jax.random.uniform(jax.random.key(0), (3, 24, 16, 13))
     together, alone = apply(variables, x), apply(variables, x[1:2])
@@ -152,7 +168,7 @@ def test_build_names_unknown_and_missing_keys(small):
         models.build(broken)
 
 
-@pytest.mark.parametrize("field", [name for name in FIELDS if name != "backbone"])
+@pytest.mark.parametrize("field", [name for name in FIELDS if name not in BEFORE])
 def test_every_field_is_required(small, field):
     with pytest.raises(UserError, match=rf"missing \['{field}'\]"):
         models.build({k: v for k, v in small.items() if k != field})
@@ -174,6 +190,8 @@ def test_every_field_is_required(small, field):
         ({"num_groups": 16, "heads": "default"}, r"decoder_width / 2 .* = 8"),
         ({"num_groups": 16, "input_stem": True}, r"widths\[0\] / 2 .* = 8"),
         ({"heatmap_prior": 1.0}, r"heatmap_prior is 1.0"),
+        ({"input_center": float("nan")}, r"input_center is nan, expected a finite"),
+        ({"input_scale": 0.0}, r"input_scale is 0.0, expected a number above 0"),
     ],
 )
 def test_impossible_values_are_named(small, changes, message):

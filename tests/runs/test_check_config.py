@@ -42,6 +42,8 @@ WRONG = [
     ("model.remat", 1),
     ("model.doppler_bins", "64"),
     ("model.heatmap_prior", 1.0),
+    ("model.input_center", NAN),
+    ("model.input_scale", 0.0),
     ("loss", 3),
     ("loss.sigma", "adaptiv"),
     ("loss.sigma_cells", 0.0),
