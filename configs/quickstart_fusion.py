@@ -39,7 +39,8 @@ def get_config(arg: str | None = None) -> ConfigDict:
     sensors, content, length, backbone = parse_words(
         arg, ("radar",), ("silhouettes",), ("short",), ("pretrained", "resnet50")
     )
-    config = _neighbour("quickstart").get_config(length)
+    words = ",".join(filter(None, ("ablation", length)))
+    config = _neighbour("quickstart").get_config(words)
     config.simulation.update(
         output="projection",
         image_width=640,  # the whole view, squeezed in height: objects are side by side

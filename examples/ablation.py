@@ -5,7 +5,8 @@
     python examples/ablation.py --table 4 --seeds 0,1,2
 
 Table 3 is RADE-Net's (attention, heads, neck, stem, decoder), 4 DinoRADE's (radar, camera,
-elevation weights, backbone), sigma the spread of the heatmap's targets. Every cell is an
+elevation weights, backbone), sigma the spread of the heatmap's targets, quickstart what the
+quickstart's own input and longer training bring. Every cell is an
 ordinary run of a config, trained on scenes of its seed and evaluated on other ones, which
 all cells share. The same command goes on where an earlier one ended or was killed, also
 within a run. `--table_only` writes the tables of what is there. Given several times at
@@ -104,8 +105,10 @@ class Work:
 
     def root(self, cell: Cell, seed: int | None) -> pathlib.Path:
         """Folder of the data of a seed's runs, or of the held-out scenes for None."""
-        name = "held" if seed is None else f"seed{seed}"
-        return self.out / "data" / f"{cell.config.partition(':')[0]}-{name}"
+        kind, name = cell.config.partition(":")[0], "held"
+        if seed is not None:
+            name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
+        return self.out / "data" / f"{kind}-{name}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
         """These data; simulated if missing."""
@@ -113,6 +116,7 @@ class Work:
         if seed is None:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
+            simulation["vulnerable_road_users"] = 1.0  # of training scenes alone
         return str(simulate_dataset(simulation, self.root(cell, seed)))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:

@@ -12,7 +12,10 @@ from radejax.core.structures import CLASSES
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 _VARIANTS = load_module(CONFIGS / "radenet.py").VARIANTS
+_RADAR = "quickstart:ablation"
 _LABELS = {"data.label_permutation_seed": 0}
+_OWN_INPUT = {"model.input_center": 0.545, "model.input_scale": 25.0}
+"""The quickstart's own."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,16 +64,15 @@ class Study:
 
 
 def _radar(**fields: Any) -> Cell:
-    return Cell(
-        "quickstart", {name.replace("__", "."): v for name, v in fields.items()}
-    )
+    named = {name.replace("__", "."): v for name, v in fields.items()}
+    return Cell(_RADAR, named)
 
 
 def _row(name: str) -> Cell:
     """A row of Table III; its wide decoder is twice the quickstart's own too."""
     fields = {f"model.{k}": v for k, v in _VARIANTS[name].items()}
     return Cell(
-        "quickstart", fields | ({"model.decoder_width": 64} if name == "expand" else {})
+        _RADAR, fields | ({"model.decoder_width": 64} if name == "expand" else {})
     )
 
 
@@ -79,7 +81,7 @@ STUDIES = {
         "RADE-Net's Table III",
         "base",
         {n: _row(n) for n in ("base", "cbam", "cbam_heads", "model", "no_cbam", "stem", "expand")}
-        | {"labels exchanged": Cell("quickstart", _LABELS)},
+        | {"labels exchanged": Cell(_RADAR, _LABELS)},
         (
             Claim("the whole network beats the plain one (64.06 to 57.96)", "model", "base"),
             Claim("attention alone does not pay (55.13 to 57.96)", "base", "cbam"),
@@ -101,7 +103,7 @@ STUDIES = {
             "sigma 0.75": _radar(loss__sigma_cells=0.75),
             "adaptive": _radar(loss__sigma="adaptive"),
             "anisotropic": _radar(loss__sigma="anisotropic"),
-            "labels exchanged": Cell("quickstart", _LABELS),
+            "labels exchanged": Cell(_RADAR, _LABELS),
         },
         (
             Claim("0.75 is best for all classes", "sigma 0.75", "sigma 3", "mean"),
@@ -136,6 +138,26 @@ STUDIES = {
             Claim("a transformer does in the mean", "R+C+W", "R+C+W ResNet", "mean"),
             Claim("control: its own images count", "R+C+W", "images exchanged"),
             Claim("control: labels teach", "R+C+W", "labels exchanged"),
+        ),
+        1024,
+    ),
+    "quickstart": Study(
+        "what the quickstart does otherwise",
+        "model",
+        {
+            "model": _row("model"),
+            "input centered": Cell(_RADAR, _OWN_INPUT),
+            "quickstart": Cell("quickstart"),
+        },
+        (
+            Claim("a centered and scaled input helps", "input centered", "model"),
+            Claim("it does in the mean", "input centered", "model", "mean"),
+            Claim("scenes, steps and spread help", "quickstart", "input centered"),
+            Claim("they do in the mean", "quickstart", "input centered", "mean"),
+            *(
+                Claim(f"all together help {cls}", "quickstart", "model", cls)
+                for cls in CLASSES[2:]
+            ),
         ),
         1024,
     ),
