@@ -6,7 +6,7 @@ Simulates K-Radar folders on a coarser sensor, projects, trains, evaluates on he
 sequences and draws. The code is that of the full model; only widths and grid differ.
 
 Words: `ablation` for the training of `examples/ablation.py`'s tables, where there are
-many: half of the scenes, a third of the steps, and the input as in the papers; `short`
+many: half of the scenes, two fifths of the steps, and the input as in the papers; `short`
 for a run of two minutes that learns next to nothing, to see that everything works.
 """
 
