@@ -188,7 +188,7 @@ def own_fields(
 FIELDS = own_fields(RadeNet)
 """Fields of a model config beside `name`."""
 
-BEFORE = {"backbone": "unet", "input_center": 0.0, "input_scale": 1.0}
+BEFORE: dict[str, Any] = {"backbone": "unet", "input_center": 0.0, "input_scale": 1.0}
 """Fields that configs of earlier versions are without, as they were then."""
 
 _CHOICES: dict[str, Collection[Any]] = {
