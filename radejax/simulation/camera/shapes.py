@@ -86,13 +86,13 @@ class Polygon:
     """A face on the image.
 
     Attributes:
-        points: Pixels (u, v) in order.
+        points: Pixels in order, u and v in turn.
         color: Red, green, blue.
         depth_m: Distance of its object; `visible_polygons` sorts by it.
         box: Index of its box in the frame.
     """
 
-    points: list[tuple[float, ...]]
+    points: list[float]
     color: tuple[int, int, int]
     depth_m: float
     box: int
@@ -252,8 +252,8 @@ def _object_faces(boxes, classes, colors, origin) -> Faces:
 
 def _project_faces(
     faces: Float[np.ndarray, "F 4 3"], calibration: CameraCalibration
-) -> list[list[tuple[float, ...]]]:
-    """Pixels of faces cut at the near plane; edges bend with the lens.
+) -> list[list[float]]:
+    """Pixels of faces cut at the near plane, u and v in turn; edges bend with the lens.
 
     A face wholly nearer than the plane, or off the image, gives an empty list.
     """
@@ -264,27 +264,26 @@ def _project_faces(
     outlines = outlines.reshape(len(faces), -1, 3)
     size = np.array([calibration.width, calibration.height], float)
     places, depth = project(outlines, camera)
-    low, high = places.min(1), places.max(1)
-    shown = ((high >= 0) & (low <= size)).all(1)
-    points = np.clip(places, -2.0 * size, 3.0 * size).tolist()
-    result = [
-        list(map(tuple, p)) if s else [] for p, s in zip(points, shown, strict=True)
-    ]
-    for index in np.flatnonzero(depth.min(1) < _NEAR_M):
-        result[index] = []
-        if depth[index].max() >= _NEAR_M:
-            cut = _cut_near(outlines[index], depth[index], _NEAR_M)
-            result[index] = _on_image(project(cut, camera)[0], size)
+    nearest, farthest = depth.min(1), depth.max(1)
+    result: list[list[float]] = [[] for _ in faces]
+    shown = ((places.max(1) >= 0) & (places.min(1) <= size)).all(1)
+    # Only these, and flat: pairs of numbers, each an object, take as long as the drawing.
+    whole = np.flatnonzero(shown & ~(nearest < _NEAR_M))
+    for index, points in zip(whole, _flat(places[whole], size), strict=True):
+        result[index] = points
+    for index in np.flatnonzero((nearest < _NEAR_M) & (farthest >= _NEAR_M)):
+        cut = project(_cut_near(outlines[index], depth[index], _NEAR_M), camera)[0]
+        if (cut.max(0) >= 0).all() and (cut.min(0) <= size).all():
+            result[index] = _flat(cut[None], size)[0]
     return result
 
 
-def _on_image(
-    points: Float[np.ndarray, "P 2"], size: Float[np.ndarray, "2"]
-) -> list[tuple[float, ...]]:
-    """Pixels of a face, not too far off an image of a size; or none."""
-    is_off = (points.max(0) < 0).any() or (points.min(0) > size).any()
-    points = np.clip(points, -2.0 * size, 3.0 * size)
-    return [] if is_off else list(map(tuple, points.tolist()))
+def _flat(
+    places: Float[np.ndarray, "F P 2"], size: Float[np.ndarray, "2"]
+) -> list[list[float]]:
+    """Pixels of every face in a row, not too far off an image of a size."""
+    near = np.clip(places, -2.0 * size, 3.0 * size)
+    return near.reshape(len(near), 2 * near.shape[1]).tolist()
 
 
 def _cut_near(outline, depth, near_m) -> np.ndarray:

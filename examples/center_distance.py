@@ -1,0 +1,125 @@
+"""What is found near where it is, whatever the boxes overlap.
+
+    python examples/center_distance.py runs/quickstart/evaluation
+
+AP where a prediction counts whose center lies within some metres of an object of its
+class on the ground, as nuScenes has it, and how far the centers are off along and across
+the line of sight. What has a high AP here and a low one by overlap is seen, and boxed
+too coarsely; what is low in both is not seen.
+"""
+
+import itertools
+import pathlib
+from collections.abc import Iterator
+
+import click
+import numpy as np
+
+from radejax.cli import entry
+from radejax.core.errors import UserError
+from radejax.core.structures import CLASSES
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.files.load import Source, load
+from radejax.evaluation.matching import Pairs, match_free
+from radejax.evaluation.overlap import ranges
+from radejax.evaluation.protocols import pooled_curve
+from radejax.evaluation.report.tables import Table, number
+
+DISTANCES_M = (0.0, 20.0, 40.0, 72.0)
+
+
+def matched(data: EvaluationSet, within_m: float) -> np.ndarray:
+    """`[M]` object of every prediction, -1 without; by falling score the nearest free."""
+    first = np.searchsorted(data.gt_group, data.pred_group)
+    after = np.searchsorted(data.gt_group, data.pred_group, side="right")
+    pred, gt = ranges(first, after - first)
+    gap = data.pred.box[pred, :2] - data.gt.box[gt, :2]
+    # The nearest is the best where the farthest allowed is the threshold.
+    pairs = Pairs(pred, gt, -np.hypot(gap[:, 0], gap[:, 1]))
+    score, groups = data.pred.score, data.pred_group
+    return match_free(pairs, score, groups, len(data.gt), -within_m)
+
+
+def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float:
+    """Area under the exact curve of one class, in percent."""
+    chosen = np.flatnonzero(data.pred.cls == cls)
+    order = chosen[np.argsort(-data.pred.score[chosen], kind="stable")]
+    curve = pooled_curve(
+        score=data.pred.score[order],
+        is_tp=match[order] >= 0,
+        weight=np.ones(order.size),
+        num_gt=int((data.gt.cls == cls).sum()),
+        curve="exact",
+    )
+    return curve.ap
+
+
+def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`[N]` metres along the line of sight to the true boxes, and across."""
+    gap, bearing = found - truth, np.arctan2(truth[:, 1], truth[:, 0])
+    along = gap[:, 0] * np.cos(bearing) + gap[:, 1] * np.sin(bearing)
+    return along, gap[:, 1] * np.cos(bearing) - gap[:, 0] * np.sin(bearing)
+
+
+def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
+    """APs by class and distance allowed."""
+    matches = [matched(data, limit) for limit in within]
+    rows = [
+        [name, int((data.gt.cls == cls).sum())]
+        + [number(average_precision(data, m, cls), digits=1) for m in matches]
+        for cls, name in enumerate(data.classes)
+    ]
+    head = ["Class", "Objects", *(f"{limit:g} m" for limit in within)]
+    return Table("AP where centers are near, region narrow", head, rows)
+
+
+def error_rows(data: EvaluationSet, match: np.ndarray) -> Iterator[list[str | int]]:
+    """Classes by distance of the object: how many are matched, and how well."""
+    hit = np.flatnonzero(match >= 0)
+    truth = data.gt.take(match[hit])
+    along, across = errors(truth.box, data.pred.box[hit])
+    every = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
+    distance = np.hypot(truth.box[:, 0], truth.box[:, 1])
+    for cls, name in enumerate(data.classes):
+        for low, high in itertools.pairwise(DISTANCES_M):
+            there = (data.gt.cls == cls) & (low <= every) & (every < high)
+            at = (truth.cls == cls) & (low <= distance) & (distance < high)
+            if at.any():
+                medians = (np.median(np.abs(e[at])) for e in (along, across))
+                texts = [number(m, digits=2) for m in medians]
+                counts = int(there.sum()), int(at.sum())
+                yield [name, f"{low:g}-{high:g} m", *counts, *texts]
+
+
+@click.command()
+@click.argument(
+    "report", type=click.Path(exists=True, file_okay=False, path_type=pathlib.Path)
+)
+@click.option(
+    "--within",
+    multiple=True,
+    type=click.FloatRange(0.0, min_open=True),
+    default=(0.5, 1.0, 2.0, 3.0),
+    show_default=True,
+)
+def main(report: pathlib.Path, within: tuple[float, ...]) -> None:
+    """AP by distance of centers in REPORT, the folder of an evaluation, and errors."""
+    with entry.exit_codes():
+        if not (report / "predictions.npz").is_file():
+            raise UserError(
+                f"{report} is no folder of an evaluation: predictions.npz is missing; "
+                "evaluate.py writes one, for a run RUN it is RUN/evaluation"
+            )
+        truth, found, frames, _ = load(report, Source(), CLASSES)
+        data = EvaluationSet(truth, found, frames=frames, roi="narrow")
+        farthest = max(within)
+        head = ["Class", "Distance", "Objects", "Found", "Along m", "Across m"]
+        title = f"errors of centers within {farthest:g} m, medians"
+        rows = list(error_rows(data, matched(data, farthest)))
+        for table in (ap_table(data, within), Table(title, head, rows)):
+            made = table.of_simulated() if data.is_simulated else table
+            click.echo(made.render())
+
+
+if __name__ == "__main__":
+    main()
