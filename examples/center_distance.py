@@ -3,8 +3,9 @@
     python examples/center_distance.py runs/quickstart/evaluation
 
 AP where a prediction counts whose center lies within some metres of an object of its
-class on the ground, as nuScenes has it, and how far the centers are off along and across
-the line of sight. What has a high AP here and a low one by overlap is seen, and boxed
+class on the ground, as nuScenes has it; how far the centers are off along and across the
+line of sight; and how many of these boxes overlap theirs by 0.3, as they are and without
+one of their errors. What has a high AP here and a low one by overlap is seen, and boxed
 too coarsely; what is low in both is not seen.
 """
 
@@ -24,8 +25,10 @@ from radejax.evaluation.matching import Pairs, match_free
 from radejax.evaluation.overlap import ranges
 from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.report.tables import Table, number
+from radejax.geometry.rotated_iou import bev_iou_np
 
 DISTANCES_M = (0.0, 20.0, 40.0, 72.0)
+IOU = 0.3
 
 
 def matched(data: EvaluationSet, within_m: float) -> np.ndarray:
@@ -55,10 +58,21 @@ def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float
 
 
 def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`[N]` metres along the line of sight to the true boxes, and across."""
-    gap, bearing = found - truth, np.arctan2(truth[:, 1], truth[:, 0])
-    along = gap[:, 0] * np.cos(bearing) + gap[:, 1] * np.sin(bearing)
-    return along, gap[:, 1] * np.cos(bearing) - gap[:, 0] * np.sin(bearing)
+    """`[N, 2]` metres in the plane, along the line of sight to true boxes and across."""
+    gap, to = found[:, :2] - truth[:, :2], truth[:, :2]
+    to = to / np.linalg.norm(to, axis=1, keepdims=True)
+    along = (gap * to).sum(1, keepdims=True) * to
+    return along, gap - along
+
+
+def overlapping(truth: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
+    """`[N]` which boxes overlap: so, right along, right across, of right size and yaw."""
+    along, across = errors(truth, found)
+    tried = [found.copy() for _ in range(4)]
+    tried[1][:, :2] -= along
+    tried[2][:, :2] -= across
+    tried[3][:, 3:] = truth[:, 3:]
+    return [bev_iou_np(boxes, truth) > IOU for boxes in tried]
 
 
 def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
@@ -76,8 +90,9 @@ def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
 def error_rows(data: EvaluationSet, match: np.ndarray) -> Iterator[list[str | int]]:
     """Classes by distance of the object: how many are matched, and how well."""
     hit = np.flatnonzero(match >= 0)
-    truth = data.gt.take(match[hit])
-    along, across = errors(truth.box, data.pred.box[hit])
+    truth, found = data.gt.take(match[hit]), data.pred.box[hit]
+    sizes = [np.linalg.norm(e, axis=1) for e in errors(truth.box, found)]
+    shares = overlapping(truth.box, found)
     every = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
     distance = np.hypot(truth.box[:, 0], truth.box[:, 1])
     for cls, name in enumerate(data.classes):
@@ -85,10 +100,10 @@ def error_rows(data: EvaluationSet, match: np.ndarray) -> Iterator[list[str | in
             there = (data.gt.cls == cls) & (low <= every) & (every < high)
             at = (truth.cls == cls) & (low <= distance) & (distance < high)
             if at.any():
-                medians = (np.median(np.abs(e[at])) for e in (along, across))
-                texts = [number(m, digits=2) for m in medians]
+                medians = [number(np.median(e[at]), digits=2) for e in sizes]
+                percent = [f"{100 * np.mean(share[at]):.0f} %" for share in shares]
                 counts = int(there.sum()), int(at.sum())
-                yield [name, f"{low:g}-{high:g} m", *counts, *texts]
+                yield [name, f"{low:g}-{high:g} m", *counts, *medians, *percent]
 
 
 @click.command()
@@ -114,7 +129,8 @@ def main(report: pathlib.Path, within: tuple[float, ...]) -> None:
         data = EvaluationSet(truth, found, frames=frames, roi="narrow")
         farthest = max(within)
         head = ["Class", "Distance", "Objects", "Found", "Along m", "Across m"]
-        title = f"errors of centers within {farthest:g} m, medians"
+        head += [f"IoU > {IOU:g}", "along right", "across right", "size, yaw right"]
+        title = f"centers within {farthest:g} m: medians of errors, boxes that overlap"
         rows = list(error_rows(data, matched(data, farthest)))
         for table in (ap_table(data, within), Table(title, head, rows)):
             made = table.of_simulated() if data.is_simulated else table

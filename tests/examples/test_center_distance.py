@@ -79,8 +79,25 @@ def test_errors_lie_along_and_across_the_line_of_sight() -> None:
     truth = np.array([[10.0, 0, 0, 1, 1, 1, 0], [0, 10.0, 0, 1, 1, 1, 0]])
     moved = truth + np.array([[0.3, 0.1, 0, 0, 0, 0, 0], [0.3, 0.1, 0, 0, 0, 0, 0]])
     along, across = center_distance.errors(truth, moved)
-    np.testing.assert_allclose(along, [0.3, 0.1])
-    np.testing.assert_allclose(across, [0.1, -0.3], atol=1e-12)
+    np.testing.assert_allclose(along, [[0.3, 0], [0, 0.1]], atol=1e-12)
+    np.testing.assert_allclose(across, [[0, 0.1], [0.3, 0]], atol=1e-12)
+
+
+def test_boxes_overlap_without_the_error_that_keeps_them_apart() -> None:
+    truth = np.tile(np.array([10.0, 0, 0, 1, 1, 1, 0.0]), (4, 1))
+    found = truth + np.array(
+        [
+            [0.1, 0.1, 0, 0, 0, 0, 0],  # overlaps
+            [0.9, 0.1, 0, 0, 0, 0, 0],  # too far along
+            [0.1, 0.9, 0, 0, 0, 0, 0],  # too far across
+            [0.1, 0.1, 0, 2, 2, 0, 0],  # too large
+        ]
+    )
+    so, along, across, shape = center_distance.overlapping(truth, found)
+    assert so.tolist() == [True, False, False, False]
+    assert along.tolist() == [True, True, False, False]
+    assert across.tolist() == [True, False, True, False]
+    assert shape.tolist() == [True, False, False, True]
 
 
 def test_a_report_is_told_in_two_tables(tmp_path: pathlib.Path) -> None:
@@ -90,10 +107,11 @@ def test_a_report_is_told_in_two_tables(tmp_path: pathlib.Path) -> None:
     arguments = [str(tmp_path), "--within", "1", "--within", "3"]
     result = CliRunner().invoke(center_distance.main, arguments)
     assert result.exit_code == 0, result.output
-    lines = [line.split() for line in result.output.splitlines()]
-    assert ["Pedestrian", "2", "50.0", "83.3"] in lines
-    assert ["Pedestrian", "0-20", "m", "1", "1", "0.80", "0.30"] in lines
-    assert ["Pedestrian", "20-40", "m", "1", "1", "0.00", "2.50"] in lines
+    lines = [" ".join(line.split()) for line in result.output.splitlines()]
+    assert "Pedestrian 2 50.0 83.3" in lines
+    none = "0 % 0 % 0 % 0 %"  # 0.5 m wide
+    assert f"Pedestrian 0-20 m 1 1 0.80 0.30 {none}" in lines
+    assert "Pedestrian 20-40 m 1 1 0.00 2.50 0 % 0 % 100 % 0 %" in lines
 
 
 def test_what_is_no_evaluation_is_told(tmp_path: pathlib.Path) -> None:
