@@ -62,6 +62,8 @@ RUN_IN = {
     "::test_example_compares_fusion_and_radar_by_the_lens",
     "examples/echo_accuracy.py": "tests/examples/test_echo_accuracy.py"
     "::test_scenes_are_measured",
+    "examples/center_distance.py": "tests/examples/test_center_distance.py"
+    "::test_a_report_is_told_in_two_tables",
     "examples/silhouettes.py": "tests/examples/test_silhouettes.py"
     "::test_both_runs_see_the_same_scenes_and_the_bar_decides",
     "examples/ablation.py": "tests/examples/test_ablation.py"
