@@ -24,11 +24,10 @@ from radejax.core.errors import UserError
 @click.option("--full-size", is_flag=True, help="K-Radar's own grid and 2560 x 720.")
 @click.option("--projections", is_flag=True, help="Write no tesseracts (260 MB each).")
 @click.option(
-    "--threads",
+    "--workers",
+    "num_workers",
     type=options.COUNT,
-    default=2,
-    show_default=True,
-    help="Frames at a time.",
+    help="Processes; one per core by default.",
 )
 def simulate(
     config: str | None,
@@ -39,13 +38,13 @@ def simulate(
     frames: int | None,
     full_size: bool,
     projections: bool,
-    threads: int,
+    num_workers: int | None,
     as_json: bool,
 ) -> None:
     """Simulate a data set in K-Radar's folders and file formats.
 
     Run again after an interruption, it goes on where it stopped. The same options give
-    the same bytes, whatever the number of threads.
+    the same bytes, whatever the number of processes.
 
     Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
     """
@@ -71,5 +70,5 @@ def simulate(
             simulation["sequences"] = [int(number) for number in sequences.split(",")]
         except ValueError:
             raise UserError(f"--sequences {sequences!r}, expected 1,5,58") from None
-    simulate_dataset(simulation, out, num_threads=threads)
+    simulate_dataset(simulation, out, num_workers=num_workers)
     options.echo_result(as_json, {"root": str(out)}, f"simulated data set in {out}")

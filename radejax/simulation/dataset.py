@@ -1,36 +1,46 @@
 """Writes simulated sequences as a K-Radar tree that no reader can tell from the real.
 
 Frames are written one by one, the label file last: a frame is there when its label
-file is. A killed run goes on where it stopped and ends with the same bytes.
+file is. A killed run goes on where it stopped and ends with the same bytes. Scenes and
+images are Python and made by worker processes, the radar's part by this one's device.
 """
 
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
+import functools
 import json
 import logging
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import IO, Any
 
+import jax
 import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.core.workers import process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
+from radejax.data.kradar.labels import Label
 from radejax.geometry.calibration import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source
-from radejax.simulation.simulator import SequenceSimulator
+from radejax.simulation.simulator import RadarInput, SequenceSimulator, radar_frame
 
 __all__ = ["default_config", "simulate_dataset"]
 
+_LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
+_FEW_FRAMES = 100  # done before worker processes have started
+
+_Prepare = Callable[[int, FrameSpec], tuple[RadarInput, list[Label]]]
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +49,7 @@ def simulate_dataset(
     config: Mapping[str, Any],
     root: str | os.PathLike,
     *,
-    num_threads: int = 2,
+    num_workers: int | None = None,
     progress: bool = True,
 ) -> pathlib.Path:
     """Simulates a data set into `root`, or finishes or reuses the one that is there.
@@ -47,7 +57,8 @@ def simulate_dataset(
     Args:
         config: Plain values as `default_config` returns (a mapping or ConfigDict).
         root: Folder of the data set; made if missing.
-        num_threads: Frames at a time.
+        num_workers: Processes that make scenes and draw images; 0: this one; None: one a
+            core, or for few frames this one.
         progress: Show a progress bar.
 
     Returns:
@@ -57,7 +68,7 @@ def simulate_dataset(
 
     Raises:
         UserError: A config value is wrong, `root` holds something else or a data set
-            of another config, or the disk is full.
+            of another config, the disk is full, or a worker was killed.
     """
     checked = SimulationConfig.from_mapping(config)
     root = pathlib.Path(root)
@@ -72,7 +83,7 @@ def simulate_dataset(
         files.write_json(root / SIMULATION_MARKER, content)
         files.remove_stale(root)
         _write_common(root, checked, source)
-        _write_frames(root, checked, source, num_threads, progress)
+        _write_frames(root, checked, source, num_workers, progress)
         files.write_json(root / SIMULATION_MARKER, content | {"finished": True})
     return root
 
@@ -147,13 +158,18 @@ def _write_frames(
     root: pathlib.Path,
     config: SimulationConfig,
     source: SceneSource,
-    num_threads: int,
+    num_workers: int | None,
     progress: bool,
 ) -> None:
     """Every frame that is not there yet; next sequences start before one has ended."""
+    missing = list(_missing(root, config, source))
     total = sum(len(source.frames(n)) for n in source.numbers)
     bar = tqdm(total=total, unit="frame", desc="simulate", disable=not progress)
-    num_threads = max(num_threads, 1)
+    bar.update(total - len(missing))
+    if num_workers is None:
+        num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
+    # Threads wait for workers and the device alike.
+    num_threads = num_workers + 2
     running: set[concurrent.futures.Future[None]] = set()
 
     def wait(at_most: int) -> None:
@@ -166,37 +182,29 @@ def _write_frames(
                 future.result()
                 bar.update()
 
-    with bar, concurrent.futures.ThreadPoolExecutor(num_threads) as pool:
+    with (
+        bar,
+        _prepare_by(num_workers, root, config, source) as prepare,
+        concurrent.futures.ThreadPoolExecutor(num_threads) as pool,
+    ):
         try:
-            for number in source.numbers:
-                writer = _SequenceWriter(root / str(number), config, source, number)
-                bar.update(len(source.frames(number)) - len(writer.missing))
-                for spec in writer.missing:
-                    running.add(pool.submit(writer.write, spec))
-                    wait(2 * num_threads)
+            for number, spec in missing:
+                running.add(
+                    pool.submit(_write_frame, root, config, number, spec, prepare)
+                )
+                wait(2 * num_threads)
             wait(0)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-class _SequenceWriter:
-    """Writes one sequence into a folder; makes its simulator if frames are missing.
-
-    Attributes:
-        missing: Frames without a label file.
-    """
-
-    def __init__(
-        self,
-        folder: pathlib.Path,
-        config: SimulationConfig,
-        source: SceneSource,
-        number: int,
-    ) -> None:
-        self.folder, self.config = folder, config
-        self.labels = folder / "info_label_v2_1"
-        specs = source.frames(number)
+def _missing(
+    root: pathlib.Path, config: SimulationConfig, source: SceneSource
+) -> Iterator[tuple[int, FrameSpec]]:
+    """Sequence and frame without a label file; writes what a sequence has once."""
+    for number in source.numbers:
+        folder, specs = root / str(number), source.frames(number)
         kradar_write.write_description(
             folder / "description.txt", *source.conditions(number)
         )
@@ -206,46 +214,97 @@ class _SequenceWriter:
             radar_idx - lidar_idx,
             *config.lidar_to_radar_m[:2],
         )
-        there = {path.stem for path in self.labels.glob("*.txt")}
-        self.missing = [spec for spec in specs if spec.name not in there]
-        if not self.missing:
-            return
-        sequence, seed = source.make(number), config.seed
-        self.simulator = SequenceSimulator(
-            sequence, config.make_grid(), config.make_parameters(), seed
-        )
-        if pair := _cameras(config):
-            self.renderer = CameraRenderer(
-                sequence,
-                pair,
-                seed,
-                cover_lens=config.cover_lens,
-                content=config.camera_content,
-            )
+        there = {path.stem for path in (folder / _LABELS).glob("*.txt")}
+        yield from ((number, spec) for spec in specs if spec.name not in there)
 
-    def write(self, spec: FrameSpec) -> None:
-        """One frame: radar, image, then labels."""
-        config, simulator = self.config, self.simulator
-        radar_idx, _, camera_idx, *_ = spec.indices
+
+def _write_frame(
+    root: pathlib.Path,
+    config: SimulationConfig,
+    number: int,
+    spec: FrameSpec,
+    prepare: _Prepare,
+) -> None:
+    """One frame: image, radar, then labels."""
+    given, labels = prepare(number, spec)
+    folder, radar_idx = root / str(number), spec.indices[0]
+    grid, parameters = config.make_grid(), config.make_parameters()
+    output = radar_frame(given, grid, parameters, config.output)
+    if config.output == "tesseract":
+        path = folder / "radar_tesseract" / f"tesseract_{radar_idx:05d}.mat"
+        kradar_write.write_tesseract(path, output)
+    else:
+        path = folder / "DERA_tesseract" / f"DERA_tesseract_{radar_idx:05d}.npy"
+        with files.atomic_write(path) as file:
+            np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
+    path = folder / _LABELS / f"{spec.name}.txt"
+    kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
+
+
+class _Scenes:
+    """Makes what a frame has but for the radar's part, and writes its image."""
+
+    def __init__(
+        self, root: pathlib.Path, config: SimulationConfig, source: SceneSource
+    ) -> None:
+        self._root, self._config, self._source = root, config, source
+        # Threads may ask for frames of the sequence before.
+        self._sequence = functools.lru_cache(maxsize=8)(self._make)
+
+    def prepare(self, number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
+        """Radar input and labels of a frame; its image is written."""
+        config, camera_idx = self._config, spec.indices[2]
+        simulator, renderer = self._sequence(number)
         frame = simulator.sequence.frame(spec.scene_idx)
-        given = simulator.radar_input(frame)
-        output = simulator.run(given, config.output)
-        if config.output == "tesseract":
-            path = self.folder / "radar_tesseract" / f"tesseract_{radar_idx:05d}.mat"
-            kradar_write.write_tesseract(path, output)
-        else:
-            name = f"DERA_tesseract_{radar_idx:05d}.npy"
-            with files.atomic_write(self.folder / "DERA_tesseract" / name) as file:
-                np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
-        if config.image_width:
-            path = self.folder / "cam-front" / f"cam-front_{camera_idx:05d}.png"
+        if renderer:
+            name = f"cam-front_{camera_idx:05d}.png"
+            path = self._root / str(number) / "cam-front" / name
             with files.atomic_write(path) as file:
-                write_png(file, self.renderer.render(frame))
+                write_png(file, renderer.render(frame))
+        given = simulator.radar_input(frame)
         labels = simulator.labels(
             frame, given, config.lidar_to_radar_m, config.label_distance_m
         )
-        path = self.labels / f"{spec.name}.txt"
-        kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
+        return given, labels
+
+    def _make(self, number: int) -> tuple[SequenceSimulator, CameraRenderer | None]:
+        config, sequence = self._config, self._source.make(number)
+        grid, parameters = config.make_grid(), config.make_parameters()
+        simulator = SequenceSimulator(sequence, grid, parameters, config.seed)
+        pair = _cameras(config)
+        if not pair:
+            return simulator, None
+        return simulator, CameraRenderer(
+            sequence,
+            pair,
+            config.seed,
+            cover_lens=config.cover_lens,
+            content=config.camera_content,
+        )
+
+
+@contextlib.contextmanager
+def _prepare_by(num_workers: int, *of_scenes: Any) -> Iterator[_Prepare]:
+    """`_Scenes.prepare`, by worker processes if there are to be any."""
+    if not num_workers:
+        yield _Scenes(*of_scenes).prepare
+        return
+    with process_pool(num_workers, _start_worker, *of_scenes) as submit:
+        yield lambda *frame: submit(_prepare_in_worker, *frame).result()
+
+
+_scenes: Any = None
+
+
+def _start_worker(*of_scenes: Any) -> None:
+    """The device is the parent's: this process has none."""
+    global _scenes
+    jax.config.update("jax_platforms", "cpu")
+    _scenes = _Scenes(*of_scenes)
+
+
+def _prepare_in_worker(number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
+    return _scenes.prepare(number, spec)
 
 
 def write_png(file: IO[bytes], image: np.ndarray) -> None:

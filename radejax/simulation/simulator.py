@@ -113,27 +113,10 @@ class SequenceSimulator:
         )
 
     def run(
-        self,
-        given: RadarInput,
-        output: tensor.Output = "projection",
+        self, given: RadarInput, output: tensor.Output = "projection"
     ) -> Float[np.ndarray, "..."]:
-        """The radar frame of an input; see `tensor.simulate`.
-
-        A tesseract comes as a view of the rows that the device made, without a copy.
-        """
-        result = np.asarray(
-            tensor.simulate(
-                given.scatterers,
-                given.noise_power,
-                given.key,
-                grid=self.grid,
-                parameters=self.parameters,
-                output="rows" if output == "tesseract" else output,
-            )
-        )
-        if output == "tesseract":
-            return result.transpose(tensor.TESSERACT_OF_ROWS)
-        return result
+        """The radar frame of an input; see `radar_frame`."""
+        return radar_frame(given, self.grid, self.parameters, output)
 
     def is_radar_visible(
         self, frame: SceneFrame, given: RadarInput
@@ -172,3 +155,28 @@ class SequenceSimulator:
                 )
             )
         return labels
+
+
+def radar_frame(
+    given: RadarInput,
+    grid: RadarGrid,
+    parameters: tensor.RadarParameters,
+    output: tensor.Output = "projection",
+) -> Float[np.ndarray, "..."]:
+    """The radar frame of an input; see `tensor.simulate`.
+
+    A tesseract comes as a view of the rows that the device made, without a copy.
+    """
+    result = np.asarray(
+        tensor.simulate(
+            given.scatterers,
+            given.noise_power,
+            given.key,
+            grid=grid,
+            parameters=parameters,
+            output="rows" if output == "tesseract" else output,
+        )
+    )
+    return (
+        result.transpose(tensor.TESSERACT_OF_ROWS) if output == "tesseract" else result
+    )

@@ -52,7 +52,7 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["fly"], "No such command 'fly'"),
         (["project", ".", "--out", "x", "--shard", "3/2"], "3/2"),
         (["project", ".", "--out", "x", "--workers", "0"], "0 is not in the range"),
-        (["simulate", "--out", "x", "--threads", "0"], "0 is not in the range"),
+        (["simulate", "--out", "x", "--workers", "0"], "0 is not in the range"),
         (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
         (["benchmark", "--config", "x", "--batch-size", "0"], "0 is not in the range"),
         (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import multiprocessing
 import os
 import socket
 import subprocess
@@ -120,9 +121,9 @@ class TestTree:
 
 
 class TestRepeating:
-    def test_same_seed_same_bytes_on_any_number_of_threads(self, tree, tmp_path):
+    def test_same_seed_same_bytes_by_worker_processes(self, tree, tmp_path):
         again = simulate_dataset(
-            small_config(), tmp_path / "again", num_threads=1, progress=False
+            small_config(), tmp_path / "again", num_workers=2, progress=False
         )
         assert digests(again) == digests(tree)
 
@@ -139,21 +140,21 @@ class TestRepeating:
         self, tree, tmp_path, monkeypatch
     ):
         root = tmp_path / "interrupted"
-        write, calls = dataset._SequenceWriter.write, []
+        write, calls = dataset._write_frame, []
 
-        def stops(self, index):
+        def stops(*frame):
             if len(calls) == 4:
                 raise KeyboardInterrupt
-            calls.append(index)
-            write(self, index)
+            calls.append(frame)
+            write(*frame)
 
-        monkeypatch.setattr(dataset._SequenceWriter, "write", stops)
+        monkeypatch.setattr(dataset, "_write_frame", stops)
         with pytest.raises(KeyboardInterrupt):
-            simulate_dataset(small_config(), root, num_threads=1, progress=False)
+            simulate_dataset(small_config(), root, num_workers=0, progress=False)
         assert not json.loads((root / dataset.SIMULATION_MARKER).read_text())[
             "finished"
         ]
-        monkeypatch.setattr(dataset._SequenceWriter, "write", write)
+        monkeypatch.setattr(dataset, "_write_frame", write)
         # A killed writer leaves its temporary file; a living one's is not touched.
         dead = subprocess.Popen([sys.executable, "-c", ""])
         dead.wait()
@@ -176,6 +177,19 @@ class TestRepeating:
 
 
 class TestWrongUse:
+    def test_a_killed_worker_is_one_line(self, tmp_path, monkeypatch):
+        root, write = tmp_path / "data", dataset._write_frame
+
+        def write_and_kill(*frame):
+            write(*frame)
+            for worker in multiprocessing.active_children():
+                worker.kill()
+
+        monkeypatch.setattr(dataset, "_write_frame", write_and_kill)
+        with pytest.raises(UserError, match="a worker process was killed"):
+            simulate_dataset(small_config(), root, num_workers=1, progress=False)
+        assert 1 <= len(list(root.rglob("info_label_v2_1/*.txt"))) < 9
+
     def test_other_config_names_the_field(self, tree):
         with pytest.raises(UserError, match=r"another simulation config.*seed"):
             simulate_dataset(small_config(seed=5), tree, progress=False)

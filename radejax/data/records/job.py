@@ -13,11 +13,8 @@ import dataclasses
 import hashlib
 import itertools
 import math
-import multiprocessing
 import os
 import pathlib
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -25,6 +22,7 @@ from typing import Any
 from tqdm import tqdm
 
 from radejax.core.errors import DataError, UserError
+from radejax.core.workers import CONTEXT, process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import check_encoding, encode, num_clipped
 from radejax.data.records import files
@@ -255,27 +253,15 @@ def _run(
 
 def _run_in_processes(tasks: list[_Task], num_workers: int, bar: tqdm) -> Iterator:
     """Results in the order in which they come; the bar moves with every frame."""
-    context = multiprocessing.get_context("spawn")
     # Without locks: a killed worker could hold one for ever. Each slot has one writer.
-    done, stop = context.RawArray("q", max(len(tasks), 1)), context.RawValue("b", 0)
-    pool = concurrent.futures.ProcessPoolExecutor(
-        min(num_workers, max(len(tasks), 1)),
-        mp_context=context,
-        initializer=_start_worker,
-        initargs=(done, stop),
-    )
-    with pool:
-        # Ctrl-C is for this process: those that start now inherit the mask, and `stop`
-        # tells them.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    done, stop = CONTEXT.RawArray("q", max(len(tasks), 1)), CONTEXT.RawValue("b", 0)
+    num_workers = min(num_workers, max(len(tasks), 1))
+    with process_pool(num_workers, _start_worker, done, stop) as submit:
         try:
             pending = {
-                pool.submit(_project_in_worker, task, slot)
+                submit(_project_in_worker, task, slot)
                 for slot, task in enumerate(tasks)
             }
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        try:
             while pending:
                 finished, pending = concurrent.futures.wait(
                     pending, 0.2, concurrent.futures.FIRST_COMPLETED
@@ -283,14 +269,8 @@ def _run_in_processes(tasks: list[_Task], num_workers: int, bar: tqdm) -> Iterat
                 bar.update(sum(done) - bar.n)
                 for future in finished:
                     yield future.result()
-        except concurrent.futures.process.BrokenProcessPool:
-            raise UserError(
-                "a worker process was killed, perhaps for want of memory; run the same "
-                "command again to continue, with fewer workers"
-            ) from None
         except BaseException:
             stop.value = 1  # the others need not finish their files first
-            pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
@@ -303,17 +283,9 @@ _stop: Any = None
 
 
 def _start_worker(done: Any, stop: Any) -> None:
-    """Shares the counters of frames, and ends this process when its parent dies."""
+    """Shares the counters of frames."""
     global _done, _stop
     _done, _stop = done, stop
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this is a worker
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def _project_in_worker(task: _Task, slot: int) -> tuple:
