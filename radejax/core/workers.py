@@ -17,6 +17,15 @@ from radejax.core.errors import UserError
 CONTEXT = multiprocessing.get_context("spawn")
 """How the processes start: shared values for them must come from it."""
 
+_KILLED = (
+    "a worker process was killed, perhaps for want of memory; run the same command again "
+    "to continue, with fewer workers"
+)
+_NOT_STARTED = (
+    "no worker process could start: a script of your own must do its work under "
+    '`if __name__ == "__main__":`, as every worker imports it, or ask for 0 workers'
+)
+
 Submit = Callable[..., concurrent.futures.Future[Any]]
 
 
@@ -35,10 +44,11 @@ def process_pool(
         `submit(function, *arguments)`, which returns a future; for any thread.
 
     Raises:
-        UserError: A process was killed.
+        UserError: A process was killed, or none could start.
     """
+    started = CONTEXT.RawValue("b", 0)
     pool = concurrent.futures.ProcessPoolExecutor(
-        num_workers, CONTEXT, _start, (start, *arguments)
+        num_workers, CONTEXT, _start, (started, start, *arguments)
     )
 
     def submit(function: Callable[..., Any], /, *args: Any) -> Any:
@@ -53,17 +63,15 @@ def process_pool(
         try:
             yield submit
         except BrokenProcessPool:
-            raise UserError(
-                "a worker process was killed, perhaps for want of memory; run the same "
-                "command again to continue, with fewer workers"
-            ) from None
+            raise UserError(_KILLED if started.value else _NOT_STARTED) from None
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
-def _start(start: Callable[..., None], *arguments: Any) -> None:
+def _start(started: Any, start: Callable[..., None], *arguments: Any) -> None:
     """Ends this process when its parent dies."""
+    started.value = 1
     parent = multiprocessing.parent_process()
     assert parent is not None  # this is a worker
 

@@ -3,6 +3,8 @@
 import os
 import pathlib
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -48,3 +50,17 @@ def test_a_killed_worker_is_one_line(tmp_path):
 
     with pytest.raises(UserError, match=r"a worker process was killed.*fewer workers"):
         dies()
+
+
+def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os\n"
+        "from radejax.core.workers import process_pool\n"
+        "with process_pool(1, os.chdir, '.') as submit:\n"
+        "    submit(os.getpid).result()\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "UserError: no worker process could start" in done.stderr.splitlines()[-1]
+    assert '`if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
