@@ -14,6 +14,7 @@ import json
 import logging
 import os
 import pathlib
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import IO, Any
 
@@ -39,6 +40,7 @@ __all__ = ["default_config", "simulate_dataset"]
 _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 _FEW_FRAMES = 100  # done before worker processes have started
+_AT_A_TIME = 2  # frames on the device or on their way to disk: 260 MB each
 
 _Prepare = Callable[[int, FrameSpec], tuple[RadarInput, list[Label]]]
 
@@ -168,8 +170,8 @@ def _write_frames(
     bar.update(total - len(missing))
     if num_workers is None:
         num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
-    # Threads wait for workers and the device alike.
-    num_threads = num_workers + 2
+    turn = threading.Semaphore(_AT_A_TIME)
+    num_threads = num_workers + _AT_A_TIME  # the others wait for their worker
     running: set[concurrent.futures.Future[None]] = set()
 
     def wait(at_most: int) -> None:
@@ -190,7 +192,7 @@ def _write_frames(
         try:
             for number, spec in missing:
                 running.add(
-                    pool.submit(_write_frame, root, config, number, spec, prepare)
+                    pool.submit(_write_frame, root, config, number, spec, prepare, turn)
                 )
                 wait(2 * num_threads)
             wait(0)
@@ -224,21 +226,29 @@ def _write_frame(
     number: int,
     spec: FrameSpec,
     prepare: _Prepare,
+    turn: threading.Semaphore,
 ) -> None:
     """One frame: image, radar, then labels."""
     given, labels = prepare(number, spec)
-    folder, radar_idx = root / str(number), spec.indices[0]
+    folder = root / str(number)
+    with turn:
+        _write_radar(folder, config, spec.indices[0], given)
+    path = folder / _LABELS / f"{spec.name}.txt"
+    kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
+
+
+def _write_radar(
+    folder: pathlib.Path, config: SimulationConfig, number: int, given: RadarInput
+) -> None:
     grid, parameters = config.make_grid(), config.make_parameters()
     output = radar_frame(given, grid, parameters, config.output)
     if config.output == "tesseract":
-        path = folder / "radar_tesseract" / f"tesseract_{radar_idx:05d}.mat"
+        path = folder / "radar_tesseract" / f"tesseract_{number:05d}.mat"
         kradar_write.write_tesseract(path, output)
-    else:
-        path = folder / "DERA_tesseract" / f"DERA_tesseract_{radar_idx:05d}.npy"
-        with files.atomic_write(path) as file:
-            np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
-    path = folder / _LABELS / f"{spec.name}.txt"
-    kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
+        return
+    path = folder / "DERA_tesseract" / f"DERA_tesseract_{number:05d}.npy"
+    with files.atomic_write(path) as file:
+        np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
 
 
 class _Scenes:

@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -126,6 +127,24 @@ class TestRepeating:
             small_config(), tmp_path / "again", num_workers=2, progress=False
         )
         assert digests(again) == digests(tree)
+
+    def test_two_frames_are_on_the_device_at_a_time(self, tmp_path, monkeypatch):
+        radar_frame, now, most = dataset.radar_frame, [], []
+
+        def counted(*given):
+            now.append(1)
+            most.append(len(now))
+            time.sleep(0.05)
+            output = radar_frame(*given)
+            now.pop()
+            return output
+
+        monkeypatch.setattr(dataset, "radar_frame", counted)
+        simulate_dataset(
+            small_config(), tmp_path / "data", num_workers=4, progress=False
+        )
+        assert len(most) == 9
+        assert max(most) == 2
 
     def test_another_seed_gives_other_bytes(self, tree, tmp_path):
         config = small_config(
