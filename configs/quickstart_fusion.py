@@ -15,8 +15,9 @@ Words: `radar` for the model without the camera; `silhouettes` for images of the
 alone, in the colour of their class and brighter when nearer, a control of what a perfect
 image would give; `pretrained` for an image transformer that stays as it is given, by
 `--image_backbone` (`examples/pretrain_backbone.py` makes one), `resnet50` for a ResNet-50
-of a quarter of the width in its place; `short` makes a run of two minutes that learns next
-to nothing, to see that everything works.
+of a quarter of the width in its place; `long` for the scenes and the training of
+`configs/quickstart.py` itself, three times what it is without; `short` makes a run of two
+minutes that learns next to nothing, to see that everything works.
 """
 
 import pathlib
@@ -37,9 +38,9 @@ def _neighbour(name: str) -> types.ModuleType:
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
     sensors, content, length, backbone = parse_words(
-        arg, ("radar",), ("silhouettes",), ("short",), ("pretrained", "resnet50")
+        arg, ("radar",), ("silhouettes",), ("short", "long"), ("pretrained", "resnet50")
     )
-    words = ",".join(filter(None, ("ablation", length)))
+    words = {None: "ablation", "short": "ablation,short", "long": ""}[length]
     config = _neighbour("quickstart").get_config(words)
     config.simulation.update(
         output="projection",
