@@ -3,13 +3,14 @@
 XLA's own weight gradient on a CPU is a convolution whose window is the whole map; on
 the finest maps of RADE-Net it is the slowest part of a training step. There the sum
 over bins is done in blocks instead: the shifted copies of a few rows stay in the cache
-and meet the output's gradient in matrix products. Other platforms, small maps and
-1x1 kernels keep XLA's.
+and meet the output's gradient in one matrix product. Other platforms, small
+convolutions and 1x1 kernels keep XLA's.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 
 import chex
 import jax
@@ -22,7 +23,8 @@ _BLOCK_BINS = 900
 """Bins whose shifted copies fit in a CPU's cache; best of 200 to 28,000, measured."""
 
 _MIN_BINS = 4096
-"""Maps up to this size gain nothing from blocks."""
+_MIN_WEIGHTS = 128 * 128
+"""Maps of up to so many bins gain from blocks only with more weights a tap than these."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
@@ -85,8 +87,11 @@ def _backward(dilation: int, saved: tuple, grad: jax.Array) -> tuple:
     x, kernel = saved
     (grad_x,) = jax.vjp(lambda x: _conv2d(x, kernel, dilation), x)[1](grad)
     plain = functools.partial(_kernel_gradient, kernel.shape[0], dilation)
-    size = kernel.shape[0]
-    if size == 1 or x.shape[1] * x.shape[2] <= _MIN_BINS:
+    size, _, *channels = kernel.shape
+    is_small = (
+        x.shape[1] * x.shape[2] <= _MIN_BINS and math.prod(channels) <= _MIN_WEIGHTS
+    )
+    if size == 1 or is_small:
         return grad_x, plain(x, grad)
     blocked = functools.partial(blocked_kernel_gradient, size=size, dilation=dilation)
     grad_kernel = jax.lax.platform_dependent(x, grad, cpu=blocked, default=plain)
@@ -126,33 +131,40 @@ def blocked_kernel_gradient(
     """
     b, r, a, c = x.shape
     padding = dilation * (size // 2)
-    rows = max(1, _BLOCK_BINS // a)
-    num_blocks = -(-r // rows)
-    # Rows that fill up the last block have zero gradient and add nothing.
+    num_blocks = -(-r // max(1, _BLOCK_BINS // a))
+    rows = -(-r // num_blocks)
+    # Rows that fill up the last block are zero and add nothing.
     fill = num_blocks * rows - r
-    x = jnp.pad(x, ((0, 0), (padding, padding + fill), (padding, padding), (0, 0)))
-    grad = jnp.pad(grad, ((0, 0), (0, fill), (0, 0), (0, 0)))
+    x = jnp.pad(x, ((0, 0), (0, fill), (0, 0), (0, 0)))
+    # The product wants bins innermost in its left side: turned around once, row by row.
+    grad = jnp.pad(
+        grad.swapaxes(2, 3), ((0, 0), (padding, padding + fill), (0, 0), (0, 0))
+    )
     offsets = [dilation * tap for tap in range(size)]
 
-    def add_block(total: list[jax.Array], i: jax.Array) -> tuple[list, None]:
-        start = (i // num_blocks, i % num_blocks * rows, 0, 0)
-        shape = (1, rows + 2 * padding, a + 2 * padding, c)
-        block = jax.lax.dynamic_slice(x, start, shape)[0]
-        grad_block = jax.lax.dynamic_slice(grad, start, (1, rows, *grad.shape[2:]))
-        # Taps along azimuth side by side; taps along range are then whole rows.
+    def add_block(total: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
+        image, start = i // num_blocks, i % num_blocks * rows
+        block = jax.lax.dynamic_slice(x, (image, start, 0, 0), (1, rows, a, c))[0]
+        block = jnp.pad(block, ((0, 0), (padding, padding), (0, 0)))
+        # Taps along azimuth shift the map, those along range the gradient's whole rows.
         taps = jnp.concatenate([block[:, o : o + a] for o in offsets], -1)
-        products = [
-            jax.lax.dot_general(
-                grad_block.reshape(rows * a, -1),
-                taps[o : o + rows].reshape(rows * a, -1),
-                (((0,), (0,)), ((), ())),
-                preferred_element_type=jnp.float32,
-            )
+        turned = [
+            jax.lax.dynamic_slice(
+                grad,
+                (image, start + 2 * padding - o, 0, 0),
+                (1, rows, *grad.shape[2:]),
+            )[0].swapaxes(0, 1)
             for o in offsets
-        ]  # k of [C', k * C]
-        return [t + p for t, p in zip(total, products, strict=True)], None
+        ]
+        product = jax.lax.dot_general(
+            jnp.concatenate(turned).reshape(-1, rows * a),
+            taps.reshape(rows * a, -1),
+            (((1,), (0,)), ((), ())),
+            preferred_element_type=jnp.float32,
+        )  # [k * F, k * C]
+        return total + product, None
 
-    zeros = [jnp.zeros((grad.shape[-1], size * c), jnp.float32)] * size
+    zeros = jnp.zeros((size * grad.shape[2], size * c), jnp.float32)
     total, _ = jax.lax.scan(add_block, zeros, jnp.arange(b * num_blocks))
-    kernel = jnp.stack(total).reshape(size, -1, size, c)  # [k, C', k, C]
+    kernel = total.reshape(size, -1, size, c)
     return kernel.transpose(0, 2, 3, 1).astype(x.dtype)
