@@ -147,7 +147,6 @@ STUDIES = {
         {
             "R long": Cell("quickstart_fusion:radar,long"),
             "R+C+W long": Cell("quickstart_fusion:pretrained,long"),
-            "ResNet long": Cell("quickstart_fusion:resnet50,long"),
             "images exchanged long": Cell(
                 "quickstart_fusion:pretrained,long", exchanges="R+C+W long"
             ),
@@ -157,10 +156,6 @@ STUDIES = {
                 Claim(f"the camera helps {cls}", "R+C+W long", "R long", cls)
                 for cls in (*CLASSES, "mean")
             ),
-            Claim("so does a ResNet's", "ResNet long", "R long"),
-            Claim("so does a ResNet's in the mean", "ResNet long", "R long", "mean"),
-            Claim("a transformer beats a ResNet", "R+C+W long", "ResNet long"),
-            Claim("it does in the mean", "R+C+W long", "ResNet long", "mean"),
             Claim("control: its own images count", "R+C+W long", "images exchanged long", "mean"),
         ),
         1024,
