@@ -44,11 +44,15 @@ def test_equals_sum_of_shifted_copies(size, dilation):
     np.testing.assert_allclose(y, naive_conv(x, kernel, dilation), atol=2e-5)
 
 
-# 83 x 61 bins are more than one block and fill the last block in part only.
-@pytest.mark.parametrize("shape", [(2, 83, 61, 3), (1, 7, 5, 3)])
+# 83 x 61 bins are more than one block and fill the last block in part only; the last
+# shape has few bins and many weights.
+@pytest.mark.parametrize(
+    ("shape", "features"),
+    [((2, 83, 61, 3), 4), ((1, 7, 5, 3), 4), ((2, 9, 6, 130), 131)],
+)
 @pytest.mark.parametrize(("size", "dilation"), [(1, 1), (3, 1), (3, 3), (7, 1)])
-def test_gradients_equal_those_of_plain_convolution(shape, size, dilation):
-    shapes = shape, (size, size, 3, 4), (*shape[:3], 4)
+def test_gradients_equal_those_of_plain_convolution(shape, features, size, dilation):
+    shapes = shape, (size, size, shape[-1], features), (*shape[:3], features)
     x, kernel, cotangent = map(jnp.asarray, arrays(*shapes))
 
     def plain(x, kernel):
