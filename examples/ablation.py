@@ -8,8 +8,8 @@ Table 3 is RADE-Net's (attention, heads, neck, stem, decoder), 4 DinoRADE's (rad
 elevation weights, backbone), sigma the spread of the heatmap's targets, quickstart what the
 quickstart's own input and longer training bring, camera what the camera adds to that. Every
 cell is an ordinary run of a config, trained on scenes of its seed and evaluated on other
-ones, which all cells share. The same command goes on where an earlier one ended or was killed, also
-within a run. `--table_only` writes the tables of what is there. Given several times at
+ones, which all cells share. The same command goes on where an earlier one ended or was
+killed, also within a run. `--table_only` writes the tables of what is there. Given several times at
 once it works on as many seeds, best one a core (`taskset -c 0 python ...`).
 
 AP is BEV at IoU 0.3, protocol `exact`, mean over seeds; intervals are of 95 %, paired,

@@ -40,7 +40,7 @@ __all__ = ["default_config", "simulate_dataset"]
 _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 _FEW_FRAMES = 100  # done before worker processes have started
-_AT_A_TIME = 2  # frames on the device or on their way to disk: 260 MB each
+_TESSERACTS_AT_A_TIME = 2  # on the device or on their way to disk: 260 MB each
 
 _Prepare = Callable[[int, FrameSpec], tuple[RadarInput, list[Label]]]
 
@@ -170,8 +170,10 @@ def _write_frames(
     bar.update(total - len(missing))
     if num_workers is None:
         num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
-    turn = threading.Semaphore(_AT_A_TIME)
-    num_threads = num_workers + _AT_A_TIME  # the others wait for their worker
+    # Threads wait for workers and the device alike.
+    num_threads = num_workers + _TESSERACTS_AT_A_TIME
+    is_large = config.output == "tesseract"
+    turn = threading.Semaphore(_TESSERACTS_AT_A_TIME if is_large else num_threads)
     running: set[concurrent.futures.Future[None]] = set()
 
     def wait(at_most: int) -> None:

@@ -128,7 +128,7 @@ class TestRepeating:
         )
         assert digests(again) == digests(tree)
 
-    def test_two_frames_are_on_the_device_at_a_time(self, tmp_path, monkeypatch):
+    def test_two_tesseracts_are_on_the_device_at_a_time(self, tmp_path, monkeypatch):
         radar_frame, now, most = dataset.radar_frame, [], []
 
         def counted(*given):
