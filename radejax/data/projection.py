@@ -68,29 +68,44 @@ def project(
     if not tesseract.dtype.isnative:
         tesseract = tesseract.astype(tesseract.dtype.newbyteorder("="))
     if tesseract.T.flags.c_contiguous:
-        return project_columns(tesseract.T, dtype=dtype)
-    rows = [_project_slab(row, _row_maxima) for row in tesseract.swapaxes(0, 1)]
-    return np.stack(rows).astype(dtype, order="C", copy=False)
+        return project_columns(tesseract.T, tesseract.shape, dtype=dtype)
+    projection = _empty(tesseract.shape, dtype)
+    for row, out in zip(tesseract.swapaxes(0, 1), projection, strict=True):
+        _project_slab(row, _row_maxima, out)
+    return projection
 
 
 def project_columns(
-    columns: Iterable[Float[np.ndarray, "E R D"]], *, dtype: Any = np.float32
+    columns: Iterable[Float[np.ndarray, "E R D"]],
+    shape_drea: tuple[int, ...],
+    *,
+    dtype: Any = np.float32,
 ) -> Float[np.ndarray, "R A DE"]:
     """`project` for a tesseract that arrives column by column, as files store it.
 
     Args:
         columns: For every azimuth a C-contiguous slab of linear power.
             A slab is used up before the next is asked for: the buffer may be the same.
+        shape_drea: Of the whole tesseract.
         dtype: Of the result.
     """
-    levels = [_project_slab(column, _column_maxima) for column in columns]
-    return np.stack(levels, axis=1).astype(dtype, order="C", copy=False)
+    projection = _empty(shape_drea, dtype)
+    for column, out in zip(columns, projection.swapaxes(0, 1), strict=True):
+        _project_slab(column, _column_maxima, out)
+    return projection
+
+
+def _empty(shape_drea: tuple[int, ...], dtype: Any) -> Float[np.ndarray, "R A DE"]:
+    doppler, range_, elevation, azimuth = shape_drea
+    return np.empty((range_, azimuth, doppler + elevation), dtype)
 
 
 def _project_slab(
-    slab: Float[np.ndarray, "_ _ _"], reduce: Callable[..., np.ndarray]
-) -> Float[np.ndarray, "_ DE"]:
-    """Projection of one azimuth or one range, in the slab's precision.
+    slab: Float[np.ndarray, "_ _ _"],
+    reduce: Callable[[np.ndarray], np.ndarray],
+    out: Float[np.ndarray, "_ DE"],
+) -> None:
+    """Write the projection of one azimuth or one range, computed in its precision.
 
     Non-negative floats order like the unsigned integers of the same bits, which NumPy
     reduces twice as fast, as it need not watch for NaN; a NaN is the largest either
@@ -100,18 +115,20 @@ def _project_slab(
     unsigned = np.dtype(f"u{slab.dtype.itemsize}")
     power = reduce(slab.view(unsigned))
     if power.max() >> (8 * unsigned.itemsize - 1):
-        return to_log_scale(reduce(slab))
-    return to_log_scale(power.view(slab.dtype))
+        power = reduce(slab)
+    to_log_scale(power.view(slab.dtype), out)
 
 
 def _column_maxima(column: Real[np.ndarray, "E R D"]) -> Real[np.ndarray, "R D+E"]:
     """Maxima of one azimuth, a C-contiguous slab."""
     elevation, range_, doppler = column.shape
+    maxima = np.empty((range_, doppler + elevation), column.dtype)
     # For many short contiguous rows reduceat has a fraction of reduce's overhead.
-    starts = np.arange(elevation * range_) * doppler
-    over_doppler = np.maximum.reduceat(column.reshape(-1), starts)
-    over_doppler = over_doppler.reshape(elevation, range_)
-    return np.concatenate([column.max(axis=0), over_doppler.T], axis=-1)
+    rows, starts = column.reshape(elevation, -1), np.arange(range_) * doppler
+    np.maximum.reduceat(rows, starts, axis=1, out=maxima[:, doppler:].T)
+    # Backwards: the elevations that were read last are still in the cache.
+    maxima[:, :doppler] = column[::-1].max(axis=0)
+    return maxima
 
 
 def _row_maxima(row: Real[np.ndarray, "D E A"]) -> Real[np.ndarray, "A D+E"]:
@@ -119,12 +136,13 @@ def _row_maxima(row: Real[np.ndarray, "D E A"]) -> Real[np.ndarray, "A D+E"]:
     return np.concatenate([row.max(axis=1).T, row.max(axis=0).T], axis=-1)
 
 
-def to_log_scale(power: Float[np.ndarray, "*cells"]) -> Float[np.ndarray, "*cells"]:
+def to_log_scale(
+    power: Float[np.ndarray, "*cells"], out: Float[np.ndarray, "*cells"] | None = None
+) -> Float[np.ndarray, "*cells"]:
     """Linear power to the normalised decibels that the networks see."""
     level = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
-    level += LOG_OFFSET_DB / LOG_SCALE_DB
-    return level
+    return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
 
 
 def project_plain(

@@ -75,7 +75,7 @@ def project_file(
             slab = np.empty(layout.shape[2::-1], layout.dtype)
             azimuth = layout.shape[3]
             columns = _read_slabs(file, slab, azimuth, timings)
-            projection = project_columns(columns, dtype=dtype)
+            projection = project_columns(columns, layout.shape, dtype=dtype)
     if projection is None:
         began = time.perf_counter()
         tesseract = read_tesseract(path, shape_drea=shape_drea)

@@ -112,7 +112,7 @@ def test_columns_one_by_one_in_the_same_buffer():
             buffer[:] = tesseract[..., i].T
             yield buffer
 
-    found = project_columns(columns(), dtype=np.float16)
+    found = project_columns(columns(), SHAPE, dtype=np.float16)
     np.testing.assert_array_equal(found, project(tesseract, dtype=np.float16))
 
 
