@@ -110,12 +110,13 @@ STEP = Step()
 
 
 class Program(click.Command):
-    """What may be a program of its own, and then asks for its memory first."""
+    """What may be a program of its own, and then sets up its memory first."""
 
     def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
         """Runs it with some arguments, by default those of this process."""
         if args is None:
             memory.restart_with_huge_pages()
+            memory.collect_seldom()
         return super().main(args, *others, **options)
 
 

@@ -107,3 +107,27 @@ def test_a_program_is_restarted_once_and_with_its_own_words(
         monkeypatch.setattr(os, "environ", environment)
         memory.restart_with_huge_pages()
         assert len(calls) == 1
+
+
+SEARCHED = """
+import gc, sys
+from radejax.core import memory
+if "seldom" in sys.argv:
+    memory.collect_seldom()
+searches = []
+gc.callbacks.append(lambda phase, _: searches.append(phase))
+kept = [[] for _ in range(40_000)]
+print(len(searches))
+kept = [[] for _ in range(200_000)]
+print(len(searches))
+"""
+
+
+def test_circles_are_looked_for_seldom_but_still() -> None:
+    def searches(*words: str) -> list[int]:
+        command = [sys.executable, "-c", SEARCHED, *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return [int(line) for line in done.stdout.split()]
+
+    few, more = searches("seldom")
+    assert few == 0 < more < searches()[1] / 10
