@@ -53,6 +53,7 @@ def main():
     if not arguments.tables:
         memory.restart_with_huge_pages()  # as every command; torch's process does not
         memory.keep_freed()
+        memory.collect_seldom()
         jax.config.update("jax_enable_compilation_cache", False)
         chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
         result = run(
