@@ -153,12 +153,16 @@ def facts(device, *more):
     }
 
 
-def processor_name():
-    """Of the CPU; its architecture where Linux does not say."""
-    path = pathlib.Path("/proc/cpuinfo")
+def processor_name(path=pathlib.Path("/proc/cpuinfo")):
+    """Of the CPU; its architecture where Linux does not say.
+
+    With family and model: in virtual machines all generations may be "AMD EPYC".
+    """
     text = path.read_text() if path.is_file() else ""
-    found = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
-    return found[1] if found else platform.machine()
+    said = dict(re.findall(r"^([\w ]+?)\s*: (.+)$", text, re.MULTILINE))
+    if not {"model name", "cpu family", "model"} <= said.keys():
+        return platform.machine()
+    return f"{said['model name']} family {said['cpu family']} model {said['model']}"
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import functools
 import json
 import pathlib
+import platform
 import types
 from typing import Any
 
@@ -114,6 +115,29 @@ def test_a_process_is_timed_until_it_says_so(
     text = "import os; raise SystemExit([k for k in os.environ if k[:8] == 'JAX_COMP'])"
     with pytest.raises(RuntimeError, match=r"no 'there'.*JAX_COMP"):
         start.until("there", ["-c", text], tmp_path, tmp_path / "kept")
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        (
+            [
+                "cpu family\t: 25",
+                "model\t\t: 17",
+                "model name\t: AMD EPYC",
+                "stepping\t: 1",
+            ],
+            "AMD EPYC family 25 model 17",
+        ),
+        (["BogoMIPS\t: 50.00", "CPU part\t: 0xd40"], platform.machine()),
+    ],
+)
+def test_generations_of_one_name_are_told_apart(
+    modules: Any, tmp_path: pathlib.Path, lines: list[str], expected: str
+) -> None:
+    path = tmp_path / "cpuinfo"
+    path.write_text("\n\n".join(["processor\t: 0\n" + "\n".join(lines) + "\n"] * 2))
+    assert modules.run.processor_name(path) == expected
 
 
 def test_what_is_stored_is_on_the_page(
