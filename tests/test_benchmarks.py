@@ -132,7 +132,7 @@ def test_a_process_is_timed_until_it_says_so(
         (["BogoMIPS\t: 50.00", "CPU part\t: 0xd40"], platform.machine()),
     ],
 )
-def test_generations_of_one_name_are_told_apart(
+def test_processors_of_one_name_are_told_apart(
     modules: Any, tmp_path: pathlib.Path, lines: list[str], expected: str
 ) -> None:
     path = tmp_path / "cpuinfo"
