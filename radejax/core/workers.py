@@ -1,4 +1,9 @@
-"""Worker processes that leave Ctrl-C to their parent and end when it dies."""
+"""Worker processes that leave Ctrl-C to their parent and end when it dies.
+
+Each has a pipe of its own, which ends with it: a worker that is killed is known at once,
+be it amid its result. The pool of `concurrent.futures` reads all results from one pipe
+and waits for ever for the rest of such a one.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,13 @@ import concurrent.futures
 import contextlib
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
 from typing import Any
 
 from radejax.core.errors import UserError
@@ -41,43 +49,100 @@ def process_pool(
         *arguments: Of `start`.
 
     Yields:
-        `submit(function, *arguments)`, which returns a future; for any thread.
-
-    Raises:
-        UserError: A process was killed, or none could start.
+        `submit(function, *arguments)`, which returns a future; for any thread. The
+        future raises `UserError` where the process was killed, or could not start.
     """
-    started = CONTEXT.RawValue("b", 0)
-    pool = concurrent.futures.ProcessPoolExecutor(
-        num_workers, CONTEXT, _start, (started, start, *arguments)
-    )
+    workers: list[_Worker] = []
+    mine = threading.local()
 
-    def submit(function: Callable[..., Any], /, *args: Any) -> Any:
-        # Ctrl-C is for this process: those that start now inherit the mask.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    def work(function: Callable[..., Any], *args: Any) -> Any:
+        if not hasattr(mine, "worker"):
+            worker = _Worker(start, *arguments)
+            workers.append(worker)
+            worker.receive()
+            mine.worker = worker
+        return mine.worker.call(function, *args)
+
+    try:
+        with concurrent.futures.ThreadPoolExecutor(num_workers) as threads:
+            try:
+                yield lambda *call: threads.submit(work, *call)
+            except BaseException:
+                threads.shutdown(cancel_futures=True)
+                raise
+    finally:
+        for worker in workers:
+            worker.pipe.close()
+        for worker in workers:
+            worker.process.join()
+
+
+class _Worker:
+    """A process that does what it is sent, and this thread's end of its pipe."""
+
+    def __init__(self, start: Callable[..., None], *arguments: Any) -> None:
+        # Ctrl-C is for the main thread: what this one starts inherits the mask, which
+        # the start of Python's resource tracker would clear.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        self.pipe, theirs = CONTEXT.Pipe()
+        self.process = CONTEXT.Process(
+            target=_serve, args=(theirs, start, *arguments), daemon=True
+        )
+        self.process.start()
+        theirs.close()  # now the pipe ends with the process
+        self._has_started = False
+
+    def call(self, function: Callable[..., Any], *args: Any) -> Any:
+        """What the function returns or raises there."""
+        message = pickle.dumps((function, args))
+        with contextlib.suppress(OSError):  # it is gone: `receive` tells
+            self.pipe.send_bytes(message)
+        return self.receive()
+
+    def receive(self) -> Any:
+        """What came of the last call; first of `start`."""
         try:
-            return pool.submit(function, *args)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-    with pool:
-        try:
-            yield submit
-        except BrokenProcessPool:
-            raise UserError(_KILLED if started.value else _NOT_STARTED) from None
-        except BaseException:
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
+            message = self.pipe.recv_bytes()
+        except (EOFError, OSError):
+            self.process.join()
+            is_killed = self._has_started or (self.process.exitcode or 0) < 0
+            raise UserError(_KILLED if is_killed else _NOT_STARTED) from None
+        self._has_started = True
+        result, error = pickle.loads(message)
+        if error is not None:
+            raise error
+        return result
 
 
-def _start(started: Any, start: Callable[..., None], *arguments: Any) -> None:
-    """Ends this process when its parent dies."""
-    started.value = 1
+def _serve(pipe: Connection, start: Callable[..., None], *arguments: Any) -> None:
+    """Does what comes until the parent closes the pipe, or dies."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        pipe.send_bytes(_outcome(start, *arguments))
+        while True:
+            pipe.send_bytes(_outcome(_do, pipe.recv_bytes()))
+
+
+def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None  # this is a worker
+    parent.join()
+    os._exit(1)
 
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
-    start(*arguments)
+def _do(message: bytes) -> Any:
+    function, args = pickle.loads(message)
+    return function(*args)
+
+
+def _outcome(function: Callable[..., Any], *args: Any) -> bytes:
+    """Result and error of a call, one of them None, as a message."""
+    try:
+        return pickle.dumps((function(*args), None))
+    except BaseException as error:
+        there = "".join(traceback.format_exception(error))
+        error.add_note(f"\nIn the worker process:\n{there}")
+        with contextlib.suppress(Exception):  # an error that pickle cannot carry
+            return pickle.dumps((None, error))
+        return pickle.dumps((None, RuntimeError(there)))
