@@ -1,12 +1,13 @@
 """Settings shared by all tests."""
 
+import faulthandler
 import importlib.metadata
 import logging
 import os
 import pathlib
 import tempfile
 import types
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import pytest
 from absl import flags
@@ -55,6 +56,35 @@ def pytest_addoption(
         from . import shapes
 
         shapes.install()
+
+
+_STDERR = pytest.StashKey[int]()
+_GRACE_SECS = 60.0
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[_STDERR] = os.dup(2)  # before tests' output is caught
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Where a test's timeout does not end it, its process ends, and says where it hung.
+
+    The timeout is an exception in the main thread, which comes to nothing while that is
+    in C code, or waits for another thread that waits for ever: once CI stood still in
+    one such test until its own end, an hour later, and never said in which.
+    """
+    marker = item.get_closest_marker("timeout")
+    given = marker.args[0] if marker else item.config.getoption("timeout")
+    seconds = float(item.config.getini("timeout") if given is None else given)
+    if seconds:
+        faulthandler.dump_traceback_later(
+            seconds + _GRACE_SECS, file=item.config.stash[_STDERR], exit=True
+        )
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 def pytest_collection_modifyitems(
