@@ -23,12 +23,12 @@ from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.projection import project_plain
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import benchmark as stages
-from radejax.interop import radenet_names, radenet_torch
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import ReferencePoints, static_reference_points
 from radejax.models.vit import rotary_angles
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step
+from radejax.weights import radenet_names, radenet_torch
 
 CONFIGS = pathlib.Path(__file__).parents[1] / "configs"
 GRID = RadarGrid.kradar()

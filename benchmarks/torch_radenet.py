@@ -1,7 +1,7 @@
 """RADE-Net in PyTorch, for comparison only: speed, and numbers for the tests.
 
 Written from the description of the released network; tensors have its names, so that
-state dicts pass through `radejax.interop.radenet_torch` in both directions.
+state dicts pass through `radejax.weights.radenet_torch` in both directions.
 """
 
 import torch

@@ -36,7 +36,6 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.interop import dinov3_hf, resnet_torch
 from radejax.models.image import normalize
 from radejax.models.resnet import STRIDE, ResNetTrunk, frozen_params
 from radejax.models.vit import ViT
@@ -46,6 +45,7 @@ from radejax.simulation.config import SimulationConfig, plain
 from radejax.simulation.scene_sources import make_source
 from radejax.simulation.world.scene import Sequence
 from radejax.simulation.world.traffic import SIZES
+from radejax.weights import dinov3_hf, resnet_torch
 
 CONFIG = (
     pathlib.Path(__file__).resolve().parents[1]

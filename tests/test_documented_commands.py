@@ -80,7 +80,6 @@ RUN_IN = {
         for path in (ROOT / "benchmarks").glob("*.py")
         if "__main__" in path.read_text(encoding="utf-8")  # not modules of the others
     },
-    "docs/images/house.py": HELP,
     "docs/images/networks.py": HELP,
     "docs/images/simulator_pictures.py": HELP,
 }

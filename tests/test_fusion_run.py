@@ -21,13 +21,13 @@ from radejax.inference.detect_files import detect_files, output_name
 from radejax.inference.detector import Detector
 from radejax.inference.open import load
 from radejax.inference.predict import predict_dataset
-from radejax.interop import image_backbone
 from radejax.models import build
 from radejax.runs import experiment
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import DataPaths, Sources
 from radejax.training import sharding
+from radejax.weights import image_backbone
 
 pytestmark = pytest.mark.slow  # several programs to compile
 

@@ -50,8 +50,8 @@ def embed(
     from radejax.core.config import load_config
     from radejax.data.kradar import KRadar
     from radejax.inference.embed import embed_dataset
-    from radejax.interop.image_backbone import load_image_backbone
     from radejax.runs.data import existing_roots
+    from radejax.weights.image_backbone import load_image_backbone
 
     entry.set_up_jax()
     settings = load_config(config)

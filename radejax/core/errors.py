@@ -36,3 +36,21 @@ class DataError(_OneLine):
     """A file that is missing parts, malformed or damaged; the message names it."""
 
     exit_code = 1
+
+
+def require(holds: bool, name: str, value: object, expected: str) -> None:
+    """Raises `UserError` unless a setting is in its range.
+
+    The constructors of what config sections configure check their fields with it.
+
+    Args:
+        holds: Whether the value is in its range.
+        name: Field as a user knows it, such as "config.train.batch_size".
+        value: What it is.
+        expected: The range, such as "an integer of at least 1".
+
+    Example:
+        >>> require(2 >= 1, "config.train.batch_size", 2, "an integer of at least 1")
+    """
+    if not holds:
+        raise UserError(f"{name} is {value!r}, expected {expected}")

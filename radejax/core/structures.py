@@ -7,6 +7,7 @@ ego frame: x forward, y left, z up, metres; yaw counter-clockwise from x, radian
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +15,8 @@ import jax
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int, Real, Shaped
+
+from radejax.core.errors import DataError
 
 Array = jax.Array | np.ndarray
 
@@ -159,3 +162,43 @@ class Detections(struct.PyTreeNode):
         columns = self.to_columns(classes)
         boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
         return pandas.DataFrame({**columns, **boxes})
+
+
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """Boxes of many frames outside `jit`: predictions, ground truth, what is drawn.
+
+    Attributes:
+        frame: int64 index of each box's frame.
+        box: float64 x, y, z, l, w, h, yaw in metres and radians, radar frame.
+        cls: Class names.
+        score: float64 in [0, 1]; None for ground truth.
+
+    Raises:
+        DataError: Columns differ in length, or a box is not finite or has no 7 numbers.
+    """
+
+    frame: Int[np.ndarray, " N"]
+    box: Float[np.ndarray, "N 7"]
+    cls: Shaped[np.ndarray, " N"]
+    score: Float[np.ndarray, " N"] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.frame)
+        score_rows = count if self.score is None else len(self.score)
+        if self.box.shape != (count, 7) or not len(self.cls) == score_rows == count:
+            raise DataError(
+                f"columns of boxes differ: {count} frames, boxes {self.box.shape}, "
+                f"{len(self.cls)} classes, {score_rows} scores; expected one row per box"
+            )
+        if not np.isfinite(self.box).all():
+            row = int(np.argmin(np.isfinite(self.box).all(-1)))
+            raise DataError(f"box {row} is {self.box[row]}, expected finite numbers")
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
+        """The boxes at positions or under a mask."""
+        score = None if self.score is None else self.score[rows]
+        return Boxes(self.frame[rows], self.box[rows], self.cls[rows], score)

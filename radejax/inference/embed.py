@@ -23,8 +23,8 @@ from radejax.data.kradar.frame import Frame
 from radejax.data.records import embeddings
 from radejax.data.records import files as record_files
 from radejax.data.records.arrays import MANIFEST
-from radejax.interop.image_backbone import weights_sha256
 from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.weights.image_backbone import weights_sha256
 
 DTYPES = ("float32", "float16")
 

@@ -25,11 +25,11 @@ from radejax.data.records.embeddings import embeddings_sha256
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import packed
 from radejax.inference.packed import LoadedModel
-from radejax.interop import dinorade_torch, image_backbone, radenet_torch
-from radejax.interop.state_dict import read_state_dict
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training.checkpoints import Checkpoints
+from radejax.weights import dinorade_torch, image_backbone, radenet_torch
+from radejax.weights.state_dict import read_state_dict
 
 _log = logging.getLogger(__name__)
 

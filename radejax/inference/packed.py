@@ -31,10 +31,10 @@ from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.records.files import sha256
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.interop.image_backbone import check_fits
 from radejax.models import dinorade_config, radenet
 from radejax.models.dinorade import IMAGE_BACKBONE as BACKBONE
 from radejax.models.vit import ViT
+from radejax.weights.image_backbone import check_fits
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 FORMAT = "radejax-1"

@@ -1,7 +1,7 @@
 """ResNet-50 as an image backbone: a frozen trunk and a last stage to fine-tune.
 
 The trunk (stem and the first three stages) and the last stage are modules of their own,
-because one is frozen and the other trained; `radejax.interop.resnet_torch` reads both
+because one is frozen and the other trained; `radejax.weights.resnet_torch` reads both
 from torchvision's file.
 
 References:

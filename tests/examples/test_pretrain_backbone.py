@@ -11,9 +11,9 @@ from click.testing import CliRunner
 from radejax import models
 from radejax.core.config import load_config
 from radejax.core.structures import CLASSES
-from radejax.interop.image_backbone import load_image_backbone
 from radejax.models.resnet import ResNetTrunk
 from radejax.simulation.config import plain
+from radejax.weights.image_backbone import load_image_backbone
 
 from .. import small_models as small
 

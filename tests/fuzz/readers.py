@@ -26,7 +26,6 @@ from radejax.evaluation.files.load import Source, load
 from radejax.geometry.calibration import CameraCalibration
 from radejax.inference import open as model_files
 from radejax.inference.packed import write_packed
-from radejax.interop import dinov3_hf, radenet_torch
 from radejax.runs import evaluate, seeds, workdir
 from radejax.runs.data import DataPaths
 from radejax.simulation import dataset
@@ -34,6 +33,7 @@ from radejax.simulation.config import SimulationConfig
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.watch import _Jsonl
 from radejax.visualize.curves import read_metrics
+from radejax.weights import dinov3_hf, radenet_torch
 
 from .. import small_models as small
 from ..data.conftest import make_labels, write_kradar

@@ -14,8 +14,8 @@ from radejax.data.kradar import write
 from radejax.data.projection import project
 from radejax.evaluation.files.kitti import prediction_texts
 from radejax.inference.packed import LoadedModel
-from radejax.interop import dinorade_torch
 from radejax.visualize.canvas import as_objects
+from radejax.weights import dinorade_torch
 
 from .. import small_models as small
 

@@ -13,10 +13,10 @@ from radejax import Detector, UserError, models
 from radejax.core.config import base_config
 from radejax.inference import open as opening
 from radejax.inference import packed
-from radejax.interop import radenet_torch
-from radejax.interop.image_backbone import weights_sha256
 from radejax.runs import workdir
 from radejax.training.checkpoints import Checkpoints
+from radejax.weights import radenet_torch
+from radejax.weights.image_backbone import weights_sha256
 
 from .. import small_models as small
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.interop.radenet_names import from_torch_layout, to_torch_layout
+from radejax.weights.radenet_names import from_torch_layout, to_torch_layout
 
 
 @pytest.fixture(scope="session")

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.interop.radenet_names import _cbam
 from radejax.models.cbam import CBAM, ChannelAttention, SpatialAttention
+from radejax.weights.radenet_names import _cbam
 
 NAMES = {k.removeprefix("m/"): v.removeprefix("m.") for k, v in _cbam("m", "m").items()}
 

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.interop.radenet_names import _double_conv
 from radejax.models.layers import (
     Conv,
     ConvGNSiLU,
@@ -17,6 +16,7 @@ from radejax.models.layers import (
     max_pool,
     uniform_fan_in,
 )
+from radejax.weights.radenet_names import _double_conv
 
 
 def strip(names, ours, theirs):

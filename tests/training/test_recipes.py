@@ -17,13 +17,13 @@ from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.open import starting_weights
-from radejax.interop import radenet_torch
 from radejax.losses.detection import detection_loss
 from radejax.runs import check_config
 from radejax.training import loop, sharding
 from radejax.training.start import Plan
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step
+from radejax.weights import radenet_torch
 
 from ..small_models import drawn
 

@@ -22,13 +22,13 @@ from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.geometry.calibration import CameraCalibration
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.interop import dinorade_torch, dinov3_hf, radenet_torch
-from radejax.interop.radenet_names import torch_shapes
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.runs.experiment import loss_options
 from radejax.training import sharding
 from radejax.training.start import Plan, compile_step
 from radejax.training.state import TrainState, create_state
+from radejax.weights import dinorade_torch, dinov3_hf, radenet_torch
+from radejax.weights.radenet_names import torch_shapes
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SEED = 1234

@@ -1,4 +1,4 @@
-"""Tests of radejax.interop.resnet_torch."""
+"""Tests of radejax.weights.resnet_torch."""
 
 import chex
 import jax
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError
-from radejax.interop import resnet_torch, torch_file
 from radejax.models.resnet import ResNetNeck, ResNetTrunk
+from radejax.weights import resnet_torch, torch_file
 
 
 def torchvision_shapes():

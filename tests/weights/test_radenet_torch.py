@@ -1,4 +1,4 @@
-"""Tests of `radejax.interop.radenet_torch` against PyTorch's numbers.
+"""Tests of `radejax.weights.radenet_torch` against PyTorch's numbers.
 
 `tests/golden/models_radenet.npz` has them at small widths; with ../shared the official
 network's outputs at full size are compared too.
@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.interop import radenet_torch
-from radejax.interop.radenet_names import torch_names, torch_shapes
 from radejax.models.radenet import from_config
+from radejax.weights import radenet_torch
+from radejax.weights.radenet_names import torch_names, torch_shapes
 
 
 @pytest.fixture(scope="module")

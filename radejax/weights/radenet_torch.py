@@ -15,15 +15,15 @@ import safetensors.numpy
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.interop import torch_file
-from radejax.interop.radenet_names import (
+from radejax.models.radenet import FIELDS, RadeNet, from_config
+from radejax.weights import torch_file
+from radejax.weights.radenet_names import (
     from_torch_layout,
     to_torch_layout,
     torch_names,
     torch_shapes,
 )
-from radejax.interop.state_dict import is_tensor, read_state_dict, shorten, to_numpy
-from radejax.models.radenet import FIELDS, RadeNet, from_config
+from radejax.weights.state_dict import is_tensor, read_state_dict, shorten, to_numpy
 
 StateDict = Mapping[str, Any]
 

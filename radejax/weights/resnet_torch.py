@@ -11,8 +11,8 @@ import numpy as np
 
 from radejax.core.errors import DataError
 from radejax.core.files import PathLike
-from radejax.interop import torch_file
-from radejax.interop.state_dict import StateDictReader, read_state_dict
+from radejax.weights import torch_file
+from radejax.weights.state_dict import StateDictReader, read_state_dict
 
 _TRUNK = ("conv1", "bn1", "layer1", "layer2", "layer3")
 DEPTHS = (3, 4, 6, 3)

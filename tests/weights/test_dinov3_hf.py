@@ -1,4 +1,4 @@
-"""Tests of radejax.interop.dinov3_hf."""
+"""Tests of radejax.weights.dinov3_hf."""
 
 import json
 import shutil
@@ -10,7 +10,7 @@ import pytest
 import safetensors.numpy
 
 from radejax.core.errors import DataError, UserError
-from radejax.interop import dinov3_hf
+from radejax.weights import dinov3_hf
 
 TOLERANCE = 5e-5
 

@@ -17,11 +17,11 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
 from radejax.data.records.embeddings import embeddings_sha256
-from radejax.interop import dinov3_hf, resnet_torch
 from radejax.models import dinorade_config
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints
 from radejax.models.vit import ViT
+from radejax.weights import dinov3_hf, resnet_torch
 
 # Fields of a ViT that are not its weights' own.
 _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")

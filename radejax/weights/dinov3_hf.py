@@ -19,8 +19,8 @@ from radejax.core import files
 from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.interop.state_dict import StateDictReader
 from radejax.models.vit import ViT
+from radejax.weights.state_dict import StateDictReader
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"

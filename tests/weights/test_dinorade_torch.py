@@ -1,4 +1,4 @@
-"""Tests of radejax.interop.dinorade_torch, against the released code's outputs."""
+"""Tests of radejax.weights.dinorade_torch, against the released code's outputs."""
 
 import functools
 import json
@@ -13,8 +13,6 @@ import pytest
 from radejax.core.config import load_module
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.calibration import CameraCalibration
-from radejax.interop import dinorade_torch
-from radejax.interop.state_dict import StateDictReader
 from radejax.models.camera_neck import CameraNeck
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import (
@@ -23,6 +21,8 @@ from radejax.models.lifting import (
     WeightingNetwork,
     static_reference_points,
 )
+from radejax.weights import dinorade_torch
+from radejax.weights.state_dict import StateDictReader
 
 
 def golden_recipes():

@@ -1,4 +1,4 @@
-"""Tests of `radejax.interop.radenet_names`."""
+"""Tests of `radejax.weights.radenet_names`."""
 
 import json
 
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.interop.radenet_names import (
+from radejax.models.radenet import RadeNet
+from radejax.weights.radenet_names import (
     from_torch_layout,
     to_torch_layout,
     torch_names,
     torch_shapes,
 )
-from radejax.models.radenet import RadeNet
 
 VARIANTS = {
     "default": {},

@@ -13,13 +13,13 @@ from typing import Any
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.interop import dinov3_hf, radenet_torch, resnet_torch
-from radejax.interop.state_dict import StateDictReader, read_state_dict, to_numpy
 from radejax.models.dinorade import DinoRade
 from radejax.models.lifting import LiftingAxes
 from radejax.models.radenet import FIELDS as RADAR_FIELDS
 from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
+from radejax.weights import dinov3_hf, radenet_torch, resnet_torch
+from radejax.weights.state_dict import StateDictReader, read_state_dict, to_numpy
 
 _RADAR_PARTS = {"rad_backbone.": "backbone.", "rad_neck.": "neck.", "head.": "head."}
 _FUSION_FIELDS = ("num_heads", "dropout", "chunk_size", "invalid")

@@ -12,7 +12,7 @@ import numpy as np
 
 from radejax.core.archives import read_npz, read_safetensors
 from radejax.core.errors import DataError
-from radejax.interop import torch_file
+from radejax.weights import torch_file
 
 _SHOWN, _LONGEST = 20, 120
 

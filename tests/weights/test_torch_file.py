@@ -1,4 +1,4 @@
-"""Tests of `radejax.interop.torch_file`."""
+"""Tests of `radejax.weights.torch_file`."""
 
 import io
 import pickle
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError
-from radejax.interop import torch_file, torch_pickle
+from radejax.weights import torch_file, torch_pickle
 
 
 def check_equal(actual, expected):

@@ -24,7 +24,7 @@ import numpy as np
 
 from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, one_line
-from radejax.interop.torch_pickle import (
+from radejax.weights.torch_pickle import (
     BFLOAT16,
     STORAGE_DTYPES,
     Storage,

@@ -9,8 +9,8 @@ import pytest
 
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
-from radejax.interop import dinov3_hf, image_backbone, resnet_torch
 from radejax.models import build
+from radejax.weights import dinov3_hf, image_backbone, resnet_torch
 
 CONFIG = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
 TRUNK = {"stem": np.arange(3.0)}

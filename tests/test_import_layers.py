@@ -1,0 +1,106 @@
+"""Packages import only from the layers below them, and modules have no import cycles."""
+
+import ast
+import graphlib
+import pathlib
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+PACKAGE = pathlib.Path(__file__).resolve().parents[1] / "radejax"
+
+LAYERS = (
+    {"core", "geometry"},
+    {"models", "detection", "data", "visualize"},
+    {"losses", "evaluation", "simulation", "weights"},
+    {"training", "configs"},
+    {"inference"},
+    {"runs"},
+    {"cli"},
+)
+"""The table of docs/architecture.md, lowest first.
+
+Packages of one layer do not import each other, except that `geometry` uses `core`.
+"""
+LAYER = {package: i for i, layer in enumerate(LAYERS) for package in layer}
+
+
+def _modules() -> dict[str, ast.Module]:
+    """Syntax tree of every module by its dotted name."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = ("radejax", *path.relative_to(PACKAGE).with_suffix("").parts)
+        name = ".".join(parts).removesuffix(".__init__")
+        found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+MODULES = _modules()
+
+
+def _imports(tree: ast.Module) -> Iterator[str]:
+    """Modules of radejax that a module imports, inside functions as well."""
+    for node in ast.walk(tree):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports are not used"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            while name and name not in MODULES:
+                name = name.rpartition(".")[0]
+            if name and name != "radejax":
+                yield name
+
+
+GRAPH = {name: set(_imports(tree)) - {name} for name, tree in MODULES.items()}
+
+
+def _package(module: str) -> str:
+    return module.split(".")[1]
+
+
+def test_every_package_has_a_layer() -> None:
+    assert {_package(name) for name in GRAPH if name != "radejax"} == set(LAYER)
+
+
+def test_packages_import_only_from_lower_layers() -> None:
+    wrong = {
+        f"{source} -> {target}"
+        for source, targets in GRAPH.items()
+        if source != "radejax"
+        for target in targets
+        if _package(source) != _package(target) != "core"
+        if LAYER[_package(source)] <= LAYER[_package(target)]
+    }
+    assert not wrong
+    core = {
+        f"{s} -> {t}" for s in GRAPH if s.startswith("radejax.core") for t in GRAPH[s]
+    }
+    assert all(".core." in line.partition(" -> ")[2] for line in core)
+
+
+def test_modules_have_no_import_cycles() -> None:
+    graph = {name: targets for name, targets in GRAPH.items() if name != "radejax"}
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
+
+
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("import radejax", "jax numpy"),
+        (
+            "from radejax.cli.main import main; main(['detect', '--help'], 'radejax',"
+            " standalone_mode=False)",
+            "jax flax matplotlib numpy absl",
+        ),
+    ],
+    ids=["import", "help"],
+)
+def test_import_and_help_do_not_load_jax(code: str, absent: str) -> None:
+    code += f"; import sys; sys.exit(str(set(sys.modules) & set({absent!r}.split())))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr.strip() == "set()"
