@@ -64,7 +64,8 @@ def _package(module: str) -> str:
 
 
 def test_every_package_has_a_layer() -> None:
-    assert {_package(name) for name in GRAPH if name != "radejax"} == set(LAYER)
+    found = {_package(name) for name in GRAPH if name != "radejax"}
+    assert found == set(LAYER) - {"configs"}  # a link to configs/, which is not walked
 
 
 def test_packages_import_only_from_lower_layers() -> None:
