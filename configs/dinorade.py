@@ -4,7 +4,7 @@
     python train.py --config configs/dinorade.py:rc,sedan ...
     python train.py --config configs/dinorade.py:official ...
 
-The argument is a list of words, at most one of each group:
+The argument is a list of options, at most one of each group:
 
 - variant: `r` radar alone (a RADE-Net with the dual stem), `rc` with camera and without
   elevation weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50,
@@ -31,7 +31,7 @@ import types
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
-from radejax.core.config import base_config, load_module, parse_words
+from radejax.core.config import base_config, load_module, parse_options
 from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
@@ -83,7 +83,7 @@ CLASS_SETS = ("all", "sedan")
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
     sigmas = _radenet().SIGMAS
-    variant, preset, sigma, classes = parse_words(
+    variant, preset, sigma, classes = parse_options(
         arg, VARIANTS, PRESETS, sigmas, CLASS_SETS
     )
     variant = variant or "rcw"

@@ -15,13 +15,13 @@ import pathlib
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import load_module, parse_words
+from radejax.core.config import load_module, parse_options
 from radejax.simulation.config import FULL_SIZE, plain
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; `arg` is None or "short"."""
-    (length,) = parse_words(arg, ("short",))
+    (length,) = parse_options(arg, ("short",))
     quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
     config = quickstart.get_config(",".join(filter(None, ("ablation", length))))
     config.simulation = ConfigDict(plain(config.simulation) | FULL_SIZE)

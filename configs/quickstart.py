@@ -5,7 +5,7 @@
 Simulates K-Radar folders on a coarser sensor, projects, trains, evaluates on held-out
 sequences and draws. The code is that of the full model; only widths and grid differ.
 
-Words: `ablation` for the training of `examples/ablation.py`'s tables, where there are
+Options: `ablation` for the training of `examples/ablation.py`'s tables, where there are
 many: two fifths of scenes and steps, and input, weights of the losses and parameters as
 in the papers; `short` for a run of two minutes that learns next to nothing, to see that
 everything works.
@@ -13,13 +13,13 @@ everything works.
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, parse_options
 from radejax.simulation.config import default_config
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
-    recipe, length = parse_words(arg, ("ablation",), ("short",))
+    recipe, length = parse_options(arg, ("ablation",), ("short",))
     config = base_config()
     config.simulation = ConfigDict(default_config())
     grid = config.simulation.grid

@@ -8,10 +8,10 @@
 The second trains a narrow DinoRADE with the small image transformer of the first,
 frozen, the third the same model without its camera, on the same simulated data: the
 difference is what the camera adds. `docs/radar_camera.md` has the numbers to expect.
-Without a word the transformer is trained with the rest, from scratch, which is too
+Without an option the transformer is trained with the rest, from scratch, which is too
 little to learn it by.
 
-Words: `radar` for the model without the camera; `silhouettes` for images of the objects
+Options: `radar` for the model without the camera; `silhouettes` for images of the objects
 alone, in the colour of their class and brighter when nearer, a control of what a perfect
 image would give; `pretrained` for an image transformer that stays as it is given, by
 `--image_backbone` (`examples/pretrain_backbone.py` makes one), `resnet50` for a ResNet-50
@@ -25,7 +25,7 @@ import types
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import load_module, parse_words
+from radejax.core.config import load_module, parse_options
 from radejax.models.lifting import LiftingAxes
 from radejax.simulation.config import SimulationConfig
 
@@ -37,11 +37,11 @@ def _neighbour(name: str) -> types.ModuleType:
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
-    sensors, content, length, backbone = parse_words(
+    sensors, content, length, backbone = parse_options(
         arg, ("radar",), ("silhouettes",), ("short", "long"), ("pretrained", "resnet50")
     )
-    words = {None: "ablation", "short": "ablation,short", "long": ""}[length]
-    config = _neighbour("quickstart").get_config(words)
+    options = {None: "ablation", "short": "ablation,short", "long": ""}[length]
+    config = _neighbour("quickstart").get_config(options)
     config.simulation.update(
         output="projection",
         image_width=640,  # the whole view, squeezed in height: objects are side by side

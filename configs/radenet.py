@@ -4,7 +4,7 @@
     python train.py --config configs/radenet.py:stem,sedan ...
     python train.py --config configs/radenet.py:official --config.train.batch_size=4 ...
 
-The argument is a list of words, at most one of each group:
+The argument is a list of options, at most one of each group:
 
 - variant: `base`, `cbam`, `cbam_heads`, `model` (default), `stem`, `expand`; the rows
   of Table III, from no attention, plain neck and small heads to the wide decoder.
@@ -26,7 +26,7 @@ enough, and no other row would show that.
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, parse_options
 from radejax.core.structures import WIDE_ROI
 
 _OFF = {"cbam": "off", "neck": "plain", "heads": "default"}
@@ -97,7 +97,7 @@ CLASS_SETS = ("all", "sedan")
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; see the module's text for `arg`."""
-    variant, preset, sigma, classes = parse_words(
+    variant, preset, sigma, classes = parse_options(
         arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS
     )
     config = base_config()

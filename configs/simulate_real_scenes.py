@@ -10,13 +10,13 @@ has the numbers to expect, beside those of a classical detector (CFAR).
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import base_config, parse_words
+from radejax.core.config import base_config, parse_options
 from radejax.simulation.config import default_config
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """One complete config; there are no variants."""
-    parse_words(arg)
+    parse_options(arg)
     config = base_config()
     config.simulation = ConfigDict(default_config())
     config.simulation.update(

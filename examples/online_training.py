@@ -78,7 +78,7 @@ def train_online(
             batch_size,
             sharding.make_mesh(),
             "train.batch_size",
-            config.train.num_accumulate,
+            config.train.gradient_accumulation_steps,
         )
         batches = OnlineBatches(
             simulation,
@@ -98,7 +98,7 @@ def train_online(
             Plan(
                 options=config.train,
                 loss=loss_options(config),
-                watch=config.watch,
+                watch=config.logging,
                 seed=config.seed,
                 info=checkpoint_info(
                     config,

@@ -186,7 +186,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(undisturbed: tuple) -> None:
         ("--config=configs/nope.py", "no such config file: configs/nope.py"),
         (
             "--config=configs/radenet.py:big",
-            "unknown config argument 'big'; available:",
+            "unknown config option 'big'; available:",
         ),
         ("--config.seed=5", "config.seed is 0 there and 5 here"),
         ("--labels=/nowhere", "/nowhere"),

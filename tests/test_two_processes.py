@@ -132,9 +132,9 @@ def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
         runs,
         "seeds",
         2,
-        "--config.seeds=0,1",
+        "--seeds=0,1",
         "--config.train.evaluate_every_epochs=2",
-        "--config.watch.num_pictures=2",
+        "--config.logging.num_visualizations=2",
         "--config.evaluation.num_pictures=2",
     )
     assert _losses(runs / "seeds" / "seed0") == _losses(runs / "two")

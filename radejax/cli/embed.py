@@ -12,7 +12,7 @@ from radejax.cli import entry, options
 
 @click.command(cls=options.Command)
 @options.roots_or_none
-@click.option("--config", required=True, help="As of `radejax train`, :words too.")
+@click.option("--config", required=True, help="As of `radejax train`, :options too.")
 @click.option(
     "--image-backbone",
     required=True,

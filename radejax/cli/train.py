@@ -14,7 +14,7 @@ _PREFIX = "--config."
 class _Command(options.Command):
     """Also takes any field of the config: `--config.train.batch_size=4`.
 
-    The last one counts where a field is given twice, and `--config.watch.wandb` alone is
+    The last one counts where a field is given twice, and `--config.logging.wandb` alone is
     true. Other options that do not exist name the field that was meant.
     """
 
@@ -51,8 +51,8 @@ class _Command(options.Command):
 @click.option(
     "--config",
     required=True,
-    metavar="NAME[:WORDS]",
-    help="One that comes along, such as radenet:official, or a file.py[:WORDS].",
+    metavar="NAME[:OPTIONS]",
+    help="A bundled config, such as radenet:official, or a file.py[:OPTIONS].",
 )
 @click.option(
     "--workdir", help="Folder of the run; runs/<name of the config> by default."
@@ -84,6 +84,14 @@ class _Command(options.Command):
     "repository); the roots' own by default.",
 )
 @click.option(
+    "--seeds",
+    multiple=True,
+    callback=options.numbers,
+    metavar="0,1,2",
+    help="Train once per seed, in seed0, seed1, ..., instead of with config.seed.",
+)
+@click.option("--profile", help="Folder for a trace of a few training steps.")
+@click.option(
     "--distributed",
     is_flag=True,
     help="One of several processes, as Slurm starts them.",
@@ -102,6 +110,8 @@ def train(
     sequence_numbers: tuple[int, ...] | None,
     weather: tuple[str, ...] | None,
     init_from: str | None,
+    seeds: tuple[int, ...] | None,
+    profile: str | None,
     distributed: bool,
     coordinator: str | None,
     num_processes: int | None,
@@ -121,8 +131,9 @@ def train(
     Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
     """
     from radejax.core.config import config_name, load_config
-    from radejax.runs import experiment, seeds
+    from radejax.runs.experiment import run
     from radejax.runs.override import override
+    from radejax.runs.seeds import run_seeds
     from radejax.runs.sources import Sources
 
     entry.check_leftovers(others)
@@ -136,12 +147,12 @@ def train(
     place = coordinator, num_processes, process_id
     if distributed or place != (None,) * 3:
         entry.join_processes(*place)
-    run = seeds.run_seeds if settings.seeds else experiment.run
-    folder = run(
-        settings,
-        name=config_name(config),
-        sources=Sources(**sources),
-        workdir=workdir,
-        init_from=init_from,
-    )
+    given: dict[str, Any] = {
+        "name": config_name(config),
+        "sources": Sources(**sources),
+        "workdir": workdir,
+        "init_from": init_from,
+        "profile": profile or "",
+    }
+    folder = run_seeds(settings, seeds, **given) if seeds else run(settings, **given)
     options.echo_result(as_json, {"workdir": str(folder)}, "")

@@ -1,6 +1,6 @@
-"""The sections that every config has, and the words that choose a variant.
+"""The sections that every config has, and the options that choose a variant.
 
-A config file builds on `base_config` and `parse_words`, so that all configs have the
+A config file builds on `base_config` and `parse_options`, so that all configs have the
 same fields. Values are plain and resolved: no paths, no devices, nothing computed later.
 """
 
@@ -25,38 +25,38 @@ CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 """Those that come along: in a checkout a link to the folder beside the package."""
 
 
-def parse_words(arg: str | None, *choices: Collection[str]) -> list[str | None]:
-    """Splits the part after the colon of `--config file.py:word,word`.
+def parse_options(arg: str | None, *choices: Collection[str]) -> list[str | None]:
+    """Splits the part after the colon of `--config file.py:option,option`.
 
     Args:
-        arg: Words separated by commas; None or empty for no word.
-        *choices: Groups of words; at most one word of each group may be given.
+        arg: Options separated by commas; None or empty for none.
+        *choices: Groups of options; at most one of each group may be given.
 
     Returns:
-        One word per group, None where none was given.
+        One option per group, None where none was given.
 
     Raises:
-        UserError: A word is in no group, or two are of the same group.
+        UserError: An option is in no group, or two are of the same group.
     """
     chosen: list[str | None] = [None] * len(choices)
-    for word in filter(None, (w.strip() for w in (arg or "").split(","))):
-        groups = [i for i, group in enumerate(choices) if word in group]
+    for option in filter(None, (o.strip() for o in (arg or "").split(","))):
+        groups = [i for i, group in enumerate(choices) if option in group]
         if not groups:
             known = "; ".join(", ".join(sorted(group)) for group in choices)
-            raise UserError(f"unknown config argument {word!r}; available: {known}")
+            raise UserError(f"unknown config option {option!r}; available: {known}")
         group = groups[0]
-        if chosen[group] not in (None, word):
+        if chosen[group] not in (None, option):
             raise UserError(
-                f"config arguments {chosen[group]!r} and {word!r} exclude each other"
+                f"config options {chosen[group]!r} and {option!r} exclude each other"
             )
-        chosen[group] = word
+        chosen[group] = option
     return chosen
 
 
 def config_name(filename: str) -> str:
     """Name of a run from its config: "configs/radenet.py:stem" gives "radenet-stem"."""
-    path, _, words = filename.partition(":")
-    return "-".join([pathlib.Path(path).stem, *filter(None, words.split(","))])
+    path, _, options = filename.partition(":")
+    return "-".join([pathlib.Path(path).stem, *filter(None, options.split(","))])
 
 
 def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
@@ -93,18 +93,18 @@ def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
     )
 
 
-def load_config(path_and_words: str) -> ConfigDict:
+def load_config(path_and_options: str) -> ConfigDict:
     """The config of a file or name such as "my/config.py" or "radenet:stem".
 
     Raises:
-        UserError: There is no such file, it makes no config, or a word is unknown.
+        UserError: There is no such file, it makes no config, or an option is unknown.
     """
-    name, _, words = path_and_words.partition(":")
+    name, _, options = path_and_options.partition(":")
     path = config_file(name)
     get_config = getattr(load_module(path), "get_config", None)
     if get_config is None:
         raise UserError(f"{path} has no function get_config()")
-    return get_config(words) if words else get_config()
+    return get_config(options) if options else get_config()
 
 
 def base_config() -> ConfigDict:
@@ -123,10 +123,7 @@ def base_config() -> ConfigDict:
     config.train = _train()
     config.data = _data()
     config.evaluation = _evaluation()
-    config.watch = _watch()
-    # Neither is part of what a run computes, nor compared when it continues.
-    config.seeds = ()  # several runs, one after the other, in seed0, seed1, ...
-    config.profile = ""  # folder for a trace of a few steps
+    config.logging = _logging()
     return config
 
 
@@ -230,7 +227,7 @@ def _train() -> ConfigDict:
             "warmup_steps": 0,
             "gradient_clip_norm": placeholder(float),
             "ema_decay": placeholder(float),  # of a moving average of the parameters
-            "num_accumulate": 1,  # parts of a batch, one after the other
+            "gradient_accumulation_steps": 1,  # parts of a batch, one after the other
             "parameter_sharding": "replicated",  # "fsdp"
             "log_every_steps": 20,
             "checkpoint_every_steps": 500,
@@ -288,10 +285,10 @@ def _evaluation() -> ConfigDict:
     )
 
 
-def _watch() -> ConfigDict:
+def _logging() -> ConfigDict:
     return ConfigDict(
         {
-            "num_pictures": 4,  # of fixed frames, at every evaluation during training
+            "num_visualizations": 4,  # of fixed frames, at every evaluation during training
             "wandb": False,  # Weights & Biases, beside TensorBoard
             "wandb_project": "radejax",
             "profile_steps": (2, 5),  # first and last traced, counted from a start

@@ -131,11 +131,6 @@ _VERSION = _one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSION
 RULES: dict[str, Rule] = {
     "seed": _SEED,
     "classes": _several(_one_of(*LABEL_CLASSES), distinct=True),
-    "seeds": Rule(
-        f"a tuple of different seeds, each {_SEED.expected}; () for none",
-        lambda value: value in ((), []) or _several(_SEED, distinct=True).holds(value),
-    ),
-    "profile": _TEXT,
     # The model: which parts there are, and what they need of each other, is told when
     # it is built.
     "model.name": _one_of("radenet", "dinorade"),
@@ -214,7 +209,7 @@ RULES: dict[str, Rule] = {
     "train.warmup_steps": _COUNT_OR_0,
     "train.gradient_clip_norm": _or_none(_POSITIVE),
     "train.ema_decay": _or_none(_BELOW_ONE),
-    "train.num_accumulate": _COUNT,
+    "train.gradient_accumulation_steps": _COUNT,
     "train.parameter_sharding": _one_of("replicated", "fsdp"),
     "train.log_every_steps": _COUNT,
     "train.checkpoint_every_steps": _COUNT,
@@ -261,10 +256,10 @@ RULES: dict[str, Rule] = {
     "evaluation.bootstrap": _COUNT_OR_0,
     "evaluation.batch_size": _COUNT,
     "evaluation.num_pictures": _COUNT_OR_0,
-    "watch.num_pictures": _COUNT_OR_0,
-    "watch.wandb": _BOOL,
-    "watch.wandb_project": _TEXT,
-    "watch.profile_steps": _where(
+    "logging.num_visualizations": _COUNT_OR_0,
+    "logging.wandb": _BOOL,
+    "logging.wandb_project": _TEXT,
+    "logging.profile_steps": _where(
         _several(_COUNT_OR_0, 2),
         "the first not after the last",
         lambda value: value[0] <= value[1],
@@ -294,7 +289,7 @@ RULES: dict[str, Rule] = {
 }
 """What each field may be; a new field of a config gets its row here."""
 
-_SECTIONS = ("model", "loss", "decode", "train", "data", "evaluation", "watch")
+_SECTIONS = ("model", "loss", "decode", "train", "data", "evaluation", "logging")
 _CAMERA_SECTIONS = ("model.image", "model.fusion", "model.axes", "data.camera")
 
 

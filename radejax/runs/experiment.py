@@ -53,6 +53,7 @@ def run(
     sources: Sources = Sources(),  # noqa: B008, frozen
     workdir: PathLike | None = None,
     init_from: PathLike | None = None,
+    profile: PathLike = "",
 ) -> pathlib.Path:
     """Everything from nothing to metrics; run again, it continues where it stopped.
 
@@ -63,6 +64,7 @@ def run(
             config says how.
         workdir: `runs/<name>` if None.
         init_from: Weights to start from: official .pth file or another work folder.
+        profile: Folder for a trace of the steps `config.logging.profile_steps`.
 
     Returns:
         The work folder.
@@ -78,7 +80,7 @@ def run(
         config.train.batch_size,
         sharding.make_mesh(),
         "config.train.batch_size",
-        config.train.num_accumulate,
+        config.train.gradient_accumulation_steps,
     )
     model = models.build(config.model)  # what cannot be built fails first
     folder = default_workdir(workdir, name)
@@ -93,7 +95,7 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.paths.roots),
             )
-        result = train(model, weights, data, folder, config)
+        result = train(model, weights, data, folder, config, str(profile))
         if not result.finished:
             _log.info(
                 "stopped at step %d; run the same command to continue", result.step
@@ -122,6 +124,7 @@ def train(
     data: Data,
     folder: pathlib.Path,
     config: ConfigDict,
+    profile: str = "",
 ) -> loop.TrainResult:
     """Trains on the train split until the configured epochs are done.
 
@@ -131,6 +134,7 @@ def train(
         data: Of the run.
         folder: Work folder.
         config: Of the run.
+        profile: Folder for a trace; empty for none.
 
     Raises:
         UserError: No frames to train on, or no usable image.
@@ -156,14 +160,14 @@ def train(
         Plan(
             options=config.train,
             loss=loss_options(config),
-            watch=config.watch,
+            watch=config.logging,
             seed=config.seed,
             info=checkpoint_info(
                 config, data.records.grid, info, _what_stays(frames, weights)
             ),
             steps_per_epoch=len(frames) // config.train.batch_size,
             pretrained=weights.pretrained,
-            trace_folder=config.profile,
+            trace_folder=profile,
             frame_names=[frame.key for frame in frames],
         ),
         evaluate=validation,

@@ -14,8 +14,7 @@ from ml_collections import ConfigDict
 from tabulate import tabulate
 
 from radejax.core import files
-from radejax.core.errors import DataError
-from radejax.runs import check_config
+from radejax.core.errors import DataError, require
 from radejax.runs.experiment import run
 from radejax.runs.workdir import PathLike, default_workdir
 from radejax.training import processes
@@ -26,16 +25,22 @@ _KEYS = ("protocol", "condition", "cls", "space", "iou")
 
 
 def run_seeds(
-    config: ConfigDict, *, name: str, workdir: PathLike | None = None, **options: Any
+    config: ConfigDict,
+    seeds: Sequence[int],
+    *,
+    name: str,
+    workdir: PathLike | None = None,
+    **options: Any,
 ) -> pathlib.Path:
-    """Runs a config with every seed of `config.seeds`, one after the other.
+    """Runs a config with every seed, one after the other.
 
     Only `config.seed` changes: weights, order of the frames and augmentation. A
     simulated data set has a seed of its own. Called again, finished seeds are evaluated
     again and the others continue.
 
     Args:
-        config: With two seeds or more.
+        config: Of the runs.
+        seeds: Two or more, all different.
         name: Of the config, for the default work folder.
         workdir: Holds `seed0`, `seed1`, ... and the summary; `runs/<name>` if None.
         **options: Further arguments of `experiment.run`.
@@ -47,13 +52,12 @@ def run_seeds(
     Raises:
         UserError: Two seeds are equal; and as `experiment.run`.
     """
-    check_config.check(config)
-    seeds = tuple(int(seed) for seed in config.seeds)
+    require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
     workdir = default_workdir(workdir, name)
     tables = {}
     for seed in seeds:
         one = config.copy_and_resolve_references()
-        one.update(seed=seed, seeds=())
+        one.seed = seed
         _log.info("seed %d of %s", seed, list(seeds))
         folder = run(one, name=name, workdir=workdir / f"seed{seed}", **options)
         if not (folder / "evaluation" / "metrics.csv").exists():

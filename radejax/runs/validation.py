@@ -134,7 +134,7 @@ class Validation:
 
     def _draw(self, predictions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Always the same frames, spread over the split."""
-        count = self._config.watch.num_pictures
+        count = self._config.logging.num_visualizations
         if not count:
             return {}
         drawer = FrameDrawer(

@@ -76,11 +76,11 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         before["simulation"] = default_config()
     files.claim(
         path,
-        json.loads(config.to_json()) | {"profile": "", "seeds": []},
+        json.loads(config.to_json()),
         "a run with another config",
         mend="give another --workdir, or remove that one",
         name="config",
-        ignore=("watch",),
+        ignore=("logging",),
         renewed=functools.partial(renewed, before=before),
     )
 

@@ -93,7 +93,7 @@ class Trace:
             self._is_on, self._is_done = False, True
         if self._folder and not self._is_done:
             _log.warning(
-                "no trace in %s: this start took %d steps, and watch.profile_steps "
+                "no trace in %s: this start took %d steps, and logging.profile_steps "
                 "begins at step %d of a start",
                 self._folder,
                 self._count,

@@ -65,7 +65,7 @@ def check_batch_size(
     """
     if num_accumulate < 1:
         raise UserError(
-            f"train.num_accumulate must be at least 1, got {num_accumulate}"
+            f"train.gradient_accumulation_steps must be at least 1, got {num_accumulate}"
         )
     devices = mesh.devices.size
     size = devices * num_accumulate
@@ -74,7 +74,8 @@ def check_batch_size(
         choices = f"{lower} or {lower + size}" if lower else f"{size}"
         raise UserError(
             f"{name}={batch_size} does not divide over {devices} devices"
-            + f" times train.num_accumulate={num_accumulate}" * (num_accumulate > 1)
+            + f" times train.gradient_accumulation_steps={num_accumulate}"
+            * (num_accumulate > 1)
             + f"; use a multiple, for example {choices}"
         )
 

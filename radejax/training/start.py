@@ -50,7 +50,7 @@ class Plan:
         steps_per_epoch: Batches of one pass over the data.
         pretrained: Part of the variables that takes the place of drawn ones, an image
             backbone's weights for example.
-        trace_folder: Writes a trace of the steps `watch.profile_steps` there.
+        trace_folder: Writes a trace of the steps `logging.profile_steps` there.
         frame_names: What `Batch.frame` counts, for messages; its numbers if None.
     """
 
@@ -223,14 +223,17 @@ def compile_step(
     """
     options, whole = plan.options, sharding.replicated(mesh)
     sharding.check_batch_size(
-        options.batch_size, mesh, "train.batch_size", options.num_accumulate
+        options.batch_size,
+        mesh,
+        "train.batch_size",
+        options.gradient_accumulation_steps,
     )
     step = make_train_step(
         model,
         optimizer,
         grid,
         loss=dict(plan.loss),
-        num_accumulate=options.num_accumulate,
+        num_accumulate=options.gradient_accumulation_steps,
         ema_decay=options.ema_decay,
     )
     placement = jax.tree.map(lambda x: x.sharding, state)

@@ -232,7 +232,7 @@ class _Wandb:
             import wandb
         except ImportError as error:
             raise UserError(
-                "config.watch.wandb is set, and wandb is not installed: "
+                "config.logging.wandb is set, and wandb is not installed: "
                 "pip install 'radejax[wandb]'"
             ) from error
         self._image = wandb.Image

@@ -85,7 +85,7 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
         ),
         (["--config=radnet:official"], "did you mean radenet?"),
         (["--config=configs_of_mine/radenet.py"], "did you mean radenet?"),
-        (["--config=radenet:big"], "unknown config argument 'big'; available:"),
+        (["--config=radenet:big"], "unknown config option 'big'; available:"),
     ],
 )
 def test_near_misses_are_answered(arguments: list[str], message: str) -> None:
@@ -104,9 +104,9 @@ def test_fields_are_read_in_every_spelling() -> None:
         "2",
         "--init_from=a",
     ]
-    train.parse_args(context, [*words, "--config.watch.wandb", "--weather=fog"])
+    train.parse_args(context, [*words, "--config.logging.wandb", "--weather=fog"])
     fields = context.meta["fields"]
-    assert fields == {"seed": "2", "watch.wandb": "true"}
+    assert fields == {"seed": "2", "logging.wandb": "true"}
     assert context.params["init_from"] == "a"
 
 

@@ -14,7 +14,7 @@ from radejax.core.config import (
     config_name,
     load_config,
     load_module,
-    parse_words,
+    parse_options,
     renewed,
 )
 from radejax.core.errors import UserError
@@ -83,10 +83,10 @@ def test_every_dinorade_config_builds(words: str) -> None:
 def test_words_that_do_not_go_together_are_refused() -> None:
     with pytest.raises(UserError, match="'base' and 'stem' exclude each other"):
         _get("radenet", "base,stem")
-    with pytest.raises(UserError, match=r"unknown config argument 'big'; available"):
+    with pytest.raises(UserError, match=r"unknown config option 'big'; available"):
         _get("radenet", "big")
-    assert parse_words("b, a", ("a",), ("b", "c")) == ["a", "b"]
-    assert parse_words(None, ("a",)) == [None]
+    assert parse_options("b, a", ("a",), ("b", "c")) == ["a", "b"]
+    assert parse_options(None, ("a",)) == [None]
 
 
 def test_names_of_runs() -> None:

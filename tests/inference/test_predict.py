@@ -47,7 +47,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         heads="default",
     )
     config.evaluation.update(score_threshold=0.45, batch_size=3)
-    config.watch.num_pictures = 1
+    config.logging.num_visualizations = 1
     model = models.build(config.model)
     data = Data.open(
         config, model, DataPaths((str(root),), None, str(folder / "records"))

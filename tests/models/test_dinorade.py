@@ -304,7 +304,7 @@ def test_configs_differ_where_paper_and_code_do():
     assert get_config("r").model.name == "radenet"
     assert not get_config("official,rcw_resnet50").model.image.standardize
     assert get_config("rcw,sedan").model.num_classes == 1
-    with pytest.raises(UserError, match="unknown config argument 'rcx'"):
+    with pytest.raises(UserError, match="unknown config option 'rcx'"):
         get_config("rcx")
 
 

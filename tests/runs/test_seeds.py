@@ -23,7 +23,6 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     seen = []
 
     def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
-        assert not config.seeds
         seen.append((config.seed, pathlib.Path(workdir).name, options["sources"]))
         folder = pathlib.Path(workdir) / "evaluation"
         folder.mkdir(parents=True)
@@ -37,9 +36,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 
     monkeypatch.setattr(seeds, "run", run)
     config = base_config()
-    config.seeds = (0, 1, 2)
     sources = Sources(data=("d",))
-    seeds.run_seeds(config, name="x", workdir=tmp_path / "runs", sources=sources)
+    seeds.run_seeds(
+        config, range(3), name="x", workdir=tmp_path / "runs", sources=sources
+    )
     assert seen == [(i, f"seed{i}", sources) for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
@@ -53,19 +53,17 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 
 
 def test_a_seed_twice_is_refused() -> None:
-    config = base_config()
-    config.seeds = (1, 2, 1)
-    with pytest.raises(
-        UserError, match=r"config.seeds is \(1, 2, 1\), expected .* different"
-    ):
-        seeds.run_seeds(config, name="x")
+    with pytest.raises(UserError, match=r"--seeds is \(1, 2, 1\), expected different"):
+        seeds.run_seeds(base_config(), (1, 2, 1), name="x")
 
 
 def test_train_takes_several_seeds(tmp_path: pathlib.Path) -> None:
-    arguments = ["--config=quickstart:short", "--config.seeds=1,2,1"]
+    arguments = ["--config=quickstart:short", "--seeds=1,2,1"]
     done = click.testing.CliRunner().invoke(
         train, [*arguments, f"--workdir={tmp_path / 'run'}"]
     )
     assert done.exit_code == 2
-    assert done.stderr.startswith("error: config.seeds is '1,2,1', expected a tuple")
+    assert done.stderr.startswith(
+        "error: --seeds is (1, 2, 1), expected different seeds"
+    )
     assert done.stderr.count("\n") == 1

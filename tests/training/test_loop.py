@@ -64,7 +64,7 @@ def run(tiny: Tiny) -> Any:
         plan = Plan(
             options=config.train,
             loss=config.loss,
-            watch=config.watch,
+            watch=config.logging,
             seed=config.seed,
             info={"config": {"seed": 0}},
             steps_per_epoch=STEPS_PER_EPOCH,
@@ -151,7 +151,7 @@ def test_a_seed_draws_its_variables(
         plan = Plan(
             options=tiny.config.train,
             loss={},
-            watch=tiny.config.watch,
+            watch=tiny.config.logging,
             seed=seed,
             info={},
             steps_per_epoch=STEPS_PER_EPOCH,

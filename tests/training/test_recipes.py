@@ -221,7 +221,7 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
         Plan(
             options=config.train,
             loss=config.loss,
-            watch=config.watch,
+            watch=config.logging,
             seed=config.seed,
             info={},
             steps_per_epoch=2,

@@ -43,11 +43,11 @@ def test_fsdp_splits_the_widest_axis_that_divides() -> None:
         ),
         (
             lambda: sharding.check_batch_size(8, sharding.make_mesh(4), "b", 4),
-            "b=8 does not divide over 4 devices times .*num_accumulate=4; .*example 16",
+            "b=8 does not divide over 4 devices .*accumulation_steps=4; .*example 16",
         ),
         (
             lambda: sharding.check_batch_size(8, sharding.make_mesh(4), "b", 0),
-            "num_accumulate must be at least 1, got 0",
+            "gradient_accumulation_steps must be at least 1, got 0",
         ),
         pytest.param(
             lambda: sharding.state_sharding({}, sharding.make_mesh(1), "sharded"),

@@ -68,7 +68,7 @@ def train(
     plan = Plan(
         options=config.train,
         loss=loss_options(config),
-        watch=config.watch,
+        watch=config.logging,
         seed=0,
         info={},
         steps_per_epoch=STEPS_PER_EPOCH,
