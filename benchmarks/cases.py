@@ -17,6 +17,7 @@ import jax
 import networks
 import numpy as np
 import scipy.io
+import stages
 import start
 from case import Case, compiled, difference, timed, waiting
 
@@ -30,7 +31,6 @@ from radejax.evaluation.average_precision import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.report.measure import Options, measure
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference import benchmark as stages
 from radejax.inference.export import export
 from radejax.inference.exported_loader import load as load_exported
 

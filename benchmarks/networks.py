@@ -13,6 +13,7 @@ import inputs
 import jax
 import jax.numpy as jnp
 import numpy as np
+import stages
 from case import Case, compiled, difference, timed, waiting
 from rival import ATTENTION
 
@@ -22,7 +23,6 @@ from radejax.data.frame_table import make_table
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.projection import project_plain
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference import benchmark as stages
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import ReferencePoints, static_reference_points
 from radejax.models.vit import rotary_angles

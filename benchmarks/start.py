@@ -17,10 +17,12 @@ from case import Case
 
 _ROOT = pathlib.Path(__file__).resolve().parents[1]
 _FIRST_STEP = "after the start"  # of the line that training writes then
-_DETECT = """
+_DETECT = f"""
+import sys
+sys.path.append({str(_ROOT / "benchmarks")!r})
 import numpy as np
 from radejax.core.config import load_config
-from radejax.inference.benchmark import untrained
+from stages import untrained
 found = untrained(load_config("radenet"), batch_sizes=(1,), score_threshold=0.0)
 x = np.zeros((1, *found.grid.projection_shape), np.float32)
 print("found:", np.asarray(found(x).scores).shape)

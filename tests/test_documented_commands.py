@@ -51,10 +51,7 @@ RUN_IN = {
     "radejax detect": ".ci/run: radejax detect --workdir",
     "radejax evaluate": "tests/cli/test_main.py"
     "::test_evaluate_scores_predictions_in_files",
-    "radejax export": "tests/cli/test_main.py"
-    "::test_export_and_benchmark_take_a_packed_folder",
-    "radejax benchmark": "tests/cli/test_main.py"
-    "::test_export_and_benchmark_take_a_packed_folder",
+    "radejax export": "tests/cli/test_main.py::test_export_takes_an_exported_folder",
     "radejax embed": "tests/test_fusion_run.py::test_embed_command",
     "examples/cfar_baseline.py": "tests/examples/test_cfar_baseline.py"
     "::test_cfar_baseline_fits_detects_and_reports",

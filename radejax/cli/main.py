@@ -5,7 +5,6 @@ from __future__ import annotations
 import click
 
 from radejax.cli import options
-from radejax.cli.benchmark import benchmark
 from radejax.cli.data import data, project
 from radejax.cli.demo import demo
 from radejax.cli.detect import detect
@@ -32,7 +31,6 @@ from radejax.cli.view import view
         detect,
         embed,
         export,
-        benchmark,
     ],
     context_settings={"help_option_names": ["-h", "--help"]},
 )

@@ -55,7 +55,6 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["project", ".", "--out", "x", "--workers", "0"], "0 is not in the range"),
         (["simulate", "--out", "x", "--workers", "0"], "0 is not in the range"),
         (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
-        (["benchmark", "--config", "x", "--batch-size", "0"], "0 is not in the range"),
         (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),
         (["demo", "--out", "demo"], "cannot write a picture as 'demo'; suffixes: ["),
         (["overlay", "1", "--data", ".", "--out", "."], "'.' is a directory"),
@@ -114,11 +113,10 @@ def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
     assert isinstance(_run("--debug", *arguments).exception, FileNotFoundError)
 
 
-def test_evaluate_and_benchmark_want_one_source() -> None:
-    for command in ("evaluate", "benchmark"):
-        result = _run(command)
-        assert result.exit_code == 2
-        assert "error: give one of" in result.output
+def test_evaluate_wants_one_source() -> None:
+    result = _run("evaluate")
+    assert result.exit_code == 2
+    assert "error: give one of" in result.output
 
 
 def test_evaluate_takes_flags_as_its_script_does(
@@ -165,7 +163,7 @@ def test_evaluate_takes_flags_as_its_script_does(
         assert (wrong.exit_code, message in wrong.output) == (2, True), wrong.output
 
 
-def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> None:
+def test_export_takes_an_exported_folder(tmp_path: pathlib.Path) -> None:
     packed = tmp_path / "packed"
     checkpoint_files.write_packed(packed, small_models.detector())
     done = _run(
@@ -179,10 +177,6 @@ def test_export_and_benchmark_take_a_packed_folder(tmp_path: pathlib.Path) -> No
         wrong = _run("export", packed, "--out", tmp_path / "x", "--platforms", platform)
         assert wrong.exit_code == 2
         assert "error: platform is 'foo', expected some of cpu, cuda" in wrong.output
-    timed = _run("benchmark", packed, "--batch-size", 1, "--repeats", 1, "--json")
-    (row,) = json.loads(timed.output)
-    assert row["batch"] == 1
-    assert row["whole_s"] > 0
 
 
 def test_evaluate_scores_predictions_in_files(tmp_path: pathlib.Path) -> None:

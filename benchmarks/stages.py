@@ -1,7 +1,11 @@
-"""Time from a tensor in host memory to boxes, by stage and by part of the network."""
+"""Time from a tensor in host memory to boxes, by stage and by part of the network.
+
+python benchmarks/stages.py runs/quickstart --batch-size 1 10
+"""
 
 from __future__ import annotations
 
+import argparse
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +17,8 @@ import numpy as np
 from tabulate import tabulate
 
 from radejax import models
+from radejax.cli.entry import set_up_jax
+from radejax.core.config import load_config
 from radejax.data.projection import project_jax
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
@@ -195,3 +201,32 @@ def as_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _cell(row: Mapping[str, Any], seconds: float) -> str:
     return f"{1000 * seconds:.2f} ms ({100 * seconds / row['sum_s']:.1f} %)"
+
+
+def main() -> None:
+    """Times the model of a run or exported folder, or an untrained one of a config."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    model = parser.add_mutually_exclusive_group(required=True)
+    model.add_argument("source", nargs="?", help="Run, exported folder or .pth file.")
+    model.add_argument("--config", help="Config of an untrained model.")
+    parser.add_argument("--batch-size", type=int, nargs="+", default=[1, 10])
+    parser.add_argument(
+        "--input", choices=["tesseract", "projection"], default="tesseract"
+    )
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--dtype", choices=["float32", "bfloat16"])
+    given = parser.parse_args()
+    set_up_jax()
+    if given.config:
+        detector = untrained(load_config(given.config), dtype=given.dtype)
+    else:
+        detector = Detector.from_checkpoint(given.source, dtype=given.dtype)
+    is_tesseract = given.input == "tesseract"
+    rows = measure(
+        detector, given.batch_size, repeats=given.repeats, tesseract=is_tesseract
+    )
+    print(as_table(rows))
+
+
+if __name__ == "__main__":
+    main()

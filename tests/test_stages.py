@@ -1,29 +1,39 @@
 """Stages of the benchmark are those of a detector's call."""
 
+import pathlib
+from typing import Any
+
 import pytest
 
 from radejax.core.config import load_config
-from radejax.inference import benchmark
 
-from .. import small_models as small
+from . import small_models as small
 
 pytestmark = pytest.mark.slow  # compiles each stage on its own
 
 
+@pytest.fixture
+def stages(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(pathlib.Path(__file__).parents[1] / "benchmarks")
+    import stages
+
+    return stages
+
+
 @pytest.mark.parametrize("kind", ["radar", "camera"])
-def test_stages_add_up_and_are_shown(kind: str) -> None:
+def test_stages_add_up_and_are_shown(kind: str, stages: Any) -> None:
     detector = small.detector(kind)
-    (row,) = benchmark.measure(detector, (2,), repeats=1)
+    (row,) = stages.measure(detector, (2,), repeats=1)
     camera = (
         {"image_backbone", "image_neck", "image_fusion"} if kind == "camera" else ()
     )
     assert set(row["parts"]) == {"backbone", "neck", "heads", *camera}
     assert all(seconds > 0 for seconds in row["parts"].values())
-    assert list(row["stages"]) == list(benchmark.STAGES)
+    assert list(row["stages"]) == list(stages.STAGES)
     assert row["sum_s"] == pytest.approx(sum(row["stages"].values()))
     assert all(seconds > 0 for seconds in row["stages"].values())
     assert row["frames_per_s"] == pytest.approx(2 / row["whole_s"])
-    text = benchmark.as_table([row])
+    text = stages.as_table([row])
     assert "batch 2" in text
     lines = [line for line in text.splitlines() if " %" in line]
     shares = {
@@ -35,8 +45,8 @@ def test_stages_add_up_and_are_shown(kind: str) -> None:
     assert detector.with_batch_sizes((2,))._run is detector._run
 
 
-def test_untrained_models_are_those_of_their_configs() -> None:
-    detector = benchmark.untrained(load_config(str(small.CONFIGS / "quickstart.py")))
+def test_untrained_models_are_those_of_their_configs(stages: Any) -> None:
+    detector = stages.untrained(load_config(str(small.CONFIGS / "quickstart.py")))
     assert detector.grid.projection_shape[-1] == (
         detector.model.doppler_bins + detector.model.elevation_bins
     )
