@@ -57,7 +57,7 @@ def make_config(steps):
     config.train.update(
         num_epochs=steps // 2, checkpoint_every_steps=7, log_every_steps=5
     )
-    config.evaluation.update(num_pictures=0, protocols=("exact",))
+    config.evaluation.update(num_visualizations=0, protocols=("all_point",))
     return config
 
 

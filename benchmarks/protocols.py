@@ -50,8 +50,8 @@ def main() -> None:
         }
         show(f"AP {space}, IoU {iou}, all weathers", data, rows)
     rows = {
-        f"{name}, skip {skip}": {"protocol": name, "skip_empty": skip, "spaces": "3d"}
-        for name in ("kradar_r40", "coco101", "exact")
+        f"{name}, skip {skip}": {"protocol": name, "empty_frames": skip, "spaces": "3d"}
+        for name in ("kradar_r40", "coco101", "all_point")
         for skip in ("class", "frame", None)
     }
     show("Frame rules, AP 3d, IoU 0.3", data, rows)
@@ -61,7 +61,7 @@ def main() -> None:
             "score_threshold": cut,
             "spaces": "3d",
         }
-        for name in ("kradar_r40", "coco101", "exact")
+        for name in ("kradar_r40", "coco101", "all_point")
         for cut in (0.0, 0.3)
     }
     show("Score cuts, AP 3d, IoU 0.3", data, rows)

@@ -49,7 +49,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         checkpoint_every_steps=200,
     )
     config.evaluation.score_threshold = 0.05
-    config.evaluation.protocols = ("kradar_r40", "exact", "coco101")
+    config.evaluation.protocols = ("kradar_r40", "all_point", "coco101")
     if recipe != "ablation":
         _teach_more(config)
     if length == "short":
@@ -64,7 +64,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
             log_every_steps=10,
             checkpoint_every_steps=2,
         )
-        config.evaluation.num_pictures = 2
+        config.evaluation.num_visualizations = 2
     return config
 
 

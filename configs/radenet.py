@@ -59,8 +59,8 @@ PRESETS = {
         "data.azimuth_mapping": "true",
         "data.validation": (),
         "data.count_disabled": False,
-        "evaluation.protocols": ("coco101", "exact", "kradar_r40"),
-        "evaluation.skip_empty": "protocol",
+        "evaluation.protocols": ("coco101", "all_point", "kradar_r40"),
+        "evaluation.empty_frames": "protocol",
     },
     "official": {
         "model.cbam": "official",
@@ -79,7 +79,7 @@ PRESETS = {
         "data.validation": (),
         "data.count_disabled": True,
         "evaluation.protocols": ("coco101",),
-        "evaluation.skip_empty": "class",
+        "evaluation.empty_frames": "class",
     },
 }
 """Where the paper and the released code differ, one field a row."""

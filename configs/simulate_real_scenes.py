@@ -46,5 +46,10 @@ def get_config(arg: str | None = None) -> ConfigDict:
         checkpoint_every_steps=100,
     )
     config.evaluation.score_threshold = 0.05
-    config.evaluation.protocols = ("exact", "kradar_r40", "kradar_r40_yaw", "coco101")
+    config.evaluation.protocols = (
+        "all_point",
+        "kradar_r40",
+        "kradar_r40_corrected",
+        "coco101",
+    )
     return config

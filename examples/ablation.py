@@ -12,7 +12,7 @@ ones, which all cells share. The same command goes on where an earlier one ended
 killed, also within a run. `--table_only` writes the tables of what is there. Given several times at
 once it works on as many seeds, best one a core (`taskset -c 0 python ...`).
 
-AP is BEV at IoU 0.3, protocol `exact`, mean over seeds; intervals are of 95 %, paired,
+AP is BEV at IoU 0.3, protocol `all_point`, mean over seeds; intervals are of 95 %, paired,
 over resampled sequences of the scenes to evaluate on. A claim is shown where the interval
 lies above 0 (and the difference reaches what is claimed), refuted where it ends below.
 """
@@ -59,7 +59,7 @@ HELD_OUT_SEED = 1_000_003
 COMMON = {
     "simulation.output": "projection",
     "simulation.test_sequences": 2,  # evaluated on the held-out scenes instead
-    "evaluation.num_pictures": 0,
+    "evaluation.num_visualizations": 0,
 }
 """Fields of every run, beside its seed and its cell's."""
 
@@ -180,7 +180,7 @@ class Work:
                 image_backbone=backbone,
                 exchange_images=0 if cell.exchanges else None,
                 other=Sources(data=(self.data(cell, None),)),
-                num_pictures=0,
+                num_visualizations=0,
             )
         minutes = (time.perf_counter() - started) / 60
         content = {"minutes": minutes, "command": self.command(name, seed)}
@@ -225,7 +225,7 @@ def resampled(
         )
         cut = config.evaluation.score_threshold
         aps = bootstrap.resample(
-            data, weights, "exact", "bev", 0.3, score_threshold=cut
+            data, weights, "all_point", "bev", 0.3, score_threshold=cut
         )
         result[condition] = aps.astype(np.float32)
     with files.atomic_write(path) as file:

@@ -52,7 +52,7 @@ def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float
         is_tp=match[order] >= 0,
         weight=np.ones(order.size),
         num_gt=int((data.gt.cls == cls).sum()),
-        curve="exact",
+        curve="all_point",
     )
     return curve.ap
 

@@ -41,7 +41,12 @@ def run_baseline(
     data: str | pathlib.Path,
     out: str | pathlib.Path,
     *,
-    protocols: tuple[str, ...] = ("exact", "kradar_r40", "kradar_r40_yaw", "coco101"),
+    protocols: tuple[str, ...] = (
+        "all_point",
+        "kradar_r40",
+        "kradar_r40_corrected",
+        "coco101",
+    ),
     score_threshold: float = 0.05,
     bootstrap: int = 0,
     balanced: bool = False,

@@ -131,7 +131,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
         radar[0],
         fusion[0],
         radar[1],
-        protocol_names=("exact",),
+        protocol_names=("all_point",),
         spaces=("bev",),
         score_threshold=options.score_threshold,
         resamples=resamples,
@@ -214,7 +214,7 @@ def main(fusion, radar, out, data, split, resamples):
         files.write_json(out / "by_lens.json", {"ap": rows, "share": shares})
         text = "\n\n".join(
             [
-                "AP BEV, IoU 0.3, protocol exact",
+                "AP BEV, IoU 0.3, protocol all_point",
                 tabulate(rows, headers="keys", floatfmt=".2f"),
                 "Share of the camera in the fused map, and that less its share in all",
                 tabulate(shares, headers="keys", floatfmt=".4f"),

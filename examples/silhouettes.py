@@ -5,7 +5,7 @@
 
 Trains `configs/quickstart_fusion.py` with silhouettes for images (every object in the
 colour of its class, brighter when nearer) and the same model without its camera, on the
-same scenes, and compares them on the test frames: AP BEV at IoU 0.3, protocol `exact`,
+same scenes, and compares them on the test frames: AP BEV at IoU 0.3, protocol `all_point`,
 paired over resampled sequences. Exit code 1 where the mean of the classes does not gain
 the bar, or its 95 % interval has 0 in it. Run again, it continues where it stopped.
 """
@@ -47,7 +47,7 @@ def compared(config, radar, fusion, resamples):
     return bootstrap.compare(
         *sets,
         frames["sequence"],
-        protocol_names=("exact",),
+        protocol_names=("all_point",),
         spaces=("bev",),
         score_threshold=config.evaluation.score_threshold,
         resamples=resamples,

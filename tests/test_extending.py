@@ -57,8 +57,8 @@ def _config() -> ConfigDict:
     config.loss.weights.height = 0.5
     config.data.format = "toy"
     config.train.update(batch_size=2, num_epochs=1, warmup_steps=0)
-    config.evaluation.update(batch_size=2, num_pictures=0)
-    config.evaluation.protocols = ("exact",)
+    config.evaluation.update(batch_size=2, num_visualizations=0)
+    config.evaluation.protocols = ("all_point",)
     return config
 
 

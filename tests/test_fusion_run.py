@@ -56,7 +56,7 @@ def small_config():
     config.model.fusion.update(num_heads=2, num_elevation=3, necks=False)
     config.data.mirror_probability = 0.0
     config.train.update(batch_size=8, num_epochs=2, log_every_steps=1)
-    config.evaluation.num_pictures = 1
+    config.evaluation.num_visualizations = 1
     return config
 
 
@@ -159,7 +159,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     with pytest.raises(UserError, match="give --image_backbone FOLDER, or --embedd"):
         evaluate_run(workdir, other=Sources(data=(str(other),)))
     given = Sources(data=(str(other),), embeddings=str(embeddings))
-    evaluate_run(workdir, other=given, num_pictures=0)
+    evaluate_run(workdir, other=given, num_visualizations=0)
     report = json.loads((workdir / "evaluation_other/metrics.json").read_text())
     assert report["ap"] == reports[0]["ap"]
 
@@ -321,7 +321,7 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
 
 
 def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
-    evaluate_run(from_images, out=tmp_path, num_pictures=0)
+    evaluate_run(from_images, out=tmp_path, num_visualizations=0)
     shares = json.loads((tmp_path / "camera_share.json").read_text())
     assert shares["all"]["frames"] == 4
     assert 0 < shares["all"]["mean"] < 1
@@ -350,7 +350,7 @@ def test_example_compares_fusion_and_radar_by_the_lens(
     from_images, three_test_sequences, tmp_path
 ):
     out, run = tmp_path / "by_lens", shutil.copytree(from_images, tmp_path / "run")
-    evaluate_run(run, num_pictures=0)
+    evaluate_run(run, num_visualizations=0)
     # The run with itself: nothing gained, on all frames and by the lens.
     text = _example("fusion_by_lens", run, run, "--out", out, "--resamples", 10)
     assert (out / "by_lens.txt").read_text() in text
@@ -381,7 +381,7 @@ def test_example_compares_on_another_data_set(
     run = shutil.copytree(from_images, tmp_path / "run")
     other = shutil.copytree(data.folder, tmp_path / "other")
     for data in (None, Sources(data=(str(other),))):
-        evaluate_run(run, num_pictures=0, other=data)
+        evaluate_run(run, num_visualizations=0, other=data)
     results = []
     monkeypatch.chdir(other)
     for arguments in ((), ("--data", ".")):
@@ -390,7 +390,7 @@ def test_example_compares_on_another_data_set(
         results.append((run / name / "by_lens.json").read_text())
     assert results[0] == results[1]
     assert len(json.loads(results[0])["ap"]) > 1
-    evaluate_run(run, num_pictures=0, split="train")
+    evaluate_run(run, num_visualizations=0, split="train")
     with pytest.raises(AssertionError, match="other frames than split test"):
         _example("fusion_by_lens", run, run)
 

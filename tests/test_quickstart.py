@@ -29,7 +29,7 @@ OVERRIDES = [
     "--config.model.num_groups=4",
     "--config.train.num_epochs=4",
     "--config.train.checkpoint_every_steps=1",
-    "--config.evaluation.num_pictures=1",
+    "--config.evaluation.num_visualizations=1",
 ]
 
 

@@ -35,7 +35,7 @@ OVERRIDES = [
     "--config.train.log_every_steps=1",
     "--config.train.checkpoint_every_steps=3",
     "--config.train.checkpoints_to_keep=9",
-    "--config.evaluation.num_pictures=0",
+    "--config.evaluation.num_visualizations=0",
     "--config.evaluation.batch_size=3",
 ]
 MIDDLE = 3  # of six steps
@@ -135,7 +135,7 @@ def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
         "--seeds=0,1",
         "--config.train.evaluate_every_epochs=2",
         "--config.logging.num_visualizations=2",
-        "--config.evaluation.num_pictures=2",
+        "--config.evaluation.num_visualizations=2",
     )
     assert _losses(runs / "seeds" / "seed0") == _losses(runs / "two")
     rows = json.loads((runs / "seeds" / "seeds.json").read_text())

@@ -57,7 +57,7 @@ _DATA_OF_RUNS = (
 _RUNS = (
     _flag("min-score", "Of a run: predictions are kept from here on.", type=float),
     _flag("batch-size", "Of a run: frames at once.", type=int),
-    _flag("num-pictures", "Of a run: frames drawn.", type=int),
+    _flag("num-visualizations", "Of a run: frames drawn.", type=int),
     click.Option(
         ["--checkpoint", "--step", "checkpoint"],
         type=STEP,
@@ -93,7 +93,7 @@ _SCORING = (
     ),
     _flag("score-threshold", "Predictions need more; 0, or the run's.", type=float),
     _flag(
-        "skip-empty",
+        "empty-frames",
         "Frames left out: without the class, without any object, none; each protocol's "
         "own by default.",
         type=click.Choice(["protocol", "class", "frame", "none"]),
@@ -173,7 +173,7 @@ def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any
         exchange_images=flags["exchange_images"],
         other=Sources(**other) if has_other else None,
         **_scoring(flags),
-        **_given(flags, "min_score", "batch_size", "num_pictures"),
+        **_given(flags, "min_score", "batch_size", "num_visualizations"),
     )
     assert report is not None  # as this is the only process
     # The table has been logged already, to standard error.
@@ -229,8 +229,8 @@ def _options(flags: dict[str, Any], name: str) -> Any:
 
     values: dict[str, Any] = {"run": name, "bootstrap": 200}
     values |= {"label_version": flags["label_version"] or "v2.1", **_scoring(flags)}
-    if values.get("skip_empty") == "none":
-        values["skip_empty"] = None
+    if values.get("empty_frames") == "none":
+        values["empty_frames"] = None
     return Options(**values)
 
 

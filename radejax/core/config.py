@@ -273,14 +273,14 @@ def _evaluation() -> ConfigDict:
         {
             "roi": NARROW_ROI,
             # The papers', ours, K-Radar's; the first chooses the best checkpoint.
-            "protocols": ("coco101", "exact", "kradar_r40"),
-            "skip_empty": "protocol",  # each one's own; "class", "frame", "none"
+            "protocols": ("coco101", "all_point", "kradar_r40"),
+            "empty_frames": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
-            "score_threshold": 0.3,  # of all protocols but "exact", which has no cut
+            "score_threshold": 0.3,  # of all protocols but "all_point", which has no cut
             "min_score": 0.05,  # predictions are kept from here on
             "bootstrap": 0,  # resamples of sequences for intervals; 1000 is plenty
             "batch_size": 8,
-            "num_pictures": 8,
+            "num_visualizations": 8,
         }
     )
 

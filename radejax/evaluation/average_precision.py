@@ -34,7 +34,7 @@ def evaluate(
     iou_thresholds: Sequence[float] | float = (0.3,),
     protocol: str = "kradar_r40",
     frames: AnyColumns | None = None,
-    skip_empty: str | None = PROTOCOL_DEFAULT,
+    empty_frames: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
     roi: str | Sequence[float] | None = None,
     spaces: Sequence[str] = SPACES,
@@ -52,7 +52,7 @@ def evaluate(
         protocol: One of `protocols.PROTOCOLS`.
         frames: Columns of the frame table, at least frame `[F]`; None takes the frames
             that occur. Boxes of other frames are an error.
-        skip_empty: Frames left out: "class" without an object of the class, "frame"
+        empty_frames: Frames left out: "class" without an object of the class, "frame"
             without an object of any class, None none; default: the protocol's rule.
         score_threshold: Predictions need a score above this. 0 keeps all (in K-Radar's
             protocols all above 0).
@@ -76,7 +76,7 @@ def evaluate(
         >>> box = np.array([[20.0, 0, 0, 4, 2, 1.5, 0]])
         >>> truth = {"frame": [0], "box": box, "cls": ["Sedan"]}
         >>> found = {**truth, "score": [0.9]}
-        >>> [r.ap for r in evaluate(truth, found, classes=["Sedan"], protocol="exact")]
+        >>> [r.ap for r in evaluate(truth, found, classes=["Sedan"], protocol="all_point")]
         [100.0, 100.0]
     """
     data = EvaluationSet(
@@ -90,7 +90,7 @@ def evaluate(
     return data.results(
         protocol,
         iou_thresholds=iou_thresholds,
-        skip_empty=skip_empty,
+        empty_frames=empty_frames,
         score_threshold=score_threshold,
         spaces=spaces,
     )

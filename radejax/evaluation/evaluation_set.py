@@ -143,13 +143,13 @@ class EvaluationSet:
         if geometry == "plain":
             return overlap.pair_iou(found[self.pair_pred], truth[self.pair_gt])
         truth = np.round(truth, 2)
-        if geometry.startswith("exchanged"):
+        if geometry.startswith("swapped_lw"):
             exchange = [0, 1, 2, 4, 3, 5, 6]
             truth, found = truth[:, exchange], found[:, exchange]
         bev, iou_3d = overlap.pair_iou(
             found[self.pair_pred],
             truth[self.pair_gt],
-            z_center=1.0 if geometry == "exchanged_top" else 0.5,
+            z_center=1.0 if geometry == "swapped_lw_z_top" else 0.5,
         )
         # The original stores overlaps in single and compares them in double precision.
         bev, iou_3d = (i.astype(np.float32).astype(np.float64) for i in (bev, iou_3d))
@@ -158,8 +158,8 @@ class EvaluationSet:
     def match(self, protocol: Protocol, space: str, iou: float) -> Matches:
         """Matches of all frames and classes: `KradarMatches` or each one's object or -1."""
         geometry = protocol.geometry
-        if geometry == "exchanged_top" and space == "bev":
-            geometry = "exchanged"  # z plays no part
+        if geometry == "swapped_lw_z_top" and space == "bev":
+            geometry = "swapped_lw"  # z plays no part
         key = (geometry, protocol.matching, space, iou)
         if key not in self._matches:
             values = self.overlaps(geometry)[SPACES.index(space)]
@@ -186,19 +186,19 @@ class EvaluationSet:
     # Results -------------------------------------------------------------------------
 
     def frame_weights(
-        self, skip_empty: str | None, weights: Shaped[np.ndarray, " F"] | None = None
+        self, empty_frames: str | None, weights: Shaped[np.ndarray, " F"] | None = None
     ) -> Int[np.ndarray, "F C"]:
         """Weights of the frames for every class, after the frame rule."""
         if weights is None:
             weights = np.ones(self.frame.size, np.int64)
         weights = np.asarray(weights).astype(np.int64)[:, None]
-        if skip_empty == "class":
+        if empty_frames == "class":
             return weights * (self.gt_count > 0)
-        if skip_empty == "frame":
+        if empty_frames == "frame":
             weights = weights * (self.gt_count.sum(axis=1, keepdims=True) > 0)
-        elif skip_empty is not None:
+        elif empty_frames is not None:
             raise UserError(
-                f'skip_empty must be "class", "frame" or None, got {skip_empty!r}'
+                f'empty_frames must be "class", "frame" or None, got {empty_frames!r}'
             )
         return np.broadcast_to(weights, self.gt_count.shape)
 
@@ -207,7 +207,7 @@ class EvaluationSet:
         protocol: str = "kradar_r40",
         *,
         iou_thresholds: Sequence[float] | float = (0.3,),
-        skip_empty: str | None = PROTOCOL_DEFAULT,
+        empty_frames: str | None = PROTOCOL_DEFAULT,
         score_threshold: float = 0.0,
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
@@ -218,14 +218,14 @@ class EvaluationSet:
         Args:
             protocol: Name of the protocol.
             iou_thresholds: As in `evaluate`.
-            skip_empty: As in `evaluate`.
+            empty_frames: As in `evaluate`.
             score_threshold: As in `evaluate`.
             spaces: As in `evaluate`.
             weights: bool or int weight of every frame; a condition is a mask.
             curves: Keep the precision, recall and score arrays.
         """
         chosen = protocols.get_protocol(protocol)
-        skip = chosen.frame_rule(skip_empty)
+        skip = chosen.frame_rule(empty_frames)
         spaces = (spaces,) if isinstance(spaces, str) else tuple(spaces)
         if not set(spaces) <= set(SPACES):
             raise UserError(f"spaces must be among {SPACES}, got {spaces}")
@@ -246,7 +246,7 @@ class EvaluationSet:
                 protocol=chosen.name,
                 num_frames=int((weight > 0).sum()),
                 score_threshold=terms.score_threshold,
-                skip_empty=skip,
+                empty_frames=skip,
                 roi=self.roi,
                 label_version=self.label_version,
                 is_simulated=self.is_simulated,

@@ -19,8 +19,8 @@ PROTOCOL_DEFAULT = "protocol"
 
 EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall
 
-Geometry = Literal["plain", "rounded", "exchanged", "exchanged_top"]
-CurveKind = Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "exact"]
+Geometry = Literal["plain", "rounded", "swapped_lw", "swapped_lw_z_top"]
+CurveKind = Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "all_point"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,12 +30,12 @@ class Protocol:
     Attributes:
         name: Name in results and reports.
         geometry: Boxes compared: "plain" as given; "rounded" with ground truth rounded to
-            2 decimals; "exchanged" rounded and with l and w exchanged (K-Radar's export);
-            "exchanged_top" also with z taken as the top of the box.
+            2 decimals; "swapped_lw" rounded and with l and w exchanged (K-Radar's export);
+            "swapped_lw_z_top" also with z taken as the top of the box.
         matching: "kradar" two passes in ground-truth order; "best" each prediction may
             only take its own best object; "free" by score, the best free object.
         curve: How precisions become one number.
-        skip_empty: Frames left out by default: "class" those without an object of the
+        empty_frames: Frames left out by default: "class" those without an object of the
             class, "frame" those without an object of any class, None none.
         summary: One line for reports.
     """
@@ -44,15 +44,15 @@ class Protocol:
     geometry: Geometry
     matching: Literal["kradar", "best", "free"]
     curve: CurveKind
-    skip_empty: Literal["class", "frame"] | None
+    empty_frames: Literal["class", "frame"] | None
     summary: str
 
-    def frame_rule(self, skip_empty: str | None) -> str | None:
+    def frame_rule(self, empty_frames: str | None) -> str | None:
         """A frame rule, or the protocol's own for `PROTOCOL_DEFAULT`."""
-        return self.skip_empty if skip_empty == PROTOCOL_DEFAULT else skip_empty
+        return self.empty_frames if empty_frames == PROTOCOL_DEFAULT else empty_frames
 
 
-RECOMMENDED = "exact"
+RECOMMENDED = "all_point"
 """The protocol of our own choice; docs/evaluation.md says why."""
 
 
@@ -68,16 +68,19 @@ def _radenet(curve: CurveKind, summary: str) -> Protocol:
 _ALL = (
     _kradar(
         "kradar_r40",
-        "exchanged",
+        "swapped_lw",
         "r40",
         "revised evaluation as the field runs it (l and w exchanged)",
     ),
     _kradar(
-        "kradar_r40_yaw", "rounded", "r40", "revised evaluation with the yaw right"
+        "kradar_r40_corrected",
+        "rounded",
+        "r40",
+        "revised evaluation with the yaw right",
     ),
     _kradar(
         "kradar_r11",
-        "exchanged_top",
+        "swapped_lw_z_top",
         "r11",
         "older evaluation: 11 of 41 samples, z as the top of a box",
     ),
@@ -89,7 +92,7 @@ _ALL = (
         RECOMMENDED,
         "plain",
         "free",
-        "exact",
+        "all_point",
         None,
         "exact area under the interpolated curve, every frame counts (recommended)",
     ),
@@ -244,12 +247,12 @@ def pooled_curve(
         is_tp: True for true positives.
         weight: Weights of their frames.
         num_gt: Number of ground truths.
-        curve: "voc11", "recall41", "coco101", "auc" (RADE-Net) or "exact".
+        curve: "voc11", "recall41", "coco101", "auc" (RADE-Net) or "all_point".
 
     Examples:
         >>> score, is_tp = np.array([0.9, 0.8, 0.6]), np.array([True, False, True])
         >>> round(pooled_curve(
-        ...     score=score, is_tp=is_tp, weight=np.ones(3), num_gt=2, curve="exact").ap, 2)
+        ...     score=score, is_tp=is_tp, weight=np.ones(3), num_gt=2, curve="all_point").ap, 2)
         83.33
     """
     counts = weight > 0  # a frame left out must not leave a point at recall 0 either
@@ -257,7 +260,7 @@ def pooled_curve(
     num_det = int(weight.sum())
     found = np.cumsum(is_tp * weight)
     made = np.cumsum(weight)
-    if curve == "exact":
+    if curve == "all_point":
         # Equal scores are one threshold, whatever order they are listed in.
         last = np.ones(score.size, bool)
         last[:-1] = score[1:] != score[:-1]
@@ -278,7 +281,7 @@ def _pooled_ap(
     precision: Float[np.ndarray, " K"], recall: Float[np.ndarray, " K"], curve: str
 ) -> float:
     """One number in [0, 1] for a curve of rising recall."""
-    if curve == "exact":
+    if curve == "all_point":
         height = np.maximum.accumulate(precision[::-1])[::-1]
         return float((np.diff(recall, prepend=0.0) * height).sum())
     precision = np.concatenate([[1.0], precision])

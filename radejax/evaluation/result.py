@@ -26,7 +26,7 @@ class Result:
         protocol: Name of the protocol.
         num_frames: Frames that take part.
         score_threshold: Predictions need a score above this.
-        skip_empty: Frame rule that was used.
+        empty_frames: Frame rule that was used.
         roi: Name of the region of interest.
         label_version: Label revision of the ground truth, if known.
         precision: Precision along the curve (K-Radar: after making it monotone).
@@ -44,7 +44,7 @@ class Result:
     protocol: str
     num_frames: int
     score_threshold: float
-    skip_empty: str | None
+    empty_frames: str | None
     roi: str
     label_version: str | None
     precision: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
@@ -66,7 +66,7 @@ class Result:
         """
         return (
             f"ap_{self.space}_iou{100 * self.iou:.4g}/{self.protocol}"
-            f"/score>{self.score_threshold:g}/skip={self.skip_empty or 'none'}"
+            f"/score>{self.score_threshold:g}/skip={self.empty_frames or 'none'}"
             f"/labels={self.label_version or 'unknown'}/roi={self.roi}"
             + ("/simulated" if self.is_simulated else "")
         )

@@ -97,7 +97,9 @@ def evaluate(
         _log.info("step %s, split %s\n%s", step, split, made.text)
         if models.has_camera(model):
             pictures.draw_camera_share(model, variables, data, frames, folder)
-        if drawer.draw_spread(folder / "pictures", config.evaluation.num_pictures):
+        if drawer.draw_spread(
+            folder / "pictures", config.evaluation.num_visualizations
+        ):
             drawer.draw_scenes(folder / "scenes.png")
         pictures.draw_curves(
             workdir, folder / "training.png", is_simulated=frames.is_simulated
@@ -146,7 +148,7 @@ def evaluate_run(
         other: Other data than the run's own; projected if they are not yet.
         **changes: Fields of `config.evaluation` in place of the run's, and `classes`,
             some of the run's, `run` and `invalid_sizes` of the report's `Options`. A
-            `score_threshold` or `skip_empty` that is given here holds for `exact` too.
+            `score_threshold` or `empty_frames` that is given here holds for `all_point` too.
 
     Returns:
         The report that was written; None on all processes but the first.
@@ -216,7 +218,7 @@ def _changed(
             f"classes has {unknown[0]!r}, expected some of the run's: "
             f"{', '.join(config.classes)}"
         )
-    if changes.keys() & {"score_threshold", "skip_empty"}:
+    if changes.keys() & {"score_threshold", "empty_frames"}:
         options["uncut"] = ()
     config = config.copy_and_resolve_references()
     config.evaluation = ConfigDict(values)
@@ -324,7 +326,7 @@ def report_options(config: ConfigDict, name: str) -> Options:
         score_threshold=options.score_threshold,
         uncut=(RECOMMENDED,),
         min_score=_lowest_score(config),
-        skip_empty=None if options.skip_empty == "none" else options.skip_empty,
+        empty_frames=None if options.empty_frames == "none" else options.empty_frames,
         label_version=config.data.label_version,
         invalid_sizes="false_positive",
         bootstrap=0,

@@ -140,14 +140,14 @@ def test_evaluate_takes_flags_as_its_script_does(
     _run("evaluate", "--workdir=run", "--split=train")
     assert seen[1] == ("run", None, None)
     flags = "--roi=0,50,-5,5,-2,6 --min_score=0.01 --iou=0.5 --classes Sedan --name n"
-    _run("evaluate", "--workdir=run", *flags.split(), "--protocols=exact,auc")
+    _run("evaluate", "--workdir=run", *flags.split(), "--protocols=all_point,auc")
     given = {k: v for k, v in scoring[2].items() if k not in scoring[1]}
     assert given == {
         "roi": (0.0, 50.0, -5.0, 5.0, -2.0, 6.0),
         "min_score": 0.01,
         "iou_thresholds": (0.5,),
         "classes": ("Sedan",),
-        "protocols": ("exact", "auc"),
+        "protocols": ("all_point", "auc"),
         "run": "n",
     }
     wrong = _run("evaluate", "--workdir", "run", "--data=", "--debug")

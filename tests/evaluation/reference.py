@@ -209,7 +209,7 @@ def average_precision(protocol, truth, found, cls, space, iou, *, classes, cut=0
     variants = {
         "kradar_r40": "revised",
         "kradar_r11": "legacy",
-        "kradar_r40_yaw": "yaw",
+        "kradar_r40_corrected": "yaw",
     }
     terms = (truth, found, cls, space, iou)
     if protocol in variants:
@@ -218,6 +218,6 @@ def average_precision(protocol, truth, found, cls, space, iou, *, classes, cut=0
         keep = [i for i, s in enumerate(found["score"]) if s > cut]
         found = {k: [v[i] for i in keep] for k, v in found.items()}
     terms = (truth, found, cls, space, iou)
-    if protocol == "exact":
+    if protocol == "all_point":
         return exact(*terms, classes=classes)
     return radenet(*terms, classes=classes, curve=protocol)

@@ -25,9 +25,10 @@ METHODS = {
 VARIANTS = {
     "kradar_r40": "revised",
     "kradar_r11": "legacy",
-    "kradar_r40_yaw": "revised_yaw_corrected",
+    "kradar_r40_corrected": "revised_yaw_corrected",
 }
-PLAIN = ("voc11", "recall41", "coco101", "auc", "exact")
+NAMES_IN_GOLDEN = {"exact": "all_point", "kradar_r40_yaw": "kradar_r40_corrected"}
+PLAIN = ("voc11", "recall41", "coco101", "auc", "all_point")
 
 
 def car(x=20.0, y=0.0, **changes):
@@ -62,13 +63,13 @@ def test_perfect_predictions_in_every_protocol():
     truth = truth_of(*((f, car(10 + f), "Sedan") for f in range(10)))
     found = found_of(*((f, car(10 + f), "Sedan", 0.9 - f / 100) for f in range(10)))
     for protocol, expected in {
-        "exact": 100.0,
+        "all_point": 100.0,
         "voc11": 1000 / 11,
         "recall41": 4000 / 41,
         "coco101": 10000 / 101,
         "auc": 100.0,
         "kradar_r40": 1000 / 41,  # ten matches fill ten of 41 samples
-        "kradar_r40_yaw": 1000 / 41,
+        "kradar_r40_corrected": 1000 / 41,
         "kradar_r11": 300 / 11,  # samples 0, 4 and 8
     }.items():
         results = evaluate(truth, found, classes=["Sedan"], protocol=protocol)
@@ -85,7 +86,7 @@ def test_detections_without_a_hit_get_radenets_floor():
         "recall41": 100 / 41,
         "coco101": 100 / 101,
         "auc": 0.0,
-        "exact": 0.0,
+        "all_point": 0.0,
         "kradar_r40": 0.0,
     }.items():
         result = evaluate(truth, found, classes=["Sedan"], protocol=protocol)[0]
@@ -103,7 +104,7 @@ def test_exact_by_hand():
         (2, car(), "Sedan", 0.6),
         (3, car(50), "Sedan", 0.5),
     )
-    result = evaluate(truth, found, classes=["Sedan"], protocol="exact")[0]
+    result = evaluate(truth, found, classes=["Sedan"], protocol="all_point")[0]
     assert result.ap == pytest.approx(62.5, abs=1e-12)
     np.testing.assert_allclose(result.precision, [1, 1 / 2, 2 / 3, 3 / 4, 3 / 5])
     np.testing.assert_allclose(result.recall, [1 / 4, 1 / 4, 2 / 4, 3 / 4, 3 / 4])
@@ -113,9 +114,9 @@ def test_equal_scores_are_one_threshold():
     truth = truth_of((0, car(), "Sedan"), (1, car(), "Sedan"))
     hit, miss = (0, car(), "Sedan", 0.5), (1, car(60), "Sedan", 0.5)
     for rows in ((hit, miss), (miss, hit)):
-        result = evaluate(truth, found_of(*rows), classes=["Sedan"], protocol="exact")[
-            0
-        ]
+        result = evaluate(
+            truth, found_of(*rows), classes=["Sedan"], protocol="all_point"
+        )[0]
         assert result.ap == pytest.approx(25.0)  # recall 1/2 at precision 1/2
 
 
@@ -130,14 +131,19 @@ def test_frame_rules_differ_as_described():
     )
     for skip, false in (("class", 1), ("frame", 2), (None, 3)):
         result = evaluate(
-            truth, found, classes=TWO, protocol="exact", skip_empty=skip, spaces="bev"
+            truth,
+            found,
+            classes=TWO,
+            protocol="all_point",
+            empty_frames=skip,
+            spaces="bev",
         )[0]
         assert result.ap == pytest.approx(100 / (1 + false))
         assert result.num_det == 1 + false
-        assert result.skip_empty == skip
+        assert result.empty_frames == skip
     # Only the classes that are evaluated decide which frames are empty.
     result = evaluate(
-        truth, found, classes=["Sedan"], protocol="exact", skip_empty="frame"
+        truth, found, classes=["Sedan"], protocol="all_point", empty_frames="frame"
     )[0]
     assert result.num_det == 2
 
@@ -150,7 +156,7 @@ def test_kradar_compares_boxes_with_length_and_width_exchanged():
     )
     terms = {"classes": ["Sedan"], "iou_thresholds": 0.4, "spaces": "bev"}
     assert evaluate(truth, found, protocol="kradar_r40", **terms)[0].ap > 0
-    assert evaluate(truth, found, protocol="kradar_r40_yaw", **terms)[0].ap == 0
+    assert evaluate(truth, found, protocol="kradar_r40_corrected", **terms)[0].ap == 0
 
 
 def test_kradar_r11_takes_z_as_the_top():
@@ -158,15 +164,15 @@ def test_kradar_r11_takes_z_as_the_top():
     tall, flat = car(h=3.0), car(h=1.0)
     truth, found = truth_of((0, tall, "Sedan")), found_of((0, flat, "Sedan", 0.9))
     data = EvaluationSet(truth, found, classes=["Sedan"])
-    assert data.overlaps("exchanged")[1] == pytest.approx(1 / 3)
-    assert data.overlaps("exchanged_top")[1] == pytest.approx(1 / 3)
+    assert data.overlaps("swapped_lw")[1] == pytest.approx(1 / 3)
+    assert data.overlaps("swapped_lw_z_top")[1] == pytest.approx(1 / 3)
     found["box"][0, 2] = -1.0
     data = EvaluationSet(truth, found, classes=["Sedan"])
-    assert data.overlaps("exchanged")[1] == pytest.approx(1 / 3)
-    assert data.overlaps("exchanged_top")[1] == pytest.approx(1 / 3)
+    assert data.overlaps("swapped_lw")[1] == pytest.approx(1 / 3)
+    assert data.overlaps("swapped_lw_z_top")[1] == pytest.approx(1 / 3)
     found["box"][0, 2] = 0.5
     data = EvaluationSet(truth, found, classes=["Sedan"])
-    assert data.overlaps("exchanged_top")[1] == pytest.approx(0.5 / 3.5)
+    assert data.overlaps("swapped_lw_z_top")[1] == pytest.approx(0.5 / 3.5)
 
 
 def test_kradar_rounds_ground_truth_only():
@@ -194,7 +200,7 @@ def test_thresholds_are_strict(protocol):
 
 def test_score_cut_is_strict_and_zero_keeps_all_in_plain_protocols():
     truth = truth_of((0, car(), "Sedan"))
-    for protocol in ("exact", "kradar_r40"):
+    for protocol in ("all_point", "kradar_r40"):
         for score, cut, kept in ((0.3, 0.3, 0), (0.31, 0.3, 1)):
             found = found_of((0, car(), "Sedan", score))
             result = evaluate(
@@ -206,7 +212,7 @@ def test_score_cut_is_strict_and_zero_keeps_all_in_plain_protocols():
             )[0]
             assert result.num_det == kept
     found = found_of((0, car(), "Sedan", 0.0))
-    assert evaluate(truth, found, classes=["Sedan"], protocol="exact")[0].ap == 100
+    assert evaluate(truth, found, classes=["Sedan"], protocol="all_point")[0].ap == 100
     assert evaluate(truth, found, classes=["Sedan"])[0].num_det == 0
 
 
@@ -275,7 +281,8 @@ def test_golden_scenes(golden):
         )
         frames = {"frame": np.arange(data[f"{scene}_num_frames"])}
         shared_set = EvaluationSet(truth, found, classes=classes, frames=frames)
-        for p, protocol in enumerate(data["protocols"].tolist()):
+        for p, name in enumerate(data["protocols"].tolist()):
+            protocol = NAMES_IN_GOLDEN.get(name, name)
             for c, cut in enumerate(data["cuts"].tolist()):
                 ap = [
                     result.ap
@@ -380,7 +387,7 @@ def test_radenet_fixture(kradar_fixture, shared):
             mask = None if condition == "all" else frames["weather"] == condition
             for protocol, method in METHODS.items():
                 results = data.results(
-                    protocol, iou_thresholds=iou, skip_empty=skip, weights=mask
+                    protocol, iou_thresholds=iou, empty_frames=skip, weights=mask
                 )
                 for result in results:
                     aps = spaces[result.space][method]["aps"]
@@ -434,7 +441,7 @@ def test_map_fixture(shared):
                 protocol=protocol,
                 roi=run["roi"],
                 spaces={"2D": "bev", "3D": "3d"}[run["dim"]],
-                skip_empty="class" if run["skip_frames_without_gt"] else None,
+                empty_frames="class" if run["skip_frames_without_gt"] else None,
             )
             aps = run["results"][method]["aps"]
             assert {r.cls for r in results if r.is_defined} == set(aps)
@@ -470,7 +477,7 @@ def test_perfect_predictions_are_worth_100_in_the_recommended_protocol(
         for result in evaluate(
             truth, found, classes=TWO, protocol=protocol, frames=frames
         ):
-            if protocol in ("exact", "auc") and result.is_defined:
+            if protocol in ("all_point", "auc") and result.is_defined:
                 assert result.ap == pytest.approx(100, abs=1e-6)
             else:
                 assert not result.ap > caps.get(protocol, 100) + 1e-9
@@ -553,7 +560,7 @@ def test_weights_repeat_frames(random_scene):
             parts.append(part)
         copies.append({k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
     data = EvaluationSet(truth, found, classes=TWO, frames=frames)
-    for protocol in ("exact", "kradar_r40", "kradar_r11", "kradar_r40_yaw"):
+    for protocol in ("all_point", "kradar_r40", "kradar_r11", "kradar_r40_corrected"):
         weighted = data.results(protocol, iou_thresholds=(0.2, 0.5), weights=weight)
         repeated = evaluate(
             *copies, classes=TWO, protocol=protocol, iou_thresholds=(0.2, 0.5)
@@ -572,8 +579,8 @@ def test_unknown_things_are_named():
         evaluate(truth, found, protocol="r40")
     with pytest.raises(UserError, match="spaces must be among"):
         evaluate(truth, found, spaces="2d")
-    with pytest.raises(UserError, match="skip_empty must be"):
-        evaluate(truth, found, skip_empty="all")
+    with pytest.raises(UserError, match="empty_frames must be"):
+        evaluate(truth, found, empty_frames="all")
     with pytest.raises(UserError, match="unknown roi 'wider'; known: narrow, wide"):
         evaluate(truth, found, roi="wider")
     with pytest.raises(UserError, match="roi must be"):

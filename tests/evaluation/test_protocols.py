@@ -73,7 +73,7 @@ def test_no_matches_no_thresholds():
         ("recall41", (20 * 1 + 20 * 2 / 3) / 41),
         ("coco101", (50 * 1 + 50 * 2 / 3) / 101),
         ("auc", 0.5 + 0.5 * (1 / 2 + 2 / 3) / 2),
-        ("exact", 0.5 + 0.5 * 2 / 3),
+        ("all_point", 0.5 + 0.5 * 2 / 3),
     ],
 )
 def test_pooled_curves_by_hand(curve, expected):

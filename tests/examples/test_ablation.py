@@ -56,7 +56,7 @@ class _Runs:
         found["score"] = np.full(is_found.sum(), 0.9)
         frames = {"frame": frame, "sequence": frame, "weather": np.full(60, "fog")}
         write_report(
-            truth, found, frames, out, protocols=("exact",), iou_thresholds=(0.3,),
+            truth, found, frames, out, protocols=("all_point",), iou_thresholds=(0.3,),
             classes=CLASSES, plots=False,
         )  # fmt: skip
 

@@ -33,7 +33,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
-    report = module.run_baseline(data, tmp_path, protocols=("exact",))
+    report = module.run_baseline(data, tmp_path, protocols=("all_point",))
     assert "Sedan from" in capsys.readouterr().out
     assert (tmp_path / "report.txt").read_text() == report.text
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -43,7 +43,7 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
 
     # The same fit, named: as from another folder.
     again = module.run_baseline(
-        data, tmp_path / "again", protocols=("exact",), fit_data=data
+        data, tmp_path / "again", protocols=("all_point",), fit_data=data
     )
     assert again.text == report.text
     # Fitted on training frames; each frame's predictions are those of the detector.

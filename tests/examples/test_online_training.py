@@ -64,7 +64,7 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     with pytest.raises(UserError, match=r"never written, .* give --data ROOT"):
         evaluate_run(whole)
     data = simulate_dataset(_config().simulation, tmp_path / "data", progress=False)
-    evaluate_run(whole, other=Sources(data=(str(data),)), num_pictures=0)
+    evaluate_run(whole, other=Sources(data=(str(data),)), num_visualizations=0)
     assert (whole / "evaluation_data" / "metrics.json").exists()
     finer = default_config() | {"train_sequences": 0, "test_sequences": 1}
     finer |= {"frames_per_sequence": 1, "output": "projection"}

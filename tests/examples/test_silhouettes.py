@@ -30,7 +30,7 @@ def _run(score_of_camera: float, seen: list[Any]) -> Any:
         found["score"] = np.where(frame % 2 == 0, 0.9, score_of_camera)[is_found]
         frames = {"frame": frame, "sequence": frame, "simulated": np.full(40, True)}
         write_report(
-            truth, found, frames, workdir / "evaluation", protocols=("exact",),
+            truth, found, frames, workdir / "evaluation", protocols=("all_point",),
             iou_thresholds=(0.3,), classes=CLASSES, plots=False,
         )  # fmt: skip
         return workdir

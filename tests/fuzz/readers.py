@@ -239,7 +239,7 @@ def _workdir(folder: Folder) -> None:
     names = [*seeds._KEYS, "ap", "num_gt"]
     lines = [
         names,
-        *(["exact", "all", "Sedan", "bev", "0.3", "12.5", "7"] for _ in range(3)),
+        *(["all_point", "all", "Sedan", "bev", "0.3", "12.5", "7"] for _ in range(3)),
     ]
     lines[1:] = [line[: len(names)] for line in lines[1:]]
     (folder / "metrics.csv").write_text("\n".join(map(",".join, lines)))

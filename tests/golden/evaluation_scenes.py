@@ -15,13 +15,13 @@ import numpy as np
 HERE = pathlib.Path(__file__).parent
 PROTOCOLS = (
     "kradar_r40",
-    "kradar_r40_yaw",
+    "kradar_r40_corrected",
     "kradar_r11",
     "voc11",
     "recall41",
     "coco101",
     "auc",
-    "exact",
+    "all_point",
 )
 SEEDS, IOUS, CUTS = (101, 102, 103), (0.3, 0.5), (0.0, 0.35)
 CLASSES = ("Sedan", "Bus or Truck", "Pedestrian")

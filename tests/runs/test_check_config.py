@@ -90,7 +90,7 @@ WRONG = [
     ("evaluation.protocols", ("nope",)),
     ("evaluation.protocols", ()),
     ("evaluation.protocols", "kradar_r40"),
-    ("evaluation.skip_empty", None),
+    ("evaluation.empty_frames", None),
     ("evaluation.iou_thresholds", (2.0,)),
     ("evaluation.iou_thresholds", (0.3, NAN)),
     ("evaluation.bootstrap", -1),

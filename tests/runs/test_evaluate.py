@@ -82,13 +82,13 @@ def _config(**evaluation: object) -> ConfigDict:
 
 
 def test_reports_of_runs_cut_all_but_exact() -> None:
-    options = report_options(_config(skip_empty="class"), "run")
+    options = report_options(_config(empty_frames="class"), "run")
     assert options.cut("kradar_r40") == 0.3
-    assert options.cut("exact") == options.min_score == 0.05
+    assert options.cut("all_point") == options.min_score == 0.05
     assert options.frame_rule("coco101") == "class"
-    assert options.frame_rule("exact") == "protocol"
+    assert options.frame_rule("all_point") == "protocol"
     # A cut below what the run would keep is kept.
-    assert report_options(_config(score_threshold=0.0), "run").cut("exact") == 0.0
+    assert report_options(_config(score_threshold=0.0), "run").cut("all_point") == 0.0
 
 
 def test_every_option_is_given_when_evaluating() -> None:

@@ -122,7 +122,7 @@ def test_labels_are_read_once_and_the_model_is_built_once(
     config.model.update(doppler_bins=4, elevation_bins=3, cbam="off", widths=(8,))
     config.model.update(decoder_width=8, num_groups=4, neck="plain", heads="default")
     config.train.update(num_epochs=1, evaluate_every_epochs=1)
-    config.evaluation.num_pictures = 0
+    config.evaluation.num_visualizations = 0
     evaluated = []
     make = validation.tables_from_frames
     monkeypatch.setattr(

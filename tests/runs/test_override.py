@@ -29,7 +29,7 @@ from radejax.runs.override import override
         ("model.input_stem", "true", True),
         ("model.input_stem", "False", False),
         ("evaluation.iou_thresholds", "0.5", (0.5,)),
-        ("evaluation.protocols", "exact,coco101", ("exact", "coco101")),
+        ("evaluation.protocols", "all_point,coco101", ("all_point", "coco101")),
         ("logging.wandb_project", "123", "123"),
     ],
 )

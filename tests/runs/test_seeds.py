@@ -28,9 +28,9 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         folder.mkdir(parents=True)
         (folder / "metrics.csv").write_text(
             HEAD
-            + f"exact,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
-            + "exact,all,Bicycle,3d,0.3,,0\n"
-            + f"exact,rain,Sedan,3d,0.3,{config.seed},3\n"
+            + f"all_point,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
+            + "all_point,all,Bicycle,3d,0.3,,0\n"
+            + f"all_point,rain,Sedan,3d,0.3,{config.seed},3\n"
         )
         return pathlib.Path(workdir)
 

@@ -54,7 +54,7 @@ def resample(
     space: str,
     iou: float,
     *,
-    skip_empty: str | None = PROTOCOL_DEFAULT,
+    empty_frames: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
 ) -> Float[np.ndarray, "B _"]:
     """`[B, C + 1]` AP of every class, then their mean, in every resample.
@@ -62,7 +62,7 @@ def resample(
     NaN where a resample has no object of a class; the mean is over classes that occur.
     """
     chosen = protocols.get_protocol(protocol)
-    skip = chosen.frame_rule(skip_empty)
+    skip = chosen.frame_rule(empty_frames)
     terms = Terms(chosen, space, iou, float(score_threshold))
     num_classes = len(data.classes)
     among = np.any(weights, axis=0)
@@ -235,7 +235,7 @@ def add_intervals(
     resamples: int,
     seed: int,
     masks: Mapping[str, Bool[np.ndarray, " F"]] | None = None,
-    skip_empty: str | None = PROTOCOL_DEFAULT,
+    empty_frames: str | None = PROTOCOL_DEFAULT,
     score_threshold: float = 0.0,
 ) -> dict[tuple[str, str, str, str, float], tuple[float, float]]:
     """95 % intervals by (protocol, condition, class, space, IoU).
@@ -248,7 +248,7 @@ def add_intervals(
         seed: Of the resampling.
         masks: Of frames by condition, resampled within the condition's sequences.
             Conditions of a single sequence get no interval.
-        skip_empty: Frame rule.
+        empty_frames: Frame rule.
         score_threshold: Score cut.
     """
     if "sequence" not in frames:
@@ -266,7 +266,7 @@ def add_intervals(
         for protocol, space, iou in terms:
             ap = resample(
                 data, weights, protocol, space, iou,
-                skip_empty=skip_empty, score_threshold=score_threshold,
+                empty_frames=empty_frames, score_threshold=score_threshold,
             )  # fmt: skip
             for index, name in enumerate((*data.classes, "mean")):
                 found[protocol, condition, name, space, iou] = interval(ap[:, index])

@@ -118,7 +118,7 @@ def _by_slice(
             is_tp=is_tp,
             weight=np.ones_like(order),
             num_gt=num_gt,
-            curve="exact",
+            curve="all_point",
         )
         above = score > operating_score
         num_det, found = int(above.sum()), int(is_tp[above].sum())

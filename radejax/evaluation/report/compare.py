@@ -69,7 +69,7 @@ def compare_files(
     cut = max(options.score_threshold, *map(stored_from, paths))
     options = dataclasses.replace(options, score_threshold=cut)
     first, *others = [_load_run(path, source, options) for path in paths]
-    named = [p for p in ("exact", "kradar_r40") if p in options.protocols]
+    named = [p for p in ("all_point", "kradar_r40") if p in options.protocols]
     parts, rows = [], []
     for path, (data, frames) in zip(paths[1:], others, strict=True):
         found = bootstrap.compare(

@@ -33,7 +33,7 @@ ORDER = {
 
 _OF_RESULT = (
     *("num_gt", "num_det", "num_frames", "score_threshold"),
-    *("skip_empty", "roi", "label_version"),
+    *("empty_frames", "roi", "label_version"),
 )
 
 
@@ -47,7 +47,7 @@ class Options:
         iou_thresholds: IoU thresholds.
         protocols: Names of protocols.
         score_threshold: Score cut of all APs.
-        skip_empty: Frame rule; "protocol" takes each protocol's own.
+        empty_frames: Frame rule; "protocol" takes each protocol's own.
         uncut: Protocols without the score cut and with their own frame rule.
         min_score: Predictions were stored from here on: nothing is cut below it.
         roi: Region of interest for both sides.
@@ -72,7 +72,7 @@ class Options:
     iou_thresholds: tuple[float, ...] = (0.3, 0.5, 0.7)
     protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
     score_threshold: float = 0.0
-    skip_empty: str | None = PROTOCOL_DEFAULT
+    empty_frames: str | None = PROTOCOL_DEFAULT
     uncut: tuple[str, ...] = ()
     min_score: float = 0.0
     roi: str | Sequence[float] | None = "narrow"
@@ -97,7 +97,7 @@ class Options:
     @property
     def main_protocols(self) -> tuple[str, ...]:
         """Protocols shown in full on the console: the usual ones, or else the first."""
-        usual = ("exact", "kradar_r40", "coco101")
+        usual = ("all_point", "kradar_r40", "coco101")
         chosen = tuple(name for name in usual if name in self.protocols)
         return chosen or self.protocols[:1]
 
@@ -107,8 +107,8 @@ class Options:
         return max(own, self.min_score)
 
     def frame_rule(self, protocol: str) -> str | None:
-        """As `skip_empty`."""
-        return PROTOCOL_DEFAULT if protocol in self.uncut else self.skip_empty
+        """As `empty_frames`."""
+        return PROTOCOL_DEFAULT if protocol in self.uncut else self.empty_frames
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a report, without callbacks."""
@@ -221,7 +221,7 @@ def measure(
         results = data.results(
             protocol,
             iou_thresholds=options.iou_thresholds,
-            skip_empty=options.frame_rule(protocol),
+            empty_frames=options.frame_rule(protocol),
             score_threshold=options.cut(protocol),
             weights=mask,
             curves=False,

@@ -62,7 +62,7 @@ def our_terms(rows: Rows, options: Options, origin: Origin) -> Terms:
         labels=made.label_version,
         classes=tuple(sorted(options.classes)),
         score_cut=made.score_threshold,
-        skip=made.skip_empty,
+        skip=made.empty_frames,
         roi=made.roi,
         split=origin.split,
         frames=origin.num_frames,
@@ -146,7 +146,7 @@ def _our_table_1_rows(
 ) -> list[list[str]]:
     """Our row in each protocol that matters, and differences to comparable rows."""
     title = SPACE_TITLES[space]
-    wanted = dict.fromkeys((options.paper_protocol, "kradar_r40", "exact"))
+    wanted = dict.fromkeys((options.paper_protocol, "kradar_r40", "all_point"))
     ours = {
         protocol: [
             shown(rows, (protocol, name, "Sedan", space, iou)) for name in CONDITIONS

@@ -56,7 +56,7 @@ def write_report(
     options: Options | None = None,
     **changes: Any,
 ) -> Report:
-    """Evaluates a run in the protocols asked for, and `exact`, and writes its report.
+    """Evaluates a run in the protocols asked for, and `all_point`, and writes its report.
 
     Args:
         ground_truth: Columns as in `average_precision.evaluate`.
@@ -161,7 +161,7 @@ def with_intervals(
             resamples=options.bootstrap,
             seed=options.seed,
             masks=weathers if name in main else {},
-            skip_empty=options.frame_rule(name),
+            empty_frames=options.frame_rule(name),
             score_threshold=options.cut(name),
         )
     result = []

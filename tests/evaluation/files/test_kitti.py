@@ -57,7 +57,7 @@ def test_round_trip_gives_the_same_results(tmp_path, scene):
     for name in ("weather", "environment", "time"):
         np.testing.assert_array_equal(frames2[name], frames[name][frames2["frame"]])
     np.testing.assert_array_equal(truth2["box"], np.round(truth["box"], 2))
-    for protocol in ("kradar_r40", "kradar_r11", "kradar_r40_yaw"):
+    for protocol in ("kradar_r40", "kradar_r11", "kradar_r40_corrected"):
         terms = {"classes": CLASSES, "protocol": protocol, "iou_thresholds": (0.3, 0.5)}
         one = evaluate(truth, found, frames=frames, **terms)
         other = evaluate(truth2, found2, frames=frames2, **terms)

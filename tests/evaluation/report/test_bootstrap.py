@@ -40,7 +40,7 @@ def test_weights_draw_whole_sequences():
 def test_weight_one_is_the_result_itself(scene):
     data = make(*scene)
     ones = np.ones((1, 60), int)
-    for protocol in ("exact", "kradar_r40", "coco101"):
+    for protocol in ("all_point", "kradar_r40", "coco101"):
         ap = bootstrap.resample(data, ones, protocol, "3d", 0.3)[0]
         results = data.results(protocol, iou_thresholds=0.3, spaces="3d")
         np.testing.assert_allclose(ap[:2], [r.ap for r in results])
@@ -50,22 +50,22 @@ def test_weight_one_is_the_result_itself(scene):
 def test_weights_of_a_condition_give_the_condition(scene):
     data, mask = make(*scene), scene[2]["weather"] == "fog"
     weights = np.stack([mask, 2 * mask]).astype(int)
-    for protocol in ("exact", "kradar_r40", "kradar_r11", "voc11"):
+    for protocol in ("all_point", "kradar_r40", "kradar_r11", "voc11"):
         ap = bootstrap.resample(data, weights[:1], protocol, "3d", 0.3)[0]
         results = data.results(protocol, iou_thresholds=0.3, spaces="3d", weights=mask)
         np.testing.assert_allclose(ap[:2], [r.ap for r in results], rtol=0, atol=1e-12)
     # Doubling every frame changes nothing but the rounding of recall steps.
-    ap = bootstrap.resample(data, weights, "exact", "3d", 0.3)
+    ap = bootstrap.resample(data, weights, "all_point", "3d", 0.3)
     np.testing.assert_allclose(ap[0], ap[1], atol=1e-9)
 
 
 def test_interval_covers_the_number_and_grows_with_the_level(scene):
     data = make(*scene)
     found = bootstrap.add_intervals(
-        data, scene[2], [("exact", "3d", 0.3)], resamples=200, seed=1
+        data, scene[2], [("all_point", "3d", 0.3)], resamples=200, seed=1
     )
-    result = data.results("exact", iou_thresholds=0.3, spaces="3d")[0]
-    low, high = found["exact", "all", "Sedan", "3d", 0.3]
+    result = data.results("all_point", iou_thresholds=0.3, spaces="3d")[0]
+    low, high = found["all_point", "all", "Sedan", "3d", 0.3]
     assert low < result.ap < high
     samples = np.arange(101.0)
     assert bootstrap.interval(samples) == pytest.approx((2.5, 97.5))
@@ -79,7 +79,7 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
     intervals = bootstrap.add_intervals(
         make(truth, found, frames),
         frames,
-        [("exact", "bev", 0.3)],
+        [("all_point", "bev", 0.3)],
         resamples=20,
         seed=0,
         masks=masks,
@@ -108,7 +108,11 @@ def test_a_run_does_not_differ_from_itself(scene):
 def test_a_large_difference_is_real_and_antisymmetric(scene):
     truth, found, frames = scene
     good, bad = make(truth, found, frames), make(truth, thin(found, 0.3), frames)
-    terms = {"resamples": 1000, "iou_thresholds": (0.2,), "protocol_names": ("exact",)}
+    terms = {
+        "resamples": 1000,
+        "iou_thresholds": (0.2,),
+        "protocol_names": ("all_point",),
+    }
     forward = bootstrap.compare(bad, good, frames["sequence"], **terms)
     backward = bootstrap.compare(good, bad, frames["sequence"], **terms)
     for one, other in zip(forward, backward, strict=True):
@@ -126,13 +130,13 @@ def test_the_comparison_is_paired(scene):
     truth, found, frames = scene
     one, other = make(truth, found, frames), make(truth, thin(found, 0.95), frames)
     row = bootstrap.compare(
-        one, other, frames["sequence"], resamples=300, protocol_names=("exact",)
+        one, other, frames["sequence"], resamples=300, protocol_names=("all_point",)
     )[0]
     weights = bootstrap.sequence_weights(frames["sequence"], resamples=300, seed=0)
     apart = bootstrap.sequence_weights(frames["sequence"], resamples=300, seed=1)
     gap = (
-        bootstrap.resample(other, weights, "exact", "bev", 0.3)
-        - bootstrap.resample(one, apart, "exact", "bev", 0.3)
+        bootstrap.resample(other, weights, "all_point", "bev", 0.3)
+        - bootstrap.resample(one, apart, "all_point", "bev", 0.3)
     )[:, 0]
     low, high = bootstrap.interval(gap)
     assert row.high - row.low < 0.7 * (high - low)
@@ -142,7 +146,7 @@ def test_holm():
     p = [0.01, 0.04, 0.03, 0.005]
     rows = [
         bootstrap.Comparison(
-            "a", "3d", 0.3, "exact", 0, 0, 0, 0, 0, value, value, False
+            "a", "3d", 0.3, "all_point", 0, 0, 0, 0, 0, value, value, False
         )
         for value in p
     ]

@@ -80,7 +80,7 @@ def test_distance_bands_sum_to_everything(random_scene):
     assert sum(n.num_det for n in numbers.values()) == (data.pred.score > 0.3).sum()
     whole = breakdown.by_distance(data, "3d", 0.3, edges_m=(0, 1000))
     for cls, result in zip(
-        CLASSES, data.results("exact", iou_thresholds=0.3, spaces="3d"), strict=True
+        CLASSES, data.results("all_point", iou_thresholds=0.3, spaces="3d"), strict=True
     ):
         assert whole["0-1000 m", cls].ap == pytest.approx(result.ap)
 

@@ -13,7 +13,7 @@ from radejax.evaluation.report import compare as commands
 from radejax.evaluation.report import report
 from radejax.evaluation.report.measure import Options
 
-OPTIONS = Options(roi=None, plots=False, protocols=("exact", "kradar_r40"))
+OPTIONS = Options(roi=None, plots=False, protocols=("all_point", "kradar_r40"))
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +94,11 @@ def test_predictions_that_were_stored_cut_say_so(stored, scene):
     kept = {k: v[found["score"] > 0.3] for k, v in found.items()}
     for name, table, min_score in (("old", kept, 0.3), ("new", found, 0.05)):
         options = dataclasses.replace(
-            OPTIONS, score_threshold=0.3, uncut=("exact",), min_score=min_score
+            OPTIONS, score_threshold=0.3, uncut=("all_point",), min_score=min_score
         )
         made = report.write_report(truth, table, frames, folder / name, options)
         cuts = {r.result.protocol: r.result.score_threshold for r in made.rows}
-        assert cuts == {"exact": min_score, "kradar_r40": 0.3}
+        assert cuts == {"all_point": min_score, "kradar_r40": 0.3}
         (folder / name / "source.json").write_text('{"roots": []}')
     path = folder / "old" / "metrics.json"
     content = json.loads(path.read_text())
@@ -107,7 +107,7 @@ def test_predictions_that_were_stored_cut_say_so(stored, scene):
     old = commands.evaluate_files(folder / "old", folder / "a", Source(), OPTIONS)
     assert "has predictions from score 0.3 on only" in old.metrics["warnings"][0]
     assert "WARNING: " in old.text
-    assert "/exact/score>0.3/" in old.metrics["ap"][0]["name"]
+    assert "/all_point/score>0.3/" in old.metrics["ap"][0]["name"]
     new = commands.evaluate_files(folder / "new", folder / "b", Source(), OPTIONS)
     assert new.metrics["warnings"] == []
     runs = [folder / "old", folder / "new"]
@@ -132,11 +132,11 @@ def test_command_line(stored):
     done = run(
         "--predictions", folder / "found.json", "--ground_truth", source.ground_truth,
         "--frames", source.frames, "--roi", "none", "--out", folder / "out",
-        "--protocols", "exact,kradar_r40", "--iou", "0.3", "--classes", "Sedan",
+        "--protocols", "all_point,kradar_r40", "--iou", "0.3", "--classes", "Sedan",
         "--bootstrap", "10",
     )  # fmt: skip
     assert done.exit_code == 0, done.stderr
-    assert "AP 3D / BEV at IoU 0.3, exact" in done.stdout
+    assert "AP 3D / BEV at IoU 0.3, all_point" in done.stdout
     assert (folder / "out" / "metrics.json").is_file()
     compared = run(
         "--compare", folder / "out", folder / "out", "--bootstrap", 20,

@@ -107,7 +107,7 @@ def test_a_difference_stands_exactly_where_terms_are_the_same(real, tmp_path):
     [
         ({"protocols": ("kradar_r40",)}, "protocol: coco101, ours kradar_r40"),
         ({"score_threshold": 0.0}, "score cut: 0.3, ours 0.0"),
-        ({"skip_empty": "frame"}, "skip: class, ours frame"),
+        ({"empty_frames": "frame"}, "skip: class, ours frame"),
         ({"roi": "wide"}, "roi: narrow, ours wide"),
         ({"label_version": "v2.0"}, "labels: v2.1, ours v2.0"),
         ({"classes": ("Sedan",)}, "ours Sedan"),

@@ -210,13 +210,13 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
         frames,
         tmp_path,
         invalid_sizes="false_positive",
-        protocols=("exact",),
+        protocols=("all_point",),
         **TERMS,
     )
     what = "predictions: size not positive, kept as false positives"
     assert made.metrics["left_out"][what] == 1
     assert made.metrics["left_out"]["predictions: size clipped to 0.01 m, kept"] == 2
-    whole = evaluate(truth, found, protocol="exact", frames=frames)
+    whole = evaluate(truth, found, protocol="all_point", frames=frames)
     row = made.rows[0].result
     assert row.num_det == whole[0].num_det
     with pytest.raises(UserError, match='"error" or "false_positive"'):
@@ -224,7 +224,7 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
 
 
 def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
-    out, terms = tmp_path / "out", {"protocols": ("exact",), **TERMS}
+    out, terms = tmp_path / "out", {"protocols": ("all_point",), **TERMS}
 
     def draw(frame, path):
         path.write_text(f"first, {frame}")
@@ -262,7 +262,7 @@ def test_frames_with_ids_only(scene, tmp_path):
     truth, found, frames = scene
     only = {"frame": frames["frame"]}
     made = report.write_report(
-        truth, found, only, tmp_path, Options(protocols=("exact",), **TERMS)
+        truth, found, only, tmp_path, Options(protocols=("all_point",), **TERMS)
     )
     assert {row.condition for row in made.rows} == {"all"}
     assert "Total" in made.text
@@ -280,7 +280,7 @@ def test_nothing_at_all(tmp_path, scene):
 def test_curves_are_drawn(scene, tmp_path):
     truth, found, frames = scene
     made = report.write_report(
-        truth, found, frames, tmp_path, roi=None, protocols=("exact",), run="x"
+        truth, found, frames, tmp_path, roi=None, protocols=("all_point",), run="x"
     )
     pictures = sorted(p.name for p in made.files if p.suffix == ".png")
     assert pictures == [
@@ -311,14 +311,17 @@ def test_panels_of_curves_say_the_protocol_and_none_is_blank():
     in_fog = [result("Sedan", False), result("Bicycle", False), result("Bus", False)]
     rain = [result("Sedan", True), *in_fog[1:]]
     results = {"all": everywhere, "fog": in_fog, "rain": rain}
-    figure = plots._precision_recall(results, "exact, bev, IoU 0.3")
+    figure = plots._precision_recall(results, "all_point, bev, IoU 0.3")
     titles = [ax.get_title() for ax in figure.axes]
-    assert titles == ["Sedan, exact, bev, IoU 0.3", "Bicycle, exact, bev, IoU 0.3"]
+    assert titles == [
+        "Sedan, all_point, bev, IoU 0.3",
+        "Bicycle, all_point, bev, IoU 0.3",
+    ]
     names = [[line.get_label()[:4] for line in ax.lines] for ax in figure.axes]
     assert names == [["all,", "rain"], ["all,"]]
     assert not figure.axes[0].texts
     missed = SimpleNamespace(**vars(result("Bus", True)) | {"recall": np.zeros(2)})
-    (panel,) = plots._precision_recall({"all": [missed]}, "exact").axes
+    (panel,) = plots._precision_recall({"all": [missed]}, "all_point").axes
     assert [text.get_text() for text in panel.texts] == ["none found"]
     # Fog has a colour of its own where it is not drawn: rain's is the third.
     assert figure.axes[0].lines[1].get_color() == SERIES_COLORS[2]
