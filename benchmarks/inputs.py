@@ -23,7 +23,7 @@ from radejax.data.records.files import RecordFileWriter, file_name
 from radejax.data.records.projections import Manifest, RecordSource, write_manifest
 from radejax.detection.decode import decode
 from radejax.geometry.boxes import bev_corners
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
 from radejax.simulation.radar import tensor
@@ -182,7 +182,7 @@ def loop_decode(logits: np.ndarray, params: np.ndarray) -> list[tuple]:
     found = {}
     for i, j, cls in np.argwhere(is_peak):
         if (i, j) not in found or scores[i, j, cls] > found[i, j][0]:
-            x, y = MAP_GRID.cell_to_ego(int(i), int(j))
+            x, y = MAP_GRID.bin_to_ego(int(i), int(j))
             dx, dy, z, length, width, height, sin, cos = params[i, j]
             box = (x + dx, y + dy, z, length, width, height, np.arctan2(sin, cos))
             found[i, j] = (scores[i, j, cls], cls, np.array(box))

@@ -32,7 +32,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from radejax.core.config import base_config, load_module, parse_options
-from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
+from radejax.geometry.camera import KRADAR_LIDAR_TO_RADAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 
@@ -161,8 +161,8 @@ def _axes(axes: LiftingAxes) -> ConfigDict:
 def _camera() -> ConfigDict:
     return ConfigDict(
         {
-            # "raw": the image as recorded, with lens distortion; "rectified",
-            # "pinhole" (no distortion, as released).
+            # "raw": the image as recorded, with lens distortion; "pinhole": without
+            # distortion, as released.
             "projection": "raw",
             # Shift from LiDAR to radar; None: each sequence's own.
             "ego_from_lidar_m": placeholder(tuple),

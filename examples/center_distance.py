@@ -25,7 +25,7 @@ from radejax.evaluation.matching import Pairs, match_free
 from radejax.evaluation.overlap import ranges
 from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.report.tables import Table, number
-from radejax.geometry.rotated_iou import bev_iou_np
+from radejax.geometry.rotated_iou import bev_iou
 
 DISTANCES_M = (0.0, 20.0, 40.0, 73.0)  # to the region's far corners
 IOU = 0.3
@@ -72,7 +72,7 @@ def overlapping(truth: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
     tried[1][:, :2] -= along
     tried[2][:, :2] -= across
     tried[3][:, 3:] = truth[:, 3:]
-    return [bev_iou_np(boxes, truth) > IOU for boxes in tried]
+    return [bev_iou(boxes[:, None], truth[:, None])[:, 0, 0] > IOU for boxes in tried]
 
 
 def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:

@@ -114,7 +114,7 @@ def object_rcs_db(
     """
     power_db = _power_db(projection, grid)
     rcs = apparent_rcs_db(power_db, grid.range_m[:, None], parameters)
-    centers = grid.cell_centers_ego()  # [R, A, 2]
+    centers = grid.bin_centers_ego()  # [R, A, 2]
     result = np.full(len(boxes), np.nan)
     for n, box in enumerate(boxes):
         cos, sin = np.cos(box[6]), np.sin(box[6])
@@ -206,7 +206,7 @@ def find_peaks(
     )
     cells = np.argwhere(is_peak)
     cells = cells[np.argsort(-power_db[tuple(cells.T)], kind="stable")]
-    places = grid.cell_to_ego(cells[:, 0].astype(float), cells[:, 1].astype(float))
+    places = grid.bin_to_ego(cells[:, 0].astype(float), cells[:, 1].astype(float))
     kept: list[int] = []
     for i, place in enumerate(places):
         # One object shows several flashes, most along the range axis.
@@ -230,7 +230,7 @@ def _near_side(power_db, r, a, grid, settings) -> np.ndarray:
         right += 1
     # The window smears a point over two bins on either side.
     near = min(first + 1.5, r)
-    return np.asarray(grid.cell_to_ego(float(near), 0.5 * (left + right)))
+    return np.asarray(grid.bin_to_ego(float(near), 0.5 * (left + right)))
 
 
 def _fit_box(name: str, near: np.ndarray, ground_m: float) -> list[float]:

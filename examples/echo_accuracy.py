@@ -25,7 +25,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.evaluation.columns import in_roi
 from radejax.evaluation.report.tables import Table, number
-from radejax.geometry.rotated_iou import bev_iou_np
+from radejax.geometry.rotated_iou import bev_iou
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
 from radejax.simulation.scene_sources import make_source
 from radejax.simulation.simulator import SequenceSimulator
@@ -73,8 +73,8 @@ def measured(
             rate = velocity @ frame.boxes[i, :2] / distance
             bin_ = round((rate - grid.doppler_mps[0]) / doppler_step)
             power_db = doppler[..., bin_ % grid.num_doppler]
-            found = locate(power_db, grid.nearest_cell(x, y))
-            along, across = found - grid.ego_to_cell(x, y)
+            found = locate(power_db, grid.nearest_bin(x, y))
+            along, across = found - grid.ego_to_bin(x, y)
             across = across * grid.azimuth_step_rad * distance
             yield frame.boxes[i], along * grid.range_step_m, across
 
@@ -86,7 +86,7 @@ def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndar
     moved = boxes.copy()
     moved[:, 0] += along * ahead + across * aside  # azimuth grows to the right
     moved[:, 1] += along * aside - across * ahead
-    return bev_iou_np(moved, boxes)
+    return bev_iou(moved[:, None], boxes[:, None])[:, 0, 0]
 
 
 def table(config: SimulationConfig, cls: str) -> Table:

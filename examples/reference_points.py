@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from radejax.cli import entry
 from radejax.data.images import read_left_image
 from radejax.data.kradar import read_labels
-from radejax.geometry.calibration import EGO_FROM_LIDAR_M, CameraCalibration
+from radejax.geometry.camera import EGO_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import LiftingAxes, static_reference_points
 from radejax.visualize.bev import save_figure

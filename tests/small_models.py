@@ -11,8 +11,7 @@ from ml_collections import ConfigDict
 
 from radejax import Detector, models
 from radejax.core.config import base_config, load_module
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"

@@ -34,19 +34,12 @@ def boxes(checked: Checked) -> types.ModuleType:
 
 
 def test_fitting_arrays_pass(boxes: types.ModuleType) -> None:
-    shifted = boxes.transform_boxes(np.zeros((2, 7)), [1, 2, 3], yaw_rad=0)
-    assert shifted[0].tolist() == [1, 2, 3, 0, 0, 0, 0]
+    assert boxes.boxes8_from_7(np.zeros((2, 7)))[0].tolist() == [0] * 7 + [1]
 
 
-@pytest.mark.parametrize(
-    ("shape", "shift", "parameter"),
-    [((2, 8), np.zeros(3), "boxes"), ((2, 7), np.zeros(2), "translation_m")],
-)
-def test_a_wrong_shape_is_refused_by_name(
-    boxes: types.ModuleType, shape: tuple[int, ...], shift: np.ndarray, parameter: str
-) -> None:
-    with pytest.raises(TypeCheckError, match=f"parameter '{parameter}'"):
-        boxes.transform_boxes(np.zeros(shape), shift)
+def test_a_wrong_shape_is_refused_by_name(boxes: types.ModuleType) -> None:
+    with pytest.raises(TypeCheckError, match="parameter 'boxes'"):
+        boxes.boxes8_from_7(np.zeros((2, 8)))
 
 
 def test_a_wrong_result_is_refused(

@@ -69,7 +69,7 @@ def draw(weather, environment, time, seed, path):
 def draw_maps(axes, power_db):
     """The three maps, each the maximum over the axes that it does not show."""
     ground, angles, doppler = axes
-    centers = GRID.cell_centers_ego()
+    centers = GRID.bin_centers_ego()
     colors = {"cmap": COLOR_MAP, "vmin": LIMITS_DB[0], "vmax": LIMITS_DB[1]}
     first = ground.pcolormesh(
         centers[..., 1], centers[..., 0], power_db.max((0, 2)), shading="nearest",

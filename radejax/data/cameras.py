@@ -17,8 +17,7 @@ from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.images import read_left_image
 from radejax.data.records.arrays import ArrayRecords
-from radejax.geometry.calibration import CameraCalibration, ImageKind
-from radejax.geometry.camera import Camera
+from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
 
 _log = logging.getLogger(__name__)
 
@@ -32,7 +31,7 @@ class CameraOptions:
     """How images and calibrations are used; `config.data.camera` states the same.
 
     Attributes:
-        projection: "raw", "rectified" or "pinhole", see `CameraCalibration.camera`.
+        projection: "raw" or "pinhole", see `CameraCalibration.camera`.
         ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own; or
             None.
         lidar_to_radar_z_m: Its z, which boxes are not moved by; None for what the

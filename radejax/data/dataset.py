@@ -16,7 +16,7 @@ from jaxtyping import Float, Shaped
 from radejax.core.errors import UserError
 from radejax.data.kradar.dataset import KRadar
 from radejax.data.kradar.findings import Summary
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 

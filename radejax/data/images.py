@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from radejax.core.errors import DataError
 from radejax.data.dataset import LabelledFrame
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 
 _MAX_SIDE, _MAX_PIXELS = 8192, 1 << 25
 

@@ -278,7 +278,7 @@ def _in_roi(
     if roi.shape != (6,):
         raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
     center = params[..., :3].astype(jnp.float32)
-    ground = jnp.asarray(grid.cell_centers_ego(), jnp.float32)[None]  # [1, R, A, 2]
+    ground = jnp.asarray(grid.bin_centers_ego(), jnp.float32)[None]  # [1, R, A, 2]
     inside = jnp.ones(params.shape[:3], bool)
     offsets = (ground[..., 0], ground[..., 1], z0_m)
     for axis, offset in enumerate(offsets):

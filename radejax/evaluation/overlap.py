@@ -8,7 +8,7 @@ import chex
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from radejax.geometry.rotated_iou import bev_intersection_np
+from radejax.geometry.rotated_iou import bev_intersection, shared_height
 
 PAIRS_PER_CHUNK = 2_000_000
 
@@ -93,8 +93,8 @@ def pair_iou(
     """
     chex.assert_equal_shape((a, b))
     bev, iou_3d = np.zeros(len(a)), np.zeros(len(a))
-    for low in range(0, len(a), PAIRS_PER_CHUNK // 8):
-        part = slice(low, low + PAIRS_PER_CHUNK // 8)
+    for low in range(0, len(a), PAIRS_PER_CHUNK // 32):
+        part = slice(low, low + PAIRS_PER_CHUNK // 32)
         bev[part], iou_3d[part] = _pair_iou(a[part], b[part], z_center)
     return bev, iou_3d
 
@@ -102,12 +102,8 @@ def pair_iou(
 def _pair_iou(
     a: Float[np.ndarray, "P 7"], b: Float[np.ndarray, "P 7"], z_center: float
 ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
-    area = bev_intersection_np(a, b)
+    area = bev_intersection(a, b)
     area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
-    top = np.minimum(
-        a[:, 2] + (1 - z_center) * a[:, 5], b[:, 2] + (1 - z_center) * b[:, 5]
-    )
-    bottom = np.maximum(a[:, 2] - z_center * a[:, 5], b[:, 2] - z_center * b[:, 5])
-    volume = area * np.maximum(top - bottom, 0.0)
+    volume = area * shared_height(a, b, z_center)
     volumes = area_a * a[:, 5] + area_b * b[:, 5]
     return area / (area_a + area_b - area), volume / (volumes - volume)

@@ -7,7 +7,6 @@ it. Functions follow the type of their input: NumPy in, NumPy out; else JAX.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -137,38 +136,6 @@ def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
     bottom = xp.concatenate([ground, level + z - half], -1)
     top = xp.concatenate([ground, level + z + half], -1)
     return xp.concatenate([bottom, top], -2)
-
-
-def transform_boxes(
-    boxes: Real[ArrayT, "*batch 7"],
-    translation_m: Real[Any, "3"] | Sequence[float],
-    yaw_rad: float = 0.0,
-) -> Float[ArrayT, "*batch 7"]:
-    """Boxes in a frame turned and shifted on the ground: rotate, then translate.
-
-    Args:
-        boxes: `[..., 7]` boxes in the source frame.
-        translation_m: `[3]` position of the source frame's origin in the target frame.
-        yaw_rad: Heading of the source frame's x axis in the target frame.
-
-    Returns:
-        `[..., 7]` boxes in the target frame; yaw is not wrapped.
-
-    Raises:
-        ValueError: The last axis is not 7 long.
-
-    Examples:
-        >>> transform_boxes(np.array([10.0, 0, 1, 4, 2, 1.5, 0]), [2.5, 1, -0.5]).tolist()
-        [12.5, 1.0, 0.5, 4.0, 2.0, 1.5, 0.0]
-    """
-    xp = array_module(boxes, translation_m)
-    boxes = _checked(xp.asarray(boxes), 7)
-    sin, cos = np.sin(yaw_rad), np.cos(yaw_rad)
-    x = boxes[..., 0] * cos - boxes[..., 1] * sin + translation_m[0]
-    y = boxes[..., 0] * sin + boxes[..., 1] * cos + translation_m[1]
-    z = boxes[..., 2] + translation_m[2]
-    center = xp.stack([x, y, z], -1)
-    return xp.concatenate([center, boxes[..., 3:6], boxes[..., 6:] + yaw_rad], -1)
 
 
 def _row(xp: Any, values: tuple[float, ...], like: Any) -> Any:

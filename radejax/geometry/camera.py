@@ -1,20 +1,57 @@
-"""Where points of the radar's world appear in the camera image, in NumPy or in JAX.
+"""Cameras: calibration files, and where points of the radar frame appear in the image.
 
-Frames and pixels as in `camera`.
+Frames: LiDAR and ego (radar) frames have parallel axes, x forward, y left, z up, and
+differ by a translation; the camera frame is x right, y down, z forward (depth). Pixels
+count from the upper left corner of the image, u to the right and v down.
+
+`CameraCalibration` (NumPy, float64) is for the host; `Camera` is a pytree of the same
+numbers for jitted code.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
+import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import chex
 import jax
 import numpy as np
 from flax import struct
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 
-from radejax.geometry.boxes import array_module
+from radejax.core.errors import DataError, require
+from radejax.geometry.boxes import array_module, corners
+from radejax.geometry.values import ArrayValues
+
+ImageKind = Literal["raw", "pinhole"]
+"""The recorded image with lens distortion, or the same matrix without distortion."""
+
+EGO_FROM_LIDAR_M = (-2.54, 0.3, 0.0)
+"""Ego = LiDAR + this, as in every sequence's `calib_radar_lidar.txt`; dz as RADE-Net.
+K-Radar's loaders use `KRADAR_LIDAR_TO_RADAR_Z_M` for boxes too."""
+
+KRADAR_LIDAR_TO_RADAR_Z_M = 0.7
+"""Meters by which K-Radar's radar is below its LiDAR, as in K-Radar's own loaders: what
+radar directions are projected with, whatever z boxes are counted from."""
+
+_ANGLES = ("yaw_ldr2cam", "pitch_ldr2cam", "roll_ldr2cam")
+_SHIFTS = ("x_ldr2cam", "y_ldr2cam", "z_ldr2cam")
+_LENS = ("k1", "k2", "k3", "k4", "k5")
+_PINHOLE = ("fx", "fy", "px", "py")
+_KEYS = _PINHOLE + _LENS + _ANGLES + _SHIFTS
+
+_MAX_PIXELS = 1 << 16
+_MAX_VALUE = 1e9  # far beyond pixels, coefficients and meters of any camera
+
+# Between the corners of `boxes.corners`.
+_BOX_EDGES = np.array(
+    [(i, (i + 1) % 4) for i in range(4)]
+    + [(4 + i, 4 + (i + 1) % 4) for i in range(4)]
+    + [(i, 4 + i) for i in range(4)]
+)
 
 
 class Camera(struct.PyTreeNode):
@@ -143,3 +180,254 @@ def to_pixels(
     folds = square > spread(camera.max_radius) ** 2
     x_seen, y_seen = xp.where(folds, x * 1e3, x_seen), xp.where(folds, y * 1e3, y_seen)
     return xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CameraCalibration(ArrayValues):
+    """One camera's calibration, in float64. Compares and hashes by value.
+
+    Attributes:
+        intrinsics: `[4]` fx, fy, cx, cy of the raw image, pixels.
+        distortion: `[5]` k1, k2, p1, p2, k3 in OpenCV's order.
+        rotation: `[3, 3]` camera from LiDAR (or ego) axes.
+        translation_m: `[3]` in camera axes: `p_cam = rotation @ p_lidar + translation`.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        ego_from_lidar_m: `[3]` shift with `p_ego = p_lidar + shift`.
+
+    Raises:
+        UserError: A value is not finite, or a size or focal length is not positive.
+    """
+
+    intrinsics: Float[np.ndarray, "4"]
+    distortion: Float[np.ndarray, "5"]
+    rotation: Float[np.ndarray, "3 3"]
+    translation_m: Float[np.ndarray, "3"]
+    width: int = 1280
+    height: int = 720
+    # An array like the others once `__post_init__` is through.
+    ego_from_lidar_m: Float[np.ndarray, "3"] = EGO_FROM_LIDAR_M  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        shapes = {
+            "intrinsics": (4,),
+            "distortion": (5,),
+            "rotation": (3, 3),
+            "translation_m": (3,),
+            "ego_from_lidar_m": (3,),
+        }
+        for name, shape in shapes.items():
+            value = self.freeze(name)
+            is_fine = value.shape == shape and bool((np.abs(value) <= _MAX_VALUE).all())
+            require(is_fine, name, value.tolist(), f"{shape} finite numbers")
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            require(0 < size <= _MAX_PIXELS, name, size, f"1 to {_MAX_PIXELS} pixels")
+        focal = self.intrinsics[:2]
+        require(bool((focal > 0).all()), "focal length", focal.tolist(), "above 0")
+
+    # Construction --------------------------------------------------------------------
+
+    @classmethod
+    def from_angles(
+        cls,
+        *,
+        intrinsics: Sequence[float],
+        yaw_deg: float,
+        pitch_deg: float,
+        roll_deg: float,
+        translation_m: Sequence[float],
+        distortion: Sequence[float] = (0.0,) * 5,
+        **fields: Any,
+    ) -> CameraCalibration:
+        """Calibration from K-Radar's angles: rotation = Rx(roll) Ry(pitch) Rz(yaw).
+
+        A camera that looks straight ahead has yaw 90, pitch 0 and roll 90 degrees.
+        """
+        rotation = (
+            _rotation(0, math.radians(roll_deg))
+            @ _rotation(1, math.radians(pitch_deg))
+            @ _rotation(2, math.radians(yaw_deg))
+        )
+        return cls(
+            intrinsics=np.asarray(intrinsics),
+            distortion=np.asarray(distortion),
+            rotation=rotation,
+            translation_m=np.asarray(translation_m),
+            **fields,
+        )
+
+    @classmethod
+    def from_kradar(cls, path: str | pathlib.Path, **fields: Any) -> CameraCalibration:
+        """Reads one of K-Radar's `cam_*.yml` files, per sequence or common.
+
+        Args:
+            path: The file: one `key: number` per line.
+            **fields: Values for the remaining attributes, e.g. `ego_from_lidar_m`.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            DataError: A line is not `key: number`, a key is missing or a value is not
+                possible; names the file.
+        """
+        path = pathlib.Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"camera calibration {path} does not exist")
+        values = _read_numbers(path)
+        if missing := [key for key in _KEYS if key not in values]:
+            raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
+        yaw, pitch, roll = (values[key] for key in _ANGLES)
+        size = {
+            "width": int(values.get("img_size_w", 1280)),
+            "height": int(values.get("img_size_h", 720)),
+        }
+        try:
+            return cls.from_angles(
+                intrinsics=[values[key] for key in _PINHOLE],
+                distortion=[values[key] for key in _LENS],
+                yaw_deg=yaw,
+                pitch_deg=pitch,
+                roll_deg=roll,
+                translation_m=[values[key] for key in _SHIFTS],
+                **(size | fields),
+            )
+        except ValueError as error:
+            raise DataError(f"{path}: {error}") from None
+
+    def to_kradar_text(self) -> str:
+        """The content of a K-Radar calibration file; `from_kradar` reads it back."""
+        pitch = math.asin(np.clip(self.rotation[0, 2], -1.0, 1.0))
+        yaw = math.atan2(-self.rotation[0, 1], self.rotation[0, 0])
+        roll = math.atan2(-self.rotation[1, 2], self.rotation[2, 2])
+        numbers = [
+            *self.intrinsics,
+            *self.distortion,
+            *np.degrees([yaw, pitch, roll]),
+            *self.translation_m,
+        ]
+        lines = [f"{k}: {float(v)!r}" for k, v in zip(_KEYS, numbers, strict=True)]
+        lines += [f"img_size_h: {self.height}", f"img_size_w: {self.width}"]
+        return "\n".join(lines) + "\n"
+
+    def resized(self, width: int, height: int) -> CameraCalibration:
+        """Calibration of the same image resized, edges onto edges."""
+        scale = np.array([width / self.width, height / self.height] * 2)
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            intrinsics=self.intrinsics * scale,
+        )
+
+    # Use -----------------------------------------------------------------------------
+
+    def camera(self, image: ImageKind = "raw", *, is_valid: bool = True) -> Camera:
+        """The numbers jitted code needs to project onto one kind of image.
+
+        Args:
+            image: "raw" is the image as recorded, with lens distortion; "pinhole" the
+                same matrix without distortion, as the released DinoRADE projects.
+            is_valid: False marks a frame without an image.
+        """
+        kinds = get_args(ImageKind)
+        require(image in kinds, "image", image, f"one of {', '.join(kinds)}")
+        rotation, shift = self.rotation, self.translation_m
+        shift = shift - rotation @ self.ego_from_lidar_m
+        distortion = self.distortion if image == "raw" else np.zeros(5)
+        return Camera(
+            cam_from_ego=np.concatenate([rotation, shift[:, None]], 1),
+            intrinsics=self.intrinsics,
+            distortion=distortion,
+            max_radius=np.float64(_fold_radius(distortion)),
+            size_px=np.array([self.width, self.height], np.float64),
+            is_valid=np.bool_(is_valid),
+        )
+
+    def project_ego(
+        self, points_ego: Real[np.ndarray, "*points 3"], image: ImageKind = "raw"
+    ) -> tuple[Float[np.ndarray, "*points 2"], Float[np.ndarray, "*points"]]:
+        """Pixels `[..., 2]` and depth `[...]` in metres of ego-frame points `[..., 3]`.
+
+        Pixels mean nothing where the depth is not positive; see `in_image`.
+        """
+        return project(np.asarray(points_ego, np.float64), self.camera(image))
+
+    def in_image(
+        self,
+        pixels: Real[np.ndarray, "*points 2"],
+        depth_m: Real[np.ndarray, "*points"],
+    ) -> Bool[Any, "*points"]:
+        """True where projected points lie in front of the camera and in the image."""
+        inside = (pixels >= 0) & (pixels < np.array([self.width, self.height]))
+        return inside.all(-1) & (depth_m > 0)
+
+    def project_boxes(
+        self,
+        boxes: Real[np.ndarray, "N 7"],
+        image: ImageKind = "raw",
+        near_m: float = 0.1,
+    ) -> tuple[Float[np.ndarray, "N 12 2 2"], Bool[np.ndarray, "N 12"]]:
+        """Edges of boxes as line segments on the image, for drawing.
+
+        Edges that pass behind the camera are cut at the near plane.
+
+        Args:
+            boxes: `[N, 7]` x, y, z, l, w, h, yaw in the ego frame, full extents.
+            image: Kind of image to draw on.
+            near_m: Smallest depth that is drawn.
+
+        Returns:
+            Segments `[N, 12, 2, 2]` in pixels (edge, end, u and v; straight lines also
+            on the raw image), and `[N, 12]` bool, False for edges out of sight.
+        """
+        camera = self.camera(image)
+        corners_cam = to_camera(corners(np.asarray(boxes, np.float64)), camera)
+        ends = corners_cam[:, _BOX_EDGES]  # [N, 12, 2, 3]
+        depth = ends[..., 2]
+        is_visible = (depth > near_m).any(-1)
+        # Move an end behind the near plane along its edge, onto the plane.
+        span = depth[..., ::-1] - depth
+        safe = np.where(span == 0, 1.0, span)
+        part = np.where(depth < near_m, (near_m - depth) / safe, 0.0)
+        ends = ends + np.clip(part, 0, 1)[..., None] * (ends[..., ::-1, :] - ends)
+        return to_pixels(ends, camera, 0.0), is_visible
+
+
+def _fold_radius(distortion: Float[np.ndarray, "5"]) -> float:
+    """Smallest radius at which the radial distortion stops growing; large for none."""
+    k1, k2, _, _, k3 = distortion
+    # In 1 / radius^2: the first coefficient is one, however small the others are.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-12)]
+    return 1 / math.sqrt(real.max()) if real.size else 1e6
+
+
+def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
+    """Right-handed rotation about a coordinate axis (0 x, 1 y, 2 z)."""
+    matrix = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix[i, i] = matrix[j, j] = math.cos(angle)
+    matrix[j, i], matrix[i, j] = math.sin(angle), -math.sin(angle)
+    return matrix
+
+
+def _read_numbers(path: pathlib.Path) -> dict[str, float]:
+    """Values of a file of `key: number` lines.
+
+    No YAML library: in YAML 1.1, `1e-05` is text.
+    """
+    values = {}
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        key, _, value = line.partition(":")
+        try:
+            values[key.strip()] = float(value)
+        except ValueError:
+            raise DataError(
+                f"{path}:{number}: expected 'key: number', found {line[:80]!r}"
+            ) from None
+    if bad := [key for key, value in values.items() if not abs(value) <= _MAX_VALUE]:
+        raise DataError(f"{path}: {bad[0]} is {values[bad[0]]}, not a finite number")
+    return values

@@ -1,4 +1,4 @@
-"""The sensor's axes and the mapping between bins and metres.
+"""The sensor's axes and the mapping between bins and meters.
 
 Every conversion between bins of the radar tensor and positions in the ego frame goes
 through `RadarGrid`; no other module knows a bin size.
@@ -14,22 +14,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
 from radejax.geometry.boxes import array_module
+from radejax.geometry.values import ArrayValues
 
-_MAX_RANGE_M = 10_000.0
-_LIMITS = {  # what a radar can have, in the unit of the axis
-    "range_m": (-1.0, _MAX_RANGE_M),
-    "azimuth_rad": (-np.pi, np.pi),
-    "elevation_rad": (-np.pi / 2, np.pi / 2),
-    "doppler_mps": (-1000.0, 1000.0),
-}
+_AXES = ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps")
+_MAX_VALUE = 10_000.0  # far beyond the axes of any radar
 
 AzimuthMapping = Literal["true", "stretched"]
-Positions = float | Real[Any, "*#cells"]
+Positions = float | Real[Any, "*#bins"]
 """One number or an array of them, which broadcast against each other: `[...]`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RadarGrid:
+class RadarGrid(ArrayValues):
     """Bin centers of a 4D radar tensor: four uniform, increasing axes.
 
     Azimuth is positive to the right of boresight, `azimuth = -atan2(y, x)`, as in
@@ -37,10 +33,10 @@ class RadarGrid:
     so they can be static arguments of jitted functions.
 
     Attributes:
-        range_m: `[R]` metres.
+        range_m: `[R]` meters.
         azimuth_rad: `[A]` radians.
         elevation_rad: `[E]` radians.
-        doppler_mps: `[D]` metres per second.
+        doppler_mps: `[D]` meters per second.
         fov_range_m: Objects farther than this are outside the field of view.
         fov_azimuth_rad: Objects beyond plus or minus this azimuth are outside.
 
@@ -60,29 +56,22 @@ class RadarGrid:
     fov_azimuth_rad: float
 
     def __post_init__(self) -> None:
-        for name in ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps"):
-            axis = np.array(getattr(self, name), np.float64)
+        for name in _AXES:
+            axis = self.freeze(name)
             if axis.ndim != 1 or axis.size < 2:
                 raise ValueError(
                     f"{name} must be a vector of at least 2 bins, got shape {axis.shape}"
                 )
-            low, high = _LIMITS[name]
-            if not (axis >= low).all() or not (axis <= high).all():
-                raise ValueError(
-                    f"{name} must lie within {low:g} and {high:g}, got {axis.min()} to "
-                    f"{axis.max()}"
-                )
+            if not (np.abs(axis) <= _MAX_VALUE).all():
+                raise ValueError(f"{name} must be finite, got {axis}")
             step = (axis[-1] - axis[0]) / (axis.size - 1)
             deviation = np.abs(axis - (axis[0] + step * np.arange(axis.size))).max()
             if not step > 0 or deviation > 1e-3 * step:
                 raise ValueError(f"{name} must be uniform and increasing, got {axis}")
-            axis.setflags(write=False)
-            object.__setattr__(self, name, axis)
-        for name, limit in (("fov_range_m", _MAX_RANGE_M), ("fov_azimuth_rad", np.pi)):
-            if not 0 < getattr(self, name) <= limit:
-                raise ValueError(
-                    f"{name} must be positive up to {limit:g}, got {getattr(self, name)}"
-                )
+        for name in ("fov_range_m", "fov_azimuth_rad"):
+            value = getattr(self, name)
+            if not 0 < value <= _MAX_VALUE:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
 
     # Construction --------------------------------------------------------------------
 
@@ -211,31 +200,31 @@ class RadarGrid:
         span = self.azimuth_rad[-1] - self.azimuth_rad[0]
         return float(span / (self.num_azimuth - 1))
 
-    # Bins and metres -----------------------------------------------------------------
+    # Bins and meters -----------------------------------------------------------------
 
-    def cell_to_ego(
-        self, range_cell: Positions, azimuth_cell: Positions
-    ) -> Float[Any, "*cells 2"]:
-        """Positions of range-azimuth cells on the ground plane of the ego frame.
+    def bin_to_ego(
+        self, range_bin: Positions, azimuth_bin: Positions
+    ) -> Float[Any, "*bins 2"]:
+        """Positions of range-azimuth bins on the ground plane of the ego frame.
 
-        Cell (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da, hence at
+        Bin (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da, hence at
         x = r cos(a), y = -r sin(a).
 
         Args:
-            range_cell: Position along range in bins, `[...]`; may be fractional.
-            azimuth_cell: Position along azimuth in bins, `[...]`.
+            range_bin: Position along range in bins, `[...]`; may be fractional.
+            azimuth_bin: Position along azimuth in bins, `[...]`.
 
         Returns:
-            `[..., 2]` x (forward) and y (left) in metres; NumPy float64 for NumPy
+            `[..., 2]` x (forward) and y (left) in meters; NumPy float64 for NumPy
             or Python input, else a JAX array.
         """
-        xp, range_cell, azimuth_cell = _as_float(range_cell, azimuth_cell)
-        range_m = self.range_m[0] + range_cell * self.range_step_m
-        azimuth = self.azimuth_rad[0] + azimuth_cell * self.azimuth_step_rad
+        xp, range_bin, azimuth_bin = _as_float(range_bin, azimuth_bin)
+        range_m = self.range_m[0] + range_bin * self.range_step_m
+        azimuth = self.azimuth_rad[0] + azimuth_bin * self.azimuth_step_rad
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
 
-    def ego_to_cell(self, x_m: Positions, y_m: Positions) -> Float[Any, "*cells 2"]:
-        """Fractional bins of ground positions: inverse of `cell_to_ego`.
+    def ego_to_bin(self, x_m: Positions, y_m: Positions) -> Float[Any, "*bins 2"]:
+        """Fractional bins of ground positions: inverse of `bin_to_ego`.
 
         Returns:
             `[..., 2]` range and azimuth in bins; not clipped to the grid.
@@ -250,11 +239,11 @@ class RadarGrid:
         azimuth_mid = float(self.azimuth_rad[-1] + self.azimuth_rad[0]) / 2
         range_m = xp.sqrt(x_m * x_m + y_m * y_m) - float(self.range_m[0])
         azimuth = -xp.arctan2(y_m, x_m) - azimuth_mid
-        range_cell = range_m * last_range / range_span
-        azimuth_cell = azimuth * last_azimuth / azimuth_span + last_azimuth / 2
-        return xp.stack([range_cell, azimuth_cell], -1)
+        range_bin = range_m * last_range / range_span
+        azimuth_bin = azimuth * last_azimuth / azimuth_span + last_azimuth / 2
+        return xp.stack([range_bin, azimuth_bin], -1)
 
-    def nearest_cell(self, x_m: Positions, y_m: Positions) -> Int[Any, "*cells 2"]:
+    def nearest_bin(self, x_m: Positions, y_m: Positions) -> Int[Any, "*bins 2"]:
         """Integer bins nearest to ground positions, clipped to the grid.
 
         Halves round to even, as in the released ground-truth encoding.
@@ -263,18 +252,18 @@ class RadarGrid:
             `[..., 2]` int32 range and azimuth indices.
         """
         xp, x_m, y_m = _as_float(x_m, y_m)
-        cell = xp.round(self.ego_to_cell(x_m, y_m))
-        range_idx = xp.clip(cell[..., 0], 0, self.num_range - 1)
-        azimuth_idx = xp.clip(cell[..., 1], 0, self.num_azimuth - 1)
+        nearest = xp.round(self.ego_to_bin(x_m, y_m))
+        range_idx = xp.clip(nearest[..., 0], 0, self.num_range - 1)
+        azimuth_idx = xp.clip(nearest[..., 1], 0, self.num_azimuth - 1)
         return xp.stack([range_idx, azimuth_idx], -1).astype(xp.int32)
 
-    def cell_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
-        """`[R, A, 2]` float64 x and y of every range-azimuth bin center, metres."""
-        return self.cell_to_ego(
+    def bin_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
+        """`[R, A, 2]` float64 x and y of every range-azimuth bin center, meters."""
+        return self.bin_to_ego(
             np.arange(self.num_range)[:, None], np.arange(self.num_azimuth)[None, :]
         )
 
-    def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*cells"]:
+    def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:
         """True where the sensor looks: in front, within maximum azimuth and range."""
         xp, x_m, y_m = _as_float(x_m, y_m)
         azimuth = xp.arctan2(y_m, x_m)
@@ -283,20 +272,6 @@ class RadarGrid:
             & (x_m >= 0)
             & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)
         )
-
-    # Value semantics -----------------------------------------------------------------
-
-    def _key(self) -> tuple[object, ...]:
-        return tuple(
-            v.tobytes() if isinstance(v, np.ndarray) else v
-            for v in (getattr(self, f.name) for f in dataclasses.fields(self))
-        )
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, RadarGrid) and self._key() == other._key()
-
-    def __hash__(self) -> int:
-        return hash(self._key())
 
 
 def _as_float(*values: Any) -> tuple[Any, ...]:

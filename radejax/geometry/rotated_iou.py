@@ -22,18 +22,21 @@ from __future__ import annotations
 from typing import Any
 
 import chex
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Real
 
-_FAR = 1e6  # metres; stands for infinity along a line, finite so that 0 * _FAR is 0
+from radejax.geometry.boxes import ArrayT, array_module
+
+_FAR = 1e6  # meters; stands for infinity along a line, finite so that 0 * _FAR is 0
 
 
 def bev_iou(
-    a: Float[jax.Array, "*batch N _"], b: Float[jax.Array, "*batch M _"]
-) -> Float[jax.Array, "*batch N M"]:
+    a: Real[ArrayT, "*batch N _"], b: Real[ArrayT, "*batch M _"]
+) -> Float[ArrayT, "*batch N M"]:
     """Bird's-eye-view IoU of every box of `a` with every box of `b`.
+
+    Corresponding boxes are compared with a batch axis: `bev_iou(a[:, None], b[:, None])`.
 
     Args:
         a: `[..., N, 7]` boxes x, y, z, l, w, h, yaw; or `[..., N, 8]` with sin and
@@ -42,8 +45,8 @@ def bev_iou(
         b: `[..., M, 7]` or `[..., M, 8]`.
 
     Returns:
-        `[..., N, M]` float32 in [0, 1]. Boxes of zero or negative size overlap
-        nothing.
+        `[..., N, M]` in [0, 1]: NumPy in float64 for NumPy input, else JAX in float32.
+        Boxes of zero or negative size overlap nothing.
 
     Raises:
         ValueError: The last axis is neither 7 nor 8 long.
@@ -55,132 +58,92 @@ def bev_iou(
         >>> round(float(jax.jit(bev_iou)(car, moved)[0, 0]), 4)
         0.3333
     """
-    return bev_iou_pairs(*_all_pairs(a, b))
+    xp, a, b = _all_pairs(a, b)
+    ground_a, ground_b = _footprint(xp, a), _footprint(xp, b)
+    area_a, area_b = ground_a[2] * ground_a[3], ground_b[2] * ground_b[3]
+    return _ratio(xp, _intersection(xp, ground_a, ground_b), area_a, area_b)
 
 
 def iou_3d(
-    a: Float[jax.Array, "*batch N _"], b: Float[jax.Array, "*batch M _"]
-) -> Float[jax.Array, "*batch N M"]:
+    a: Real[ArrayT, "*batch N _"], b: Real[ArrayT, "*batch M _"], z_center: float = 0.5
+) -> Float[ArrayT, "*batch N M"]:
     """Volume IoU of every box of `a` with every box of `b`; arguments of `bev_iou`.
 
+    Args:
+        a: `[..., N, 7]` or `[..., N, 8]` boxes.
+        b: `[..., M, 7]` or `[..., M, 8]` boxes.
+        z_center: Where z lies in the height of a box: 0.5 in the middle, 1 at the top.
+
     Returns:
-        `[..., N, M]` float32 in [0, 1].
+        `[..., N, M]` in [0, 1].
 
     Examples:
         >>> car = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
         >>> round(float(jax.jit(iou_3d)(car, car.at[0, 2].set(0.75))[0, 0]), 4)
         0.3333
     """
-    return iou_3d_pairs(*_all_pairs(a, b))
+    xp, a, b = _all_pairs(a, b)
+    ground_a, ground_b = _footprint(xp, a), _footprint(xp, b)
+    area = _intersection(xp, ground_a, ground_b)
+    height_a, height_b = xp.maximum(a[..., 5], 0), xp.maximum(b[..., 5], 0)
+    # The difference of top and bottom may round to more than either height.
+    shared = xp.minimum(shared_height(a, b, z_center), xp.minimum(height_a, height_b))
+    volume = area * shared
+    volume_a = ground_a[2] * ground_a[3] * height_a
+    volume_b = ground_b[2] * ground_b[3] * height_b
+    return _ratio(xp, volume, volume_a, volume_b)
 
 
-def bev_iou_pairs(
-    a: Float[jax.Array, "*#pairs _"], b: Float[jax.Array, "*#pairs _"]
-) -> Float[jax.Array, "*pairs"]:
-    """Bird's-eye-view IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`.
-
-    Examples:
-        >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]] * 3)
-        >>> jax.jit(bev_iou_pairs)(cars, cars).shape
-        (3,)
-    """
-    return _bev_iou(jnp, _as_float32(a), _as_float32(b))
-
-
-def iou_3d_pairs(
-    a: Float[jax.Array, "*#pairs _"], b: Float[jax.Array, "*#pairs _"]
-) -> Float[jax.Array, "*pairs"]:
-    """Volume IoU of corresponding boxes: `[..., 7 or 8]` -> `[...]`.
-
-    Examples:
-        >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]] * 3)
-        >>> jax.jit(iou_3d_pairs)(cars, cars).shape
-        (3,)
-    """
-    a, b = _as_float32(a), _as_float32(b)
-    return _iou_3d(jnp, a, b)
-
-
-def bev_intersection_np(
-    a: Real[np.ndarray, "P _"], b: Real[np.ndarray, "P _"], *, chunk_size: int = 1 << 16
-) -> Float[np.ndarray, " P"]:
-    """Footprint overlap of corresponding boxes in float64, without JAX.
+def bev_intersection(
+    a: Real[ArrayT, "*#pairs _"], b: Real[ArrayT, "*#pairs _"]
+) -> Float[ArrayT, "*pairs"]:
+    """Area in square meters that the footprints of corresponding boxes share.
 
     Args:
-        a: `[P, 7]` boxes, or `[P, 8]` (see `bev_iou`).
-        b: `[P, 7]` or `[P, 8]`.
-        chunk_size: Pairs worked on at a time; bounds memory to about 100 MB.
-
-    Returns:
-        `[P]` intersection areas in square metres.
-
-    Raises:
-        ValueError: Shapes differ or are not `[P, 7]` or `[P, 8]`.
+        a: `[..., 7]` or `[..., 8]` boxes, see `bev_iou`; leading axes broadcast.
+        b: `[..., 7]` or `[..., 8]` boxes.
 
     Examples:
         >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
-        >>> ahead = car + [3, 0, 0, 0, 0, 0, 0]
-        >>> bev_intersection_np(car, ahead).round(6).tolist()
+        >>> bev_intersection(car, car + [3, 0, 0, 0, 0, 0, 0]).round(6).tolist()
         [2.0]
     """
-    return _by_chunks(
-        lambda a, b: _intersection(np, _footprint(np, a), _footprint(np, b)),
-        a,
-        b,
-        chunk_size,
-    )
+    xp, a, b = _as_floats(a, b)
+    return _intersection(xp, _footprint(xp, a), _footprint(xp, b))
 
 
-def bev_iou_np(
-    a: Real[np.ndarray, "P _"], b: Real[np.ndarray, "P _"], *, chunk_size: int = 1 << 16
-) -> Float[np.ndarray, " P"]:
-    """Bird's-eye-view IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`.
+def shared_height(
+    a: Real[ArrayT, "*#pairs _"], b: Real[ArrayT, "*#pairs _"], z_center: float = 0.5
+) -> Float[ArrayT, "*pairs"]:
+    """Height in meters that corresponding boxes share; 0 where they do not overlap.
 
     Examples:
         >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
-        >>> ahead = car + [2, 0, 0, 0, 0, 0, 0]
-        >>> bev_iou_np(car, ahead).round(4).tolist()
-        [0.3333]
+        >>> shared_height(car, car + [0, 0, 0.5, 0, 0, 0, 0]).tolist()
+        [1.0]
     """
-    return _by_chunks(lambda a, b: _bev_iou(np, a, b), a, b, chunk_size)
+    xp = array_module(a, b)
+    above, below = 1 - z_center, z_center
+    top = xp.minimum(a[..., 2] + above * a[..., 5], b[..., 2] + above * b[..., 5])
+    bottom = xp.maximum(a[..., 2] - below * a[..., 5], b[..., 2] - below * b[..., 5])
+    return xp.maximum(top - bottom, 0)
 
 
-def iou_3d_np(
-    a: Real[np.ndarray, "P _"], b: Real[np.ndarray, "P _"], *, chunk_size: int = 1 << 16
-) -> Float[np.ndarray, " P"]:
-    """Volume IoU of corresponding boxes in float64: `[P, 7]` -> `[P]`.
-
-    Examples:
-        >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
-        >>> higher = car + [0, 0, 0.75, 0, 0, 0, 0]
-        >>> iou_3d_np(car, higher).round(4).tolist()
-        [0.3333]
-    """
-    return _by_chunks(lambda a, b: _iou_3d(np, a, b), a, b, chunk_size)
-
-
-def _all_pairs(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`[..., N, 1, 7 or 8]` and `[..., 1, M, 7 or 8]`."""
+def _all_pairs(a: Any, b: Any) -> tuple[Any, Any, Any]:
+    """The array module, then `[..., N, 1, 7 or 8]` and `[..., 1, M, 7 or 8]`."""
+    xp, a, b = _as_floats(a, b)
     chex.assert_equal_rank([a, b])
     chex.assert_equal_shape_prefix([a, b], a.ndim - 2)
-    return a[..., :, None, :], b[..., None, :, :]
+    return xp, a[..., :, None, :], b[..., None, :, :]
 
 
-def _by_chunks(function: Any, a: Any, b: Any, chunk_size: int) -> np.ndarray:
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if a.ndim != 2 or b.ndim != 2 or a.shape[0] != b.shape[0]:
-        raise ValueError(
-            f"expected two arrays of P boxes [P, 7], got {a.shape} and {b.shape}"
-        )
-    starts = range(0, max(len(a), 1), chunk_size)
-    parts = [function(a[i : i + chunk_size], b[i : i + chunk_size]) for i in starts]
-    return np.concatenate(parts)
-
-
-def _as_float32(boxes: Any) -> jax.Array:
-    """At least float32: float64 passes through where JAX has it enabled."""
-    boxes = jnp.asarray(boxes)
-    return boxes.astype(jnp.promote_types(boxes.dtype, jnp.float32))
+def _as_floats(*boxes: Any) -> tuple[Any, ...]:
+    """The array module, then the boxes: float64 on the host, at least float32 in JAX."""
+    xp = array_module(*boxes)
+    if xp is np:
+        return (np, *(np.asarray(value, np.float64) for value in boxes))
+    arrays = [jnp.asarray(value) for value in boxes]
+    return (xp, *(v.astype(jnp.promote_types(v.dtype, jnp.float32)) for v in arrays))
 
 
 def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
@@ -203,11 +166,6 @@ def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
     sin = boxes[..., 6] / divisor
     cos = xp.where(scale > 0, boxes[..., 7] / divisor, 1)
     return x, y, xp.maximum(length * scale, 0), xp.maximum(breadth * scale, 0), sin, cos
-
-
-def _bev_iou(xp: Any, a: Any, b: Any) -> Any:
-    a, b = _footprint(xp, a), _footprint(xp, b)
-    return _ratio(xp, _intersection(xp, a, b), a[2] * a[3], b[2] * b[3])
 
 
 def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
@@ -260,19 +218,6 @@ def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
         twice_area = twice_area + inside * (b_half[j][0] + x * vy - y * vx)
     smaller = xp.minimum(a_length * a_width, b_length * b_width)
     return xp.clip(twice_area / 2, 0, smaller)
-
-
-def _iou_3d(xp: Any, a: Any, b: Any) -> Any:
-    """Volume IoU: overlap on the ground times overlap in height."""
-    ground_a, ground_b = _footprint(xp, a), _footprint(xp, b)
-    height_a, height_b = xp.maximum(a[..., 5], 0), xp.maximum(b[..., 5], 0)
-    gap = xp.abs(a[..., 2] - b[..., 2])
-    # Written about the center distance, so that boxes of one height give it exactly.
-    shared = xp.minimum((height_a + height_b) / 2 - gap, xp.minimum(height_a, height_b))
-    volume = _intersection(xp, ground_a, ground_b) * xp.maximum(shared, 0)
-    volume_a = ground_a[2] * ground_a[3] * height_a
-    volume_b = ground_b[2] * ground_b[3] * height_b
-    return _ratio(xp, volume, volume_a, volume_b)
 
 
 def _ratio(xp: Any, shared: Any, size_a: Any, size_b: Any) -> Any:

@@ -37,7 +37,7 @@ CAMERA_SHAPES = {
     "max_radius": (),
     "size_px": (2,),
 }
-"""Float fields of `radejax.geometry.calibration.Camera`, beside the bool `is_valid`."""
+"""Float fields of `radejax.geometry.camera.Camera`, beside the bool `is_valid`."""
 
 
 def export(
@@ -287,7 +287,7 @@ The model takes a camera: `detect(projection, image, camera)` with images
 under `left_out`, and `camera` a dictionary of arrays: `cam_from_ego` [B, 3, 4],
 `intrinsics` [B, 4], `distortion` [B, 5], `max_radius` [B], `size_px` [B, 2] (float32) and
 `is_valid` [B] (bool, False: no image, radar alone), the fields of
-`radejax.geometry.calibration.Camera`.
+`radejax.geometry.camera.Camera`.
 """
 
 

@@ -23,11 +23,12 @@ from radejax.data.cameras import CameraOptions, no_camera
 from radejax.data.images import read_left_image
 from radejax.data.projection import MAX_LEVEL
 from radejax.data.tesseract import read_frame
-from radejax.geometry.calibration import (
+from radejax.geometry.camera import (
     KRADAR_LIDAR_TO_RADAR_Z_M,
+    Camera,
     CameraCalibration,
+    stack_cameras,
 )
-from radejax.geometry.camera import Camera, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import ReferencePoints

@@ -233,7 +233,7 @@ def _pairs_at_centers(
     z0_m: Scalar,
 ) -> Pairs:
     """Predictions at the objects' own bins."""
-    cell = grid.nearest_cell(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
+    cell = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
     predicted = boxes_at(_params_at(maps.box_params, cell), cell, grid, z0_m)
     return _neutral(predicted, boxes, is_valid)
 

@@ -72,7 +72,7 @@ def gaussian_heatmap(
     chex.assert_equal_shape_prefix([boxes, classes, is_valid], boxes.ndim - 1)
     chex.assert_equal_rank([classes, is_valid])
     boxes = boxes.astype(jnp.float32)
-    cell = grid.nearest_cell(boxes[..., 0], boxes[..., 1])  # [..., N, 2]
+    cell = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [..., N, 2]
     sigma_range, sigma_azimuth = _sigmas(boxes, sigma, sigma_cells)
     range_profile = _profile(cell[..., 0], sigma_range, grid.num_range)
     azimuth_profile = _profile(cell[..., 1], sigma_azimuth, grid.num_azimuth)

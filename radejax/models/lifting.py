@@ -22,8 +22,7 @@ from flax import struct
 from jaxtyping import Bool, Float
 
 from radejax.core.errors import UserError
-from radejax.geometry.calibration import CameraCalibration, ImageKind
-from radejax.geometry.camera import Camera, project
+from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
 

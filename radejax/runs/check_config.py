@@ -233,7 +233,7 @@ RULES: dict[str, Rule] = {
     "data.gain_db": _NOT_NEGATIVE,
     "data.gain_slope_db": _NOT_NEGATIVE,
     "data.label_permutation_seed": _or_none(_COUNT_OR_0),
-    "data.camera.projection": _one_of("raw", "rectified", "pinhole"),
+    "data.camera.projection": _one_of("raw", "pinhole"),
     "data.camera.ego_from_lidar_m": _or_none(_several(_number(), 3)),
     "data.camera.lidar_to_radar_z_m": _or_none(_number()),
     "data.camera.calibration": _one_of("sequence", "common"),

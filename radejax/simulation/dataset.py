@@ -29,7 +29,7 @@ from radejax.core.workers import process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source

@@ -17,7 +17,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 
 from radejax.core.errors import UserError
 from radejax.geometry.boxes import corners
-from radejax.geometry.calibration import CameraCalibration, ImageKind
+from radejax.geometry.camera import CameraCalibration, ImageKind
 from radejax.visualize.canvas import (
     Objects,
     Style,

@@ -27,7 +27,7 @@ from radejax.core.errors import UserError
 from radejax.core.files import atomic_path
 from radejax.core.structures import CLASSES
 from radejax.geometry.boxes import bev_corners
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 # The brightest fifth is left out: white boxes must stand out on the strongest echoes.

@@ -76,7 +76,7 @@ def draw_map(
     # Edges half a bin outside the centers; the range edge before zero is zero.
     range_cell = np.arange(grid.num_range + 1) - 0.5
     range_cell = np.maximum(range_cell, -grid.range_m[0] / grid.range_step_m)
-    edges = grid.cell_to_ego(
+    edges = grid.bin_to_ego(
         range_cell[rows.start : rows.stop + 1, None],
         np.arange(columns.start, columns.stop + 1)[None, :] - 0.5,
     )  # [R' + 1, A' + 1, 2]

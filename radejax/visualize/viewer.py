@@ -149,7 +149,7 @@ def ground_mesh(
     grid: RadarGrid,
 ) -> tuple[Float[np.ndarray, "bins 3"], Int[np.ndarray, "T 3"]]:
     """Vertices at bin centers on z = -2 m and triangles."""
-    centers = grid.cell_centers_ego().reshape(-1, 2)
+    centers = grid.bin_centers_ego().reshape(-1, 2)
     vertices = np.concatenate([centers, np.full((len(centers), 1), -2.0)], 1)
     first = (
         np.arange(grid.num_range - 1)[:, None] * grid.num_azimuth

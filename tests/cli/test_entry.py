@@ -9,19 +9,12 @@ import pytest
 
 from radejax.cli import entry
 from radejax.core.errors import DataError, DiskFullError, UserError
-from radejax.geometry.calibration import CalibrationError, CalibrationFileError
 
 
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
         (UserError("no such field"), 2, "error: no such field\n"),
-        (
-            CalibrationFileError("cam_1.yml: lacks k3"),
-            1,
-            "error: cam_1.yml: lacks k3\n",
-        ),
-        (CalibrationError("image must be raw"), 2, "error: image must be raw\n"),
         (DataError("a.txt:3: half a line"), 1, "error: a.txt:3: half a line\n"),
         (
             FileNotFoundError(errno.ENOENT, "No such file", "/nowhere"),

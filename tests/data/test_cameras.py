@@ -8,8 +8,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import Frame
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import project
+from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera.renderer import stereo_calibration
 
 CALIBRATION = CameraCalibration.from_angles(

@@ -20,7 +20,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.pipeline import LoaderOptions, make_loader, steps_per_epoch
 from radejax.data.records.job import project_dataset
 from radejax.data.records.projections import RecordSource
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 
 OPTIONS = LoaderOptions(3, seed=1, process_index=0, process_count=1)
 

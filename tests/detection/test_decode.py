@@ -218,11 +218,11 @@ def test_encoded_boxes_come_back():
     logits, params, cells, classes = scattered()
     rng = np.random.default_rng(1)
     boxes = np.zeros((len(cells), 7))
-    boxes[:, :2] = GRID.cell_to_ego(*cells.T) + rng.uniform(-1, 1, (len(cells), 2))
+    boxes[:, :2] = GRID.bin_to_ego(*cells.T) + rng.uniform(-1, 1, (len(cells), 2))
     boxes[:, 2:6] = rng.uniform(0.5, 3, (len(cells), 4))
     boxes[:, 6] = rng.uniform(-3, 3, len(cells))
     for (i, j), box in zip(cells, boxes, strict=True):
-        offset = box[:2] - GRID.cell_to_ego(i, j)
+        offset = box[:2] - GRID.bin_to_ego(i, j)
         heading = [np.sin(box[6]), np.cos(box[6])]
         params[0, i, j] = [*offset, box[2] - 0.7, *box[3:6], *heading]
     found = decode(
@@ -280,7 +280,7 @@ def test_more_rows_than_bins():
 
 def test_region_bounds_are_inclusive_and_leave_room_for_others():
     logits, params, cells, _ = scattered(num=10)
-    x, y = GRID.cell_to_ego(*cells.T).T
+    x, y = GRID.bin_to_ego(*cells.T).T
     inside = (np.abs(y) <= 30) & (x <= 90)
     assert 3 < inside.sum() < 10
     roi = np.array([0, 90, -30, 30, 0, 0.0])

@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from reference_points import draw_reference_points
 
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 
 matplotlib.use("agg")
 

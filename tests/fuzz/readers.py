@@ -23,7 +23,7 @@ from radejax.evaluation.columns import KNOWN_CLASSES
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import kitti, predictions
 from radejax.evaluation.files.load import Source, load
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.inference import open as model_files
 from radejax.inference.packed import write_packed
 from radejax.runs import evaluate, seeds, workdir

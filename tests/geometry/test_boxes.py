@@ -55,19 +55,6 @@ def test_corners_of_both_forms_agree_in_jax_and_numpy():
     assert isinstance(B.corners(boxes), np.ndarray)
 
 
-def test_transform_turns_then_shifts():
-    moved = B.transform_boxes(CAR, np.array([1.0, 0.0, -0.5]), np.pi / 2)
-    np.testing.assert_allclose(moved, [-1, 10, 0.5, 4, 2, 1.5, np.pi], atol=1e-12)
-
-
-@settings(deadline=None, max_examples=25)
-@given(st.floats(-3, 3), st.floats(-20, 20), st.floats(-20, 20))
-def test_transform_moves_corners_as_points(yaw, x, y):
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    moved = B.bev_corners(B.transform_boxes(CAR, np.array([x, y, 0.0]), yaw))
-    np.testing.assert_allclose(moved, B.bev_corners(CAR) @ turn.T + [x, y], atol=1e-9)
-
-
 @pytest.mark.wrong_types
 @pytest.mark.parametrize("function", [B.boxes8_from_7, B.boxes7_from_8, B.bev_corners])
 def test_wrong_width_is_refused(function):

@@ -7,12 +7,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from radejax.geometry import rotated_iou as R
-from radejax.geometry.boxes import bev_corners, boxes8_from_7, transform_boxes
+from radejax.geometry.boxes import bev_corners, boxes8_from_7
 
 bev = jax.jit(R.bev_iou)
 volume = jax.jit(R.iou_3d)
-bev_pairs = jax.jit(R.bev_iou_pairs)
-volume_pairs = jax.jit(R.iou_3d_pairs)
+
+
+def of_pairs(function):
+    """IoU of corresponding boxes `[P, 7]` by a function of all pairs."""
+    return lambda a, b: function(a[..., None, :], b[..., None, :])[..., 0, 0]
+
+
+bev_pairs = of_pairs(bev)
+volume_pairs = of_pairs(jax.jit(R.iou_3d))
+bev_host, volume_host = of_pairs(R.bev_iou), of_pairs(R.iou_3d)
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +50,14 @@ def test_half_overlap_by_hand():
     above = np.array([[12.0, 0, 1, 4, 2, 2, 0]])
     np.testing.assert_allclose(bev(car, ahead), [[4 / 12]], rtol=1e-6)
     np.testing.assert_allclose(volume(car, above), [[4 / 28]], rtol=1e-6)
-    np.testing.assert_allclose(R.bev_intersection_np(car, ahead), [4.0])
+    np.testing.assert_allclose(R.bev_intersection(car, ahead), [4.0])
 
 
 def test_square_turned_by_45_degrees_is_an_octagon():
     square = np.array([[0.0, 0, 0, 2, 2, 1, 0]])
     turned = np.array([[0.0, 0, 0, 2, 2, 1, np.pi / 4]])
     octagon = 8 * (np.sqrt(2) - 1)
-    np.testing.assert_allclose(R.bev_intersection_np(square, turned), [octagon])
+    np.testing.assert_allclose(R.bev_intersection(square, turned), [octagon])
     np.testing.assert_allclose(
         bev(square, turned), [[octagon / (8 - octagon)]], rtol=1e-6
     )
@@ -58,8 +66,8 @@ def test_square_turned_by_45_degrees_is_an_octagon():
 @pytest.mark.parametrize(
     ("exact", "double", "single"),
     [
-        ("iou_bev_exact", R.bev_iou_np, bev_pairs),
-        ("iou_3d_exact", R.iou_3d_np, volume_pairs),
+        ("iou_bev_exact", bev_host, bev_pairs),
+        ("iou_3d_exact", volume_host, volume_pairs),
     ],
 )
 def test_agrees_with_polygon_clipping_on_every_kind(pairs, exact, double, single):
@@ -106,7 +114,7 @@ def test_nearly_identical_boxes_against_shapely(scale):
     b = nearly(rng, a, scale)
     expected = shapely_intersection(a, b)
     union = a[:, 3] * a[:, 4] + b[:, 3].astype(np.float64) * b[:, 4] - expected
-    np.testing.assert_allclose(R.bev_intersection_np(a, b), expected, rtol=1e-9)
+    np.testing.assert_allclose(R.bev_intersection(a, b), expected, rtol=1e-9)
     np.testing.assert_allclose(bev_pairs(a, b), expected / union, atol=1e-6)
 
 
@@ -122,10 +130,10 @@ def test_boxes_slid_along_an_edge_share_collinear_edges(along):
     size, other = (a[:, 3], a[:, 4]) if along else (a[:, 4], a[:, 3])
     expected = np.maximum(size - slide, 0) * other
     area = a[:, 3] * a[:, 4]
-    found = R.bev_intersection_np(a, b)
+    found = R.bev_intersection(a, b)
     np.testing.assert_allclose(found / area, expected / area, atol=1e-12)
     a, b = a.astype(np.float32), b.astype(np.float32)  # not quite collinear any more
-    np.testing.assert_allclose(bev_pairs(a, b), R.bev_iou_np(a, b), atol=1e-6)
+    np.testing.assert_allclose(bev_pairs(a, b), bev_host(a, b), atol=1e-6)
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 3])
@@ -135,8 +143,8 @@ def test_identical_boxes_in_every_quarter_turn(turns):
     same[:, 6] += turns * np.pi / 2
     if turns % 2:
         same[:, [3, 4]] = same[:, [4, 3]]
-    np.testing.assert_allclose(R.bev_iou_np(boxes, same), 1, atol=1e-5)  # angles round
-    exact = R.bev_iou_np(boxes, same)
+    np.testing.assert_allclose(bev_host(boxes, same), 1, atol=1e-5)  # angles round
+    exact = bev_host(boxes, same)
     np.testing.assert_allclose(bev_pairs(boxes, same), exact, atol=1e-6)
 
 
@@ -174,7 +182,7 @@ def test_symmetric_bounded_and_bev_at_least_volume(a, b):
     assert 0 <= ground <= 1
     np.testing.assert_allclose(ground, bev_pairs(b, a), atol=1e-6)
     np.testing.assert_allclose(space, volume_pairs(b, a), atol=1e-6)
-    np.testing.assert_allclose(ground, R.bev_iou_np(a, b), atol=2e-6)
+    np.testing.assert_allclose(ground, bev_host(a, b), atol=2e-6)
 
 
 @settings(deadline=None, max_examples=100)
@@ -193,9 +201,13 @@ def test_identical_boxes_have_iou_1(a):
 def test_unchanged_by_a_common_rigid_motion(a, b, yaw, shift):
     a, b = as_box(a).astype(np.float64), as_box(b).astype(np.float64)
     translation = np.array([shift, 2 * shift, 1.0])
-    moved = [transform_boxes(box, translation, yaw) for box in (a, b)]
-    np.testing.assert_allclose(R.bev_iou_np(*moved), R.bev_iou_np(a, b), atol=1e-9)
-    np.testing.assert_allclose(R.iou_3d_np(*moved), R.iou_3d_np(a, b), atol=1e-9)
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    turn = np.eye(7)
+    turn[:2, :2] = [[cos, -sin], [sin, cos]]
+    motion = np.array([*translation, 0, 0, 0, yaw])
+    moved = [box @ turn.T + motion for box in (a, b)]
+    np.testing.assert_allclose(bev_host(*moved), bev_host(a, b), atol=1e-9)
+    np.testing.assert_allclose(volume_host(*moved), volume_host(a, b), atol=1e-9)
 
 
 @settings(deadline=None, max_examples=100)
@@ -204,7 +216,7 @@ def test_unchanged_by_a_common_rigid_motion(a, b, yaw, shift):
 def test_against_shapely(a, b):
     a, b = as_box(a), as_box(b)
     expected = shapely_intersection(a, b)
-    np.testing.assert_allclose(R.bev_intersection_np(a, b), expected, atol=1e-7)
+    np.testing.assert_allclose(R.bev_intersection(a, b), expected, atol=1e-7)
 
 
 def test_contained_box_gives_the_ratio_of_areas():
@@ -266,19 +278,13 @@ def test_bfloat16_boxes_are_compared_in_float32():
     np.testing.assert_allclose(matrix.diagonal(), 1, atol=1e-6)
 
 
-def test_chunks_do_not_change_the_result():
-    rng = np.random.default_rng(8)
-    a, b = random_boxes(rng, 101), random_boxes(rng, 101)
-    for function in (R.bev_intersection_np, R.bev_iou_np, R.iou_3d_np):
-        whole = function(a, b)
-        np.testing.assert_array_equal(function(a, b, chunk_size=10), whole)
-        assert whole.dtype == np.float64
-        assert function(a[:0], b[:0]).shape == (0,)
+def test_numpy_boxes_are_compared_in_float64():
+    boxes = random_boxes(np.random.default_rng(8), 5).astype(np.float32)
+    for function in (R.bev_intersection, R.bev_iou, R.iou_3d):
+        assert function(boxes, boxes).dtype == np.float64
 
 
 @pytest.mark.wrong_types
 def test_bad_shapes_are_refused():
     with pytest.raises(ValueError, match=r"must be \[..., 7\] or \[..., 8\], got"):
         bev(np.zeros((2, 5)), np.zeros((2, 7)))
-    with pytest.raises(ValueError, match=r"two arrays of P boxes .* \(2, 7\) and \(3"):
-        R.bev_intersection_np(np.zeros((2, 7)), np.zeros((3, 7)))

@@ -10,11 +10,11 @@ import pytest
 from radejax import Detector, UserError
 from radejax.core.structures import Batch
 from radejax.data.cameras import CameraOptions
-from radejax.geometry.calibration import (
+from radejax.geometry.camera import (
     EGO_FROM_LIDAR_M,
     KRADAR_LIDAR_TO_RADAR_Z_M,
+    stack_cameras,
 )
-from radejax.geometry.camera import stack_cameras
 from radejax.inference.inputs import prepare
 from radejax.models.lifting import reference_points
 

@@ -104,7 +104,7 @@ def windows(maps, case, fill):
     found = []
     for frame, row in want["patch_frame_object"].astype(int):
         x, y = want["boxes"][frame, row, :2].astype(np.float64)
-        i, j = STRETCHED.nearest_cell(x, y)
+        i, j = STRETCHED.nearest_bin(x, y)
         cls = want["classes"][frame, row]
         found.append(padded[frame, cls, i : i + 13, j : j + 13])
     return np.stack(found)
@@ -182,7 +182,7 @@ def small_scene(rng, counts=(0, 1, 3), rows=4):
     classes = np.full((b, rows), -1, np.int32)
     is_valid = np.arange(rows) < np.array(counts)[:, None]
     cells = rng.uniform([2, 0], [23, 15], (b, rows, 2))
-    boxes[..., :2] = GRID.cell_to_ego(cells[..., 0], cells[..., 1])
+    boxes[..., :2] = GRID.bin_to_ego(cells[..., 0], cells[..., 1])
     boxes[..., 2:6] = rng.uniform(0.5, 5, (b, rows, 4))
     yaw = rng.uniform(-3, 3, (b, rows))
     boxes[..., 6], boxes[..., 7] = np.sin(yaw), np.cos(yaw)
@@ -228,9 +228,9 @@ def naive_regression(maps, batch, transform="sqrt", z0_m=0.0):
         frame = []
         for n in np.flatnonzero(batch.is_valid[b]):
             wanted = np.asarray(batch.boxes[b, n])
-            i, j = GRID.nearest_cell(*wanted[:2])
+            i, j = GRID.nearest_bin(*wanted[:2])
             predicted = np.array(maps.box_params[b, i, j])
-            predicted[:2] += GRID.cell_to_ego(i, j)
+            predicted[:2] += GRID.bin_to_ego(i, j)
             predicted[2] += z0_m
             gap = np.abs(predicted - wanted)
             l1 = np.where(gap < 1, gap**2 / 2, gap - 0.5).mean()
@@ -283,7 +283,7 @@ def test_another_part_is_a_function_and_a_weight(monkeypatch):
     heights = [
         np.mean(
             [
-                abs(maps.box_params[b, *GRID.nearest_cell(*box[:2]), 2] - box[2])
+                abs(maps.box_params[b, *GRID.nearest_bin(*box[:2]), 2] - box[2])
                 for box in boxes[b][batch.is_valid[b]]
             ]
             or 0
@@ -321,9 +321,9 @@ def test_perfect_boxes_give_finite_gradients():
     maps, batch = small_scene(np.random.default_rng(3), counts=(3, 0, 0))
     params = np.array(maps.box_params)
     for box in np.asarray(batch.boxes[0, :3]):
-        i, j = GRID.nearest_cell(*box[:2])
+        i, j = GRID.nearest_bin(*box[:2])
         params[0, i, j] = box
-        params[0, i, j, :2] -= GRID.cell_to_ego(i, j)
+        params[0, i, j, :2] -= GRID.bin_to_ego(i, j)
     maps = maps.replace(box_params=jnp.asarray(params))
     (_, parts), grad = loss_and_grad(maps, batch)
     assert float(parts["gwd"]) * 3 == pytest.approx(1 - 1 / 1.65, abs=1e-5)
@@ -405,8 +405,8 @@ def scene_with_peaks():
     boxes = np.zeros((3, 4, 8), np.float32)
     for array in (params, boxes):
         array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
-    boxes[0, 0, :2] = GRID.cell_to_ego(10, 8) + np.array([1.0, 0.5])
-    boxes[0, 1, :2] = GRID.cell_to_ego(5, 2)
+    boxes[0, 0, :2] = GRID.bin_to_ego(10, 8) + np.array([1.0, 0.5])
+    boxes[0, 1, :2] = GRID.bin_to_ego(5, 2)
     is_valid = np.zeros((3, 4), bool)
     is_valid[0, :2] = True
     maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
@@ -458,7 +458,7 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     boxes = np.zeros((1, 2, 8), np.float32)
     for row, cell in enumerate(((10, 8), (11, 8))):
         logits[0, *cell, row] = 0.0
-        boxes[0, row, :2] = GRID.cell_to_ego(*cell)
+        boxes[0, row, :2] = GRID.bin_to_ego(*cell)
     for array in (params, boxes):
         array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
     batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))

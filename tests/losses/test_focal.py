@@ -19,7 +19,7 @@ heatmap = jax.jit(
 def objects(cells, sizes=((4.0, 2.0),)):
     """Boxes centered near given bins, a little off the bin centers."""
     cells = np.asarray(cells, np.float64)
-    ground = GRID.cell_to_ego(cells[:, 0] + 0.2, cells[:, 1] - 0.3)
+    ground = GRID.bin_to_ego(cells[:, 0] + 0.2, cells[:, 1] - 0.3)
     boxes = np.zeros((len(cells), 8), np.float32)
     boxes[:, :2] = ground
     boxes[:, 3:5] = np.broadcast_to(sizes, (len(cells), 2))

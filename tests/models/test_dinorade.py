@@ -11,8 +11,7 @@ import pytest
 
 from radejax.core.config import load_module
 from radejax.core.errors import UserError
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.models import build, dinorade, lifting
 from radejax.models.lifting import ReferencePoints
 from radejax.models.radenet import RadeNet

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import Camera, stack_cameras
+from radejax.geometry.camera import Camera, CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
 from radejax.models.lifting import LiftingAxes, WeightingNetwork

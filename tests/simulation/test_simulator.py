@@ -38,7 +38,7 @@ def test_visible_objects_stand_out_of_the_noise(urban):
         floor.append(np.median(peak))
         for box in frame.boxes[visible]:
             toward = box[:2] * (1.0 - box[3] / 2 / np.hypot(*box[:2]))
-            r, a = GRID.nearest_cell(*toward)
+            r, a = GRID.nearest_bin(*toward)
             near = peak[max(r - 2, 0) : r + 4, max(a - 2, 0) : a + 3]
             brightness.append(near.max())
     stands_out = np.array(brightness) > np.mean(floor) + 6.0 / 184.3

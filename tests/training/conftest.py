@@ -90,7 +90,7 @@ def make_frames(grid: RadarGrid, seed: int) -> Batch:
     rng = np.random.default_rng(seed)
     n = NUM_FRAMES
     cells = np.stack([rng.integers(4, 14, (n, 2)), rng.integers(2, 12, (n, 2))], -1)
-    xy = grid.cell_to_ego(
+    xy = grid.bin_to_ego(
         *np.moveaxis(cells + rng.uniform(-0.3, 0.3, cells.shape), -1, 0)
     )
     projection = 0.05 * rng.random((n, *grid.projection_shape))

@@ -13,8 +13,7 @@ from radejax import models
 from radejax.core.config import load_module
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.open import starting_weights
 from radejax.losses.detection import detection_loss

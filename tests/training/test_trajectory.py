@@ -19,8 +19,7 @@ import pytest
 from radejax import models
 from radejax.core.config import load_module
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import stack_cameras
+from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.runs.experiment import loss_options

@@ -44,7 +44,7 @@ def brightest_tile(figure, ax) -> np.ndarray:
 def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
     ax = bev.draw_bev(Scene(projection, GRID), extent="fov", show_legend=False)
-    x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
+    x, y = GRID.bin_to_ego(range_idx, azimuth_idx)
     tile = brightest_tile(ax.figure, ax)
     # At 5 pixels a metre a bin is 10 pixels deep; its center is hit to one pixel.
     np.testing.assert_allclose(tile, ax.transData.transform((y, x)), atol=1.0)
@@ -54,7 +54,7 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
 def test_polar_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
     ax = bev.draw_polar(Scene(projection, GRID), show_legend=False)
-    x, y = GRID.cell_to_ego(range_idx, azimuth_idx)
+    x, y = GRID.bin_to_ego(range_idx, azimuth_idx)
     outline = bev.to_polar(np.array([x, y]))
     tile = brightest_tile(ax.figure, ax)
     np.testing.assert_allclose(tile, ax.transData.transform(outline), atol=1.0)
@@ -212,7 +212,7 @@ def test_map_shows_every_bin_of_a_partial_extent():
     ax = bev.draw_map(values, GRID, extent=extent, show_colorbar=False)
     mesh = ax.collections[0]
     shown = set(np.round(mesh.get_array().ravel().astype(float), 2))
-    centers = GRID.cell_centers_ego()
+    centers = GRID.bin_centers_ego()
     inside = (
         (centers[..., 0] >= extent[0])
         & (centers[..., 0] <= extent[1])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.visualize import camera
 
 # Looks along +x from the ego origin: u = 64 - 100 y / x, v = 36 - 100 z / x.

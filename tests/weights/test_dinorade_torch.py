@@ -12,7 +12,7 @@ import pytest
 
 from radejax.core.config import load_module
 from radejax.core.errors import DataError, UserError
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.models.camera_neck import CameraNeck
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import (

@@ -19,7 +19,7 @@ from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_json
 from radejax.data.kradar.labels import MAX_LABEL_BYTES, read_label_bytes
-from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M
+from radejax.geometry.camera import KRADAR_LIDAR_TO_RADAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 
 SIMULATION_MARKER = "simulation.json"

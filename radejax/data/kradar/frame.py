@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped
 
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.data.tesseract import read_frame
-from radejax.geometry.calibration import KRADAR_LIDAR_TO_RADAR_Z_M, CameraCalibration
+from radejax.geometry.camera import KRADAR_LIDAR_TO_RADAR_Z_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int32, UInt8
 from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera import lens, panels, shapes
 from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
 

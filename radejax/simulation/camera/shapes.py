@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from radejax.geometry.calibration import CameraCalibration
-from radejax.geometry.camera import project
+from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details, lens
 from radejax.simulation.camera.panels import Panels
 

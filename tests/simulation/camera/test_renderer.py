@@ -8,7 +8,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import read_labels
-from radejax.geometry.calibration import CameraCalibration
+from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera import lens
 from radejax.simulation.camera import renderer as camera
 from radejax.simulation.config import SimulationConfig, default_config
@@ -116,7 +116,9 @@ class TestLabelsProjectOntoObjects:
         calibration = CameraCalibration.from_kradar(tmp_path / "cam.yml")
         read = read_labels(tmp_path / "1.txt")[0]
         assert read.visibility == "R"
-        pixels, _ = calibration.project_lidar(corners(read.box))
+        pixels, _ = calibration.project_ego(
+            corners(read.box) + calibration.ego_from_lidar_m
+        )
         mask = camera.CameraRenderer(sequence, PAIR, 0).shown_boxes(frame, 0)
         np.testing.assert_allclose(mask_bounds(mask, 0), bounds(pixels), atol=1.5)
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from radejax.geometry.rotated_iou import bev_intersection_np
+from radejax.geometry.rotated_iou import bev_intersection
 from radejax.simulation.world.environments import ENVIRONMENTS
 from radejax.simulation.world.scene import FRAME_PERIOD_S, Road
 from radejax.simulation.world.traffic import make_sequence
@@ -37,7 +37,7 @@ class TestEveryEnvironment:
             boxes = sequence(environment, seed).frame(10).boxes
             vehicles = boxes[boxes[:, 3] > 1.5]
             pairs = np.array(list(itertools.combinations(range(len(vehicles)), 2)))
-            area = bev_intersection_np(vehicles[pairs[:, 0]], vehicles[pairs[:, 1]])
+            area = bev_intersection(vehicles[pairs[:, 0]], vehicles[pairs[:, 1]])
             smaller = np.minimum(
                 *(vehicles[pairs[:, k], 3] * vehicles[pairs[:, k], 4] for k in (0, 1))
             )

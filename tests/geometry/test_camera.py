@@ -1,4 +1,4 @@
-"""Tests of radejax.geometry.calibration."""
+"""Tests of radejax.geometry.camera."""
 
 import json
 import math
@@ -11,12 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax.core.errors import DataError, UserError
 from radejax.geometry import camera as camera_lib
-from radejax.geometry.calibration import (
-    CalibrationError,
-    CalibrationFileError,
-    CameraCalibration,
-)
+from radejax.geometry.camera import CameraCalibration
 
 # The distortion and matrix of K-Radar's cameras.
 INTRINSICS = (567.720776478944, 577.2136917114258, 628.72078, 369.30687)
@@ -36,6 +33,10 @@ def forward_camera(**fields) -> CameraCalibration:
         "ego_from_lidar_m": (0.0, 0.0, 0.0),
     }
     return CameraCalibration.from_angles(**(settings | fields))
+
+
+def of_lidar(camera, points):
+    return camera.project_ego(points + camera.ego_from_lidar_m)
 
 
 def test_a_camera_that_looks_ahead_by_hand():
@@ -61,7 +62,7 @@ def test_image_borders_belong_to_the_left_and_top():
 def test_lidar_points_are_ego_points_minus_the_shift():
     camera = forward_camera(ego_from_lidar_m=(-2.54, 0.3, 0.7))
     lidar = np.array([12.0, -1.0, 0.5])
-    from_lidar, _ = camera.project_lidar(lidar)
+    from_lidar, _ = of_lidar(camera, lidar)
     from_ego, _ = camera.project_ego(lidar + np.array([-2.54, 0.3, 0.7]))
     np.testing.assert_allclose(from_lidar, [50 + 50 / 12, 40 - 25 / 12], atol=1e-12)
     np.testing.assert_allclose(from_ego, from_lidar, atol=1e-12)
@@ -105,15 +106,13 @@ def test_projection_of_a_real_frame(shared):
         behind = 0
         for thing in case["objects"]:
             lidar = np.array(thing["xyz_lidar"])
-            pixels, depth = camera.project_lidar(lidar)
+            pixels, depth = of_lidar(camera, lidar)
             np.testing.assert_allclose(depth, thing["xyz_cam"][2], atol=1e-8)
             if thing["uv_raw"] is None:
                 behind += 1
                 assert depth < 0
                 continue
             np.testing.assert_allclose(pixels, thing["uv_raw"], atol=1e-6)
-            pixels, _ = camera.project_lidar(lidar, "rectified")
-            np.testing.assert_allclose(pixels, thing["uv_undistorted"], atol=1e-6)
         assert behind == 1, name
 
 
@@ -128,7 +127,7 @@ def test_every_calibration_of_the_data_set_can_be_read(shared):
     }
     assert len(extrinsics) == 37
     for camera in cameras:
-        pixel, depth = camera.project_lidar(np.array([30.0, 0, 0]))
+        pixel, depth = of_lidar(camera, np.array([30.0, 0, 0]))
         assert depth > 29
         assert camera.in_image(pixel, depth)
 
@@ -189,7 +188,7 @@ def test_box_edges_turn_with_yaw():
     np.testing.assert_array_equal(key(a), key(b))
 
 
-@pytest.mark.parametrize("image", ["raw", "rectified", "pinhole"])
+@pytest.mark.parametrize("image", ["raw", "pinhole"])
 def test_batches_of_cameras_under_jit(image):
     rng = np.random.default_rng(0)
     calibrations = [
@@ -232,29 +231,25 @@ def test_bad_calibrations(tmp_path):
     path = tmp_path / "cam_1.yml"
     text = forward_camera().to_kradar_text()
     path.write_text(text.replace("fx: ", "fx= "))
-    with pytest.raises(
-        CalibrationFileError, match=r"cam_1\.yml:1: expected 'key: number'"
-    ):
+    with pytest.raises(DataError, match=r"cam_1\.yml:1: expected 'key: number'"):
         CameraCalibration.from_kradar(path)
     path.write_text("\n".join(line for line in text.splitlines() if "k3" not in line))
-    with pytest.raises(CalibrationFileError, match="lacks k3"):
+    with pytest.raises(DataError, match="lacks k3"):
         CameraCalibration.from_kradar(path)
-    with pytest.raises(CalibrationError, match="intrinsics must be"):
+    with pytest.raises(UserError, match="intrinsics is"):
         forward_camera(intrinsics=(1.0, 2.0))
-    with pytest.raises(CalibrationError, match="raw, rectified, pinhole"):
+    with pytest.raises(UserError, match="raw, pinhole"):
         forward_camera().camera("fisheye")
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("img_size_w", "0", r"width and height must be 1 to 65536 pixels, got 0 x 80"),
-        ("img_size_h", "-3", r"width and height must be"),
-        ("fx", "-1", r"focal lengths must be positive"),
-        ("fx", "inf", r"expected 'key: number' up to 1e\+09, found 'fx: inf'"),
-        ("k1", "1e308", r"expected 'key: number' up to"),
-        ("k1", "1e8", r"distortion must be .* up to 1000"),
-        ("x_ldr2cam", "1e8", r"translation_m must be"),
+        ("img_size_w", "0", r"width is 0, expected 1 to 65536 pixels"),
+        ("fx", "-1", r"focal length is \[-1.0, .*\], expected above 0"),
+        ("fx", "inf", r"fx is inf, not a finite number"),
+        ("k1", "nan", r"k1 is nan"),
+        ("k1", "1e308", r"k1 is 1e\+308"),
     ],
 )
 def test_impossible_cameras_name_the_file(tmp_path, key, value, message):
@@ -262,8 +257,8 @@ def test_impossible_cameras_name_the_file(tmp_path, key, value, message):
     text = forward_camera().to_kradar_text()
     lines = [x for x in text.splitlines() if not x.startswith(f"{key}:")]
     path.write_text("\n".join([*lines, f"{key}: {value}"]))
-    with pytest.raises(CalibrationFileError, match=r"cam_1\.yml:.*" + message):
+    with pytest.raises(DataError, match=r"cam_1\.yml:.*" + message):
         CameraCalibration.from_kradar(path)
     path.write_bytes(b"\xff")
-    with pytest.raises(CalibrationFileError, match=r"cam_1\.yml: not a UTF-8"):
+    with pytest.raises(DataError, match=r"cam_1\.yml:1: expected 'key: number'"):
         CameraCalibration.from_kradar(path)
