@@ -253,7 +253,7 @@ def dinorade(machine, task="forward"):
         rng = np.random.default_rng(0)
         image = rng.integers(0, 256, (size, *model.image_size, 3), np.uint8)
         places = static_reference_points(
-            inputs.CALIBRATION, model.axes, 256, 112
+            inputs.CALIBRATION, model.query_grid, 256, 112
         ).points
         places = np.asarray(places, np.float32)
         # All in the image, as torch's has it.
@@ -314,7 +314,9 @@ def attention(machine):
     state = {f"{k}.weight": v["kernel"].T for k, v in params.items()}
     state |= {f"{k}.bias": v["bias"] for k, v in params.items()}
     _, model, _ = network("dinorade.py", "float32")
-    places = static_reference_points(inputs.CALIBRATION, model.axes, 256, 112).points
+    places = static_reference_points(
+        inputs.CALIBRATION, model.query_grid, 256, 112
+    ).points
     scale = np.exp(normal((1, bins, elevation)))
     given = (
         normal((1, bins, width)),

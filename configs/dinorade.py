@@ -52,23 +52,23 @@ VARIANTS = {
 
 PRESETS = {
     "paper": {
-        "loss.sigma_cells": 0.75,
+        "loss.heatmap_sigma_bins": 0.75,
         "train.num_epochs": 11,
         "model.fusion.num_points": 4,
         "model.fusion.weighting": "mlp",
         "model.fusion.gate": "channel",
-        "model.fusion.invalid": "drop",
+        "model.fusion.out_of_view": "drop",
         "model.image.standardize": True,
         "data.camera.projection": "raw",
         "data.camera.lidar_to_radar_z_m": KRADAR_LIDAR_TO_RADAR_Z_M,
     },
     "official": {
-        "loss.sigma_cells": 3.0,
+        "loss.heatmap_sigma_bins": 3.0,
         "train.num_epochs": 11,
         "model.fusion.num_points": 8,
         "model.fusion.weighting": "cnn",
         "model.fusion.gate": "bin",
-        "model.fusion.invalid": "official",
+        "model.fusion.out_of_view": "official",
         "model.image.standardize": True,
         "data.camera.projection": "pinhole",
         "data.camera.ego_from_lidar_m": OFFICIAL_OFFSET_M,
@@ -89,7 +89,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
     variant = variant or "rcw"
     config = base_config()
     config.model.input_stem = True
-    config.loss.sigma_cells = 0.75
+    config.loss.heatmap_sigma_bins = 0.75
     config.train.update(batch_size=6, num_epochs=11)
     config.data.camera = _camera()
     _add_camera_model(config.model)
@@ -97,7 +97,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         for rows in (_radenet().PRESETS[preset], PRESETS[preset]):
             config.update_from_flattened_dict(rows)
     if preset == "official":
-        config.model.axes = _axes(LiftingAxes.official())
+        config.model.query_grid = _axes(LiftingAxes.official())
         # The released ResNet sees colours in [0, 1].
         config.model.image.standardize = variant != "rcw_resnet50"
     config.update_from_flattened_dict(VARIANTS[variant])
@@ -105,7 +105,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         config.loss.update(sigmas[sigma])
     if variant == "r":
         config.model.name = "radenet"
-        for section in ("image", "fusion", "axes"):
+        for section in ("image", "fusion", "query_grid"):
             del config.model[section]
         del config.data.camera
     if classes == "sedan":
@@ -143,13 +143,13 @@ def _add_camera_model(model: ConfigDict) -> None:
             "num_elevation": 10,
             "weighting": "mlp",  # "cnn", "off"
             "gate": "channel",  # "bin"
-            "invalid": "drop",  # "official"
+            "out_of_view": "drop",  # "official"
             "necks": True,
             "dropout": 0.1,
             "chunk_size": 0,  # chosen by platform
         }
     )
-    model.axes = _axes(LiftingAxes.of_grid(RadarGrid.kradar()))
+    model.query_grid = _axes(LiftingAxes.of_grid(RadarGrid.kradar()))
 
 
 def _axes(axes: LiftingAxes) -> ConfigDict:

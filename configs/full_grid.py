@@ -28,7 +28,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.simulation.output = "projection"  # a tensor in K-Radar's files has 1 GB
     config.model.update(doppler_bins=64, elevation_bins=37)
     # The spread of `quickstart:ablation` in metres of range: bins are 2.6 times finer.
-    config.loss.sigma_cells = 2.6
+    config.loss.heatmap_sigma_bins = 2.6
     if length == "short":
         config.simulation.update(
             train_sequences=2, test_sequences=1, frames_per_sequence=4

@@ -40,7 +40,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         num_groups=8,
         heatmap_prior=0.02,  # saves the first epochs, which push all bins down to here
     )
-    config.loss.sigma_cells = 1.0  # of bins of 1.2 m
+    config.loss.heatmap_sigma_bins = 1.0  # of bins of 1.2 m
     config.train.update(
         batch_size=2,
         num_epochs=7,
@@ -73,7 +73,7 @@ def _teach_more(config: ConfigDict) -> None:
     config.simulation.update(train_sequences=1600, vulnerable_road_users=5.0)
     # Noise is at 0.545 with a spread of 0.02: the input as it is is next to constant.
     config.model.update(input_center=0.545, input_scale=25.0)
-    config.loss.sigma_cells = 0.75
+    config.loss.heatmap_sigma_bins = 0.75
     # Finding is harder than boxing; and of boxes, smooth L1 learns from those that are
     # far off, trucks' most of all, the GWD from those that are nearly right.
     config.loss.weights.update(focal=8.0, gwd=4.0)

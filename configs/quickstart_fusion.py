@@ -83,11 +83,11 @@ def _add_camera(config: ConfigDict) -> None:
     config.model.fusion = full.model.fusion
     # Without the necks before the attention and with fewer samples: half the time.
     config.model.fusion.update(num_elevation=4, num_points=2, necks=False)
-    config.model.axes = ConfigDict(
+    config.model.query_grid = ConfigDict(
         {
             name: getattr(axes, name)
             for name in ("range_m", "azimuth_deg", "elevation_deg")
         }
     )
     # Four segments over the sensor's 36 degrees would pass above and below the cars.
-    config.model.axes.elevation_deg = (-6.0, 6.0)
+    config.model.query_grid.elevation_deg = (-6.0, 6.0)

@@ -47,7 +47,7 @@ PRESETS = {
         "model.cbam": "paper",
         "model.crop_output": True,
         "loss.gwd_transform": "sqrt",
-        "loss.matching": "nms",
+        "loss.assignment": "nms",
         "loss.z0_m": 0.0,
         "decode.threshold_inclusive": True,
         "decode.roi": None,
@@ -66,7 +66,7 @@ PRESETS = {
         "model.cbam": "official",
         "model.crop_output": False,
         "loss.gwd_transform": "none",
-        "loss.matching": "center",
+        "loss.assignment": "center",
         "loss.z0_m": 0.0,
         "decode.threshold_inclusive": False,
         "decode.roi": WIDE_ROI,
@@ -85,10 +85,10 @@ PRESETS = {
 """Where the paper and the released code differ, one field a row."""
 
 SIGMAS = {
-    "sigma3": {"sigma": "fixed", "sigma_cells": 3.0},
-    "sigma0.75": {"sigma": "fixed", "sigma_cells": 0.75},
-    "adaptive": {"sigma": "adaptive"},
-    "anisotropic": {"sigma": "anisotropic"},
+    "sigma3": {"heatmap_sigma_mode": "fixed", "heatmap_sigma_bins": 3.0},
+    "sigma0.75": {"heatmap_sigma_mode": "fixed", "heatmap_sigma_bins": 0.75},
+    "adaptive": {"heatmap_sigma_mode": "adaptive"},
+    "anisotropic": {"heatmap_sigma_mode": "anisotropic"},
 }
 """Fields of `config.loss` for the spread of the heatmap's targets."""
 

@@ -37,7 +37,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         num_groups=8,
         heatmap_prior=0.02,
     )
-    config.loss.sigma_cells = 1.0
+    config.loss.heatmap_sigma_bins = 1.0
     config.train.update(
         batch_size=4,
         num_epochs=4,

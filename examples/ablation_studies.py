@@ -98,11 +98,11 @@ STUDIES = {
         "spread of the heatmap's targets",
         "sigma 3",
         {
-            "sigma 3": _radar(loss__sigma_cells=3.0),
+            "sigma 3": _radar(loss__heatmap_sigma_bins=3.0),
             "model": _row("model"),  # sigma 1
-            "sigma 0.75": _radar(loss__sigma_cells=0.75),
-            "adaptive": _radar(loss__sigma="adaptive"),
-            "anisotropic": _radar(loss__sigma="anisotropic"),
+            "sigma 0.75": _radar(loss__heatmap_sigma_bins=0.75),
+            "adaptive": _radar(loss__heatmap_sigma_mode="adaptive"),
+            "anisotropic": _radar(loss__heatmap_sigma_mode="anisotropic"),
             "labels exchanged": Cell(_RADAR, _LABELS),
         },
         (

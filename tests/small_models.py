@@ -50,7 +50,7 @@ def camera_config() -> ConfigDict:
         size=IMAGE_SIZE, hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16
     )
     config.model.fusion.update(num_heads=2, num_points=2, num_elevation=3)
-    config.model.axes.update(range_m=(1.0, 1.9), azimuth_deg=(-50.0, 7.0))
+    config.model.query_grid.update(range_m=(1.0, 1.9), azimuth_deg=(-50.0, 7.0))
     return config
 
 

@@ -112,7 +112,7 @@ def base_config() -> ConfigDict:
 
     Two fields are not the paper's, because the released weights and the reported
     parameter count are not either: `model.cbam` ("official", the released block) and
-    `loss.matching` ("center"). `configs/radenet.py` has presets for both worlds.
+    `loss.assignment` ("center"). `configs/radenet.py` has presets for both worlds.
     """
     config = ConfigDict()
     config.seed = 0
@@ -180,12 +180,12 @@ def _model() -> ConfigDict:
 def _loss() -> ConfigDict:
     return ConfigDict(
         {
-            "sigma": "fixed",  # "adaptive", "anisotropic"
-            "sigma_cells": 3.0,
+            "heatmap_sigma_mode": "fixed",  # "adaptive", "anisotropic"
+            "heatmap_sigma_bins": 3.0,
             "gwd_transform": "sqrt",  # "none", "log1p"
             "gwd_tau": 1.65,
             "normalize_yaw": False,
-            "matching": "center",  # "nms", with the thresholds of `decode`
+            "assignment": "center",  # "nms", with the thresholds of `decode`
             "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
             "normalize": True,  # divide each part by its own value
             # Boxes are z0 + dz. The paper prints no value for its sensor height.

@@ -88,7 +88,7 @@ class Detections(struct.PyTreeNode):
         scores: In [0, 1]; 0 where not `is_valid`.
         classes: int32 class indices; -1 where not `is_valid`.
         is_valid: True where a row is a detection.
-        num_cut: int32 peaks above the score threshold that did not fit in K.
+        num_truncated: int32 peaks above the score threshold that did not fit in K.
         class_names: Names of the class indices, the detector's; static under `jit`.
             The methods take others in their place.
     """
@@ -97,7 +97,7 @@ class Detections(struct.PyTreeNode):
     scores: Float[jax.Array, "B K"]
     classes: Int[jax.Array, "B K"]
     is_valid: Bool[jax.Array, "B K"]
-    num_cut: Int[jax.Array, " B"]
+    num_truncated: Int[jax.Array, " B"]
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
     def __repr__(self) -> str:

@@ -90,7 +90,7 @@ def decode(
 
     Returns:
         Detections by descending score; equal scores in order of range, then azimuth.
-        `num_cut` counts peaks beyond `pre_nms` and boxes after NMS beyond K.
+        `num_truncated` counts peaks beyond `pre_nms` and boxes after NMS beyond K.
 
     Raises:
         ValueError: Shapes of maps and grid differ, or a size is not positive.
@@ -303,7 +303,7 @@ def _compact(
         scores=jnp.where(is_valid, at(peaks.scores, order), 0.0),
         classes=jnp.where(is_valid, at(peaks.classes, order), -1),
         is_valid=is_valid,
-        num_cut=peaks.num_found
+        num_truncated=peaks.num_found
         - num_entered
         + jnp.maximum(num_kept - max_detections, 0),
     )

@@ -155,7 +155,7 @@ def stablehlo(
             camera = Camera(**camera)
         tree = traverse_util.unflatten_dict(weights, sep="/")
         found = function(tree, projection, image, camera, *settings, is_tesseract=False)
-        names = ("boxes", "scores", "classes", "is_valid", "num_cut")
+        names = ("boxes", "scores", "classes", "is_valid", "num_truncated")
         return {name: getattr(found, name) for name in names}
 
     (batch,) = jax.export.symbolic_shape("b")
@@ -227,7 +227,7 @@ found = detect(projection)   # [B, {shape}] float32
 `found` is a dictionary of arrays with {detector.decode_options["max_detections"]} rows a
 frame: `boxes` [B, K, 7] (x, y, z, l, w, h, yaw; metres and radians, x forward, y left, z
 up, seen from the radar), `scores` [B, K], `classes` [B, K] (indices into `classes` of
-`config.json`), `is_valid` [B, K] (True where a row is a detection) and `num_cut` [B]
+`config.json`), `is_valid` [B, K] (True where a row is a detection) and `num_truncated` [B]
 (peaks that found no row). `detect` also takes `score_threshold`, `nms_iou` and `roi`
 (x0, x1, y0, y1, z0, z1 in metres).
 
@@ -267,7 +267,7 @@ import numpy as np, onnxruntime
 session = onnxruntime.InferenceSession("detector.onnx")
 everywhere = np.array([-1e9, 1e9] * 3, np.float32)   # x0, x1, y0, y1, z0, z1 in metres
 settings = {{"score_threshold": np.float32(0.3), "nms_iou": np.float32(0.3), "roi": everywhere}}
-boxes, scores, classes, is_valid, num_cut = session.run(
+boxes, scores, classes, is_valid, num_truncated = session.run(
     None, {{"projection": x, **settings}})   # x [{batch_size}, {shape}] float32
 ```
 

@@ -20,7 +20,7 @@ DETECTOR_FILE = "detector.onnx"
 INPUTS = ("projection", "image")
 SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
 MAPS = ("heatmap_logits", "box_params")
-DETECTIONS = ("boxes", "scores", "classes", "is_valid", "num_cut")
+DETECTIONS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
 
 
 def onnx_files(

@@ -270,5 +270,7 @@ def _camera_fields(model: Any) -> dict[str, Any]:
     image |= {
         k: getattr(vit, k) for k in dinorade_config.IMAGE_FIELDS if k not in image
     }
-    axes = {name: getattr(model.axes, name) for name in dinorade_config.AXES_FIELDS}
-    return {"image": image, "fusion": dict(model.fusion), "axes": axes}
+    axes = {
+        name: getattr(model.query_grid, name) for name in dinorade_config.AXES_FIELDS
+    }
+    return {"image": image, "fusion": dict(model.fusion), "query_grid": axes}

@@ -16,10 +16,10 @@ from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import boxes_at, find_peaks, suppress
 from radejax.detection.matching import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.focal import Sigma, focal_loss, gaussian_heatmap
+from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
-Matching = Literal["center", "nms"]
+Assignment = Literal["center", "nms"]
 Pairs = tuple[
     Float[jax.Array, "B M 8"], Float[jax.Array, "B M 8"], Bool[jax.Array, "B M"]
 ]
@@ -49,7 +49,7 @@ def loss_names() -> tuple[str, ...]:
     return ("focal", "gwd", *BOX_LOSSES)
 
 
-class AfterNms(NamedTuple):
+class NmsAssignment(NamedTuple):
     """Which predicted boxes are compared with an object where NMS chooses them.
 
     Attributes:
@@ -74,17 +74,17 @@ def detection_loss(
     batch: Batch,
     grid: RadarGrid,
     *,
-    sigma: Sigma = "fixed",
-    sigma_cells: float = 3.0,
+    heatmap_sigma_mode: SigmaMode = "fixed",
+    heatmap_sigma_bins: float = 3.0,
     gwd_transform: Transform = "sqrt",
     gwd_tau: float = 1.65,
     normalize_yaw: bool = False,
-    matching: Matching = "center",
+    assignment: Assignment = "center",
     weights: Weights = _WEIGHTS,
     normalize: bool = True,
     z0_m: Scalar = 0.0,
     is_frame_valid: Bool[jax.Array, " B"] | None = None,
-    nms: AfterNms = AfterNms(),  # noqa: B008, immutable
+    nms: NmsAssignment = NmsAssignment(),  # noqa: B008, immutable
 ) -> tuple[Float[jax.Array, ""], dict[str, Num[jax.Array, ""]]]:
     """Weighted sum of the losses that `weights` names, and its parts; in float32.
 
@@ -95,13 +95,13 @@ def detection_loss(
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
         batch: Ground truth: `boxes`, `classes`, `is_valid` are read.
         grid: The grid of the maps (padded where they are).
-        sigma: Target shape, see `gaussian_heatmap`.
-        sigma_cells: Standard deviation of targets in bins, for "fixed".
+        heatmap_sigma_mode: Target shape, see `gaussian_heatmap`.
+        heatmap_sigma_bins: Standard deviation of targets in bins, for "fixed".
         gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
         gwd_tau: Likewise.
         normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released: raw).
             Smooth L1 always sees it raw, which teaches the network its length.
-        matching: "center": boxes at each object's own bin (as released); "nms": those
+        assignment: "center": boxes at each object's own bin (as released); "nms": those
             that survive NMS with the object that they overlap most (the paper).
         weights: Of some of `loss_names()`; a part without one is not computed.
         normalize: Divide each part by its own value, held constant: gradients of the
@@ -129,12 +129,14 @@ def detection_loss(
         4.0
     """
     check_weights(weights)
-    _check(maps, batch, grid, matching)
+    _check(maps, batch, grid, assignment)
     boxes, is_valid = _objects(batch, is_frame_valid)
     logits = maps.heatmap_logits
-    draw = partial(gaussian_heatmap, sigma=sigma, sigma_cells=sigma_cells)
+    draw = partial(
+        gaussian_heatmap, sigma_mode=heatmap_sigma_mode, sigma_bins=heatmap_sigma_bins
+    )
     target = draw(boxes, batch.classes, is_valid, grid, num_classes=logits.shape[-1])
-    pair = _pairs_at_centers if matching == "center" else partial(_after_nms, nms)
+    pair = _pairs_at_centers if assignment == "center" else partial(_after_nms, nms)
     predicted, wanted, is_matched = pair(maps, boxes, is_valid, grid, z0_m)
     losses = BOX_LOSSES | {"gwd": partial(_gwd, gwd_tau, gwd_transform, normalize_yaw)}
     parts = {}
@@ -239,7 +241,7 @@ def _pairs_at_centers(
 
 
 def _after_nms(
-    nms: AfterNms,
+    nms: NmsAssignment,
     maps: DetectionMaps,
     boxes: Float[jax.Array, "B N 8"],
     is_valid: Bool[jax.Array, "B N"],
@@ -345,9 +347,9 @@ def check_weights(weights: Weights) -> None:
         )
 
 
-def _check(maps: DetectionMaps, batch: Batch, grid: RadarGrid, matching: str) -> None:
-    if matching not in ("center", "nms"):
-        raise ValueError(f"matching must be 'center' or 'nms', got {matching!r}")
+def _check(maps: DetectionMaps, batch: Batch, grid: RadarGrid, assignment: str) -> None:
+    if assignment not in ("center", "nms"):
+        raise ValueError(f"assignment must be 'center' or 'nms', got {assignment!r}")
     logits, boxes = maps.heatmap_logits.shape, batch.boxes.shape
     if logits[1:3] != (grid.num_range, grid.num_azimuth):
         raise ValueError(

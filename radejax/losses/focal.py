@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from radejax.core.structures import Array
 from radejax.geometry.radar_grid import RadarGrid
 
-Sigma = Literal["fixed", "adaptive", "anisotropic"]
+SigmaMode = Literal["fixed", "adaptive", "anisotropic"]
 
 # Logits of the bounds [1e-6, 1 - 1e-6] to which probabilities are clipped, as float32
 # rounds them: 1 - 1e-6 becomes 1 - 1.013e-6.
@@ -29,8 +29,8 @@ def gaussian_heatmap(
     grid: RadarGrid,
     *,
     num_classes: int,
-    sigma: Sigma = "fixed",
-    sigma_cells: float = 3.0,
+    sigma_mode: SigmaMode = "fixed",
+    sigma_bins: float = 3.0,
 ) -> Float[jax.Array, "*batch R A C"]:
     """Target heatmaps: per class the clipped sum of Gaussians at the objects' bins.
 
@@ -46,16 +46,16 @@ def gaussian_heatmap(
         is_valid: `[..., N]` bool, True where a box is an object.
         grid: The grid of the maps.
         num_classes: C.
-        sigma: "fixed": `sigma_cells` in both axes. "adaptive": 0.3 max(l, w) in both.
+        sigma_mode: "fixed": `sigma_bins` in both axes. "adaptive": 0.3 max(l, w) in both.
             "anisotropic": l / 6 along range and w / 6 along azimuth. The latter two
             read metres as bins, as released.
-        sigma_cells: Standard deviation for "fixed", in bins.
+        sigma_bins: Standard deviation for "fixed", in bins.
 
     Returns:
         `[..., R, A, C]` float32 in [0, 1].
 
     Raises:
-        ValueError: `sigma` is unknown.
+        ValueError: `sigma_mode` is unknown.
         AssertionError: Shapes of boxes, classes and mask do not fit together.
 
     References:
@@ -73,7 +73,7 @@ def gaussian_heatmap(
     chex.assert_equal_rank([classes, is_valid])
     boxes = boxes.astype(jnp.float32)
     cell = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [..., N, 2]
-    sigma_range, sigma_azimuth = _sigmas(boxes, sigma, sigma_cells)
+    sigma_range, sigma_azimuth = _sigmas(boxes, sigma_mode, sigma_bins)
     range_profile = _profile(cell[..., 0], sigma_range, grid.num_range)
     azimuth_profile = _profile(cell[..., 1], sigma_azimuth, grid.num_azimuth)
     one_hot = jax.nn.one_hot(classes, num_classes) * is_valid[..., None]
@@ -171,19 +171,19 @@ def focal_loss_per_bin(
 
 
 def _sigmas(
-    boxes: Float[jax.Array, "*objects _"], sigma: str, sigma_cells: float
+    boxes: Float[jax.Array, "*objects _"], sigma_mode: str, sigma_bins: float
 ) -> tuple[Float[jax.Array, "*objects"], Float[jax.Array, "*objects"]]:
     """Standard deviations along range and azimuth, in bins: `[..., N]` each."""
     length, width = boxes[..., 3], boxes[..., 4]
-    if sigma == "fixed":
-        along_range = along_azimuth = jnp.full_like(length, sigma_cells)
-    elif sigma == "adaptive":
+    if sigma_mode == "fixed":
+        along_range = along_azimuth = jnp.full_like(length, sigma_bins)
+    elif sigma_mode == "adaptive":
         along_range = along_azimuth = 0.3 * jnp.maximum(length, width)
-    elif sigma == "anisotropic":
+    elif sigma_mode == "anisotropic":
         along_range, along_azimuth = length / 6, width / 6
     else:
         raise ValueError(
-            f"sigma must be 'fixed', 'adaptive' or 'anisotropic', got {sigma!r}"
+            f"sigma_mode must be 'fixed', 'adaptive' or 'anisotropic', got {sigma_mode!r}"
         )
     return (
         jnp.maximum(along_range, _SMALLEST_SIGMA),

@@ -45,7 +45,7 @@ class DinoRade(nn.Module):
             has under the same names.
         vit: Fields of the image transformer, or None for a ResNet-50.
         fusion: Fields of `Fusion`.
-        axes: Centers of the radar queries.
+        query_grid: Centers of the radar queries.
         image_size: Height and width of the images.
         freeze: No gradients through the image backbone.
         resnet_width: Channels of the ResNet's stem, where there is one.
@@ -55,7 +55,7 @@ class DinoRade(nn.Module):
     radar: radenet.RadeNet
     vit: ViT | None
     fusion: Mapping[str, Any]
-    axes: LiftingAxes
+    query_grid: LiftingAxes
     image_size: tuple[int, int] = (720, 1280)
     freeze: bool = True
     resnet_width: int = 64
@@ -169,9 +169,9 @@ class DinoRade(nn.Module):
         b, r, a = shape[:3]
         if isinstance(camera, Camera):
             arrays = jax.tree.map(jnp.asarray, camera)
-            invalid = self.fusion["invalid"]
-            camera = reference_points(arrays, self.axes, r, a, invalid)
-        expected = (r, a, self.axes.num_elevation)
+            out_of_view = self.fusion["out_of_view"]
+            camera = reference_points(arrays, self.query_grid, r, a, out_of_view)
+        expected = (r, a, self.query_grid.num_elevation)
         found = camera.is_valid.shape
         if found[1:] != expected or found[0] not in (1, b):
             raise UserError(

@@ -35,9 +35,9 @@ IMAGE_FIELDS = (
 """Fields of `config.model.image`."""
 
 AXES_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
-"""Fields of `config.model.axes`."""
+"""Fields of `config.model.query_grid`."""
 
-FIELDS = (*radenet.FIELDS, "image", "fusion", "axes")
+FIELDS = (*radenet.FIELDS, "image", "fusion", "query_grid")
 """Fields of a model config beside `name`."""
 
 _VIT, _FUSION, _AXES = map(get_type_hints, (ViT, Fusion, LiftingAxes))
@@ -51,7 +51,7 @@ _IMAGE = {
 HINTS = radenet.HINTS | {
     "image": {name: (_VIT | _IMAGE)[name] for name in IMAGE_FIELDS},
     "fusion": {name: _FUSION[name] for name in FUSION_FIELDS},
-    "axes": {name: _AXES[name] for name in AXES_FIELDS},
+    "query_grid": {name: _AXES[name] for name in AXES_FIELDS},
 }
 """What the fields may be."""
 
@@ -61,14 +61,18 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
 
     Args:
         config: Exactly the keys `name` and `FIELDS`; RADE-Net's keys describe the radar
-            branch, `image`, `fusion` and `axes` are mappings with exactly their fields.
+            branch, `image`, `fusion` and `query_grid` are mappings with exactly their fields.
 
     Raises:
         UserError: A key is missing or unknown, or a value is not possible.
     """
     fields = radenet.BEFORE | {k: config[k] for k in config if k != "name"}
     radenet.check_keys(fields, FIELDS, "model")
-    sections = {"image": IMAGE_FIELDS, "fusion": FUSION_FIELDS, "axes": AXES_FIELDS}
+    sections = {
+        "image": IMAGE_FIELDS,
+        "fusion": FUSION_FIELDS,
+        "query_grid": AXES_FIELDS,
+    }
     for name, keys in sections.items():
         fields[name] = dict(_section(fields, name, keys))
     fields = radenet.check_values(fields, HINTS)
@@ -83,7 +87,7 @@ def from_config(config: Mapping[str, Any]) -> DinoRade:
         radar=radenet.from_config({"name": "radenet"} | radar),
         vit=_vit(image) if image["kind"] == "vit" else None,
         fusion=fusion,
-        axes=LiftingAxes(
+        query_grid=LiftingAxes(
             **{k: (float(axes[k][0]), float(axes[k][1])) for k in AXES_FIELDS},
             num_elevation=fusion["num_elevation"],
         ),
@@ -138,9 +142,12 @@ def _check_sizes(model: DinoRade) -> None:
                 f"config.model.image: {hidden} channels in {heads} heads; each head "
                 "needs a multiple of 4"
             )
-    if model.fusion["invalid"] == "official" and model.image_size[1] <= 2 * MARGIN_PX:
+    if (
+        model.fusion["out_of_view"] == "official"
+        and model.image_size[1] <= 2 * MARGIN_PX
+    ):
         raise UserError(
-            f"config.model.fusion.invalid='official' leaves out {MARGIN_PX} pixels left "
+            f"config.model.fusion.out_of_view='official' leaves out {MARGIN_PX} pixels left "
             f"and right, but config.model.image.size is {model.image_size}"
         )
     width, heads = model.radar.decoder_width, model.fusion["num_heads"]

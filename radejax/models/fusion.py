@@ -2,7 +2,7 @@
 
 References:
     DinoRADE, sections 3.3 to 3.5. Where the released code differs from the paper, both
-    are there: `weighting`, `gate`, `invalid`.
+    are there: `weighting`, `gate`, `out_of_view`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from radejax.core.structures import Array
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.layers import Dense
 from radejax.models.lifting import (
-    InvalidRule,
+    OutOfViewRule,
     ReferencePoints,
     WeightingKind,
     WeightingNetwork,
@@ -40,7 +40,7 @@ class Fusion(nn.Module):
         weighting: Elevation weights: "mlp" (paper), "cnn" (released) or "off".
         gate: "channel": one number per channel that weighs the radar (paper); "bin":
             one per bin that weighs the camera (released).
-        invalid: Queries outside the image: "drop" leaves them out of the mean, and a
+        out_of_view: Queries outside the image: "drop" leaves them out of the mean, and a
             bin without any keeps its radar feature; "official" zeroes them, but they
             still attend at the image border and count.
         necks: A dilated neck on each map before the attention. The released settings
@@ -57,7 +57,7 @@ class Fusion(nn.Module):
     num_elevation: int = 10
     weighting: WeightingKind = "mlp"
     gate: GateKind = "channel"
-    invalid: InvalidRule = "drop"
+    out_of_view: OutOfViewRule = "drop"
     necks: bool = True
     dropout: float = 0.1
     num_groups: int = 32
@@ -102,7 +102,7 @@ class Fusion(nn.Module):
             self.num_elevation, self.weighting, self.dtype, name="weighting"
         )(elevation)  # [B, R, A, E]
         scale = weights * reference.is_valid
-        mean = query_weights(jnp.asarray(reference.is_valid), self.invalid)
+        mean = query_weights(jnp.asarray(reference.is_valid), self.out_of_view)
 
         def per_bin(x: Real[Array, "_ R A ..."]) -> Real[jax.Array, "_ bins ..."]:
             return jnp.asarray(x).reshape(x.shape[0], r * a, *x.shape[3:])

@@ -26,7 +26,7 @@ from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, projec
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
 
-InvalidRule = Literal["drop", "official"]
+OutOfViewRule = Literal["drop", "official"]
 WeightingKind = Literal["mlp", "cnn", "off"]
 
 OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
@@ -34,7 +34,7 @@ OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
 with, together with the "pinhole" image."""
 
 MARGIN_PX = 280
-"""Left and right, of an image 1280 wide, that `invalid="official"` leaves out: a leftover
+"""Left and right, of an image 1280 wide, that `out_of_view="official"` leaves out: a leftover
 of square image crops."""
 
 _OFFICIAL_DEPTH_OFFSET_M = 1e-6
@@ -124,7 +124,7 @@ def reference_points(
     axes: LiftingAxes,
     num_range: int,
     num_azimuth: int,
-    invalid: InvalidRule = "drop",
+    out_of_view: OutOfViewRule = "drop",
 ) -> ReferencePoints:
     """Projects the centers of all queries of a map.
 
@@ -136,7 +136,7 @@ def reference_points(
         axes: Centers of the queries.
         num_range: Range bins R of the map, padding included.
         num_azimuth: Azimuth bins A.
-        invalid: "official" counts only the middle of the image as valid, as released.
+        out_of_view: "official" counts only the middle of the image as valid, as released.
 
     Returns:
         Points and mask with a leading axis of 1 or B.
@@ -153,10 +153,10 @@ def reference_points(
     )
     if not is_batch:
         camera = jax.tree.map(lambda x: xp.asarray(x)[None], camera)
-    offset = _OFFICIAL_DEPTH_OFFSET_M if invalid == "official" else 0.0
+    offset = _OFFICIAL_DEPTH_OFFSET_M if out_of_view == "official" else 0.0
     pixels, depth = project(centers, camera, depth_offset_m=offset)
     width, height = (camera.size_px[:, i, None, None, None] for i in (0, 1))
-    margin = MARGIN_PX if invalid == "official" else 0.0
+    margin = MARGIN_PX if out_of_view == "official" else 0.0
     u, v = pixels[..., 0], pixels[..., 1]
     is_valid = (depth > 0) & (u >= margin) & (u < width - margin)
     is_valid = is_valid & (v >= 0) & (v < height)
@@ -178,7 +178,7 @@ def static_reference_points(
     num_azimuth: int,
     *,
     image: ImageKind = "raw",
-    invalid: InvalidRule = "drop",
+    out_of_view: OutOfViewRule = "drop",
 ) -> ReferencePoints:
     """`reference_points` of one calibration, computed once on the host and kept.
 
@@ -186,11 +186,11 @@ def static_reference_points(
         NumPy arrays with a leading axis of 1, for batches that share the calibration.
     """
     camera = calibration.camera(image)
-    return reference_points(camera, axes, num_range, num_azimuth, invalid)
+    return reference_points(camera, axes, num_range, num_azimuth, out_of_view)
 
 
 def query_weights(
-    is_valid: Bool[jax.Array, "*bins E"], invalid: InvalidRule
+    is_valid: Bool[jax.Array, "*bins E"], out_of_view: OutOfViewRule
 ) -> Float[jax.Array, "*bins E"]:
     """Weights of the mean over a bin's queries.
 
@@ -200,12 +200,12 @@ def query_weights(
     Raises:
         UserError: The rule is neither.
     """
-    if invalid == "official":
+    if out_of_view == "official":
         return jnp.full(is_valid.shape, 1.0 / is_valid.shape[-1], jnp.float32)
-    if invalid == "drop":
+    if out_of_view == "drop":
         weights = is_valid.astype(jnp.float32)
         return weights / jnp.maximum(weights.sum(-1, keepdims=True), 1.0)
-    raise UserError(f"invalid must be 'drop' or 'official', got {invalid!r}")
+    raise UserError(f"out_of_view must be 'drop' or 'official', got {out_of_view!r}")
 
 
 class WeightingNetwork(nn.Module):

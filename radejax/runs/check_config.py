@@ -173,19 +173,19 @@ RULES: dict[str, Rule] = {
     "model.fusion.num_elevation": _COUNT,
     "model.fusion.weighting": _one_of("mlp", "cnn", "off"),
     "model.fusion.gate": _one_of("channel", "bin"),
-    "model.fusion.invalid": _one_of("drop", "official"),
+    "model.fusion.out_of_view": _one_of("drop", "official"),
     "model.fusion.necks": _BOOL,
     "model.fusion.dropout": _BELOW_ONE,
     "model.fusion.chunk_size": _COUNT_OR_0,
-    "model.axes.range_m": _AXIS,
-    "model.axes.azimuth_deg": _AXIS,
-    "model.axes.elevation_deg": _AXIS,
-    "loss.sigma": _one_of("fixed", "adaptive", "anisotropic"),
-    "loss.sigma_cells": _POSITIVE,
+    "model.query_grid.range_m": _AXIS,
+    "model.query_grid.azimuth_deg": _AXIS,
+    "model.query_grid.elevation_deg": _AXIS,
+    "loss.heatmap_sigma_mode": _one_of("fixed", "adaptive", "anisotropic"),
+    "loss.heatmap_sigma_bins": _POSITIVE,
     "loss.gwd_transform": _one_of("sqrt", "none", "log1p"),
     "loss.gwd_tau": _POSITIVE,
     "loss.normalize_yaw": _BOOL,
-    "loss.matching": _one_of("center", "nms"),
+    "loss.assignment": _one_of("center", "nms"),
     "loss.weights": Rule(
         f"numbers of at least 0, not all 0, by names of {', '.join(loss_names())}",
         lambda value: _are_weights(value),
@@ -290,7 +290,7 @@ RULES: dict[str, Rule] = {
 """What each field may be; a new field of a config gets its row here."""
 
 _SECTIONS = ("model", "loss", "decode", "train", "data", "evaluation", "logging")
-_CAMERA_SECTIONS = ("model.image", "model.fusion", "model.axes", "data.camera")
+_CAMERA_SECTIONS = ("model.image", "model.fusion", "model.query_grid", "data.camera")
 
 
 def check(config: ConfigDict) -> None:

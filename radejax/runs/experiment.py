@@ -17,7 +17,7 @@ from radejax.core.config import renewed
 from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence
 from radejax.inference.open import PathLike, StartingWeights, starting_weights
-from radejax.losses.detection import AfterNms
+from radejax.losses.detection import NmsAssignment
 from radejax.runs import check_config
 from radejax.runs.data import Data, open_data
 from radejax.runs.evaluate import evaluate
@@ -180,7 +180,7 @@ def loss_options(config: ConfigDict) -> dict[str, Any]:
     Boxes that "nms" compares with objects are those that decoding would find.
     """
     decode = config.decode
-    nms = AfterNms(
+    nms = NmsAssignment(
         score_threshold=decode.score_threshold,
         threshold_inclusive=decode.threshold_inclusive,
         nms_iou=decode.nms_iou,

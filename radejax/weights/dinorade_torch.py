@@ -22,7 +22,7 @@ from radejax.weights import dinov3_hf, radenet_torch, resnet_torch
 from radejax.weights.state_dict import StateDictReader, read_state_dict, to_numpy
 
 _RADAR_PARTS = {"rad_backbone.": "backbone.", "rad_neck.": "neck.", "head.": "head."}
-_FUSION_FIELDS = ("num_heads", "dropout", "chunk_size", "invalid")
+_FUSION_FIELDS = ("num_heads", "dropout", "chunk_size", "out_of_view")
 _UNUSED = (r"fusion\.output_proj\.",)  # built by the released code, never called
 
 
@@ -85,7 +85,7 @@ def load(
         radar=radar,
         vit=vit,
         fusion=fusion,
-        axes=LiftingAxes.official(),
+        query_grid=LiftingAxes.official(),
         # The released code feeds its ResNet colours in [0, 1].
         standardize_image=vit is not None,
     )
@@ -131,7 +131,7 @@ def fusion_fields(
         "num_elevation": 10,
         "weighting": "cnn" if has_weights else "off",
         "gate": "bin",
-        "invalid": "official",
+        "out_of_view": "official",
         "necks": any(n.startswith("fusion.rad_neck.") for n in tensors),
         "dropout": 0.1,
         "chunk_size": 0,

@@ -114,7 +114,7 @@ def check_fits(
 
     inputs: list[jax.ShapeDtypeStruct | ReferencePoints] = [array(bins, bins, channels)]
     if radar is not model:
-        queries = (bins, bins, model.axes.num_elevation)
+        queries = (bins, bins, model.query_grid.num_elevation)
         points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
         inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]
     wanted = jax.eval_shape(model.init, jax.random.key(0), *inputs)

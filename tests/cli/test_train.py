@@ -71,8 +71,8 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
         (["--learning-rat", "1"], "did you mean --config.train.learning_rate?"),
         (["--wordkir=a"], "--workdir"),
         (
-            ["--config.loss.sigma=foo"],
-            "error: config.loss.sigma is 'foo', expected one of 'fixed', 'adaptive'",
+            ["--config.loss.heatmap_sigma_mode=foo"],
+            "error: config.loss.heatmap_sigma_mode is 'foo', expected one of 'fixed', 'adaptive'",
         ),
         (
             ["--config.evaluation.roi=(0,1)"],

@@ -52,7 +52,7 @@ def test_parameters_of_the_papers_model() -> None:
 def test_presets_are_the_two_worlds() -> None:
     paper, official = _get("radenet", "paper"), _get("radenet", "official")
     assert (paper.model.cbam, official.model.cbam) == ("paper", "official")
-    assert (paper.loss.matching, official.loss.matching) == ("nms", "center")
+    assert (paper.loss.assignment, official.loss.assignment) == ("nms", "center")
     assert (paper.loss.gwd_transform, official.loss.gwd_transform) == ("sqrt", "none")
     assert official.data.azimuth_mapping == "stretched"
     assert paper.train.final_learning_rate == 1e-4
@@ -77,7 +77,7 @@ def test_the_quickstart_fits_its_own_sensor(words: str | None) -> None:
 def test_every_dinorade_config_builds(words: str) -> None:
     config = _get("dinorade", words)
     models.build(config.model)
-    assert config.loss.sigma_cells == (3.0 if words == "official" else 0.75)
+    assert config.loss.heatmap_sigma_bins == (3.0 if words == "official" else 0.75)
 
 
 def test_words_that_do_not_go_together_are_refused() -> None:

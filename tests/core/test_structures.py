@@ -14,7 +14,7 @@ def _detections(classes: list[list[int]]) -> Detections:
         scores=jnp.where(cls >= 0, 0.5, 0.0),
         classes=cls,
         is_valid=cls >= 0,
-        num_cut=jnp.zeros(len(classes), jnp.int32),
+        num_truncated=jnp.zeros(len(classes), jnp.int32),
     )
 
 

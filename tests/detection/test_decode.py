@@ -120,7 +120,7 @@ def test_detections_of_the_released_code(case):
         np.testing.assert_allclose(found.boxes[frame, :count, 6], yaw, atol=2e-5)
         np.testing.assert_allclose(found.scores[frame, :count], kept[:, 8], atol=1e-6)
         np.testing.assert_array_equal(found.classes[frame, :count], kept[:, 9])
-    np.testing.assert_array_equal(found.num_cut, 0)
+    np.testing.assert_array_equal(found.num_truncated, 0)
 
 
 def test_golden_boxes_are_the_reference(case, shared):
@@ -243,7 +243,7 @@ def test_what_k_cuts_off_is_counted():
         found = decode(
             maps, GRID, max_detections=k, score_threshold=0.3, pre_nms=pre_nms
         )
-        counts[k, pre_nms] = int(found.num_cut[0])
+        counts[k, pre_nms] = int(found.num_truncated[0])
         assert int(found.is_valid[0].sum()) == min(k, 10)
         assert found.boxes.shape == (1, k, 7)
         assert (np.diff(found.scores[0]) <= 0).all()
@@ -257,7 +257,7 @@ def test_boxes_dropped_by_nms_are_not_counted_as_cut():
     params[..., 3:5] = 500  # everything overlaps
     found = decode(maps_of(logits, params), GRID, max_detections=5, score_threshold=0.3)
     assert int(found.is_valid[0].sum()) == 1
-    assert int(found.num_cut[0]) == 0
+    assert int(found.num_truncated[0]) == 0
     few = decode(
         maps_of(logits, params),
         GRID,
@@ -265,7 +265,7 @@ def test_boxes_dropped_by_nms_are_not_counted_as_cut():
         score_threshold=0.3,
         pre_nms=7,
     )
-    assert int(few.num_cut[0]) == 3
+    assert int(few.num_truncated[0]) == 3
 
 
 def test_more_rows_than_bins():

@@ -47,7 +47,7 @@ def test_every_form_of_a_camera_gives_the_same(
     path.write_text(calibration.to_kradar_text())
     camera = calibration.camera("raw")
     expected = fusion(projection, image, calibration)
-    axes = fusion.model.axes
+    axes = fusion.model.query_grid
     points = reference_points(camera, axes, 16, 16)
     for given in (
         path,

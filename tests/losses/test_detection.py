@@ -11,7 +11,7 @@ from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import (
     BOX_LOSSES,
-    AfterNms,
+    NmsAssignment,
     detection_loss,
     smooth_l1,
     whole_batch_loss,
@@ -72,11 +72,12 @@ def case(request, cases):
     want = {k.split("/")[1]: v for k, v in cases.items() if k.startswith(f"{name}/")}
     batch = batch_of(want["boxes"], want["classes"], want["is_valid"])
     maps, heatmap = reference_maps(int(want["stream"]), len(want["boxes"]))
-    sigma = {"sigma": str(want["sigma_mode"])}
-    sigma["sigma_cells"] = float(want["sigma_cells"])
+    sigma = {"sigma_mode": str(want["sigma_mode"])}
+    sigma["sigma_bins"] = float(want["sigma_cells"])
+    options = {f"heatmap_{name}": value for name, value in sigma.items()}
 
     def loss(maps):
-        return detection_loss(maps, batch, STRETCHED, gwd_transform="none", **sigma)
+        return detection_loss(maps, batch, STRETCHED, gwd_transform="none", **options)
 
     (total, parts), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(maps)
     target = gaussian_heatmap(
@@ -202,7 +203,7 @@ def _loss_and_grad(maps, batch, is_frame_valid, numbers, weights, options):
             GRID,
             is_frame_valid=is_frame_valid,
             z0_m=z0_m,
-            nms=AfterNms(score_threshold=score_threshold, nms_iou=nms_iou),
+            nms=NmsAssignment(score_threshold=score_threshold, nms_iou=nms_iou),
             **dict(options),
             **given,
         )
@@ -306,10 +307,10 @@ def test_an_unknown_part_is_named_with_those_that_there_are(weights):
         detection_loss(maps, batch, GRID, weights=weights)
 
 
-@pytest.mark.parametrize("matching", ["center", "nms"])
-def test_without_objects_everything_is_finite(matching):
+@pytest.mark.parametrize("assignment", ["center", "nms"])
+def test_without_objects_everything_is_finite(assignment):
     maps, batch = small_scene(np.random.default_rng(2), counts=(0, 0, 0))
-    (total, parts), grad = loss_and_grad(maps, batch, matching=matching)
+    (total, parts), grad = loss_and_grad(maps, batch, assignment=assignment)
     assert float(total) == pytest.approx(2)
     assert all(np.isfinite(v) for v in parts.values())
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
@@ -355,7 +356,7 @@ def test_what_fills_up_a_batch_does_not_matter_to_nms_matching():
         return x.at[2].set(y[2])
 
     results = [
-        loss_and_grad(*scene, is_frame_valid, matching="nms")
+        loss_and_grad(*scene, is_frame_valid, assignment="nms")
         for scene in (
             (maps, batch),
             jax.tree.map(with_last_of_others, (maps, batch), others),
@@ -416,7 +417,7 @@ def scene_with_peaks():
 def test_nms_matching_by_hand():
     # (12, 8) is 10 m behind (10, 8): it overlaps neither it nor the object.
     maps, batch = scene_with_peaks()
-    (_, parts), grad = loss_and_grad(maps, batch, matching="nms")
+    (_, parts), grad = loss_and_grad(maps, batch, assignment="nms")
     assert int(parts["num_matched"]) == 1
     assert int(parts["num_objects"]) == 2
     # Off by (1, 0.5) in 2 of 8 numbers, sqrt(1.25) m apart, in one of three frames.
@@ -429,15 +430,15 @@ def test_nms_matching_by_hand():
 
 def test_nms_matching_without_a_peak_has_no_regression_loss():
     maps, batch = scene_with_peaks()
-    (_, parts), _ = loss_and_grad(maps, batch, matching="nms", score_threshold=0.99)
+    (_, parts), _ = loss_and_grad(maps, batch, assignment="nms", score_threshold=0.99)
     assert parts["gwd"] == parts["smooth_l1"] == parts["num_matched"] == 0
 
 
 def test_suppressed_peaks_are_not_matched():
     maps, batch = scene_with_peaks()
     wide = maps.replace(box_params=maps.box_params.at[..., 3:5].set(30.0))
-    (_, parts), _ = loss_and_grad(wide, batch, matching="nms", nms_iou=0.3)
-    (_, every), _ = loss_and_grad(wide, batch, matching="nms", nms_iou=1.1)
+    (_, parts), _ = loss_and_grad(wide, batch, assignment="nms", nms_iou=0.3)
+    (_, every), _ = loss_and_grad(wide, batch, assignment="nms", nms_iou=1.1)
     assert int(parts["num_matched"]) < int(every["num_matched"])
 
 
@@ -462,10 +463,10 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     for array in (params, boxes):
         array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
     batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))
-    nms = AfterNms(**{"score_threshold": 0.5, **changes})
+    nms = NmsAssignment(**{"score_threshold": 0.5, **changes})
     maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
     _, parts = jax.jit(
-        lambda maps: detection_loss(maps, batch, GRID, matching="nms", nms=nms)
+        lambda maps: detection_loss(maps, batch, GRID, assignment="nms", nms=nms)
     )(maps)
     assert int(parts["num_matched"]) == num_matched
 
@@ -488,8 +489,8 @@ def test_gradient_descent_finds_the_objects():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"matching": "nearest"}, "'center' or 'nms', got 'nearest'"),
-        ({"sigma": "round"}, "sigma must be"),
+        ({"assignment": "nearest"}, "'center' or 'nms', got 'nearest'"),
+        ({"heatmap_sigma_mode": "round"}, "sigma_mode must be"),
         ({"gwd_transform": "cube"}, "transform must be"),
     ],
 )
@@ -524,7 +525,7 @@ def test_matching_after_nms_begins_where_boxes_have_a_size():
     @jax.jit
     def step(maps, state):
         def loss(maps):
-            return detection_loss(maps, batch, grid, matching="nms")
+            return detection_loss(maps, batch, grid, assignment="nms")
 
         (_, parts), grads = jax.value_and_grad(loss, has_aux=True)(maps)
         updates, state = optimizer.update(grads, state)

@@ -12,7 +12,8 @@ GRID = RadarGrid.reduced(num_doppler=4, num_range=24, num_elevation=4, num_azimu
 C = 3
 
 heatmap = jax.jit(
-    F.gaussian_heatmap, static_argnames=("grid", "num_classes", "sigma", "sigma_cells")
+    F.gaussian_heatmap,
+    static_argnames=("grid", "num_classes", "sigma_mode", "sigma_bins"),
 )
 
 
@@ -58,8 +59,8 @@ def test_targets_equal_the_definition(sigma, sigmas):
         np.ones(5, bool),
         GRID,
         num_classes=C,
-        sigma=sigma,
-        sigma_cells=1.5,
+        sigma_mode=sigma,
+        sigma_bins=1.5,
     )
     np.testing.assert_allclose(found, naive_heatmap(CELLS, CLASSES, sigmas), atol=1e-6)
 
@@ -110,7 +111,7 @@ def test_object_of_zero_size_is_one_bin(sigma):
             np.array([True]),
             GRID,
             num_classes=C,
-            sigma=sigma,
+            sigma_mode=sigma,
         )
     )
     assert found[5, 5, 1] == 1
@@ -136,7 +137,7 @@ def test_unknown_sigma_is_refused():
             jnp.ones(1, bool),
             GRID,
             num_classes=C,
-            sigma="round",
+            sigma_mode="round",
         )
 
 

@@ -37,7 +37,7 @@ CHOICES = {
     "image.attention": "blocked",
     "fusion.weighting": "mlp",
     "fusion.gate": "bin",
-    "fusion.invalid": "official",
+    "fusion.out_of_view": "official",
 }
 
 

@@ -62,12 +62,12 @@ def small_config(**changes):
             "num_elevation": 3,
             "weighting": "mlp",
             "gate": "channel",
-            "invalid": "drop",
+            "out_of_view": "drop",
             "necks": True,
             "dropout": 0.1,
             "chunk_size": 16,
         },
-        "axes": {
+        "query_grid": {
             "range_m": (2.0, 5.0),
             "azimuth_deg": (-45.0, 15.0),
             "elevation_deg": (-10.0, 10.0),
@@ -178,7 +178,7 @@ def test_embedded_images_give_the_same_prediction():
 def test_reference_points_computed_before_give_the_same_prediction():
     model, variables = model_and_variables()
     projection, image, camera = batch(yaws=(90.0, 90.0))
-    reference = lifting.static_reference_points(calibration(), model.axes, 8, 8)
+    reference = lifting.static_reference_points(calibration(), model.query_grid, 8, 8)
     assert 0.05 < reference.is_valid.mean() < 0.95
     chex.assert_trees_all_close(
         applied()(variables, projection, image, reference),
@@ -292,12 +292,12 @@ def config_module():
 def test_configs_differ_where_paper_and_code_do():
     get_config = config_module().get_config
     default, official = get_config(), get_config("official")
-    assert default.loss.sigma_cells == 0.75
+    assert default.loss.heatmap_sigma_bins == 0.75
     assert (default.train.batch_size, default.train.num_epochs) == (6, 11)
-    assert default.model.fusion.invalid == "drop"
-    assert official.model.fusion.invalid == "official"
+    assert default.model.fusion.out_of_view == "drop"
+    assert official.model.fusion.out_of_view == "official"
     assert official.data.azimuth_mapping == "stretched"
-    assert build(official.model).axes == lifting.LiftingAxes.official()
+    assert build(official.model).query_grid == lifting.LiftingAxes.official()
     assert get_config("paper").model.cbam == "paper"
     assert get_config("rc").model.fusion.weighting == "off"
     assert get_config("r").model.name == "radenet"
@@ -319,7 +319,7 @@ def test_images_of_another_size_are_refused():
         model.apply(variables, projection, None, camera)
     with pytest.raises(UserError, match="image is given without camera"):
         model.apply(variables, projection, image)
-    reference = lifting.static_reference_points(calibration(), model.axes, 4, 8)
+    reference = lifting.static_reference_points(calibration(), model.query_grid, 4, 8)
     with pytest.raises(
         UserError, match=r"reference points are \(1, 4, 8, 3\), expected"
     ):
@@ -334,12 +334,12 @@ def test_images_of_another_size_are_refused():
         ({"image.kind": "vgg"}, r"config.model.image.kind is 'vgg', expected one of"),
         ({"fusion.gate": "pixel"}, r"fusion.gate is 'pixel'"),
         ({"fusion.depth": 3}, r"config.model.fusion has unknown \['depth'\]"),
-        ({"axes": {}}, r"config.model.axes has missing"),
+        ({"query_grid": {}}, r"config.model.query_grid has missing"),
         ({"image.size": (30, 48)}, r"image.size is \(30, 48\); .* multiples of 16"),
         ({"image.hidden_size": 20}, r"20 channels in 2 heads; .* multiple of 4"),
         ({"fusion.num_heads": 3}, r"fusion.num_heads = 3 does not divide"),
         (
-            {"fusion.invalid": "official"},
+            {"fusion.out_of_view": "official"},
             r"leaves out 280 pixels left and right, but .*size is \(32, 48\)",
         ),
         (

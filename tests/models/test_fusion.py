@@ -70,7 +70,7 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
         [(H, W)],
     )
     attended = np.asarray(attended).reshape(B, R, A, E, C)
-    if module.invalid == "official":
+    if module.out_of_view == "official":
         seen, has_camera = attended.mean(3), np.ones((B, R, A, 1), bool)
     else:
         count = is_valid.sum(-1)[..., None]
@@ -87,15 +87,15 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
 
 
 @pytest.mark.parametrize(
-    ("weighting", "gate", "invalid", "batch_geometry"),
+    ("weighting", "gate", "out_of_view", "batch_geometry"),
     [
         ("mlp", "channel", "drop", True),
         ("mlp", "bin", "official", False),
         ("off", "channel", "drop", False),
     ],
 )
-def test_fusion_follows_the_equations(weighting, gate, invalid, batch_geometry):
-    module = Fusion(**SMALL, weighting=weighting, gate=gate, invalid=invalid)
+def test_fusion_follows_the_equations(weighting, gate, out_of_view, batch_geometry):
+    module = Fusion(**SMALL, weighting=weighting, gate=gate, out_of_view=out_of_view)
     args = inputs(batch_geometry=batch_geometry)
     variables = variables_of(module, args)
     fused = jax.jit(module.apply)(variables, *args)
@@ -116,7 +116,7 @@ def test_bins_that_see_nothing_keep_their_radar_feature():
 
 @pytest.mark.parametrize("necks", [False, True])
 def test_a_missing_image_leaves_the_radar_alone(necks):
-    module = Fusion(**(SMALL | {"necks": necks}), invalid="official")
+    module = Fusion(**(SMALL | {"necks": necks}), out_of_view="official")
     radar, elevation, camera, reference = inputs()
     variables = variables_of(module, (radar, elevation, camera, reference))
     reference = reference.replace(has_image=np.array([True, False]))

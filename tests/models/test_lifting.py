@@ -81,7 +81,7 @@ def test_released_reference_points(golden):
     file = np.load(golden / "dinorade_geometry.npz")
     calibration = official_calibration(golden)
     axes = LiftingAxes.official()
-    settings = {"image": "pinhole", "invalid": "official"}
+    settings = {"image": "pinhole", "out_of_view": "official"}
     on_host = lifting.static_reference_points(calibration, axes, 256, 112, **settings)
     chex.assert_shape(on_host.points, (1, 256, 112, 10, 2))
     assert on_host.points.dtype == np.float32
@@ -107,7 +107,7 @@ def test_released_mask_of_all_queries(shared):
     )
     axes = LiftingAxes.official()
     reference = lifting.static_reference_points(
-        calibration, axes, 256, 112, image="pinhole", invalid="official"
+        calibration, axes, 256, 112, image="pinhole", out_of_view="official"
     )
     check_official(
         reference, file["index"], file["reference_points_f64"], file["valid"]

@@ -42,8 +42,8 @@ WRONG = [
     ("model.input_center", NAN),
     ("model.input_scale", 0.0),
     ("loss", 3),
-    ("loss.sigma", "adaptiv"),
-    ("loss.sigma_cells", 0.0),
+    ("loss.heatmap_sigma_mode", "adaptiv"),
+    ("loss.heatmap_sigma_bins", 0.0),
     ("loss.gwd_tau", 0.0),
     ("loss.gwd_tau", NAN),
     ("loss.gwd_transform", "log"),
@@ -108,7 +108,7 @@ WRONG = [
     ("model.image.num_heads", 0),
     ("model.image.size", (720,)),
     ("model.fusion.dropout", 1.0),
-    ("model.axes.range_m", (0.0, NAN)),
+    ("model.query_grid.range_m", (0.0, NAN)),
     ("data.camera.projection", "fisheye"),
     ("data.camera.ego_from_lidar_m", (1.0, 2.0)),
 ]
@@ -163,7 +163,7 @@ def test_fields_that_are_missing_or_unknown() -> None:
         check(config)
     config = base_config()
     del config["loss"]
-    with pytest.raises(UserError, match=r"config.loss.sigma is missing"):
+    with pytest.raises(UserError, match=r"config.loss.heatmap_sigma_mode is missing"):
         check(config)
 
 

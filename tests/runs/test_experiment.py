@@ -13,7 +13,7 @@ from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.inference.open import StartingWeights
-from radejax.losses.detection import AfterNms
+from radejax.losses.detection import NmsAssignment
 from radejax.runs import experiment, validation
 from radejax.runs.sources import Sources
 from radejax.runs.workdir import claimed
@@ -70,7 +70,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     assert "radejax detect" in caplog.text
     assert not {"evaluation/", "Evaluate again:"} & set(caplog.text.split("  "))
     # What NMS chooses for the loss is what decoding finds.
-    expected = AfterNms(
+    expected = NmsAssignment(
         score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False, per_class=False
     )
     assert plans[0].loss["nms"] == expected

@@ -59,7 +59,11 @@ def test_fields_inside_of_a_field_keep_their_type() -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("loss.sigma", "foo", "config.loss.sigma is 'foo', expected one of 'fixed'"),
+        (
+            "loss.heatmap_sigma_mode",
+            "foo",
+            "config.loss.heatmap_sigma_mode is 'foo', expected one of 'fixed'",
+        ),
         ("train.batch_size", "many", "is 'many', expected an integer of at least 1"),
         ("train.batch_size", "1.5", "is '1.5', expected an integer of at least 1"),
         ("model.input_stem", "1", "is '1', expected True or False"),

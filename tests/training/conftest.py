@@ -56,7 +56,7 @@ def tiny() -> Tiny:
         heads="default",
         heatmap_prior=0.1,
     )
-    config.loss.sigma_cells = 1.0
+    config.loss.heatmap_sigma_bins = 1.0
     config.train.update(
         batch_size=4,
         num_epochs=2,

@@ -101,10 +101,20 @@ def test_a_word_for_sigma_changes_the_targets_alone(name: str, preset: str) -> N
         config = _get(name, f"{preset},{word}").to_dict()
         check_config.check(ConfigDict(config))
         loss = config.pop("loss")
-        assert loss["sigma"] == ("fixed" if word in fixed else word)
-        assert loss["sigma_cells"] == fixed.get(word, plain["loss"]["sigma_cells"])
-        others = {**plain["loss"], "sigma": None, "sigma_cells": None}
-        assert {**loss, "sigma": None, "sigma_cells": None} == others
+        assert loss["heatmap_sigma_mode"] == ("fixed" if word in fixed else word)
+        assert loss["heatmap_sigma_bins"] == fixed.get(
+            word, plain["loss"]["heatmap_sigma_bins"]
+        )
+        others = {
+            **plain["loss"],
+            "heatmap_sigma_mode": None,
+            "heatmap_sigma_bins": None,
+        }
+        assert {
+            **loss,
+            "heatmap_sigma_mode": None,
+            "heatmap_sigma_bins": None,
+        } == others
         assert config == {k: v for k, v in plain.items() if k != "loss"}
     with pytest.raises(UserError, match="exclude each other"):
         _get(name, "sigma3,adaptive")
@@ -161,7 +171,7 @@ def _shrink(config: Any) -> None:
             resnet_width=4,
         )
         model.fusion.update(num_heads=2, num_elevation=3, chunk_size=16)
-        model.axes.update(
+        model.query_grid.update(
             range_m=(2.0, 4.0), azimuth_deg=(-45.0, 12.0), elevation_deg=(-10.0, 10.0)
         )
     config.train.batch_size = 2

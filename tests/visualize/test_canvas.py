@@ -23,7 +23,7 @@ BOXES = np.arange(14.0).reshape(2, 7)
             scores=np.array([0.5, 0.25, 0.0]),
             classes=np.array([0, 2, -1]),
             is_valid=np.array([True, True, False]),
-            num_cut=np.array(0),
+            num_truncated=np.array(0),
         ),
         canvas.Objects(BOXES, ("Sedan", "Pedestrian"), np.array([0.5, 0.25])),
     ],

@@ -60,7 +60,7 @@ def released_geometry(shared):
         256,
         112,
         image="pinhole",
-        invalid="official",
+        out_of_view="official",
     )
 
 
