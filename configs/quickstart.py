@@ -29,7 +29,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         train_sequences=640,
         test_sequences=224,
         frames_per_sequence=1,
-        vulnerable_road_users=3.0,
+        vru_density_scale=3.0,
     )
     config.data.mirror_probability = 0.5
     config.model.update(
@@ -70,7 +70,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
 
 def _teach_more(config: ConfigDict) -> None:
     """What `docs/results.md` has found to help, beside more scenes and steps."""
-    config.simulation.update(train_sequences=1600, vulnerable_road_users=5.0)
+    config.simulation.update(train_sequences=1600, vru_density_scale=5.0)
     # Noise is at 0.545 with a spread of 0.02: the input as it is is next to constant.
     config.model.update(input_center=0.545, input_scale=25.0)
     config.loss.heatmap_sigma_bins = 0.75

@@ -48,7 +48,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         image_height=80,
     )
     if content == "silhouettes":
-        config.simulation.camera_content = "objects"
+        config.simulation.camera_mode = "oracle"
     config.model.input_stem = True
     if sensors != "radar":
         _add_camera(config)

@@ -116,7 +116,7 @@ class Work:
         if seed is None:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
-            simulation["vulnerable_road_users"] = 1.0  # of training scenes alone
+            simulation["vru_density_scale"] = 1.0  # of training scenes alone
         return str(simulate_dataset(simulation, self.root(cell, seed)))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:

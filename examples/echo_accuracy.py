@@ -133,7 +133,7 @@ def main(
             raise UserError("--full-size has 256 range bins: give it or --range-bins")
         values["grid"]["num_range"] = range_bins or 64
         values |= {"seed": seed, "train_sequences": scenes, "test_sequences": 0}
-        values |= {"frames_per_sequence": 1, "vulnerable_road_users": 5.0}
+        values |= {"frames_per_sequence": 1, "vru_density_scale": 5.0}
         values |= FULL_SIZE if full_size else {}
         click.echo(table(SimulationConfig.from_mapping(values), cls).render())
 

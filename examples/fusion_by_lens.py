@@ -66,7 +66,7 @@ def lens_of_frames(root, frames):
     simulation = files.read_json(marker)["config"]
     if simulation["scenes"] != "procedural":
         raise UserError(f"{root}: the lens is known of procedural scenes only")
-    is_drawn = simulation.get("camera_content", "scene") == "scene"
+    is_drawn = simulation.get("camera_mode", "scene") == "scene"
     if not simulation["cover_lens"] or not is_drawn:
         return np.full(len(frames["sequence"]), "clear")
     levels, counts = [], collections.Counter()  # frames count from 0 in a sequence

@@ -112,7 +112,9 @@ class OnlineBatches:
         given = simulator.radar_input(frame)
         visible = simulator.is_radar_visible(frame, given)
         boxes = frame.boxes[visible].copy()
-        boxes[:, 2] -= self._config.lidar_to_radar_m[2]  # z as readers of files have it
+        boxes[:, 2] -= self._config.radar_from_lidar_m[
+            2
+        ]  # z as readers of files have it
         key = tensor.frame_key(self._seed, step, row)
         return index, given, key, boxes, frame.cls[visible]
 

@@ -103,7 +103,7 @@ def draw(
     if config.scenes != "procedural" or not config.image_width:
         raise UserError("images are drawn of procedural scenes, of a size above 0")
     height, width = config.image_height, config.image_width
-    cameras = stereo_calibration(config.lidar_to_radar_m, width, height)
+    cameras = stereo_calibration(config.radar_from_lidar_m, width, height)
     origin = camera_position(cameras[0])
     source = make_source(config)
     shape = (count, height // patch, width // patch)
@@ -125,7 +125,7 @@ def draw(
             cameras,
             seed,
             cover_lens=config.cover_lens,
-            content=config.camera_content,
+            mode=config.camera_mode,
         )
         frame = sequence.frame(0)
         box = renderer.shown_boxes(frame, 0)

@@ -273,7 +273,7 @@ RULES: dict[str, Rule] = {
     "simulation.label_version": _VERSION,
     "simulation.frames_per_sequence": _COUNT_OR_0,
     "simulation.frame_stride": _COUNT,
-    "simulation.vulnerable_road_users": _number(),
+    "simulation.vru_density_scale": _number(),
     "simulation.grid": Rule(
         "'kradar' or a mapping of sizes",
         lambda value: value == "kradar" or isinstance(value, Mapping),
@@ -283,8 +283,8 @@ RULES: dict[str, Rule] = {
     "simulation.image_width": _COUNT_OR_0,
     "simulation.image_height": _COUNT_OR_0,
     "simulation.cover_lens": _BOOL,
-    "simulation.camera_content": _one_of("scene", "objects"),
-    "simulation.lidar_to_radar_m": _several(_number(), 3),
+    "simulation.camera_mode": _one_of("scene", "oracle"),
+    "simulation.radar_from_lidar_m": _several(_number(), 3),
     "simulation.label_distance_m": _POSITIVE,
 }
 """What each field may be; a new field of a config gets its row here."""

@@ -43,7 +43,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.packed import LoadedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.sources import DataPaths, Sources, check_folders
-from radejax.simulation.config import without_later_fields
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import processes
 
@@ -384,9 +383,7 @@ def existing_roots(
 def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
     """Folder of a simulated data set, named by its config where none is given."""
     if not data:
-        # The same folder as before the config had its later fields.
-        values = without_later_fields(json.loads(simulation.to_json()))
-        text = json.dumps(values, sort_keys=True)
+        text = json.dumps(json.loads(simulation.to_json()), sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:8]
         return str(pathlib.Path("data") / f"simulated-{digest}")
     if len(data) != 1:

@@ -1,14 +1,15 @@
-"""What a simulated data set depends on, as plain values, and the checks on them."""
+"""The settings of a simulated dataset."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
 
@@ -36,24 +37,7 @@ CONDITIONS = (
 )
 
 
-_LATER_FIELDS = {"camera_content": "scene", "vulnerable_road_users": 1.0}
-"""What configs and data sets of earlier versions are without."""
-
-_MOST_VULNERABLE = 5.0
-"""Of `vulnerable_road_users`: more would fill the roads with nobody else."""
-
-_RADAR_LIMITS = {
-    "gain_db": (-1e3, 1e3),
-    "noise_db": (-1e3, 1e3),
-    "wavelength_m": (1e-4, 1.0),
-    "azimuth_elements": (1.0, 512.0),
-    "elevation_elements": (1.0, 512.0),
-    "array_pedestal": (0.0, 1.0),
-    "range_resolution_m": (0.0, 100.0),
-    "pattern_exponent": (0.0, 100.0),
-    "max_scatterers_per_row": (1, 4096),
-}
-"""Of the fields of `RadarParameters`; an integer where the least is one."""
+_MAX_VRU_DENSITY_SCALE = 5.0  # more would leave no room for other road users
 
 FULL_SIZE = {
     "grid": "kradar",
@@ -61,14 +45,12 @@ FULL_SIZE = {
     "image_width": 1280,
     "image_height": 720,
 }
-"""Fields that make a config one of K-Radar's own sensors."""
+"""Fields of a config with K-Radar's own sensors."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulationConfig:
-    """Checked values of a simulation; by default the quickstart's.
-
-    Its data set is small, but with every kind of thing in it.
+    """Settings of a simulated dataset; the defaults are a small one for tests.
 
     Attributes:
         seed: Everything random follows from it.
@@ -80,20 +62,22 @@ class SimulationConfig:
         label_version: Version of real labels.
         frames_per_sequence: At 10 frames a second; 0 for all of real labels.
         frame_stride: Use every n-th frame of real labels.
-        vulnerable_road_users: Pedestrians, motorcycles and bicycles of procedural
-            training scenes, as a multiple of what there is of them on a road of the
-            type. Test scenes have what there is.
+        vru_density_scale: Number of pedestrians, motorcycles and bicycles in procedural
+            training scenes, as a multiple of what a road of the type has; at most 5.
+            Test scenes are not changed.
         grid: Arguments of `RadarGrid.reduced`, or "kradar".
         radar: Fields of `RadarParameters` that differ from its defaults.
         output: "tesseract" for K-Radar's files, "projection" for the projections alone.
         image_width: Of one of the two stereo images; 0 for none.
         image_height: The same.
         cover_lens: Let bad weather cover the lens, as often as in K-Radar.
-        camera_content: "scene" draws all that a camera sees; "objects" silhouettes of the
-            objects alone, in the colour of their class: what a perfect image would give.
-        lidar_to_radar_m: Radar position = LiDAR position + this; z as in K-Radar's own
-            loaders.
-        label_distance_m: Farther objects get no label.
+        camera_mode: "scene" renders all that a camera sees; "oracle" only silhouettes
+            of the objects in the color of their class, an upper bound for the camera.
+        radar_from_lidar_m: `p_radar = p_lidar + t`; z as in K-Radar's own loaders.
+        label_distance_m: Objects farther away get no label.
+
+    Raises:
+        UserError: A field is out of its range; names it.
     """
 
     seed: int = 0
@@ -102,11 +86,11 @@ class SimulationConfig:
     # learns more from 20 roads for 2 seconds than from 10 roads for 4.
     train_sequences: int = 20
     test_sequences: int = 8
-    sequences: list[int] | None = None
+    sequences: tuple[int, ...] | None = None
     label_version: str = "v2.1"
     frames_per_sequence: int = 20
     frame_stride: int = 1
-    vulnerable_road_users: float = 1.0
+    vru_density_scale: float = 1.0
     grid: str | Mapping[str, Any] = dataclasses.field(
         default_factory=lambda: {
             "num_doppler": 16,
@@ -123,31 +107,25 @@ class SimulationConfig:
     image_width: int = 320
     image_height: int = 180
     cover_lens: bool = True
-    camera_content: str = "scene"
-    lidar_to_radar_m: tuple[float, float, float] = (-2.54, 0.3, 0.7)
+    camera_mode: Literal["scene", "oracle"] = "scene"
+    radar_from_lidar_m: tuple[float, float, float] = (-2.54, 0.3, 0.7)
     label_distance_m: float = 90.0
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> SimulationConfig:
-        """Checks a mapping (or ConfigDict) of plain values, all of the fields.
+        """Settings from plain values or a ConfigDict; missing fields have defaults.
 
         Raises:
-            UserError: A field is unknown, missing or has a value out of range.
+            UserError: A field is unknown or out of its range.
         """
-        values = _LATER_FIELDS | plain(values)
-        names = [f.name for f in dataclasses.fields(cls)]
-        for key in values:
-            if key not in names:
-                raise UserError(
-                    f"unknown simulation field {key!r}; fields: {', '.join(names)}"
-                )
-        for name in names:
-            if name not in values:
-                raise UserError(f"simulation field {name!r} is missing")
-        offset = values["lidar_to_radar_m"]
-        if isinstance(offset, list) and all(map(_is_number, offset)):
-            offset = tuple(map(float, offset))
-        return cls(**dict(values, lidar_to_radar_m=offset))
+        values = dict(plain(values))
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        for name in values:
+            require(name in fields, "config.simulation field", name, ", ".join(fields))
+        for name in ("sequences", "radar_from_lidar_m"):
+            if isinstance(values.get(name), list):
+                values[name] = tuple(values[name])
+        return cls(**values)
 
     def __post_init__(self) -> None:
         is_procedural = self.scenes == "procedural"
@@ -161,97 +139,67 @@ class SimulationConfig:
             ("image_height", 0),
         ):
             value = getattr(self, name)
-            if not isinstance(value, int) or value < least:
-                raise UserError(
-                    f"simulation.{name} must be an integer of at least {least},"
-                    f" got {value!r}"
-                )
-        for is_wrong, text in (
-            (
-                not isinstance(self.scenes, str),
-                ".scenes must be 'procedural' or a path of labels,"
-                f" got {self.scenes!r}",
+            is_fine = isinstance(value, int) and value >= least
+            self._require(is_fine, name, f"an integer of at least {least}")
+        density, shift = self.vru_density_scale, self.radar_from_lidar_m
+        rules = {
+            "output": (
+                self.output in ("tesseract", "projection"),
+                "'tesseract' or 'projection'",
             ),
-            (
-                is_procedural and self.train_sequences + self.test_sequences == 0,
-                " has no sequences: train_sequences is 0",
+            "camera_mode": (
+                self.camera_mode in ("scene", "oracle"),
+                "'scene' or 'oracle'",
             ),
-            (
-                is_procedural and self.sequences is not None,
-                ".sequences chooses sequences of real labels; procedural ones"
-                " are counted by train_sequences and test_sequences",
+            "label_distance_m": (0 < self.label_distance_m < math.inf, "above 0"),
+            "radar_from_lidar_m": (
+                len(shift) == 3 and all(map(math.isfinite, shift)),
+                "three numbers",
             ),
-            (
-                not isinstance(self.vulnerable_road_users, int | float)
-                or not 0.0 <= self.vulnerable_road_users <= _MOST_VULNERABLE,
-                ".vulnerable_road_users must be a number from 0 to"
-                f" {_MOST_VULNERABLE:g}, got {self.vulnerable_road_users!r}",
+            "vru_density_scale": (
+                0 <= density <= _MAX_VRU_DENSITY_SCALE
+                and (is_procedural or density == 1),
+                f"0 to {_MAX_VRU_DENSITY_SCALE:g}, and 1 for scenes of real labels",
             ),
-            (
-                not is_procedural and self.vulnerable_road_users != 1.0,
-                ".vulnerable_road_users is of procedural scenes; those of real labels"
-                " have what the labels say: leave it at 1, not"
-                f" {self.vulnerable_road_users!r}",
+            "train_sequences": (
+                not is_procedural or self.train_sequences + self.test_sequences > 0,
+                "a sequence to train or to test on",
             ),
-            (
-                self.output not in ("tesseract", "projection"),
-                f".output must be 'tesseract' or 'projection', got {self.output!r}",
+            "sequences": (
+                not is_procedural or self.sequences is None,
+                "None: it selects sequences of real labels",
             ),
-            (
-                self.camera_content not in ("scene", "objects"),
-                ".camera_content must be 'scene' or 'objects', got "
-                f"{self.camera_content!r}",
-            ),
-            (
-                not _is_number(self.label_distance_m) or not self.label_distance_m > 0,
-                f".label_distance_m must be a number above 0, got {self.label_distance_m!r}",
-            ),
-            (
-                not isinstance(self.lidar_to_radar_m, tuple)
-                or len(self.lidar_to_radar_m) != 3,
-                f".lidar_to_radar_m must be three numbers, got {self.lidar_to_radar_m!r}",
-            ),
-        ):
-            if is_wrong:
-                raise UserError(f"simulation{text}")
+        }
+        for name, (holds, expected) in rules.items():
+            self._require(holds, name, expected)
         self.make_grid()
         self.make_parameters()
+
+    def _require(self, holds: bool, name: str, expected: str) -> None:
+        require(holds, f"config.simulation.{name}", getattr(self, name), expected)
 
     def make_grid(self) -> RadarGrid:
         """The radar's axes."""
         if self.grid == "kradar":
             return RadarGrid.kradar()
-        if isinstance(self.grid, str):
-            raise UserError(
-                f"simulation.grid must be 'kradar' or sizes, got {self.grid!r}"
-            )
+        is_mapping = isinstance(self.grid, Mapping)
+        self._require(is_mapping, "grid", "'kradar' or arguments of RadarGrid.reduced")
+        assert isinstance(self.grid, Mapping)
         try:
             return RadarGrid.reduced(**self.grid)
         except (TypeError, ValueError) as error:
-            raise UserError(f"simulation.grid: {error}") from None
+            raise UserError(f"config.simulation.grid: {error}") from None
 
     def make_parameters(self) -> RadarParameters:
         """The rest of the radar."""
-        for name, value in self.radar.items():
-            if name not in _RADAR_LIMITS:
-                raise UserError(
-                    f"simulation.radar: unknown field {name!r};"
-                    f" fields: {', '.join(_RADAR_LIMITS)}"
-                )
-            least, most = _RADAR_LIMITS[name]
-            kind = type(least)
-            if not _is_number(value, kind) or not least <= value <= most:
-                word = "an integer" if kind is int else "a number"
-                raise UserError(
-                    f"simulation.radar.{name} must be {word} from {least:g} to {most:g},"
-                    f" got {value!r}"
-                )
-        return RadarParameters(**self.radar)
+        try:
+            return RadarParameters(**self.radar)
+        except TypeError as error:
+            raise UserError(f"config.simulation.radar: {error}") from None
 
     def to_json(self) -> str:
-        """Canonical text: equal configs give equal text, also that of earlier versions."""
-        values = without_later_fields(dataclasses.asdict(self))
-        return json.dumps(values, sort_keys=True)
+        """Canonical text: equal settings give equal text."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
     def fingerprint(self) -> str:
         """Short hash of everything the files depend on."""
@@ -263,31 +211,15 @@ class SimulationConfig:
         return CONDITIONS[(number - 1) % len(CONDITIONS)]
 
 
-def _is_number(value: Any, kind: type = float) -> bool:
-    kinds = (int,) if kind is int else (int, float)
-    return isinstance(value, kinds) and not isinstance(value, bool)
-
-
-def without_later_fields(values: dict[str, Any]) -> dict[str, Any]:
-    """Less the fields at their defaults that earlier data sets were made without."""
-    return {
-        name: value
-        for name, value in values.items()
-        if name not in _LATER_FIELDS or value != _LATER_FIELDS[name]
-    }
-
-
 def default_config() -> dict[str, Any]:
     """Fields and defaults of `SimulationConfig` as fresh plain values."""
     return plain(dataclasses.asdict(SimulationConfig()))
 
 
 def plain(config: Any) -> Any:
-    """ConfigDicts and other mappings as dictionaries, tuples as lists, recursively."""
+    """ConfigDicts and other mappings as dictionaries, recursively."""
     if hasattr(config, "to_dict"):
         config = config.to_dict()
     if isinstance(config, Mapping):
         return {str(key): plain(value) for key, value in config.items()}
-    if isinstance(config, list | tuple):
-        return [plain(value) for value in config]
     return config

@@ -1,21 +1,21 @@
-"""Writes simulated sequences as a K-Radar tree that no reader can tell from the real.
+"""Writes simulated sequences in K-Radar's folders and file formats.
 
-Frames are written one by one, the label file last: a frame is there when its label
-file is. A killed run goes on where it stopped and ends with the same bytes. Scenes and
-images are Python and made by worker processes, the radar's part by this one's device.
+Frames are written one by one, the label file last: a frame exists when its label file
+does. A killed run resumes and ends with the same bytes. Worker processes make scenes and
+images; this process computes the radar's part on its device.
 """
 
 from __future__ import annotations
 
-import concurrent.futures
+import collections
 import contextlib
 import functools
 import json
 import logging
 import os
 import pathlib
-import threading
-from collections.abc import Callable, Iterator, Mapping
+import pickle
+from collections.abc import Iterator, Mapping, Sequence
 from typing import IO, Any
 
 import jax
@@ -25,24 +25,24 @@ from tqdm import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.core.workers import process_pool
+from radejax.core.workers import Submit, process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
 from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.radar import tensor
 from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source
-from radejax.simulation.simulator import RadarInput, SequenceSimulator, radar_frame
+from radejax.simulation.simulator import RadarInput, SequenceSimulator
 
 __all__ = ["default_config", "simulate_dataset"]
 
 _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 _FEW_FRAMES = 100  # done before worker processes have started
-_TESSERACTS_AT_A_TIME = 2  # on the device or on their way to disk: 260 MB each
 
-_Prepare = Callable[[int, FrameSpec], tuple[RadarInput, list[Label]]]
+_Prepared = tuple[int, FrameSpec, RadarInput, list[Label]]
 
 _log = logging.getLogger(__name__)
 
@@ -59,8 +59,8 @@ def simulate_dataset(
     Args:
         config: Plain values as `default_config` returns (a mapping or ConfigDict).
         root: Folder of the data set; made if missing.
-        num_workers: Processes that make scenes and draw images; 0: this one; None: one a
-            core, or for few frames this one.
+        num_workers: Processes that make scenes and render images; 0: this one; None: one
+            per core, or this one for few frames.
         progress: Show a progress bar.
 
     Returns:
@@ -137,7 +137,7 @@ def _cameras(
     if not config.image_width:
         return ()
     size = config.image_width, config.image_height
-    return stereo_calibration(config.lidar_to_radar_m, *size)
+    return stereo_calibration(config.radar_from_lidar_m, *size)
 
 
 def _write_common(
@@ -163,44 +163,37 @@ def _write_frames(
     num_workers: int | None,
     progress: bool,
 ) -> None:
-    """Every frame that is not there yet; next sequences start before one has ended."""
+    """Writes every frame that does not exist yet."""
     missing = list(_missing(root, config, source))
     total = sum(len(source.frames(n)) for n in source.numbers)
-    bar = tqdm(total=total, unit="frame", desc="simulate", disable=not progress)
-    bar.update(total - len(missing))
     if num_workers is None:
         num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
-    # Threads wait for workers and the device alike.
-    num_threads = num_workers + _TESSERACTS_AT_A_TIME
-    is_large = config.output == "tesseract"
-    turn = threading.Semaphore(_TESSERACTS_AT_A_TIME if is_large else num_threads)
-    running: set[concurrent.futures.Future[None]] = set()
-
-    def wait(at_most: int) -> None:
-        nonlocal running
-        while len(running) > at_most:
-            done, running = concurrent.futures.wait(
-                running, return_when=concurrent.futures.FIRST_COMPLETED
-            )
-            for future in done:
-                future.result()
-                bar.update()
-
+    is_whole = config.output == "tesseract"
+    settings: Any = {
+        "grid": config.make_grid(),
+        "parameters": config.make_parameters(),
+        "output": "rows" if is_whole else "projection",
+    }
     with (
-        bar,
-        _prepare_by(num_workers, root, config, source) as prepare,
-        concurrent.futures.ThreadPoolExecutor(num_threads) as pool,
+        tqdm(
+            total=total, unit="frame", desc="simulate", disable=not progress
+        ) as progress_bar,
+        _prepared(num_workers, missing, root, config, source) as frames,
     ):
-        try:
-            for number, spec in missing:
-                running.add(
-                    pool.submit(_write_frame, root, config, number, spec, prepare, turn)
-                )
-                wait(2 * num_threads)
-            wait(0)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        progress_bar.update(total - len(missing))
+        last: tuple[Any, ...] | None = None
+        for number, spec, given, labels in frames:
+            # The device computes this frame while the one before is written.
+            output = tensor.simulate(
+                given.scatterers, given.noise_power, given.key, **settings
+            )
+            if last:
+                _write_frame(root, config, *last)
+                progress_bar.update()
+            last = number, spec, output, labels
+        if last:
+            _write_frame(root, config, *last)
+            progress_bar.update()
 
 
 def _missing(
@@ -216,7 +209,7 @@ def _missing(
         kradar_write.write_calibration(
             folder / "info_calib" / "calib_radar_lidar.txt",
             radar_idx - lidar_idx,
-            *config.lidar_to_radar_m[:2],
+            *config.radar_from_lidar_m[:2],
         )
         there = {path.stem for path in (folder / _LABELS).glob("*.txt")}
         yield from ((number, spec) for spec in specs if spec.name not in there)
@@ -227,44 +220,34 @@ def _write_frame(
     config: SimulationConfig,
     number: int,
     spec: FrameSpec,
-    prepare: _Prepare,
-    turn: threading.Semaphore,
+    output: jax.Array,
+    labels: list[Label],
 ) -> None:
-    """One frame: image, radar, then labels."""
-    given, labels = prepare(number, spec)
-    folder = root / str(number)
-    with turn:
-        _write_radar(folder, config, spec.indices[0], given)
+    """Writes what the radar receives, then the labels."""
+    folder, index = root / str(number), spec.indices[0]
+    if config.output == "tesseract":
+        path = folder / "radar_tesseract" / f"tesseract_{index:05d}.mat"
+        tesseract = np.asarray(output).transpose(tensor.TESSERACT_OF_ROWS)
+        kradar_write.write_tesseract(path, tesseract)
+    else:
+        path = folder / "DERA_tesseract" / f"DERA_tesseract_{index:05d}.npy"
+        with files.atomic_write(path) as file:
+            np.save(file, np.moveaxis(np.asarray(output), -1, 0))  # [D+E, R, A]
     path = folder / _LABELS / f"{spec.name}.txt"
     kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
 
 
-def _write_radar(
-    folder: pathlib.Path, config: SimulationConfig, number: int, given: RadarInput
-) -> None:
-    grid, parameters = config.make_grid(), config.make_parameters()
-    output = radar_frame(given, grid, parameters, config.output)
-    if config.output == "tesseract":
-        path = folder / "radar_tesseract" / f"tesseract_{number:05d}.mat"
-        kradar_write.write_tesseract(path, output)
-        return
-    path = folder / "DERA_tesseract" / f"DERA_tesseract_{number:05d}.npy"
-    with files.atomic_write(path) as file:
-        np.save(file, np.moveaxis(output, -1, 0))  # [D+E, R, A]
-
-
 class _Scenes:
-    """Makes what a frame has but for the radar's part, and writes its image."""
+    """Makes everything of a frame except the radar's part, and writes its image."""
 
     def __init__(
         self, root: pathlib.Path, config: SimulationConfig, source: SceneSource
     ) -> None:
         self._root, self._config, self._source = root, config, source
-        # Threads may ask for frames of the sequence before.
-        self._sequence = functools.lru_cache(maxsize=8)(self._make)
+        self._sequence = functools.lru_cache(maxsize=2)(self._make)
 
     def prepare(self, number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
-        """Radar input and labels of a frame; its image is written."""
+        """Radar input and labels of a frame; writes its image."""
         config, camera_idx = self._config, spec.indices[2]
         simulator, renderer = self._sequence(number)
         frame = simulator.sequence.frame(spec.scene_idx)
@@ -275,7 +258,7 @@ class _Scenes:
                 write_png(file, renderer.render(frame))
         given = simulator.radar_input(frame)
         labels = simulator.labels(
-            frame, given, config.lidar_to_radar_m, config.label_distance_m
+            frame, given, config.radar_from_lidar_m, config.label_distance_m
         )
         return given, labels
 
@@ -291,32 +274,60 @@ class _Scenes:
             pair,
             config.seed,
             cover_lens=config.cover_lens,
-            content=config.camera_content,
+            mode=config.camera_mode,
         )
 
 
 @contextlib.contextmanager
-def _prepare_by(num_workers: int, *of_scenes: Any) -> Iterator[_Prepare]:
-    """`_Scenes.prepare`, by worker processes if there are to be any."""
+def _prepared(
+    num_workers: int, missing: Sequence[tuple[int, FrameSpec]], *of_scenes: Any
+) -> Iterator[Iterator[_Prepared]]:
+    """Sequence, frame, radar input and labels, in order; by `num_workers` processes."""
     if not num_workers:
-        yield _Scenes(*of_scenes).prepare
+        scenes = _Scenes(*of_scenes)
+        yield (
+            (number, spec, *scenes.prepare(number, spec)) for number, spec in missing
+        )
         return
     with process_pool(num_workers, _start_worker, *of_scenes) as submit:
-        yield lambda *frame: submit(_prepare_in_worker, *frame).result()
+        yield _by_workers(submit, missing, 2 * num_workers)
+
+
+def _by_workers(
+    submit: Submit, missing: Sequence[tuple[int, FrameSpec]], num_ahead: int
+) -> Iterator[_Prepared]:
+    waiting: collections.deque[tuple[int, FrameSpec, Any]] = collections.deque()
+    for number, spec in missing:
+        waiting.append((number, spec, submit(_prepare_in_worker, number, spec)))
+        if len(waiting) > num_ahead:
+            yield _received(*waiting.popleft())
+    while waiting:
+        yield _received(*waiting.popleft())
+
+
+def _received(number: int, spec: FrameSpec, future: Any) -> _Prepared:
+    path = pathlib.Path(future.result())
+    given, labels = pickle.loads(path.read_bytes())
+    path.unlink()
+    return number, spec, given, labels
 
 
 _scenes: Any = None
 
 
-def _start_worker(*of_scenes: Any) -> None:
-    """The device is the parent's: this process has none."""
+def _start_worker(root: pathlib.Path, *of_scenes: Any) -> None:
+    """The device belongs to the parent: this process only has its CPU."""
     global _scenes
     jax.config.update("jax_platforms", "cpu")
-    _scenes = _Scenes(*of_scenes)
+    _scenes = root, _Scenes(root, *of_scenes)
 
 
-def _prepare_in_worker(number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
-    return _scenes.prepare(number, spec)
+def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
+    """File with radar input and labels, as results of workers must be short."""
+    root, scenes = _scenes
+    path = root / f".{number}_{spec.name}.tmp"
+    path.write_bytes(pickle.dumps(scenes.prepare(number, spec)))
+    return str(path)
 
 
 def write_png(file: IO[bytes], image: np.ndarray) -> None:

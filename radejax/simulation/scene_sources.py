@@ -76,14 +76,14 @@ class ProceduralSource:
     def make(self, number: int) -> Sequence:
         """The scene of a sequence."""
         environment, time, weather = self.conditions(number)
-        times = self._config.vulnerable_road_users if self._is_training(number) else 1.0
+        times = self._config.vru_density_scale if self._is_training(number) else 1.0
         return make_sequence(
             number,
             environment=environment,
             time=time,
             weather=weather,
             num_frames=self._config.frames_per_sequence,
-            vulnerable_road_users=times,
+            vru_density_scale=times,
             rng=np.random.default_rng([self._config.seed, number]),
         )
 
@@ -135,7 +135,7 @@ class LabelSource:
         """The scene of a sequence."""
         return make_real_sequence(
             self._frames[number],
-            lidar_to_radar_m=self._config.lidar_to_radar_m,
+            radar_from_lidar_m=self._config.radar_from_lidar_m,
             rng=np.random.default_rng([self._config.seed, number]),
         )
 

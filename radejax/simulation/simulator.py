@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
@@ -113,10 +114,23 @@ class SequenceSimulator:
         )
 
     def run(
-        self, given: RadarInput, output: tensor.Output = "projection"
+        self,
+        given: RadarInput,
+        output: Literal["tesseract", "projection"] = "projection",
     ) -> Float[np.ndarray, "..."]:
-        """The radar frame of an input; see `radar_frame`."""
-        return radar_frame(given, self.grid, self.parameters, output)
+        """The 4D radar tensor `[D, R, E, A]` or the projection `[R, A, D+E]`."""
+        result = np.asarray(
+            tensor.simulate(
+                given.scatterers,
+                given.noise_power,
+                given.key,
+                grid=self.grid,
+                parameters=self.parameters,
+                output="rows" if output == "tesseract" else "projection",
+            )
+        )
+        is_whole = output == "tesseract"
+        return result.transpose(tensor.TESSERACT_OF_ROWS) if is_whole else result
 
     def is_radar_visible(
         self, frame: SceneFrame, given: RadarInput
@@ -129,7 +143,7 @@ class SequenceSimulator:
         self,
         frame: SceneFrame,
         given: RadarInput,
-        lidar_to_radar_m: tuple[float, float, float],
+        radar_from_lidar_m: tuple[float, float, float],
         max_distance_m: float,
     ) -> list[Label]:
         """Labels of a frame, in the LiDAR frame as K-Radar's files have them.
@@ -137,7 +151,7 @@ class SequenceSimulator:
         Args:
             frame: Scene of the frame.
             given: Radar input of the same frame.
-            lidar_to_radar_m: Metres from LiDAR to radar positions.
+            radar_from_lidar_m: `p_radar = p_lidar + t`.
             max_distance_m: Farther objects get no label.
         """
         visible = self.is_radar_visible(frame, given)
@@ -145,7 +159,7 @@ class SequenceSimulator:
         labels = []
         for n in np.flatnonzero(distance < max_distance_m):
             box = frame.boxes[n].copy()
-            box[:3] -= lidar_to_radar_m
+            box[:3] -= radar_from_lidar_m
             labels.append(
                 Label(
                     cls=self.sequence.tracks.label_cls[frame.track[n]],
@@ -155,28 +169,3 @@ class SequenceSimulator:
                 )
             )
         return labels
-
-
-def radar_frame(
-    given: RadarInput,
-    grid: RadarGrid,
-    parameters: tensor.RadarParameters,
-    output: tensor.Output = "projection",
-) -> Float[np.ndarray, "..."]:
-    """The radar frame of an input; see `tensor.simulate`.
-
-    A tesseract comes as a view of the rows that the device made, without a copy.
-    """
-    result = np.asarray(
-        tensor.simulate(
-            given.scatterers,
-            given.noise_power,
-            given.key,
-            grid=grid,
-            parameters=parameters,
-            output="rows" if output == "tesseract" else output,
-        )
-    )
-    return (
-        result.transpose(tensor.TESSERACT_OF_ROWS) if output == "tesseract" else result
-    )

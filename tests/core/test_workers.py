@@ -2,7 +2,6 @@
 
 import os
 import pathlib
-import pickle
 import signal
 import subprocess
 import sys
@@ -49,68 +48,27 @@ def test_a_killed_worker_is_one_line(tmp_path):
         with process_pool(2, os.chdir, tmp_path) as submit:
             submit(signal.raise_signal, signal.SIGKILL).result()
 
-    with pytest.raises(UserError, match=r"a worker process was killed.*fewer workers"):
+    with pytest.raises(UserError, match=r"a worker process ended early.*fewer workers"):
         dies()
 
 
-_KILLED_AMID_ITS_RESULT = """
-import os, signal
-from multiprocessing.connection import Connection
-
-def send_half(self, message, write=None):
-    os.write(self._handle, message[: len(message) // 2])
-    signal.raise_signal(signal.SIGKILL)
-
-Connection._send = send_half
-"""
-
-
-def test_a_worker_killed_amid_its_result_is_one_line(tmp_path):
-    def dies():
-        with process_pool(2, os.chdir, tmp_path) as submit:
-            submit(exec, _KILLED_AMID_ITS_RESULT, {}).result()
-
-    with pytest.raises(UserError, match="a worker process was killed"):
-        dies()
-
-
-def test_other_workers_finish_when_one_is_killed(tmp_path):
-    with process_pool(2, os.chdir, tmp_path) as submit:
-        slow = submit(eval, "__import__('time').sleep(0.5) or 'finished'")
-        with pytest.raises(UserError, match="a worker process was killed"):
-            submit(signal.raise_signal, signal.SIGKILL).result()
-        assert slow.result() == "finished"
-
-
-_NO_PICKLE_CARRIES = """
-error = ValueError("of a lambda")
-error.function = lambda: None
-raise error
-"""
-
-
-def test_errors_of_a_worker_say_where_they_were_raised(tmp_path):
+def test_errors_of_a_worker_are_raised_here(tmp_path):
     with process_pool(1, os.chdir, tmp_path) as submit:
-        with pytest.raises(DataError, match="line 3") as raised:
+        with pytest.raises(DataError, match="line 3"):
             submit(exec, "raise error", {"error": DataError("line 3")}).result()
-        assert 'File "<string>", line 1' in raised.value.__notes__[0]
-        with pytest.raises(RuntimeError, match="ValueError: of a lambda"):
-            submit(exec, _NO_PICKLE_CARRIES, {}).result()
-        with pytest.raises((AttributeError, pickle.PicklingError), match="lambda"):
-            submit(lambda: None).result()
-        with pytest.raises(SystemExit):
-            submit(sys.exit, 1).result()
-        assert submit(os.getpid).result() != os.getpid()  # goes on
+        assert submit(os.getpid).result() != os.getpid()  # it continues to work
 
 
-def test_an_error_of_the_start_is_that_of_the_work(tmp_path):
-    with process_pool(1, os.chdir, tmp_path / "nowhere") as submit:
-        for _ in range(2):
-            with pytest.raises(FileNotFoundError, match="nowhere"):
-                submit(os.getpid).result()
+def test_a_start_that_fails_is_one_line(tmp_path):
+    def fails():
+        with process_pool(1, os.chdir, tmp_path / "nowhere") as submit:
+            submit(os.getpid).result()
+
+    with pytest.raises(UserError, match="a worker process ended early"):
+        fails()
 
 
-def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
+def test_a_script_without_a_guard_names_what_it_lacks(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import os\n"
@@ -120,5 +78,5 @@ def test_a_script_without_a_guard_is_told_what_it_lacks(tmp_path):
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True)
     assert done.returncode == 1
-    assert "UserError: no worker process could start" in done.stderr.splitlines()[-1]
+    assert "UserError: a worker process ended early" in done.stderr.splitlines()[-1]
     assert '`if __name__ == "__main__":`' in done.stderr.splitlines()[-1]

@@ -35,7 +35,7 @@ def _drawn(count, share=0.0, **fields):
 
 def test_patches_show_the_classes_that_are_drawn():
     plain_images = _drawn(6)
-    flat = _drawn(6, camera_content="objects")
+    flat = _drawn(6, camera_mode="oracle")
     np.testing.assert_array_equal(flat.pixels, plain_images.pixels)
     # Silhouettes have the colour of their class: where the roadside hides none, each
     # of its pixels is one of the class.

@@ -54,7 +54,7 @@ def test_both_runs_see_the_same_scenes_and_the_bar_decides(
     radar, camera = seen
     assert (radar.model.name, camera.model.name) == ("radenet", "dinorade")
     assert radar.simulation == camera.simulation
-    assert camera.simulation.camera_content == "objects"
+    assert camera.simulation.camera_mode == "oracle"
     assert radar.seed == camera.seed == 3
 
 

@@ -91,13 +91,13 @@ def test_frames_are_projected_beside_their_data_once(
 def test_a_folder_of_before_the_config_had_more_fields_is_found_again() -> None:
     simulation = ConfigDict(default_config())
     before = simulation.copy_and_resolve_references()
-    del before["camera_content"], before["vulnerable_road_users"]
+    del before["camera_mode"], before["vru_density_scale"]
     # As runs have it, whose configs are sorted; a command reads the file's own order.
     text = ConfigDict(before.to_dict()).to_json()
     digest = hashlib.sha256(text.encode()).hexdigest()[:8]
     for config in (simulation, ConfigDict(simulation.to_dict())):
         assert _simulated_root(config, ()) == f"data/simulated-{digest}"
-    simulation.camera_content = "objects"
+    simulation.camera_mode = "oracle"
     assert _simulated_root(simulation, ()) != f"data/simulated-{digest}"
 
 

@@ -54,8 +54,8 @@ def test_a_run_older_than_a_field_of_the_config_goes_on(tmp_path: pathlib.Path) 
     old = json.loads(config.to_json())
     config.simulation = ConfigDict(default_config())
     old["simulation"] = default_config()
-    del old["simulation"]["camera_content"], old["data"]["validation"]
-    del old["simulation"]["vulnerable_road_users"]
+    del old["simulation"]["camera_mode"], old["data"]["validation"]
+    del old["simulation"]["vru_density_scale"]
     del old["data"]["sequences"], old["seed"], old["train"]["schedule"]
     old["loss"]["weights"] = [2.0, 1.0, 1.0]
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)

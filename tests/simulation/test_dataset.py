@@ -8,7 +8,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -84,7 +83,7 @@ class TestTree:
 
     def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
         cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras
-        shift = small_config()["lidar_to_radar_m"]
+        shift = small_config()["radar_from_lidar_m"]
         drawn = stereo_calibration(tuple(shift), 64, 36)[0].camera()
         np.testing.assert_allclose(
             cameras[0].cam_from_ego, drawn.cam_from_ego, atol=1e-12
@@ -127,24 +126,6 @@ class TestRepeating:
             small_config(), tmp_path / "again", num_workers=2, progress=False
         )
         assert digests(again) == digests(tree)
-
-    def test_two_tesseracts_are_on_the_device_at_a_time(self, tmp_path, monkeypatch):
-        radar_frame, now, most = dataset.radar_frame, [], []
-
-        def counted(*given):
-            now.append(1)
-            most.append(len(now))
-            time.sleep(0.05)
-            output = radar_frame(*given)
-            now.pop()
-            return output
-
-        monkeypatch.setattr(dataset, "radar_frame", counted)
-        simulate_dataset(
-            small_config(), tmp_path / "data", num_workers=4, progress=False
-        )
-        assert len(most) == 9
-        assert max(most) == 2
 
     def test_another_seed_gives_other_bytes(self, tree, tmp_path):
         config = small_config(
@@ -205,7 +186,7 @@ class TestWrongUse:
                 worker.kill()
 
         monkeypatch.setattr(dataset, "_write_frame", write_and_kill)
-        with pytest.raises(UserError, match="a worker process was killed"):
+        with pytest.raises(UserError, match="a worker process ended early"):
             simulate_dataset(small_config(), root, num_workers=1, progress=False)
         assert 1 <= len(list(root.rglob("info_label_v2_1/*.txt"))) < 9
 

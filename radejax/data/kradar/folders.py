@@ -275,11 +275,11 @@ def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
     for path in (folder / SIMULATION_MARKER for folder in folders):
         if path.is_file():
             try:
-                shift = read_json(path).get("config", {}).get("lidar_to_radar_m")
+                shift = read_json(path).get("config", {}).get("radar_from_lidar_m")
                 found[path] = KRADAR_LIDAR_TO_RADAR_Z_M if shift is None else shift[2]
             except (AttributeError, IndexError, TypeError, KeyError):
                 raise DataError(
-                    f"{path}: config.lidar_to_radar_m is not three numbers"
+                    f"{path}: config.radar_from_lidar_m is not three numbers"
                 ) from None
     if len(set(found.values())) > 1:
         raise DataError(

@@ -46,12 +46,12 @@ _HALF_BRIGHT_M = 20.0
 
 
 def stereo_calibration(
-    lidar_to_radar_m: tuple[float, float, float], width: int = 1280, height: int = 720
+    radar_from_lidar_m: tuple[float, float, float], width: int = 1280, height: int = 720
 ) -> tuple[CameraCalibration, CameraCalibration]:
     """Left and right front camera with K-Radar's intrinsics, scaled to an image size.
 
     Args:
-        lidar_to_radar_m: Metres to add to LiDAR positions to get radar positions.
+        radar_from_lidar_m: Metres to add to LiDAR positions to get radar positions.
         width: Width of one of the two images.
         height: Height.
     """
@@ -60,7 +60,7 @@ def stereo_calibration(
             intrinsics=_INTRINSICS,
             distortion=_DISTORTION,
             translation_m=translation,
-            ego_from_lidar_m=np.array(lidar_to_radar_m),
+            ego_from_lidar_m=np.array(radar_from_lidar_m),
             **_ANGLES,
         ).resized(width, height)
         for translation in _TRANSLATIONS
@@ -136,7 +136,7 @@ class CameraRenderer:
         calibrations: Left and right camera.
         seed: Colours of the objects, drops and flakes.
         cover_lens: Let bad weather cover the lens at times.
-        content: "scene", or "objects": their silhouettes alone, see `silhouettes`.
+        mode: "scene", or "oracle": only silhouettes of the objects, see `silhouettes`.
     """
 
     def __init__(
@@ -146,11 +146,11 @@ class CameraRenderer:
         seed: int,
         *,
         cover_lens: bool = True,
-        content: str = "scene",
+        mode: str = "scene",
     ) -> None:
         self.sequence = sequence
         self.calibrations = calibrations
-        self.cover_lens, self.seed, self.content = cover_lens, seed, content
+        self.cover_lens, self.seed, self.mode = cover_lens, seed, mode
         self.grounds = [trace_ground(c, sequence.ground_m) for c in calibrations]
         rng = np.random.default_rng([seed, sequence.name, 7])
         self.colors = shapes.object_colors(sequence.tracks.cls, rng)
@@ -171,7 +171,7 @@ class CameraRenderer:
 
     def view(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
         """Image of one camera."""
-        if self.content == "objects":
+        if self.mode == "oracle":
             return self.silhouettes(frame, side)
         calibration = self.calibrations[side]
         canvas = Image.fromarray(self._background(frame, self.grounds[side]))

@@ -21,14 +21,28 @@ from flax import struct
 from jax import lax
 from jaxtyping import Float, UInt32
 
+from radejax.core.errors import require
 from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
 
-Output = Literal["tesseract", "rows", "projection"]
+Output = Literal["rows", "projection"]
 
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
+
+
+_PARAMETER_RANGES = {
+    "gain_db": (-1e3, 1e3),
+    "noise_db": (-1e3, 1e3),
+    "wavelength_m": (1e-4, 1.0),
+    "azimuth_elements": (1.0, 512.0),
+    "elevation_elements": (1.0, 512.0),
+    "array_pedestal": (0.0, 1.0),
+    "range_resolution_m": (0.0, 100.0),
+    "pattern_exponent": (0.0, 100.0),
+    "max_scatterers_per_row": (1, 4096),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +63,9 @@ class RadarParameters:
         pattern_exponent: Two-way antenna gain is `cos(angle) ** exponent`.
         max_scatterers_per_row: Scatterers summed in one range row, the strongest
             ones; what lies below them is dropped.
+
+    Raises:
+        UserError: A value is out of its range.
     """
 
     gain_db: float = 178.0
@@ -60,6 +77,20 @@ class RadarParameters:
     range_resolution_m: float = 0.0
     pattern_exponent: float = 3.0
     max_scatterers_per_row: int = 96
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in _PARAMETER_RANGES.items():
+            value, kind = (
+                getattr(self, name),
+                int if type(least) is int else float | int,
+            )
+            is_number = isinstance(value, kind) and not isinstance(value, bool)
+            require(
+                is_number and least <= value <= most,
+                f"config.simulation.radar.{name}",
+                value,
+                f"{least:g} to {most:g}",
+            )
 
 
 class Scatterers(struct.PyTreeNode):
@@ -135,9 +166,7 @@ def range_response(
     return window_response((axis - range_m[None]) / resolution, 0.0)
 
 
-@functools.partial(
-    jax.jit, static_argnames=("grid", "parameters", "output", "rows_per_step")
-)
+@functools.partial(jax.jit, static_argnames=("grid", "parameters", "output"))
 def simulate(
     scatterers: Scatterers,
     noise_power: Float[Array, "R D"],
@@ -146,7 +175,6 @@ def simulate(
     grid: RadarGrid,
     parameters: RadarParameters = RadarParameters(),
     output: Output = "projection",
-    rows_per_step: int = 0,
 ) -> Float[jax.Array, "..."]:
     """One radar frame, jitted; map it over frames with `jax.vmap`.
 
@@ -157,12 +185,10 @@ def simulate(
         key: Seed of the noise of this frame.
         grid: Axes of the tensor.
         parameters: The sensor.
-        output: "tesseract" for `[D, R, E, A]` linear power, "rows" for the same as it is
-            made, `[R, E, D, A]` (turning 260 MB around takes time), "projection" for
-            `[R, A, D+E]` normalised projections: the numbers that
-            `radejax.data.projection.project` makes of the tesseract.
-        rows_per_step: Range rows at a time; 0: 1 on CPUs, 64 on accelerators. Does not
-            change the numbers, only memory and speed.
+        output: "rows" for linear power `[R, E, D, A]`, a tensor in the order in which it
+            is computed (see `TESSERACT_OF_ROWS`); "projection" for `[R, A, D+E]`
+            normalized projections, the values that `radejax.data.projection` makes of
+            the tensor.
 
     Returns:
         float32 array as `output` says.
@@ -200,12 +226,8 @@ def simulate(
         # One by one is without a batch's axis.
         return lax.map(row, rows, batch_size=None if count == 1 else count)
 
-    if rows_per_step:
-        result = by_rows(rows_per_step, *rows)
-    else:
-        one, many = (functools.partial(by_rows, count) for count in (1, 64))
-        result = lax.platform_dependent(*rows, cpu=one, default=many)
-    return jnp.transpose(result, TESSERACT_OF_ROWS) if output == "tesseract" else result
+    one, many = (functools.partial(by_rows, count) for count in (1, 64))
+    return lax.platform_dependent(*rows, cpu=one, default=many)
 
 
 def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:

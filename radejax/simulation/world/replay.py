@@ -37,20 +37,20 @@ MAX_SPEED_MPS = 60.0
 def make_real_sequence(
     frames: list[Frame],
     *,
-    lidar_to_radar_m: tuple[float, float, float],
+    radar_from_lidar_m: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> Sequence:
     """A scene from the labels of one sequence.
 
     Args:
         frames: Consecutive frames of one sequence in order, with all their labels.
-        lidar_to_radar_m: Metres to add to LiDAR positions to get radar positions.
+        radar_from_lidar_m: Metres to add to LiDAR positions to get radar positions.
         rng: Source of the surroundings and of what labels do not tell.
 
     Returns:
         Scene whose objects have the labels' boxes, frame by frame.
     """
-    tracks = collect_tracks(frames, lidar_to_radar_m)
+    tracks = collect_tracks(frames, radar_from_lidar_m)
     clock = np.array([f.header.timestamp_s for f in frames])
     relative = relative_velocity(tracks, clock)
     environment = frames[0].environment
@@ -84,7 +84,7 @@ def make_real_sequence(
 
 
 def collect_tracks(
-    frames: list[Frame], lidar_to_radar_m: tuple[float, float, float]
+    frames: list[Frame], radar_from_lidar_m: tuple[float, float, float]
 ) -> Tracks:
     """Labels of all frames as tracks, positions in the radar's frame.
 
@@ -106,7 +106,7 @@ def collect_tracks(
             boxes[index, n], present[index, n] = box, True
         first = next(iter(track.values()))
         boxes[~present[:, n], n, 3:6] = first[3:6]
-    boxes[..., :3] += lidar_to_radar_m
+    boxes[..., :3] += radar_from_lidar_m
     return Tracks(
         position_m=boxes[..., :3],
         yaw_rad=boxes[..., 6],

@@ -45,7 +45,7 @@ def make_sequence(
     weather: str,
     num_frames: int,
     rng: np.random.Generator,
-    vulnerable_road_users: float = 1.0,
+    vru_density_scale: float = 1.0,
 ) -> Sequence:
     """A procedural sequence; the same generator state gives the same sequence.
 
@@ -56,10 +56,10 @@ def make_sequence(
         weather: One of K-Radar's seven.
         num_frames: Length at 10 frames a second.
         rng: Source of everything random.
-        vulnerable_road_users: Pedestrians and two-wheelers, as a multiple of the
+        vru_density_scale: Pedestrians and two-wheelers, as a multiple of the
             environment's own.
     """
-    law = ENVIRONMENTS[environment].with_vulnerable(vulnerable_road_users)
+    law = ENVIRONMENTS[environment].with_vulnerable(vru_density_scale)
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * FRAME_PERIOD_S
     speed = rng.uniform(*law.speed_mps) * _speed_wave(clock, rng)

@@ -1,17 +1,13 @@
 """Drawn objects lie where labels and calibration say, to the pixel."""
 
-import json
-
 import numpy as np
 import pytest
 
-from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import read_labels
 from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera import lens
 from radejax.simulation.camera import renderer as camera
-from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.scene import Reflectors, Road, Sequence, Tracks
 from radejax.simulation.world.traffic import make_sequence
@@ -226,7 +222,7 @@ class TestSilhouettes:
             sequence = make_scene(
                 boxes, ["Sedan", "Sedan", "Pedestrian"], time=time, weather=weather
             )
-            renderer = camera.CameraRenderer(sequence, pair, 0, content="objects")
+            renderer = camera.CameraRenderer(sequence, pair, 0, mode="oracle")
             frame = sequence.frame(0)
             images.append(renderer.render(frame))
         image, mask = images[0], renderer.shown_boxes(frame, 0)
@@ -242,16 +238,3 @@ class TestSilhouettes:
             expected = np.eye(3)[channel] * int(255 * 20 / (20 + depth))
             np.testing.assert_array_equal(color[0], expected)
         assert near[0, 0] > 1.4 * far[0, 0]
-
-    def test_a_data_set_of_before_is_one_of_whole_scenes(self):
-        old = default_config()
-        del old["camera_content"], old["vulnerable_road_users"]
-        scene = SimulationConfig.from_mapping(old)
-        assert scene == SimulationConfig.from_mapping(default_config())
-        assert "camera_content" not in scene.to_json()
-        objects = default_config() | {"camera_content": "objects"}
-        other = SimulationConfig.from_mapping(objects)
-        assert other.fingerprint() != scene.fingerprint()
-        assert SimulationConfig.from_mapping(json.loads(other.to_json())) == other
-        with pytest.raises(UserError, match="must be 'scene' or 'objects', got 'x'"):
-            SimulationConfig.from_mapping(old | {"camera_content": "x"})

@@ -76,10 +76,10 @@ def test_all_classes_and_sedans_everywhere():
     assert seen == set(range(5))
 
 
-def test_vulnerable_road_users_are_as_many_times_more():
+def test_vru_density_scale_are_as_many_times_more():
     def counted(times):
         scenes = [
-            sequence(environment, seed, 1, vulnerable_road_users=times)
+            sequence(environment, seed, 1, vru_density_scale=times)
             for environment in ("urban", "university")
             for seed in range(80)
         ]
