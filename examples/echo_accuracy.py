@@ -27,8 +27,7 @@ from radejax.evaluation.columns import in_roi
 from radejax.evaluation.report.tables import Table, number
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
-from radejax.simulation.scene_sources import make_source
-from radejax.simulation.simulator import SequenceSimulator
+from radejax.simulation.simulator import SequenceSimulator, make_source
 
 DISTANCES_M = ((5.0, 20.0), (20.0, 40.0))
 

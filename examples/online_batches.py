@@ -21,8 +21,7 @@ from radejax.core.structures import Batch
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.radar import tensor
-from radejax.simulation.scene_sources import make_source
-from radejax.simulation.simulator import RadarInput, SequenceSimulator
+from radejax.simulation.simulator import RadarInput, SequenceSimulator, make_source
 
 _CACHED_SEQUENCES = 64
 

@@ -42,7 +42,7 @@ from radejax.models.vit import ViT
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.camera.shapes import camera_position
 from radejax.simulation.config import SimulationConfig, plain
-from radejax.simulation.scene_sources import make_source
+from radejax.simulation.simulator import make_source
 from radejax.simulation.world.scene import Sequence
 from radejax.simulation.world.traffic import SIZES
 from radejax.weights import dinov3_hf, resnet_torch

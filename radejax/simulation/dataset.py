@@ -33,8 +33,13 @@ from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.radar import tensor
-from radejax.simulation.scene_sources import FrameSpec, SceneSource, make_source
-from radejax.simulation.simulator import RadarInput, SequenceSimulator
+from radejax.simulation.simulator import (
+    FrameSpec,
+    RadarInput,
+    SceneSource,
+    SequenceSimulator,
+    make_source,
+)
 
 __all__ = ["default_config", "simulate_dataset"]
 

@@ -12,8 +12,8 @@ from radejax.simulation.config import (
     SimulationConfig,
     default_config,
 )
+from radejax.simulation.radar.propagation import WEATHERS
 from radejax.simulation.radar.tensor import RadarParameters
-from radejax.simulation.radar.weather import WEATHERS
 from radejax.simulation.world.environments import ENVIRONMENTS
 
 

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
 from radejax.geometry.camera import CameraCalibration
-from radejax.simulation.camera import lens, panels, shapes
+from radejax.simulation.camera import details, lens, shapes
 from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
 
 # K-Radar's values for the pair (see the calibration files of the data set).
@@ -223,7 +223,7 @@ class CameraRenderer:
         """What one camera sees of objects and roadside, far ones first."""
         calibration = self.calibrations[side]
         origin, white = shapes.camera_position(calibration), self.air.white
-        roadside = panels.make_panels(frame, origin, self.sequence.ground_m, white)
+        roadside = details.make_panels(frame, origin, self.sequence.ground_m, white)
         classes, colors = [CLASSES[c] for c in frame.cls], self.colors[frame.track]
         return shapes.visible_polygons(
             frame.boxes, classes, colors, calibration, self.light, roadside

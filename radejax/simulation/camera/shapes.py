@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details, lens
-from radejax.simulation.camera.panels import Panels
+from radejax.simulation.camera.details import Panels
 
 # A block in units of the half extents: x, y, z ranges; colour role; share kept of the
 # length and width at its top (a taper).

@@ -16,8 +16,8 @@ from radejax.simulation.world.environments import (
     GROUND_M,
     SIGHT_M,
     Environment,
+    make_surroundings,
 )
-from radejax.simulation.world.roadside import make_surroundings
 from radejax.simulation.world.scene import (
     FRAME_PERIOD_S,
     Road,

@@ -7,7 +7,7 @@ import pytest
 
 from radejax.data.kradar.sequences import KRADAR_CONDITIONS
 from radejax.simulation.camera import lens
-from radejax.simulation.radar.weather import WEATHERS
+from radejax.simulation.radar.propagation import WEATHERS
 
 
 def test_every_weather_has_air_and_cover():

@@ -10,7 +10,7 @@ from radejax.data.kradar import KRadar, read_labels, write
 from radejax.data.kradar.labels import Label
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.simulation.dataset import simulate_dataset
-from radejax.simulation.scene_sources import LabelSource
+from radejax.simulation.simulator import LabelSource
 from radejax.simulation.world import replay
 
 OFFSET = (-2.54, 0.3, 0.7)

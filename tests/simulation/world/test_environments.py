@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from radejax.simulation.world import roadside
+from radejax.simulation.world import environments
 from radejax.simulation.world.environments import ENVIRONMENTS
 from radejax.simulation.world.scene import REFLECTOR_KINDS, Road
 
 
 def test_highway_has_rails_that_follow_the_road():
     rng = np.random.default_rng(0)
-    found, mirrors = roadside.make_surroundings(
+    found, mirrors = environments.make_surroundings(
         ENVIRONMENTS["highway"], Road(0.002), 120.0, (-6.0, 16.0), rng, -0.9
     )
     rail = found.kind == REFLECTOR_KINDS.index("rail")
