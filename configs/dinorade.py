@@ -32,7 +32,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 
 from radejax.core.config import base_config, load_module, parse_options
-from radejax.geometry.camera import KRADAR_LIDAR_TO_RADAR_Z_M
+from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 
@@ -60,7 +60,7 @@ PRESETS = {
         "model.fusion.out_of_view": "drop",
         "model.image.standardize": True,
         "data.camera.projection": "raw",
-        "data.camera.lidar_to_radar_z_m": KRADAR_LIDAR_TO_RADAR_Z_M,
+        "data.camera.radar_from_lidar_z_m": KRADAR_RADAR_FROM_LIDAR_Z_M,
     },
     "official": {
         "loss.heatmap_sigma_bins": 3.0,
@@ -71,7 +71,7 @@ PRESETS = {
         "model.fusion.out_of_view": "official",
         "model.image.standardize": True,
         "data.camera.projection": "pinhole",
-        "data.camera.ego_from_lidar_m": OFFICIAL_OFFSET_M,
+        "data.camera.radar_from_lidar_m": OFFICIAL_OFFSET_M,
         "data.camera.calibration": "common",
     },
 }
@@ -165,10 +165,10 @@ def _camera() -> ConfigDict:
             # distortion, as released.
             "projection": "raw",
             # Shift from LiDAR to radar; None: each sequence's own.
-            "ego_from_lidar_m": placeholder(tuple),
+            "radar_from_lidar_m": placeholder(tuple),
             # Its z, which boxes are not moved by. None: as the sensors stand, K-Radar's
             # 0.7 or what a simulation says.
-            "lidar_to_radar_z_m": placeholder(float),
+            "radar_from_lidar_z_m": placeholder(float),
             "calibration": "sequence",  # "common": cam_front0.yml for all, as released
             # Images of another size than model.image.size: resized, or an error.
             "resize": False,

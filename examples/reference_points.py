@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from radejax.cli import entry
 from radejax.data.images import read_left_image
 from radejax.data.kradar import read_labels
-from radejax.geometry.camera import EGO_FROM_LIDAR_M, CameraCalibration
+from radejax.geometry.camera import RADAR_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import LiftingAxes, static_reference_points
 from radejax.visualize.bev import save_figure
@@ -83,7 +83,7 @@ def main(image, calibration, label, version, out):
         ground_truth = None
         if label is not None:
             labels = read_labels(label, version)
-            shift = np.array([*EGO_FROM_LIDAR_M, 0, 0, 0, 0])
+            shift = np.array([*RADAR_FROM_LIDAR_M, 0, 0, 0, 0])
             boxes = np.array([x.box for x in labels]).reshape(-1, 7) + shift
             ground_truth = (boxes, [x.cls for x in labels])
         ax = draw_camera(pixels, camera, ground_truth=ground_truth)

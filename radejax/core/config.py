@@ -246,7 +246,7 @@ def _data() -> ConfigDict:
             "format": "kradar",
             "label_version": "v2.1",
             "visibility": ("R",),  # what the radar can see
-            "count_disabled": False,  # v1.1 lines without a *, as released
+            "include_unstarred_v11_labels": False,  # v1.1 lines without a *, as released
             "sequences": (),  # only these, such as (1, 58); () for all that are there
             "weather": (),  # only these, such as ("fog", "rain"); () for all
             # Whole sequences of the train split that choose the best checkpoint and are

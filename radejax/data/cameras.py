@@ -22,7 +22,7 @@ from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
 _log = logging.getLogger(__name__)
 
 
-BEFORE = {"lidar_to_radar_z_m": 0.0, "calibration": "sequence"}
+BEFORE = {"radar_from_lidar_z_m": 0.0, "calibration": "sequence"}
 """What models were trained with when these were no fields yet."""
 
 
@@ -32,10 +32,10 @@ class CameraOptions:
 
     Attributes:
         projection: "raw" or "pinhole", see `CameraCalibration.camera`.
-        ego_from_lidar_m: Shift from LiDAR to radar in place of each frame's own; or
+        radar_from_lidar_m: Shift from LiDAR to radar in place of each frame's own; or
             None.
-        lidar_to_radar_z_m: Its z, which boxes are not moved by; None for what the
-            sensors' set-up says. No part of `ego_from_lidar_m` where that is given.
+        radar_from_lidar_z_m: Its z, which boxes are not moved by; None for what the
+            sensors' set-up says. No part of `radar_from_lidar_m` where that is given.
         calibration: "sequence" for each sequence's own file, where it has one;
             "common" for `cam_front0.yml` everywhere, as released.
         resize: Image files of another size than the model's are resized, and their
@@ -45,8 +45,8 @@ class CameraOptions:
     """
 
     projection: ImageKind = "raw"
-    ego_from_lidar_m: tuple[float, float, float] | None = None
-    lidar_to_radar_z_m: float | None = None
+    radar_from_lidar_m: tuple[float, float, float] | None = None
+    radar_from_lidar_z_m: float | None = None
     calibration: Literal["sequence", "common"] = "sequence"
     resize: bool = False
     allow_missing: bool = True
@@ -69,10 +69,10 @@ class CameraOptions:
 
     def shift(self, frame: LabelledFrame) -> tuple[float, ...]:
         """Metres to add to LiDAR positions to get where the radar sees them."""
-        if self.ego_from_lidar_m is not None:
-            return self.ego_from_lidar_m
-        z = self.lidar_to_radar_z_m
-        z = frame.lidar_to_radar_z_m if z is None else z
+        if self.radar_from_lidar_m is not None:
+            return self.radar_from_lidar_m
+        z = self.radar_from_lidar_z_m
+        z = frame.radar_from_lidar_z_m if z is None else z
         return (*frame.radar_from_lidar_m[:2], z)
 
 

@@ -35,7 +35,7 @@ class LabelledFrame(Protocol):
         camera_calibration_path: Its calibration, or None.
         radar_from_lidar_m: Offset from where the calibration is measured to where boxes
             are: x, y, z; zeros where the two are the same.
-        lidar_to_radar_z_m: By which the radar itself is higher, whatever z boxes have.
+        radar_from_lidar_z_m: By which the radar itself is higher, whatever z boxes have.
     """
 
     @property
@@ -65,7 +65,7 @@ class LabelledFrame(Protocol):
     @property
     def radar_from_lidar_m(self) -> tuple[float, float, float]: ...
     @property
-    def lidar_to_radar_z_m(self) -> float: ...
+    def radar_from_lidar_z_m(self) -> float: ...
 
     def read_projection(
         self, grid: RadarGrid, timings: dict[str, float] | None = None
@@ -73,7 +73,7 @@ class LabelledFrame(Protocol):
         """Projection; seconds of reading are added to "reading"."""
 
     def read_calibration(
-        self, ego_from_lidar_m: tuple[float, ...] | None = None
+        self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
         """Of the camera; `radar_from_lidar_m` stands where no offset is given."""
 

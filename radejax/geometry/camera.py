@@ -29,11 +29,11 @@ from radejax.geometry.values import ArrayValues
 ImageKind = Literal["raw", "pinhole"]
 """The recorded image with lens distortion, or the same matrix without distortion."""
 
-EGO_FROM_LIDAR_M = (-2.54, 0.3, 0.0)
+RADAR_FROM_LIDAR_M = (-2.54, 0.3, 0.0)
 """Ego = LiDAR + this, as in every sequence's `calib_radar_lidar.txt`; dz as RADE-Net.
-K-Radar's loaders use `KRADAR_LIDAR_TO_RADAR_Z_M` for boxes too."""
+K-Radar's loaders use `KRADAR_RADAR_FROM_LIDAR_Z_M` for boxes too."""
 
-KRADAR_LIDAR_TO_RADAR_Z_M = 0.7
+KRADAR_RADAR_FROM_LIDAR_Z_M = 0.7
 """Meters by which K-Radar's radar is below its LiDAR, as in K-Radar's own loaders: what
 radar directions are projected with, whatever z boxes are counted from."""
 
@@ -193,7 +193,7 @@ class CameraCalibration(ArrayValues):
         translation_m: `[3]` in camera axes: `p_cam = rotation @ p_lidar + translation`.
         width: Image width in pixels.
         height: Image height in pixels.
-        ego_from_lidar_m: `[3]` shift with `p_ego = p_lidar + shift`.
+        radar_from_lidar_m: `[3]` shift with `p_ego = p_lidar + shift`.
 
     Raises:
         UserError: A value is not finite, or a size or focal length is not positive.
@@ -206,7 +206,7 @@ class CameraCalibration(ArrayValues):
     width: int = 1280
     height: int = 720
     # An array like the others once `__post_init__` is through.
-    ego_from_lidar_m: Float[np.ndarray, "3"] = EGO_FROM_LIDAR_M  # type: ignore[assignment]
+    radar_from_lidar_m: Float[np.ndarray, "3"] = RADAR_FROM_LIDAR_M  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         shapes = {
@@ -214,7 +214,7 @@ class CameraCalibration(ArrayValues):
             "distortion": (5,),
             "rotation": (3, 3),
             "translation_m": (3,),
-            "ego_from_lidar_m": (3,),
+            "radar_from_lidar_m": (3,),
         }
         for name, shape in shapes.items():
             value = self.freeze(name)
@@ -263,7 +263,7 @@ class CameraCalibration(ArrayValues):
 
         Args:
             path: The file: one `key: number` per line.
-            **fields: Values for the remaining attributes, e.g. `ego_from_lidar_m`.
+            **fields: Values for the remaining attributes, e.g. `radar_from_lidar_m`.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -332,7 +332,7 @@ class CameraCalibration(ArrayValues):
         kinds = get_args(ImageKind)
         require(image in kinds, "image", image, f"one of {', '.join(kinds)}")
         rotation, shift = self.rotation, self.translation_m
-        shift = shift - rotation @ self.ego_from_lidar_m
+        shift = shift - rotation @ self.radar_from_lidar_m
         distortion = self.distortion if image == "raw" else np.zeros(5)
         return Camera(
             cam_from_ego=np.concatenate([rotation, shift[:, None]], 1),

@@ -24,7 +24,7 @@ from radejax.data.images import read_left_image
 from radejax.data.projection import MAX_LEVEL
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import (
-    KRADAR_LIDAR_TO_RADAR_Z_M,
+    KRADAR_RADAR_FROM_LIDAR_Z_M,
     Camera,
     CameraCalibration,
     stack_cameras,
@@ -314,17 +314,17 @@ def _cameras(
 
 
 def _one_camera(camera: Any, options: CameraOptions) -> Camera:
-    z = options.lidar_to_radar_z_m
+    z = options.radar_from_lidar_z_m
     if isinstance(camera, PathLike):
         camera = CameraCalibration.from_kradar(camera)
-        z = KRADAR_LIDAR_TO_RADAR_Z_M if z is None else z
+        z = KRADAR_RADAR_FROM_LIDAR_Z_M if z is None else z
     if isinstance(camera, CameraCalibration):
-        shift = camera.ego_from_lidar_m
-        if options.ego_from_lidar_m is not None:
-            shift = np.asarray(options.ego_from_lidar_m)
+        shift = camera.radar_from_lidar_m
+        if options.radar_from_lidar_m is not None:
+            shift = np.asarray(options.radar_from_lidar_m)
         elif z is not None:
             shift = np.array([*shift[:2], z])
-        camera = dataclasses.replace(camera, ego_from_lidar_m=shift)
+        camera = dataclasses.replace(camera, radar_from_lidar_m=shift)
         return camera.camera(options.projection)
     if isinstance(camera, Camera) and np.ndim(camera.max_radius) == 0:
         return camera

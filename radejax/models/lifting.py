@@ -30,7 +30,7 @@ OutOfViewRule = Literal["drop", "official"]
 WeightingKind = Literal["mlp", "cnn", "off"]
 
 OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
-"""Released offsets between radar and camera rig: the `ego_from_lidar_m` to project
+"""Released offsets between radar and camera rig: the `radar_from_lidar_m` to project
 with, together with the "pinhole" image."""
 
 MARGIN_PX = 280

@@ -12,7 +12,7 @@ from typing import Any
 from ml_collections import ConfigDict
 
 from radejax.core.errors import UserError
-from radejax.data.kradar.labels import AVAILABILITY_FLAGS, LABEL_CLASSES, VERSIONS
+from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, VISIBILITY_FLAGS
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.losses.detection import loss_names
@@ -219,8 +219,8 @@ RULES: dict[str, Rule] = {
     "train.max_skipped_steps": _COUNT_OR_0,
     "data.format": _TEXT,
     "data.label_version": _VERSION,
-    "data.visibility": _or_none(_several(_one_of(*AVAILABILITY_FLAGS), distinct=True)),
-    "data.count_disabled": _BOOL,
+    "data.visibility": _or_none(_several(_one_of(*VISIBILITY_FLAGS), distinct=True)),
+    "data.include_unstarred_v11_labels": _BOOL,
     "data.sequences": _some(_COUNT),
     "data.weather": _some(_one_of(*WEATHERS)),
     "data.validation": _HELD_OUT,
@@ -234,8 +234,8 @@ RULES: dict[str, Rule] = {
     "data.gain_slope_db": _NOT_NEGATIVE,
     "data.label_permutation_seed": _or_none(_COUNT_OR_0),
     "data.camera.projection": _one_of("raw", "pinhole"),
-    "data.camera.ego_from_lidar_m": _or_none(_several(_number(), 3)),
-    "data.camera.lidar_to_radar_z_m": _or_none(_number()),
+    "data.camera.radar_from_lidar_m": _or_none(_several(_number(), 3)),
+    "data.camera.radar_from_lidar_z_m": _or_none(_number()),
     "data.camera.calibration": _one_of("sequence", "common"),
     "data.camera.resize": _BOOL,
     "data.camera.allow_missing": _BOOL,

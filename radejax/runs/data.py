@@ -110,7 +110,9 @@ class Data:
             camera_calibration=paths.camera_calibration,
             common_camera=camera is not None and camera.calibration == "common",
             # Runs of before are without these fields.
-            count_disabled=config.data.get("count_disabled", False),
+            include_unstarred_v11_labels=config.data.get(
+                "include_unstarred_v11_labels", False
+            ),
             sequence_numbers=config.data.get("sequences") or None,
             weather=config.data.get("weather") or None,
         )

@@ -35,7 +35,7 @@ def load(
     """Model and variables from an official checkpoint, with the released geometry.
 
     Project with `CameraCalibration.from_kradar(file,
-    ego_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see
+    radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see
     `radejax.models.lifting`. Maps stay on the padded grid, which for official weights
     is `RadarGrid.kradar().padded(8, "stretched")`.
 

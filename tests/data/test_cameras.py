@@ -29,7 +29,7 @@ class _Frame:
     camera_path: str | None
     camera_calibration_path: str | None
     radar_from_lidar_m: tuple = (-2.54, 0.3, 0.0)
-    lidar_to_radar_z_m: float = 0.7
+    radar_from_lidar_z_m: float = 0.7
 
     read_calibration = Frame.read_calibration
 
@@ -48,17 +48,20 @@ def frames(tmp_path):
 
 def test_cameras_project_as_their_calibration(frames):
     frames[1].radar_from_lidar_m = (1.0, 2.0, 0.0)
-    frames[1].lidar_to_radar_z_m = 3.0
+    frames[1].radar_from_lidar_z_m = 3.0
     cameras = frame_cameras(frames, (32, 64))
     for frame, camera in zip(frames, cameras, strict=True):
         wanted = dataclasses.replace(
             CALIBRATION,
-            ego_from_lidar_m=(*frame.radar_from_lidar_m[:2], frame.lidar_to_radar_z_m),
+            radar_from_lidar_m=(
+                *frame.radar_from_lidar_m[:2],
+                frame.radar_from_lidar_z_m,
+            ),
         ).camera()
         np.testing.assert_allclose(camera.cam_from_ego, wanted.cam_from_ego)
         np.testing.assert_allclose(camera.distortion, wanted.distortion)
         assert camera.is_valid
-    fixed = frame_cameras(frames, (32, 64), ego_from_lidar_m=(1.0, 2.0, 3.0))
+    fixed = frame_cameras(frames, (32, 64), radar_from_lidar_m=(1.0, 2.0, 3.0))
     np.testing.assert_allclose(fixed[0].cam_from_ego, cameras[1].cam_from_ego)
 
 
@@ -73,10 +76,10 @@ def test_boxes_have_no_say_in_the_height_that_queries_start_at(frames):
         camera = frame_cameras(frames[:1], (720, 1280), **options)[0]
         return project(ahead, camera)[0][:, 1]
 
-    np.testing.assert_allclose(rows(), rows(lidar_to_radar_z_m=0.7))
+    np.testing.assert_allclose(rows(), rows(radar_from_lidar_z_m=0.7))
     before = dataclasses.asdict(CameraOptions.of_fields({"allow_missing": False}))
     np.testing.assert_allclose(rows() - rows(**before), [32, 18], atol=1)
-    frames[0].lidar_to_radar_z_m = 0.0
+    frames[0].radar_from_lidar_z_m = 0.0
     np.testing.assert_allclose(rows(), rows(**before))
 
 

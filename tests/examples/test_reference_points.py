@@ -18,7 +18,7 @@ def test_valid_points_and_the_radar_are_drawn_in_pixels():
         pitch_deg=0.0,
         roll_deg=90.0,
         translation_m=(0.0, 0.0, 0.0),
-        ego_from_lidar_m=(-2.0, 0.0, 1.0),
+        radar_from_lidar_m=(-2.0, 0.0, 1.0),
         width=100,
         height=80,
     )

@@ -30,13 +30,13 @@ def forward_camera(**fields) -> CameraCalibration:
         "translation_m": (0.0, 0.0, 0.0),
         "width": 100,
         "height": 80,
-        "ego_from_lidar_m": (0.0, 0.0, 0.0),
+        "radar_from_lidar_m": (0.0, 0.0, 0.0),
     }
     return CameraCalibration.from_angles(**(settings | fields))
 
 
 def of_lidar(camera, points):
-    return camera.project_ego(points + camera.ego_from_lidar_m)
+    return camera.project_ego(points + camera.radar_from_lidar_m)
 
 
 def test_a_camera_that_looks_ahead_by_hand():
@@ -60,7 +60,7 @@ def test_image_borders_belong_to_the_left_and_top():
 
 
 def test_lidar_points_are_ego_points_minus_the_shift():
-    camera = forward_camera(ego_from_lidar_m=(-2.54, 0.3, 0.7))
+    camera = forward_camera(radar_from_lidar_m=(-2.54, 0.3, 0.7))
     lidar = np.array([12.0, -1.0, 0.5])
     from_lidar, _ = of_lidar(camera, lidar)
     from_ego, _ = camera.project_ego(lidar + np.array([-2.54, 0.3, 0.7]))

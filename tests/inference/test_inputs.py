@@ -11,8 +11,8 @@ from radejax import Detector, UserError
 from radejax.core.structures import Batch
 from radejax.data.cameras import CameraOptions
 from radejax.geometry.camera import (
-    EGO_FROM_LIDAR_M,
-    KRADAR_LIDAR_TO_RADAR_Z_M,
+    KRADAR_RADAR_FROM_LIDAR_Z_M,
+    RADAR_FROM_LIDAR_M,
     stack_cameras,
 )
 from radejax.inference.inputs import prepare
@@ -41,8 +41,8 @@ def test_every_form_of_a_camera_gives_the_same(
 ) -> None:
     projection, image = small.projections(2), small.images(2)
     # A path says nothing about the radar's place: it has K-Radar's.
-    shift = (*EGO_FROM_LIDAR_M[:2], KRADAR_LIDAR_TO_RADAR_Z_M)
-    calibration = small.calibration(ego_from_lidar_m=shift)
+    shift = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
+    calibration = small.calibration(radar_from_lidar_m=shift)
     path = tmp_path / "cam_front0.yml"
     path.write_text(calibration.to_kradar_text())
     camera = calibration.camera("raw")
@@ -67,7 +67,7 @@ def test_every_form_of_a_camera_gives_the_same(
     )
     _equal(fusion(batch), expected)
     assert _differs(fusion(projection, image[::-1], calibration), expected)
-    turned = small.calibration(yaw_deg=70.0, ego_from_lidar_m=shift)
+    turned = small.calibration(yaw_deg=70.0, radar_from_lidar_m=shift)
     assert _differs(fusion(projection, image, turned), expected)
     assert _differs(fusion(projection), expected)
 
@@ -180,11 +180,11 @@ def test_the_height_of_the_radar_is_the_models_or_kradars(
         )
         return -small.calibration().rotation.T @ camera.cam_from_ego[0, :, 3]
 
-    own = small.calibration(ego_from_lidar_m=(1.0, 2.0, 3.0))
+    own = small.calibration(radar_from_lidar_m=(1.0, 2.0, 3.0))
     for camera, options, expected in (
         (str(path), {}, (-2.54, 0.3, 0.7)),
-        (str(path), {"lidar_to_radar_z_m": 0.0}, (-2.54, 0.3, 0.0)),
+        (str(path), {"radar_from_lidar_z_m": 0.0}, (-2.54, 0.3, 0.0)),
         (own, {}, (1, 2, 3)),
-        (own, {"lidar_to_radar_z_m": 0.5}, (1, 2, 0.5)),
+        (own, {"radar_from_lidar_z_m": 0.5}, (1, 2, 0.5)),
     ):
         np.testing.assert_allclose(shift(camera, **options), expected, atol=1e-6)

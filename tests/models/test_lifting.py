@@ -24,7 +24,7 @@ def official_calibration(golden) -> CameraCalibration:
         distortion=np.zeros(5),
         rotation=extrinsics[:, :3],
         translation_m=extrinsics[:, 3],
-        ego_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
+        radar_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
     )
 
 
@@ -36,7 +36,7 @@ def ahead(**fields) -> CameraCalibration:
         "pitch_deg": 0.0,
         "roll_deg": 90.0,
         "translation_m": (0.0, 0.0, 0.0),
-        "ego_from_lidar_m": (0.0, 0.0, 0.0),
+        "radar_from_lidar_m": (0.0, 0.0, 0.0),
         "width": 100,
         "height": 80,
     }
@@ -103,7 +103,7 @@ def test_released_mask_of_all_queries(shared):
     file = np.load(folder / "geometry.npz")
     calibration = CameraCalibration.from_kradar(
         shared / "data/kradar/calib/common/cam_front0.yml",
-        ego_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
+        radar_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
     )
     axes = LiftingAxes.official()
     reference = lifting.static_reference_points(

@@ -110,7 +110,7 @@ WRONG = [
     ("model.fusion.dropout", 1.0),
     ("model.query_grid.range_m", (0.0, NAN)),
     ("data.camera.projection", "fisheye"),
-    ("data.camera.ego_from_lidar_m", (1.0, 2.0)),
+    ("data.camera.radar_from_lidar_m", (1.0, 2.0)),
 ]
 
 

@@ -76,17 +76,19 @@ def test_an_old_run_goes_on_with_the_height_that_it_had(tmp_path: pathlib.Path) 
     config = small.camera_config()
     old = json.loads(config.to_json())
     del (
-        old["data"]["camera"]["lidar_to_radar_z_m"],
+        old["data"]["camera"]["radar_from_lidar_z_m"],
         old["data"]["camera"]["calibration"],
     )
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     (tmp_path / "config.json").write_text(json.dumps(old))
     with (
-        pytest.raises(UserError, match=r"camera\.lidar_to_radar_z_m is 0\.0 there and"),
+        pytest.raises(
+            UserError, match=r"camera\.radar_from_lidar_z_m is 0\.0 there and"
+        ),
         workdir.claimed(tmp_path, config),
     ):
         pass
-    config.data.camera.lidar_to_radar_z_m = 0.0
+    config.data.camera.radar_from_lidar_z_m = 0.0
     with workdir.claimed(tmp_path, config):
         pass
 

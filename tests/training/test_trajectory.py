@@ -225,7 +225,7 @@ def test_dinorade_trains_as_released(
     variables["params"]["image_backbone"] = backbone
     calibration = CameraCalibration.from_kradar(
         shared / "data/kradar/calib/common/cam_front0.yml",
-        ego_from_lidar_m=OFFICIAL_OFFSET_M,
+        radar_from_lidar_m=OFFICIAL_OFFSET_M,
     )
     with np.load(shared / "fixtures/trajectory/dinorade_official.npz") as file:
         fixture = dict(file)

@@ -13,7 +13,7 @@ CALIBRATION = CameraCalibration(
     translation_m=np.zeros(3),
     width=128,
     height=72,
-    ego_from_lidar_m=np.zeros(3),
+    radar_from_lidar_m=np.zeros(3),
 )
 IMAGE = np.zeros((72, 128, 3), np.uint8)
 BOX = [12.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]
@@ -93,7 +93,7 @@ def test_real_frame(shared):
     check = json.loads((folder / "frame_example/projection_check.json").read_text())
     calibration = CameraCalibration.from_kradar(folder / "calib/common/cam_front0.yml")
     van = next(o for o in check["front0"]["objects"] if o["id"] == 101)
-    center = np.array(van["xyz_lidar"]) + calibration.ego_from_lidar_m
+    center = np.array(van["xyz_lidar"]) + calibration.radar_from_lidar_m
     box = [*center, 4.9, 1.9, 2.2, 0.0]
     image = np.zeros((720, 1280, 3), np.uint8)
     ax = camera.draw_camera(image, calibration, ground_truth=([box], ["Bus or Truck"]))

@@ -52,7 +52,7 @@ def part(shared, name, prefix):
 def released_geometry(shared):
     calibration = CameraCalibration.from_kradar(
         shared / "data/kradar/calib/common/cam_front0.yml",
-        ego_from_lidar_m=OFFICIAL_OFFSET_M,
+        radar_from_lidar_m=OFFICIAL_OFFSET_M,
     )
     return static_reference_points(
         calibration,

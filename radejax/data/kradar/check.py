@@ -20,7 +20,7 @@ from radejax.data.kradar.dataset import KRadar, as_paths
 from radejax.data.kradar.findings import Findings, Summary
 from radejax.data.kradar.folders import SequenceFolder, find_sequences, read_grid
 from radejax.data.kradar.frame import Frame
-from radejax.data.kradar.labels import VERSIONS, normalise_version
+from radejax.data.kradar.labels import VERSIONS, normalize_version
 from radejax.data.kradar.splits import read_split_entries
 from radejax.data.tesseract import check_tesseract
 from radejax.geometry.radar_grid import RadarGrid
@@ -202,7 +202,7 @@ def check_dataset(
         ]
     return HealthReport(
         [str(path) for path in paths],
-        data.version if data is not None else normalise_version(version),
+        data.version if data is not None else normalize_version(version),
         rows,
         _count_classes(frames, splits),
         findings.summary(),
@@ -234,7 +234,7 @@ def _open(
         findings.report(
             "label version",
             data.label_source,
-            f"the labels are {other}, not {normalise_version(version)}: give "
+            f"the labels are {other}, not {normalize_version(version)}: give "
             f"--label-version {other}, in training --config.data.label_version={other}",
         )
         return data

@@ -23,11 +23,11 @@ from radejax.data.kradar import folders
 from radejax.data.kradar.findings import Findings, Summary
 from radejax.data.kradar.frame import Frame
 from radejax.data.kradar.labels import (
-    AVAILABILITY_FLAGS,
     LABEL_CLASSES,
+    VISIBILITY_FLAGS,
     LabelFile,
     Problem,
-    normalise_version,
+    normalize_version,
     parse_label_file,
 )
 from radejax.data.kradar.sequences import (
@@ -58,7 +58,7 @@ class KRadar(Sequence[Frame]):
             None: from each sequence's calibration file, else (-2.54, 0.3).
         z_offset_m: Metres to add to LiDAR z: 0 in the papers, 0.7 in K-Radar's code.
         visibility: Availability flags to keep, None for all.
-        count_disabled: Lines of v1.x labels without a `*` count too, as released.
+        include_unstarred_v11_labels: Lines of v1.x labels without a `*` count too, as released.
         classes: Classes to keep.
         field_of_view: Keep only boxes whose center is in the field of view.
         sequence_numbers: Only these sequences; None for all. Sequences that have labels
@@ -94,7 +94,7 @@ class KRadar(Sequence[Frame]):
         radar_from_lidar: tuple[float, float] | None = None,
         z_offset_m: float = 0.0,
         visibility: Sequence[str] | None = ("R",),
-        count_disabled: bool = False,
+        include_unstarred_v11_labels: bool = False,
         classes: Sequence[str] = CLASSES,
         field_of_view: bool = True,
         sequence_numbers: Iterable[int] | None = None,
@@ -102,7 +102,7 @@ class KRadar(Sequence[Frame]):
         camera_calibration: PathLike | None = None,
         common_camera: bool = False,
     ) -> None:
-        self.version = normalise_version(version)
+        self.version = normalize_version(version)
         self.strict = strict
         self.classes = tuple(classes)
         self.roots = as_paths(root)
@@ -115,13 +115,13 @@ class KRadar(Sequence[Frame]):
         if labels is not None:
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
         self.is_simulated = folders.are_simulated(self.split_folders)
-        self._lidar_to_radar_z_m = folders.read_lidar_to_radar_z(self.split_folders)
+        self._radar_from_lidar_z_m = folders.read_radar_from_lidar_z(self.split_folders)
         self._sequence_numbers = sequence_numbers and tuple(sequence_numbers)
         self._offset = (radar_from_lidar, float(z_offset_m))
         self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
         self._common_camera = common_camera
         self._visibility, self._field_of_view = visibility, field_of_view
-        self._count_disabled = count_disabled
+        self._count_disabled = include_unstarred_v11_labels
         self._parsed: dict[Key, _Parsed] = {}
         self._read(split)
 
@@ -264,7 +264,7 @@ class KRadar(Sequence[Frame]):
                         self.version,
                         where=where,
                         problems=problems,
-                        count_disabled=self._count_disabled,
+                        include_unstarred_v11_labels=self._count_disabled,
                     )
                 except DataError as error:
                     file, problems = None, [Problem("label file", where, str(error))]
@@ -283,7 +283,7 @@ class KRadar(Sequence[Frame]):
     def _count_labels(self, key: Key, file: LabelFile) -> None:
         self.counts["objects in the label files"] += len(file.labels)
         self.counts["disabled objects (no leading *)"] += file.num_disabled
-        odd = [x for x in file.labels if x.visibility not in AVAILABILITY_FLAGS]
+        odd = [x for x in file.labels if x.visibility not in VISIBILITY_FLAGS]
         self.counts["objects with an odd availability flag"] += len(odd)
         expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
         self.counts["files named unlike their header"] += key[1] != expected
@@ -368,7 +368,7 @@ class KRadar(Sequence[Frame]):
             camera,
             info.camera_calibration_path,
             self.is_simulated,
-            self._lidar_to_radar_z_m,
+            self._radar_from_lidar_z_m,
         )
 
 

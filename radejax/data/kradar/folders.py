@@ -19,7 +19,7 @@ from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_json
 from radejax.data.kradar.labels import MAX_LABEL_BYTES, read_label_bytes
-from radejax.geometry.camera import KRADAR_LIDAR_TO_RADAR_Z_M
+from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M
 from radejax.geometry.radar_grid import RadarGrid
 
 SIMULATION_MARKER = "simulation.json"
@@ -262,7 +262,7 @@ def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
     return any(os.path.isfile(folder / SIMULATION_MARKER) for folder in folders)
 
 
-def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
+def read_radar_from_lidar_z(folders: Sequence[pathlib.Path]) -> float:
     """Metres from LiDAR up to radar as the sensors stand, not as boxes are counted.
 
     What a simulated data set says of its set-up, else K-Radar's own; its calibration
@@ -276,7 +276,7 @@ def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
         if path.is_file():
             try:
                 shift = read_json(path).get("config", {}).get("radar_from_lidar_m")
-                found[path] = KRADAR_LIDAR_TO_RADAR_Z_M if shift is None else shift[2]
+                found[path] = KRADAR_RADAR_FROM_LIDAR_Z_M if shift is None else shift[2]
             except (AttributeError, IndexError, TypeError, KeyError):
                 raise DataError(
                     f"{path}: config.radar_from_lidar_m is not three numbers"
@@ -286,7 +286,7 @@ def read_lidar_to_radar_z(folders: Sequence[pathlib.Path]) -> float:
             f"different heights of radar over LiDAR in {', '.join(map(str, found))}; data "
             "sets of different sensors cannot be read as one"
         )
-    return float(next(iter(found.values()), KRADAR_LIDAR_TO_RADAR_Z_M))
+    return float(next(iter(found.values()), KRADAR_RADAR_FROM_LIDAR_Z_M))
 
 
 def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:

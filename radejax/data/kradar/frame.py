@@ -10,7 +10,7 @@ from jaxtyping import Float, Shaped
 
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.data.tesseract import read_frame
-from radejax.geometry.camera import KRADAR_LIDAR_TO_RADAR_Z_M, CameraCalibration
+from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 
@@ -34,7 +34,7 @@ class Frame:
         camera_path: Front image (stereo pair), None where it is missing.
         camera_calibration_path: Calibration of the left front camera, or None.
         is_simulated: Nothing of it was measured.
-        lidar_to_radar_z_m: By which the radar itself is above the LiDAR, whatever z
+        radar_from_lidar_z_m: By which the radar itself is above the LiDAR, whatever z
             was added to the boxes.
     """
 
@@ -54,7 +54,7 @@ class Frame:
     camera_path: pathlib.Path | None
     camera_calibration_path: pathlib.Path | None
     is_simulated: bool = False
-    lidar_to_radar_z_m: float = KRADAR_LIDAR_TO_RADAR_Z_M
+    radar_from_lidar_z_m: float = KRADAR_RADAR_FROM_LIDAR_Z_M
 
     @property
     def key(self) -> str:
@@ -80,11 +80,11 @@ class Frame:
         return read_frame(self.radar_path, grid, timings)
 
     def read_calibration(
-        self, ego_from_lidar_m: tuple[float, ...] | None = None
+        self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
         """Of the camera, with the frame's own offset or another; see `from_kradar`."""
         assert self.camera_calibration_path is not None  # for those who look first
         return CameraCalibration.from_kradar(
             self.camera_calibration_path,
-            ego_from_lidar_m=ego_from_lidar_m or self.radar_from_lidar_m,
+            radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
         )

@@ -34,7 +34,7 @@ LABEL_CLASSES = (
 """Every class that occurs in K-Radar's labels; detectors use the first five."""
 
 VERSIONS = ("v1.0", "v1.1", "v2.0", "v2.1")
-AVAILABILITY_FLAGS = ("R", "L", "L1")
+VISIBILITY_FLAGS = ("R", "L", "L1")
 
 MAX_LABEL_BYTES = 1 << 18
 """Of a label file; K-Radar's largest have 3 kB."""
@@ -140,7 +140,7 @@ class LabelFile:
     num_disabled: int
 
 
-def normalise_version(version: str) -> str:
+def normalize_version(version: str) -> str:
     """`"2.1"`, `"v2_1"` and `"v2.1"` all name version `"v2.1"`.
 
     Raises:
@@ -186,7 +186,7 @@ def read_label_file(
     problems: list[Problem] | None = None,
 ) -> LabelFile:
     """Header and objects of one label file; arguments as in `read_labels`."""
-    version, path = normalise_version(version), pathlib.Path(path)
+    version, path = normalize_version(version), pathlib.Path(path)
     content = read_label_bytes(path)
     return parse_label_file(content, version, where=str(path), problems=problems)
 
@@ -211,17 +211,17 @@ def parse_label_file(
     *,
     where: str = "<labels>",
     problems: list[Problem] | None = None,
-    count_disabled: bool = False,
+    include_unstarred_v11_labels: bool = False,
 ) -> LabelFile:
     """Like `read_label_file` for the content of a file; `where` names it in errors.
 
-    With `count_disabled` v1.x lines without a `*` are objects like others where they
+    With `include_unstarred_v11_labels` v1.x lines without a `*` are objects like others where they
     have the fields of one, as the released code reads them.
 
     A damaged header or an undecodable file raises even with `problems`: nothing in
     such a file can be trusted.
     """
-    version = normalise_version(version)
+    version = normalize_version(version)
     lines = _LINE_END.split(_decode(content, where))
     if len(lines[0]) > 2 * _MAX_LINE:  # of v2.0 also with an object
         raise DataError(f"{where}:1: {_short(lines[0])} is too long for a header")
@@ -236,7 +236,7 @@ def parse_label_file(
             continue
         if version.startswith("v1") and not line.lstrip().startswith("*"):
             line = "*," + line.partition(",")[2]
-            if not (count_disabled and _LINES[version].fullmatch(line)):
+            if not (include_unstarred_v11_labels and _LINES[version].fullmatch(line)):
                 num_disabled += 1
                 continue
         try:

@@ -17,7 +17,7 @@ from jaxtyping import Real
 
 from radejax.core.errors import UserError
 from radejax.core.files import atomic_write, write_text
-from radejax.data.kradar.labels import Label, normalise_version
+from radejax.data.kradar.labels import Label, normalize_version
 from radejax.geometry.radar_grid import RadarGrid
 
 _SENSORS = "tesseract_os2-64_cam-front_os1-128_cam-lrr"
@@ -44,7 +44,7 @@ def write_labels(
     Raises:
         UserError: There are not five indices, or no such version.
     """
-    version = normalise_version(version)
+    version = normalize_version(version)
     if len(indices) != 5:
         raise UserError(f"a label header has five frame numbers, got {list(indices)}")
     if not isinstance(timestamp_s, str):

@@ -60,7 +60,7 @@ def stereo_calibration(
             intrinsics=_INTRINSICS,
             distortion=_DISTORTION,
             translation_m=translation,
-            ego_from_lidar_m=np.array(radar_from_lidar_m),
+            radar_from_lidar_m=np.array(radar_from_lidar_m),
             **_ANGLES,
         ).resized(width, height)
         for translation in _TRANSLATIONS

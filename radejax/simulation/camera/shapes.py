@@ -193,7 +193,7 @@ def visible_polygons(
 
 def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
     """Of the camera in the radar's frame."""
-    return calibration.ego_from_lidar_m - (
+    return calibration.radar_from_lidar_m - (
         calibration.rotation.T @ calibration.translation_m
     )
 

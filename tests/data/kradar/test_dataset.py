@@ -13,7 +13,7 @@ from radejax.data.kradar import KRadar, dataset, write
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     Label,
-    normalise_version,
+    normalize_version,
     parse_label_file,
 )
 
@@ -93,7 +93,7 @@ def test_lines_without_a_star_count_where_they_are_to(tmp_path):
     kept = KRadar(tmp_path, version="v1.1")
     assert (kept.class_counts()["Sedan"], len(kept)) == (1, 1)
     assert kept.counts["disabled objects (no leading *)"] == 1
-    released = KRadar(tmp_path, version="v1.1", count_disabled=True)
+    released = KRadar(tmp_path, version="v1.1", include_unstarred_v11_labels=True)
     assert released.class_counts()["Sedan"] == 2
     assert not released.counts["disabled objects (no leading *)"]
 
@@ -327,7 +327,7 @@ def test_parsed_objects_equal_the_reference(shared, tmp_path):
         assert flags.tolist() == [o["avail"] for o in wanted]
         values = np.array([o["values"] for o in wanted]).reshape(-1, 7)
         np.testing.assert_array_equal(boxes[:, [0, 1, 2, 6, 3, 4, 5]], values)
-    assert normalise_version("v2_1") == "v2.1"
+    assert normalize_version("v2_1") == "v2.1"
 
 
 def test_published_counts_of_the_training_split(shared):

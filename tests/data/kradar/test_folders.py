@@ -183,18 +183,18 @@ def test_split_files_and_camera_calibration_are_found(tmp_path):
 def test_height_of_the_radar_is_kradars_or_the_simulations(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     touch(a / "1/x")
-    assert folders.read_lidar_to_radar_z([a]) == 0.7
+    assert folders.read_radar_from_lidar_z([a]) == 0.7
     touch(
         b / "simulation.json", '{"config": {"radar_from_lidar_m": [-2.54, 0.3, 0.2]}}'
     )
-    assert folders.read_lidar_to_radar_z([a, b]) == 0.2
+    assert folders.read_radar_from_lidar_z([a, b]) == 0.2
     touch(a / "simulation.json", "{}")
-    assert folders.read_lidar_to_radar_z([a]) == 0.7
+    assert folders.read_radar_from_lidar_z([a]) == 0.7
     with pytest.raises(DataError, match="different heights of radar over LiDAR in"):
-        folders.read_lidar_to_radar_z([a, b])
+        folders.read_radar_from_lidar_z([a, b])
     touch(b / "simulation.json", '{"config": {"radar_from_lidar_m": [1]}}')
     with pytest.raises(DataError, match=r"radar_from_lidar_m is not three numbers"):
-        folders.read_lidar_to_radar_z([b])
+        folders.read_radar_from_lidar_z([b])
 
 
 def test_grid_of_the_roots(tmp_path):

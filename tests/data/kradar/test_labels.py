@@ -9,7 +9,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.labels import (
     VERSIONS,
     Problem,
-    normalise_version,
+    normalize_version,
     parse_label_file,
     read_label_file,
     read_labels,
@@ -80,7 +80,7 @@ def test_disabled_objects_are_skipped_and_counted(version):
     file = parse(f"{HEADER}\n#{line[1:]}\n{line}\n", version)
     assert (len(file.labels), file.num_disabled) == (1, 1)
     text = f"{HEADER}\n#{line[1:]}\n{line}\n# no, object\n"
-    file = parse(text, version, count_disabled=True)
+    file = parse(text, version, include_unstarred_v11_labels=True)
     assert (len(file.labels), file.num_disabled) == (2, 1)
     assert file.labels[0] == file.labels[1]
 
@@ -176,7 +176,7 @@ def test_missing_file_folder_and_version(tmp_path):
         read_labels(tmp_path)
     with pytest.raises(UserError, match=r"'v3' does not exist; choose from v1\.0"):
         read_labels(tmp_path / "none.txt", "v3")
-    assert normalise_version("2.1") == normalise_version("V2_1") == "v2.1"
+    assert normalize_version("2.1") == normalize_version("V2_1") == "v2.1"
 
 
 # Properties -------------------------------------------------------------------------

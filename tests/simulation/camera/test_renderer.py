@@ -113,7 +113,7 @@ class TestLabelsProjectOntoObjects:
         read = read_labels(tmp_path / "1.txt")[0]
         assert read.visibility == "R"
         pixels, _ = calibration.project_ego(
-            corners(read.box) + calibration.ego_from_lidar_m
+            corners(read.box) + calibration.radar_from_lidar_m
         )
         mask = camera.CameraRenderer(sequence, PAIR, 0).shown_boxes(frame, 0)
         np.testing.assert_allclose(mask_bounds(mask, 0), bounds(pixels), atol=1.5)
