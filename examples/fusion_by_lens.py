@@ -7,7 +7,7 @@
 Compares two runs on the same simulated test frames, by weather and by the state of the
 lens, which the simulator knows: AP of both, their difference with an interval from
 resampled sequences, and the camera's share in the fused map with the same. Writes
-tables and a picture into OUT. `--data ROOT` takes another simulated data set, on which
+tables into OUT. `--data ROOT` takes another simulated data set, on which
 both were evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same
 `--split`.
 """
@@ -30,14 +30,9 @@ from radejax.evaluation.report import bootstrap
 from radejax.evaluation.report.measure import repair_sizes
 from radejax.inference.open import load as open_model
 from radejax.runs.data import data_of_run
-from radejax.runs.pictures import frame_shares
+from radejax.runs.figures import frame_shares, mean_share
 from radejax.runs.sources import Sources
 from radejax.simulation.camera.lens import cover_level
-from radejax.visualize.camera_share import (
-    average_by_group,
-    mean_share,
-    write_camera_share,
-)
 
 GROUPS = {
     "normal, overcast": lambda weather, lens: weather in ("normal", "overcast"),
@@ -181,20 +176,8 @@ def main(fusion, radar, out, data, split, resamples):
                 )
         lens = lens_of_frames(opened.paths.roots[0], frames)
         groups = conditions(frames["weather"], lens)
-        level_of = {f.key: level for f, level in zip(dataset, lens, strict=True)}
-        means = []
-
-        def by_lens():
-            found = frame_shares(run.model, run.variables, opened, list(dataset))
-            for frame, share in found:
-                means.append(mean_share(share, run.grid))
-                place = frame.weather, level_of[frame.key]
-                yield next(n for n, rule in GROUPS.items() if rule(*place)), share
-
-        maps, counts = average_by_group(by_lens())
-        out.mkdir(parents=True, exist_ok=True)
-        ordered = {name: maps[name] for name in ("all", *GROUPS) if name in maps}
-        write_camera_share(out, ordered, counts, run.grid)
+        found = frame_shares(run.model, run.variables, opened, list(dataset))
+        means = [mean_share(share, run.grid) for _, share in found]
         sequences = np.asarray(frames["sequence"])
         # Intervals come from resampled sequences: one alone has none.
         is_small = {

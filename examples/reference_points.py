@@ -19,8 +19,8 @@ from radejax.data.kradar import read_labels
 from radejax.geometry.camera import RADAR_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import LiftingAxes, static_reference_points
-from radejax.visualize.bev import save_figure
 from radejax.visualize.camera import draw_camera
+from radejax.visualize.style import save_figure
 
 POINT_COLOR = "#d03b3b"
 RADAR_COLOR = "#2a6fdb"

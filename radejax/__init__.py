@@ -13,7 +13,9 @@ _LAZY = {
     "DetectionMaps": "radejax.core.structures",
     "Detections": "radejax.core.structures",
     "Detector": "radejax.inference.detector",
+    "Scene": "radejax.visualize.style",
     "UserError": "radejax.core.errors",
+    "draw_frame": "radejax.visualize.draw",
 }
 
 __all__ = list(_LAZY)

@@ -1,4 +1,4 @@
-"""`radejax overlay`: labels on radar and camera, a frame or a sequence."""
+"""`radejax overlay`: labels on radar and camera, for a frame or a sequence."""
 
 from __future__ import annotations
 
@@ -21,16 +21,20 @@ ANIMATIONS = (".gif", ".mp4")
 @options.sequences
 @options.weather
 @click.option("--out", type=options.FILE, default="overlay.png", show_default=True)
-@click.option("--slices", is_flag=True, help="Range-azimuth, -Doppler, elevation.")
+@click.option(
+    "--slices",
+    is_flag=True,
+    help="Draw slices of the projection.",
+)
 @click.option(
     "--roi",
     type=click.Choice(["narrow", "wide", "none"]),
     default="narrow",
     show_default=True,
-    help="Region of interest, as of `radejax evaluate`.",
+    help="Region of interest to draw.",
 )
 @click.option(
-    "--max-frames", type=options.COUNT, help="Of an animation; all by default."
+    "--max-frames", type=options.COUNT, help="Frames of an animation. Default: all."
 )
 def overlay(
     name: str,
@@ -47,16 +51,17 @@ def overlay(
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
-    FRAME is sequence/radar_lidar, sequence/radar, or a sequence: its first frame, or
-    all of them where --out ends in .gif or .mp4. So are --sequences and --weather
-    without a FRAME.
+    FRAME is sequence/radar_lidar, sequence/radar, or a sequence, of which the first
+    frame is drawn. All frames are drawn where --out ends in .gif or .mp4.
+    --sequences and --weather select frames without a FRAME.
 
     Example: radejax overlay 1/00033_00001 --data ROOT
     """
     import tqdm
 
     from radejax.data.kradar import KRadar
-    from radejax.visualize import animate, bev
+    from radejax.visualize.animate import animate
+    from radejax.visualize.style import save_figure
 
     sequence, _, frame_name = name.partition("/")
     if sequence.isdecimal():
@@ -87,41 +92,30 @@ def overlay(
         found = found[:max_frames]
         drawn = (_draw(frame, frames.grid, slices, roi) for frame in found)
         total = len(found)
-        animate.animate(tqdm.tqdm(drawn, "draw", total, unit="frame"), out)
+        animate(tqdm.tqdm(drawn, "draw", total, unit="frame"), out)
     else:
         found = found[:1]
-        bev.save_figure(_draw(found[0], frames.grid, slices, roi), out)
+        save_figure(_draw(found[0], frames.grid, slices, roi), out)
     options.echo_result(
-        as_json, {"picture": str(out), "frames": len(found)}, f"drew {out}"
+        as_json, {"figure": str(out), "frames": len(found)}, f"drew {out}"
     )
 
 
 def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
-    """Figure of one frame: planes of the radar, or radar map and camera image.
+    """Figure of one frame: slices of the projection, or radar map and camera image.
 
     Raises:
-        UserError: It has neither tesseract nor projection.
+        UserError: It has neither tensor nor projection.
     """
     from radejax.core.structures import ROIS
-    from radejax.data.images import front_view
-    from radejax.visualize import bev, projections
-    from radejax.visualize.canvas import Scene
+    from radejax.runs.figures import frame_scene
+    from radejax.visualize.draw import draw_frame
+    from radejax.visualize.slices import draw_slices
 
     projection = frame.read_projection(grid)
-    title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}"
-    if slices:
-        objects = frame.boxes, list(frame.classes)
-        figure = projections.draw_slices(projection, grid, ground_truth=objects)
-        figure.suptitle(title)
-        return figure
-    image, camera = front_view(frame)
-    scene = Scene(
-        projection,
-        grid,
-        ground_truth=(frame.boxes, list(frame.classes)),
-        roi=ROIS.get(roi),
-        image=image,
-        camera=camera,
-        title=title,
-    )
-    return bev.draw_frame(scene)
+    scene = frame_scene(frame, projection, grid, roi=ROIS.get(roi))
+    if not slices:
+        return draw_frame(scene)
+    figure = draw_slices(projection, grid, ground_truth=scene.ground_truth)
+    figure.suptitle(scene.title)
+    return figure

@@ -1,7 +1,8 @@
-"""`radejax view`: a recording of radar, labels with tracks, camera and detections."""
+"""`radejax view`: a recording of radar, labels, camera and detections."""
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -20,10 +21,14 @@ from radejax.core.errors import UserError
 @options.labels
 @options.label_version
 @click.option(
-    "--workdir", type=options.EXISTING, help="Run whose detections are shown too."
+    "--workdir", type=options.EXISTING, help="Run whose detections are shown."
 )
-@click.option("--max-frames", type=options.COUNT, help="All by default.")
-@click.option("--open", "open_it", is_flag=True, help="Open it in the viewer.")
+@click.option(
+    "--max-frames", type=options.COUNT, help="Frames to record. Default: all."
+)
+@click.option(
+    "--open", "open_it", is_flag=True, help="Open the recording in the viewer."
+)
 def view(
     roots: tuple[pathlib.Path, ...],
     out: pathlib.Path,
@@ -37,7 +42,7 @@ def view(
 ) -> None:
     """Record a sequence for the rerun viewer (extra "viewer").
 
-    Frames without tesseract and projection are left out and counted.
+    Frames without radar tensor and projection are skipped and counted.
 
     Example: radejax view data/kradar --sequence 5 --out five.rrd --open
     """
@@ -57,7 +62,7 @@ def view(
     complete = [frame for frame in frames if frame.radar_path]
     if not complete:
         raise UserError(
-            f"no tesseract or projection for any of {len(frames)} labelled frames"
+            f"no radar tensor or projection for any of {len(frames)} labelled frames"
         )
     shown = complete[:max_frames]
     detector = None if workdir is None else Detector.from_workdir(workdir)
@@ -68,53 +73,27 @@ def view(
     text = f"{len(shown)} frames written to {out}"
     lacking = len(frames) - len(complete)
     if lacking:
-        text += f"; {lacking} without tesseract or projection left out"
+        text += f"; {lacking} without radar tensor or projection skipped"
     values = {"frames": len(shown), "without_radar": lacking, "recording": str(out)}
     options.echo_result(as_json, values, text)
 
 
 def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:
     """`Scene` of each frame with radar data, read as it is needed."""
-    import jax
-    import numpy as np
-
-    from radejax.data.images import front_view
-    from radejax.visualize.canvas import Scene
+    from radejax.core.structures import Boxes
+    from radejax.runs.figures import frame_scene
 
     for frame in frames:
-        projection = frame.read_projection(grid)
-        image, calibration = front_view(frame)
-        found = None
-        if detector is not None:
-            inputs = [projection]
-            if detector.takes_camera and calibration is not None:
-                inputs += [frame.camera_path, calibration]
-            found = jax.tree.map(lambda x: np.asarray(x[0]), detector(*inputs))
-        yield Scene(
-            projection,
+        scene = frame_scene(
+            frame,
+            frame.read_projection(grid),
             grid,
-            ground_truth=frame,
-            predictions=found,
-            track_ids=track_ids(frame),
-            image=image,
-            camera=calibration,
             time_s=frame.header.timestamp_s,
-            title=f"sequence {frame.sequence}, {frame.name}, {frame.weather}",
         )
-
-
-def track_ids(frame: Any) -> list[tuple[int, int] | None]:
-    """Sequence and track id of each box that the data set keeps: `[N]`.
-
-    Boxes are those of some labels, moved to the radar's frame. None where the label
-    has no id.
-    """
-    import numpy as np
-
-    if not len(frame.boxes):
-        return []
-    centers = np.array([label.box[:3] for label in frame.labels])
-    centers = centers + np.asarray(frame.radar_from_lidar_m)
-    gaps = np.linalg.norm(frame.boxes[:, None, :3] - centers[None], axis=-1)  # [N, L]
-    ids = [frame.labels[i].track_id for i in gaps.argmin(1)]
-    return [(frame.sequence, i) if i >= 0 else None for i in ids]
+        if detector is not None:
+            inputs = [scene.projection]
+            if detector.takes_camera and scene.camera is not None:
+                inputs += [frame.camera_path, scene.camera]
+            found = Boxes(**detector(*inputs).to_columns())
+            scene = dataclasses.replace(scene, predictions=found)
+        yield scene

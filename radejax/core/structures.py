@@ -195,6 +195,14 @@ class Boxes:
             row = int(np.argmin(np.isfinite(self.box).all(-1)))
             raise DataError(f"box {row} is {self.box[row]}, expected finite numbers")
 
+    @classmethod
+    def one_frame(cls, box: Any, names: Any, score: Any = None) -> Boxes:
+        """Boxes of one frame, numbered 0, from boxes, class names and scores."""
+        box = np.asarray(box, np.float64).reshape(-1, 7)
+        score = None if score is None else np.asarray(score, np.float64)
+        names = np.asarray(names, str)
+        return cls(np.zeros(len(box), np.int64), box, names, score)
+
     def __len__(self) -> int:
         return len(self.frame)
 

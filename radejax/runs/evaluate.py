@@ -17,6 +17,7 @@ from radejax import models
 from radejax.core import files
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
+from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.evaluation.files.load import tables_from_frames
@@ -25,7 +26,7 @@ from radejax.evaluation.report.measure import Options, rare_classes
 from radejax.evaluation.report.report import Report, write_report
 from radejax.inference.open import PathLike, Step, load
 from radejax.inference.predict import Predictor, predict_dataset
-from radejax.runs import check_config, pictures
+from radejax.runs import check_config, figures
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.sources import Sources
 from radejax.training import processes
@@ -77,10 +78,10 @@ def evaluate(
     def write(folder: pathlib.Path) -> Report:
         source = {"step": step, **source_of(data, split, exchange_images)}
         files.write_json(folder / "source.json", source)
-        drawer = pictures.FrameDrawer(
+        drawer = figures.FrameDrawer(
             data.records,
             frames,
-            predictions,
+            Boxes(**predictions),
             roi=config.evaluation.roi,
             score_threshold=config.decode.score_threshold,
         )
@@ -96,12 +97,14 @@ def evaluate(
         )
         _log.info("step %s, split %s\n%s", step, split, made.text)
         if models.has_camera(model):
-            pictures.draw_camera_share(model, variables, data, frames, folder)
+            figures.write_camera_share(
+                folder / "camera_share.json", model, variables, data, frames
+            )
         if drawer.draw_spread(
             folder / "pictures", config.evaluation.num_visualizations
         ):
             drawer.draw_scenes(folder / "scenes.png")
-        pictures.draw_curves(
+        figures.draw_curves(
             workdir, folder / "training.png", is_simulated=frames.is_simulated
         )
         return made

@@ -16,6 +16,7 @@ from ml_collections import ConfigDict
 from PIL import Image
 
 from radejax.core.errors import UserError
+from radejax.core.structures import Boxes
 from radejax.evaluation.columns import Columns, roi_bounds
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files.load import tables_from_frames
@@ -24,7 +25,7 @@ from radejax.inference.predict import predict_dataset
 from radejax.runs.check_config import check_best_metric
 from radejax.runs.data import Data
 from radejax.runs.evaluate import make_predictor, report_options
-from radejax.runs.pictures import FrameDrawer
+from radejax.runs.figures import FrameDrawer
 from radejax.training import processes
 from radejax.training.state import TrainState
 from radejax.training.watch import Scores
@@ -140,7 +141,7 @@ class Validation:
         drawer = FrameDrawer(
             self._records,
             self._frames,
-            predictions,
+            Boxes(**predictions),
             roi=roi_bounds(self._options.roi),
             score_threshold=self._config.decode.score_threshold,
         )

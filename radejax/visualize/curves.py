@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,94 +13,47 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from radejax.core import files
-from radejax.core.errors import DataError, UserError
-from radejax.visualize.canvas import SERIES_COLORS, new_figure
+from radejax.core.errors import UserError
+from radejax.visualize.style import SERIES_COLORS, new_figure
 
 _LINE_STYLES = ("-", "--", "-.", ":")
-_AXIS_LABELS = {
-    "frames_per_s": "frames per second",
-    "learning_rate": "learning rate",
-    "data_wait_share": "share of time without a batch",
-}
 
 
 def draw_precision_recall(
-    curves: Mapping[str, tuple[Any, Any] | None] | Iterable[Any],
+    curves: Mapping[str, tuple[Any, Any] | None],
     *,
     ax: Axes | None = None,
-    title: str | None = None,
+    title: str = "",
 ) -> Axes:
-    """Draws precision over recall, one line a class or model.
+    """Draw precision over recall, one line per class or model.
 
-    Lines differ in colour and in dash pattern.
+    Lines differ in color and in dash pattern.
 
     Args:
-        curves: Name to `(recall [K], precision [K])`, both in [0, 1], or to None, which
-            keeps the looks of the others the same from panel to panel; or results of
-            `evaluation.average_precision.evaluate`, which are named by class and AP.
-            Results of classes without any object are left out.
+        curves: Name to `(recall [K], precision [K])`, both in [0, 1]; None keeps the
+            looks of the others the same from panel to panel.
         ax: Where to draw; a new figure by default.
-        title: Title; for results, their metric's full name by default.
-
-    Raises:
-        UserError: Results of several metrics in one picture, or vectors that differ in
-            length.
+        title: Title of the axes.
     """
-    if not isinstance(curves, Mapping):
-        curves, name = _named_curves(curves)
-        title = title or name
     ax = new_figure(5.2, 4.6, layout="constrained").add_subplot() if ax is None else ax
     for i, (label, curve) in enumerate(curves.items()):
-        if curve is None:
-            continue
-        recall, precision = curve
-        recall, precision = np.asarray(recall, float), np.asarray(precision, float)
-        if recall.ndim != 1 or recall.shape != precision.shape:
-            raise UserError(
-                f"{label}: recall {recall.shape} and precision {precision.shape} must "
-                "be vectors of one length"
-            )
-        order = np.argsort(recall, kind="stable")
-        ax.plot(recall[order], precision[order], label=label, **_line(i))
-    ax.set(
-        xlim=(0, 1.02),
-        ylim=(0, 1.02),
-        xlabel="recall",
-        ylabel="precision",
-        title=title or "",
-    )
-    ax.title.set_fontsize(9)
+        if curve is not None:
+            recall, precision = (np.asarray(values, float) for values in curve)
+            order = np.argsort(recall, kind="stable")
+            ax.plot(recall[order], precision[order], label=label, **_line(i))
+    limits = (0, 1.02)
+    ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="precision")
+    ax.set_title(title, fontsize=9)
     ax.grid(alpha=0.3)
     if curves:
-        # Below the axes, where it covers no curve.
-        columns = 1 if len(curves) < 4 else 2
-        ax.legend(
+        ax.legend(  # below the axes, where it covers no curve
             fontsize=7,
             loc="upper center",
             bbox_to_anchor=(0.5, -0.16),
-            ncols=columns,
+            ncols=1 if len(curves) < 4 else 2,
             frameon=False,
         )
     return ax
-
-
-def _named_curves(results: Iterable[Any]) -> tuple[dict[str, tuple], str | None]:
-    """Curves and common metric of evaluation results."""
-    results = list(results)
-    metrics = sorted({result.metric for result in results})
-    if len(metrics) > 1:
-        raise UserError(
-            f"one picture shows one metric, got {', '.join(metrics)}; filter the results"
-        )
-    curves = {
-        f"{result.cls}, AP {result.ap:.1f} ({result.num_gt} objects)": (
-            result.recall,
-            result.precision,
-        )
-        for result in results
-        if result.num_gt > 0
-    }
-    return curves, metrics[0] if metrics else None
 
 
 def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -109,24 +62,16 @@ def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndar
     An unfinished last line, as an interrupted run leaves it, is ignored.
 
     Raises:
-        FileNotFoundError: Names the file.
+        FileNotFoundError: The file does not exist.
         DataError: A line is not a JSON object with a step; names file and line.
     """
     path = pathlib.Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no metrics of a run at {path}")
     series: dict[str, list[tuple[float, float]]] = {}
-    lines = files.read_text(path).split("\n")
+    *lines, _ = files.read_text(path).split("\n")
     for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
-        try:
-            where = f"{path}, line {number}"
-            record = files.parse_json(line, {"step": float}, where)
-        except DataError:
-            if number == len(lines):
-                break
-            raise
+        record = files.parse_json(line, {"step": float}, f"{path}, line {number}")
         step = float(record.pop("step"))
         for name, value in record.items():
             if isinstance(value, int | float):
@@ -135,48 +80,29 @@ def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndar
 
 
 def draw_training(
-    metrics: str | os.PathLike | Mapping[str, tuple[Any, Any]],
-    *,
-    keys: Sequence[str] | None = None,
-    smoothing: float = 0.05,
-    title: str | None = None,
+    series: Mapping[str, tuple[Any, Any]], keys: Sequence[str], title: str = ""
 ) -> Figure:
-    """Figure of a run's losses over steps, one panel each.
+    """Figure of a run's losses over steps, one panel per key.
 
     Args:
-        metrics: Path of `metrics.jsonl`, or name to `(step [N], value [N])`.
-        keys: Names to show; by default the weighted sum of the losses where it is there.
-        smoothing: Share of the run over which the bold line averages.
+        series: Name to `(step [N], value [N])`, such as those of `read_metrics`.
+        keys: Names of the series to show.
         title: Title of the figure.
-
-    Raises:
-        UserError: A key is not in the metrics; lists those that are.
     """
-    series = metrics if isinstance(metrics, Mapping) else read_metrics(metrics)
-    keys = keys or [k for k in ("weighted_sum",) if k in series] or sorted(series)[:3]
-    unknown = [key for key in keys if key not in series]
-    if unknown or not keys:
-        raise UserError(
-            f"no {', '.join(unknown) or 'values'} in the metrics; there are: "
-            f"{', '.join(sorted(series)) or 'none'}"
-        )
     figure = new_figure(4.0 * len(keys), 3.4, layout="constrained")
-    for i, (key, ax) in enumerate(
-        zip(keys, figure.subplots(1, len(keys), squeeze=False)[0], strict=True)
-    ):
+    axes = figure.subplots(1, len(keys), squeeze=False)[0]
+    for key, ax, color in zip(keys, axes, SERIES_COLORS, strict=False):
         step, value = (np.asarray(v, float) for v in series[key])
-        color = SERIES_COLORS[i % len(SERIES_COLORS)]
+        smooth = moving_mean(value, max(1, round(0.05 * value.size)))
         ax.plot(step, value, color=color, alpha=0.3, lw=0.8, label="logged")
-        smooth = moving_mean(value, max(1, round(smoothing * value.size)))
         ax.plot(step, smooth, color=color, lw=1.8, label="moving mean")
-        ax.set(xlabel="step", title=_AXIS_LABELS.get(key, key))
+        ax.set(xlabel="step", title=key)
         finite = value[np.isfinite(value)]
         if finite.size and finite.min() > 0 and finite.max() > 20 * finite.min():
             ax.set_yscale("log")
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
-    if title:
-        figure.suptitle(title)
+    figure.suptitle(title)
     return figure
 
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from radejax.cli.overlay import overlay
 from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.visualize import bev
+from radejax.visualize import style
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_the_region_is_that_of_the_evaluation_and_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drawn = []
-    monkeypatch.setattr(bev, "save_figure", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(style, "save_figure", lambda figure, _: drawn.append(figure))
     assert _run("1", root, "--out", tmp_path / "a.png", *arguments).exit_code == 0
     texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert texts[1:] == ([expected] if expected else [])

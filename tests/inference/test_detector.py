@@ -14,7 +14,6 @@ from radejax.data.kradar import write
 from radejax.data.projection import project
 from radejax.evaluation.files.kitti import prediction_texts
 from radejax.inference.packed import LoadedModel
-from radejax.visualize.canvas import as_objects
 from radejax.weights import dinorade_torch
 
 from .. import small_models as small
@@ -221,7 +220,6 @@ def test_detections_carry_the_names_of_their_detector(
     found = turned(projections)  # two chunks
     index = int(found.classes[0, 0])
     assert found.to_list()[0][0]["cls"] == names[index]
-    assert as_objects(jax.tree.map(lambda x: x[0], found)).names[0] == names[index]
     assert found.to_list(CLASSES)[0][0]["cls"] == CLASSES[index]
     assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]
 

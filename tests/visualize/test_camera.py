@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
+from radejax.core.structures import Boxes
 from radejax.geometry.camera import CameraCalibration
 from radejax.visualize import camera
 
@@ -25,7 +26,9 @@ def segments_of(ax) -> np.ndarray:
 
 
 def test_edges_by_hand():
-    ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=([BOX], ["Sedan"]))
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=Boxes.one_frame(BOX, ["Sedan"])
+    )
     segments = segments_of(ax)
     assert segments.shape == (12, 2, 2)
     # The rear face, at 10 m, spans y 0..2 and z +-0.5: 64..44 and 31..41.
@@ -42,7 +45,10 @@ def test_squeezed_images_look_natural():
     sizes = []
     for picture, calibration in ((IMAGE, CALIBRATION), (image, squeezed)):
         ax = camera.draw_camera(
-            picture, calibration, ground_truth=([BOX], ["Sedan"]), title="frame"
+            picture,
+            calibration,
+            ground_truth=Boxes.one_frame(BOX, ["Sedan"]),
+            title="frame",
         )
         sizes.append([*ax.figure.get_size_inches(), *ax.get_window_extent().size])
         assert [t.get_text() for t in ax.texts] == ["Sedan"]
@@ -50,33 +56,43 @@ def test_squeezed_images_look_natural():
 
 
 def test_tinted_face_is_the_front():
-    ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=([BOX], ["Sedan"]))
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=Boxes.one_frame(BOX, ["Sedan"])
+    )
     face = ax.collections[0].get_paths()[0].vertices
     # The front, at 14 m: 64 - 100 * 2 / 14 .. 64.
     np.testing.assert_allclose(face[:, 0].min(), 64 - 200 / 14 - 0.5)
     turned = [*BOX[:6], np.pi]
-    ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=([turned], ["Sedan"]))
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=Boxes.one_frame(turned, ["Sedan"])
+    )
     face = ax.collections[0].get_paths()[0].vertices
     np.testing.assert_allclose(face[:, 0].min(), 43.5)
 
 
 def test_boxes_behind_the_camera_are_not_drawn():
     behind = [-12.0, *BOX[1:]]
-    ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=([behind], ["Sedan"]))
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=Boxes.one_frame(behind, ["Sedan"])
+    )
     assert not segments_of(ax).size
     assert not ax.texts
 
 
 def test_box_around_the_camera_is_cut_at_the_near_plane():
     around = [0.0, 0.0, 0.0, 20.0, 2.0, 1.0, 0.0]
-    ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=([around], ["Sedan"]))
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=Boxes.one_frame(around, ["Sedan"])
+    )
     segments = segments_of(ax)
     assert np.isfinite(segments).all()
     assert len(segments) == 8  # the far face and the four edges towards us
 
 
 def test_predictions_carry_scores():
-    ax = camera.draw_camera(IMAGE, CALIBRATION, predictions=([BOX], [0.5], [1]))
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, predictions=Boxes.one_frame(BOX, ["Bus or Truck"], [0.5])
+    )
     assert [t.get_text() for t in ax.texts] == ["Bus or Truck 0.50"]
 
 
@@ -96,7 +112,9 @@ def test_real_frame(shared):
     center = np.array(van["xyz_lidar"]) + calibration.radar_from_lidar_m
     box = [*center, 4.9, 1.9, 2.2, 0.0]
     image = np.zeros((720, 1280, 3), np.uint8)
-    ax = camera.draw_camera(image, calibration, ground_truth=([box], ["Bus or Truck"]))
+    ax = camera.draw_camera(
+        image, calibration, ground_truth=Boxes.one_frame(box, ["Bus or Truck"])
+    )
     points = segments_of(ax).reshape(-1, 2)
     low, high = points.min(0), points.max(0)
     assert (low < van["uv_raw"]).all()
@@ -107,7 +125,9 @@ def test_real_frame(shared):
 def test_far_boxes_get_no_label():
     far = [60.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]  # 2 of 72 pixels high
     ax = camera.draw_camera(
-        IMAGE, CALIBRATION, ground_truth=([far, BOX], ["Sedan", "Bicycle"])
+        IMAGE,
+        CALIBRATION,
+        ground_truth=Boxes.one_frame([far, BOX], ["Sedan", "Bicycle"]),
     )
     assert [t.get_text() for t in ax.texts] == ["Bicycle"]
     assert len(segments_of(ax)) == 24

@@ -1,5 +1,4 @@
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,23 +8,13 @@ from radejax.core.errors import DataError, UserError
 from radejax.visualize import curves
 
 
-def result(cls="Sedan", metric="AP3D_R41@0.3", num_gt=3):
-    return SimpleNamespace(
-        cls=cls,
-        metric=metric,
-        ap=70.0,
-        num_gt=num_gt,
-        recall=np.array([0.5, 0.1]),
-        precision=np.array([0.8, 1.0]),
-    )
-
-
 def test_precision_over_recall_in_order_of_recall():
-    ax = curves.draw_precision_recall([result(), result("Bicycle", num_gt=0)])
+    curve = np.array([0.5, 0.1]), np.array([0.8, 1.0])
+    ax = curves.draw_precision_recall({"Sedan": curve, "Bicycle": None}, title="AP")
     (line,) = ax.lines
     np.testing.assert_array_equal(line.get_xydata(), [[0.1, 1.0], [0.5, 0.8]])
-    assert line.get_label() == "Sedan, AP 70.0 (3 objects)"
-    assert ax.get_title() == "AP3D_R41@0.3"
+    assert line.get_label() == "Sedan"
+    assert ax.get_title() == "AP"
 
 
 def test_lines_differ_beyond_colour():
@@ -34,25 +23,6 @@ def test_lines_differ_beyond_colour():
     looks = {(line.get_color(), line.get_linestyle()) for line in ax.lines}
     assert len(looks) == 12
     assert len({line.get_linestyle() for line in ax.lines[:4]}) == 4
-
-
-def test_evaluation_results_can_be_drawn():
-    from radejax.evaluation.average_precision import evaluate
-
-    box = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [30.0, 0, 0, 4, 2, 1.5, 0]])
-    truth = {"frame": np.zeros(2, int), "box": box, "cls": np.array(["Sedan"] * 2)}
-    found = {**truth, "score": np.array([0.9, 0.8])}
-    results = evaluate(truth, found, classes=("Sedan",), iou_thresholds=(0.3,))
-    bev = [r for r in results if r.space == "bev"]
-    ax = curves.draw_precision_recall(bev)
-    assert len(ax.lines) == 1
-    with pytest.raises(UserError, match="one metric"):
-        curves.draw_precision_recall(results)
-
-
-def test_precision_recall_lengths_must_agree():
-    with pytest.raises(UserError, match="Sedan"):
-        curves.draw_precision_recall({"Sedan": ([0, 1], [1])})
 
 
 def write_metrics(path, extra=""):
@@ -65,7 +35,7 @@ def test_metrics_are_read_by_name(tmp_path):
     path = write_metrics(tmp_path / "metrics.jsonl", '{"step": 5, "foc')
     series = curves.read_metrics(path)
     np.testing.assert_array_equal(series["focal"], [[1, 2, 4], [1, 0.5, 0.25]])
-    figure = curves.draw_training(path, title="run")
+    figure = curves.draw_training(series, ["focal", "gwd"], "run")
     assert [ax.get_title() for ax in figure.axes] == ["focal", "gwd"]
 
 
@@ -75,8 +45,6 @@ def test_damaged_metrics_are_named(tmp_path):
         curves.read_metrics(path)
     with pytest.raises(FileNotFoundError, match=r"none\.jsonl"):
         curves.read_metrics(tmp_path / "none.jsonl")
-    with pytest.raises(UserError, match=r"loss.*there are: gwd"):
-        curves.draw_training({"gwd": ([1], [2])}, keys=["loss"])
 
 
 def test_moving_mean_by_hand():

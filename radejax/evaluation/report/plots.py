@@ -31,8 +31,8 @@ def draw(
         The pictures.
     """
     # Here, as matplotlib takes a second to load and not every report has pictures.
-    from radejax.visualize.canvas import save_figure
     from radejax.visualize.curves import draw_calibration
+    from radejax.visualize.style import save_figure
 
     iou = options.iou_thresholds[0]
     kind = ", simulated data" if data.is_simulated else ""
@@ -64,8 +64,8 @@ def draw(
 
 def _precision_recall(results: Mapping[str, Sequence[Result]], terms: str) -> Any:
     """Figure with one panel per class that has objects, one curve per condition."""
-    from radejax.visualize.canvas import new_figure
     from radejax.visualize.curves import draw_precision_recall
+    from radejax.visualize.style import new_figure
 
     classes = list(zip(*results.values(), strict=True))  # results of a class each
     seen = [panel for panel in classes if any(result.is_defined for result in panel)]

@@ -17,7 +17,7 @@ from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.report import measure, paper_tables, plots, report, tables
 from radejax.evaluation.report.measure import Options
 from radejax.evaluation.report.published import published_rows
-from radejax.visualize.canvas import SERIES_COLORS
+from radejax.visualize.style import SERIES_COLORS
 
 TERMS = {"roi": None, "plots": False}
 

@@ -2,13 +2,18 @@ import dataclasses
 import threading
 import time
 
+import matplotlib.colors
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
 
 from radejax.core.errors import UserError
+from radejax.core.structures import Boxes
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize import bev
-from radejax.visualize.canvas import COLOR_MAP, Objects, Scene, footprints
+from radejax.visualize import draw, slices
+from radejax.visualize.animate import render
+from radejax.visualize.draw import ZOOM_COLOR, draw_scenes
+from radejax.visualize.style import COLOR_MAP, Scene, footprints, save_figure
 
 GRID = RadarGrid.reduced(num_doppler=4, num_range=60, num_elevation=3, num_azimuth=54)
 ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
@@ -43,7 +48,7 @@ def brightest_tile(figure, ax) -> np.ndarray:
 @pytest.mark.parametrize(("range_idx", "azimuth_idx"), [(20, 5), (30, 27), (33, 44)])
 def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
-    ax = bev.draw_bev(Scene(projection, GRID), extent="fov", show_legend=False)
+    ax = draw.draw_bev(Scene(projection, GRID), extent="fov", show_legend=False)
     x, y = GRID.bin_to_ego(range_idx, azimuth_idx)
     tile = brightest_tile(ax.figure, ax)
     # At 5 pixels a metre a bin is 10 pixels deep; its center is hit to one pixel.
@@ -53,15 +58,15 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
 @pytest.mark.parametrize(("range_idx", "azimuth_idx"), [(20, 5), (50, 44)])
 def test_polar_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     projection = blob_at(range_idx, azimuth_idx)
-    ax = bev.draw_polar(Scene(projection, GRID), show_legend=False)
+    ax = draw.draw_polar(Scene(projection, GRID), show_legend=False)
     x, y = GRID.bin_to_ego(range_idx, azimuth_idx)
-    outline = bev.to_polar(np.array([x, y]))
+    outline = slices.to_polar(np.array([x, y]))
     tile = brightest_tile(ax.figure, ax)
     np.testing.assert_allclose(tile, ax.transData.transform(outline), atol=1.0)
 
 
 def test_left_is_left_and_ahead_is_up():
-    ax = bev.draw_bev(Scene(blob_at(3, 3), GRID, roi=ROI))
+    ax = draw.draw_bev(Scene(blob_at(3, 3), GRID, roi=ROI))
     to_display = ax.transData.transform
     left, right = to_display((5.0, 20.0)), to_display((-5.0, 20.0))
     assert left[0] < right[0]
@@ -72,11 +77,12 @@ def test_left_is_left_and_ahead_is_up():
 
 
 def test_boxes_are_drawn_where_they_are():
-    truth = ([[10.0, 3.0, 0.0, 4.0, 2.0, 1.5, np.pi / 2]], ["Sedan"])
-    found = ([[20.0, -3.0, 0.0, 4.0, 2.0, 1.5, 0.0]], [0.875], [1])
+    truth = Boxes.one_frame([10.0, 3.0, 0.0, 4.0, 2.0, 1.5, np.pi / 2], ["Sedan"])
+    found = Boxes.one_frame([20.0, -3.0, 0, 4, 2, 1.5, 0], ["Bus or Truck"], [0.875])
     scene = Scene(blob_at(3, 3), GRID, roi=ROI, ground_truth=truth, predictions=found)
-    ax = bev.draw_bev(scene)
+    ax = draw.draw_bev(scene)
     boxes = [c for c in ax.collections if hasattr(c, "get_segments")]
+    boxes = boxes[1::2]  # each over its rim
     first, second = (c.get_segments()[0] for c in boxes)
     # Turned by 90 degrees: 4 m along y, 2 m along x. Axes hold (y, x).
     assert first.min(0) == pytest.approx([1.0, 9.0])
@@ -93,16 +99,16 @@ def test_boxes_are_drawn_where_they_are():
 
 
 def test_roi_is_a_dashed_rectangle():
-    ax = bev.draw_bev(Scene(blob_at(3, 3), GRID, roi=ROI))
+    ax = draw.draw_bev(Scene(blob_at(3, 3), GRID, roi=ROI))
     line = next(line for line in ax.lines if line.is_dashed())
     y, x = line.get_data()
-    assert (min(x), max(x), min(y), max(y)) == ROI[:4]
+    assert (min(x), max(x), min(y), max(y)) == pytest.approx(ROI[:4])
 
 
 def test_color_bar_names_unit_and_reduction():
-    ax = bev.draw_bev(Scene(blob_at(3, 3), GRID), units="db", reduce="mean")
+    ax = draw.draw_bev(Scene(blob_at(3, 3), GRID))
     labels = [a.get_ylabel() for a in [*ax.figure.axes, *ax.child_axes]]
-    assert "power [dB], mean over Doppler and elevation" in labels
+    assert slices.POWER_LABEL in labels
 
 
 def test_frame_has_radar_camera_and_polar_view():
@@ -110,17 +116,17 @@ def test_frame_has_radar_camera_and_polar_view():
     scene = Scene(
         blob_at(20, 20),
         GRID,
-        ground_truth=(footprint_boxes(3), ["Sedan"] * 3),
-        predictions=(np.zeros((0, 7)), np.zeros(0), []),
+        ground_truth=Boxes.one_frame(footprint_boxes(3), ["Sedan"] * 3),
+        predictions=Boxes.one_frame([], [], []),
         roi=ROI,
         image=image,
         title="sequence 1",
     )
-    figure = bev.draw_frame(scene)
+    figure = draw.draw_frame(scene)
     assert len(figure.axes) == 3
     assert figure.get_suptitle() == "sequence 1"
     assert any(ax.images for ax in figure.axes)
-    assert len(bev.draw_frame(Scene(blob_at(20, 20), GRID)).axes) == 2
+    assert len(draw.draw_frame(Scene(blob_at(20, 20), GRID)).axes) == 2
 
 
 def footprint_boxes(count: int) -> np.ndarray:
@@ -132,44 +138,8 @@ def footprint_boxes(count: int) -> np.ndarray:
 def test_padded_maps_need_the_padded_grid():
     values = np.zeros((64, 56))
     with pytest.raises(UserError, match=r"\(64, 56\).*\(60, 54\)"):
-        bev.draw_map(values, GRID)
-    bev.draw_map(values, GRID.padded(8), color_limits=(0, 1), label="gate")
-
-
-@pytest.mark.wrong_types
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"extent": "all"}, "extent must be"),
-        ({"extent": (0, 1, 2)}, "extent must be"),
-        ({"channels": "power"}, "all, doppler, elevation"),
-        ({"reduce": "sum"}, "max, mean"),
-        ({"units": "dbm"}, "normalized, db"),
-    ],
-)
-def test_wrong_options_are_named(options, message):
-    with pytest.raises(UserError, match=message):
-        bev.draw_bev(Scene(blob_at(3, 3), GRID), **options)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"roi": (0, 72, -6.4)}, "roi must be"),
-        ({"roi": (72, 0, -6.4, 6.4)}, "roi must be"),
-        ({"ground_truth": (np.zeros((1, 8)), ["Sedan"])}, r"\[N, 7\].*\(1, 8\)"),
-        ({"ground_truth": (np.zeros((1, 7)), [])}, "1 boxes but 0 classes"),
-        ({"predictions": (np.zeros((1, 7)), [0.5], [9])}, "class index 9"),
-    ],
-)
-def test_wrong_scenes_are_named(fields, message):
-    with pytest.raises(UserError, match=message):
-        bev.draw_bev(Scene(blob_at(3, 3), GRID, **fields))
-
-
-def test_batched_projection_is_refused():
-    with pytest.raises(UserError, match="one frame"):
-        bev.draw_bev(Scene(blob_at(3, 3)[None], GRID))
+        draw.draw_map(values, GRID)
+    draw.draw_map(values, GRID.padded(8), color_limits=(0, 1), label="gate")
 
 
 def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
@@ -177,14 +147,14 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 
     errors = []
 
-    def draw(i):
+    def draw_one(i):
         try:
-            figure = bev.draw_frame(Scene(blob_at(20, 20), GRID, roi=ROI))
-            bev.save_figure(figure, tmp_path / f"{i}.png")
+            figure = draw.draw_frame(Scene(blob_at(20, 20), GRID, roi=ROI))
+            save_figure(figure, tmp_path / f"{i}.png")
         except Exception as error:
             errors.append(error)
 
-    threads = [threading.Thread(target=draw, args=(i,)) for i in range(3)]
+    threads = [threading.Thread(target=draw_one, args=(i,)) for i in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -197,11 +167,11 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 
 def test_a_frame_takes_less_than_two_seconds(tmp_path):
     """Half a second on an idle core; the bound leaves room for a busy machine."""
-    truth = Objects(footprint_boxes(3), ("Sedan",) * 3)
-    bev.save_figure(bev.draw_frame(Scene(blob_at(9, 9), GRID)), tmp_path / "warm.png")
+    truth = Boxes.one_frame(footprint_boxes(3), ["Sedan"] * 3)
+    save_figure(draw.draw_frame(Scene(blob_at(9, 9), GRID)), tmp_path / "warm.png")
     start = time.process_time()
-    figure = bev.draw_frame(Scene(blob_at(9, 9), GRID, ground_truth=truth, roi=ROI))
-    bev.save_figure(figure, tmp_path / "frame.png")
+    figure = draw.draw_frame(Scene(blob_at(9, 9), GRID, ground_truth=truth, roi=ROI))
+    save_figure(figure, tmp_path / "frame.png")
     assert time.process_time() - start < 2.0
 
 
@@ -209,7 +179,7 @@ def test_map_shows_every_bin_of_a_partial_extent():
     """Bins left out for speed must lie outside the picture."""
     extent = (30.0, 60.0, -20.0, 5.0)
     values = np.arange(60.0)[:, None] + np.arange(54.0)[None] / 100
-    ax = bev.draw_map(values, GRID, extent=extent, show_colorbar=False)
+    ax = draw.draw_map(values, GRID, extent=extent, show_colorbar=False)
     mesh = ax.collections[0]
     shown = set(np.round(mesh.get_array().ravel().astype(float), 2))
     centers = GRID.bin_centers_ego()
@@ -232,8 +202,65 @@ def test_footprint_of_a_turned_box():
 
 
 def test_the_legend_names_region_and_threshold() -> None:
-    found = (np.array([[20.0, 0, 0, 4, 2, 1.5, 0]]), [0.9], ["Sedan"])
+    found = Boxes.one_frame([20.0, 0, 0, 4, 2, 1.5, 0], ["Sedan"], [0.9])
     scene = Scene(blob_at(3, 3), GRID, predictions=found, roi=ROI)
     scene = dataclasses.replace(scene, score_threshold=0.3)
-    legend = [t.get_text() for t in bev.draw_bev(scene).get_legend().get_texts()]
+    legend = [t.get_text() for t in draw.draw_bev(scene).get_legend().get_texts()]
     assert legend == ["prediction (1), score from 0.3", "wide region"]
+
+
+SMALL_GRID = RadarGrid.reduced(
+    num_doppler=3, num_range=32, num_elevation=3, num_azimuth=24, max_range_m=60.0
+)
+
+
+def _scene(level: float, **fields) -> Scene:
+    projection = np.full(SMALL_GRID.projection_shape, level, np.float32)
+    projection[10, 5] = level + 0.1
+    truth = Boxes.one_frame([30.0, 2.0, 0.5, 4.5, 2.0, 1.6, 0.2], ["Sedan"])
+    return Scene(projection, SMALL_GRID, ground_truth=truth, **fields)
+
+
+def _has_color(pixels: np.ndarray, color: str) -> bool:
+    rgb = np.round(255 * np.array(matplotlib.colors.to_rgb(color)))
+    return bool((np.abs(pixels - rgb).max(-1) < 8).sum() > 50)
+
+
+def test_scenes_share_a_scale_and_have_an_image_above_a_map() -> None:
+    image = np.full((90, 160, 3), 128, np.uint8)
+    roi = (0, 50, -10, 10, -2, 6)
+    scenes = [
+        _scene(0.2, title="fog", image=image, roi=roi),
+        _scene(0.6, title="rain", roi=roi),
+    ]
+    figure = draw_scenes(scenes)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert [title for title in titles if title] == ["fog", "rain"]
+    assert len(figure.axes) == 4  # image and map, map, colour bar
+    assert "power" in figure.axes[-1].get_xlabel()
+    meshes = [
+        m for ax in figure.axes for m in ax.collections if m.get_array() is not None
+    ]
+    assert len({mesh.get_clim() for mesh in meshes if mesh.get_array().size > 99}) == 1
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["ground truth", "region of interest"]
+    assert not _has_color(render(figure).astype(int), ZOOM_COLOR)
+
+
+def test_one_strong_echo_does_not_darken_the_maps() -> None:
+    scene = _scene(0.2)
+    scene.projection[..., :] += np.linspace(0, 0.2, 24)[None, :, None]
+    scene.projection[3, 3] = 5.0
+    figure = draw_scenes([scene])
+    (mesh,) = [m for m in figure.axes[0].collections if isinstance(m, QuadMesh)]
+    assert mesh.get_clim()[1] < 0.5
+
+
+def test_a_magnified_view_is_framed_in_orange() -> None:
+    figure = draw_scenes([_scene(0.2, zoom=(30.0, 2.0))])
+    assert _has_color(render(figure).astype(int), ZOOM_COLOR)
+
+
+def test_no_scenes() -> None:
+    with pytest.raises(UserError, match="no scenes"):
+        draw_scenes([])

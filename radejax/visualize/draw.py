@@ -1,0 +1,421 @@
+"""Figures of radar frames: bird's-eye view, polar view, one frame, several scenes.
+
+The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map with
+the region of interest dashed, ground truth white with its class, predictions red with
+class and score, and the camera image. In the bird's-eye view x points up and y to the
+left, in meters, and every range-azimuth bin covers the ground that it measures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+
+from radejax.core.errors import UserError
+from radejax.core.structures import ROIS
+from radejax.geometry.boxes import bev_corners
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.visualize.camera import draw_camera
+from radejax.visualize.labels import Label, draw_labels
+from radejax.visualize.slices import POWER_LABEL, bin_edges, range_azimuth, to_polar
+from radejax.visualize.style import (
+    COLOR_MAP,
+    ROI_COLOR,
+    Scene,
+    add_colorbar,
+    draw_lines,
+    draw_tiles,
+    footprints,
+    halo,
+    label_texts,
+    line_scales,
+    new_figure,
+)
+
+Extent = Literal["roi", "fov"] | Sequence[float]
+Limits = tuple[float, float] | None
+
+ZOOM_COLOR = "#E69F00"
+_OUTSIDE_COLOR = "0.90"
+_BEHIND_M = 2.0  # shown behind the sensor, so that its mark is whole
+_POINTS_PER_EDGE = 8  # straight edges bend in the polar view
+_SCENE_PERCENTILES = (20.0, 99.5)
+_FOOT_IN = 0.8  # legend and color bar below scenes
+_COLUMN_IN, _ROW_IN = 4.9, 8.0  # large enough for scores of crowded scenes
+
+
+def draw_map(
+    values: Any,
+    grid: RadarGrid,
+    *,
+    ax: Axes | None = None,
+    extent: Extent = "fov",
+    color_limits: Limits = None,
+    label: str = "",
+    show_colorbar: bool = True,
+) -> Axes:
+    """Draw any range-azimuth map on the ground plane: heatmaps, gates, attention.
+
+    Args:
+        values: `[R, A]`.
+        grid: Grid of the map; padded maps need the padded grid.
+        ax: Where to draw; a new figure by default.
+        extent: "fov", or x_min, x_max, y_min, y_max in meters.
+        color_limits: Limits of the color bar; by default from the values shown.
+        label: Text of the color bar.
+        show_colorbar: Add a color bar.
+
+    Raises:
+        UserError: Map and grid differ in shape.
+    """
+    values = np.asarray(values, np.float32)
+    if values.shape != (grid.num_range, grid.num_azimuth):
+        raise UserError(
+            f"map has shape {values.shape}, the grid expects (range, azimuth) = "
+            f"{(grid.num_range, grid.num_azimuth)}"
+        )
+    x0, x1, y0, y1 = _extent_m(grid, None, extent)
+    ax = _axes_for_extent((x0, x1, y0, y1)) if ax is None else ax
+    # Range bins outside the figure take time to draw and would set its colors.
+    x, y = np.moveaxis(grid.bin_centers_ego(), -1, 0)
+    is_shown = ((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)).any(1)
+    rows = np.flatnonzero(is_shown) if is_shown.any() else np.arange(grid.num_range)
+    first, last = max(rows[0] - 2, 0), min(rows[-1] + 3, grid.num_range)
+    # Edges half a bin outside the centers; the range edge before zero is zero.
+    range_bin = np.arange(first, last + 1) - 0.5
+    range_bin = np.maximum(range_bin, -grid.range_m[0] / grid.range_step_m)
+    azimuth_bin = np.arange(grid.num_azimuth + 1) - 0.5
+    edges = grid.bin_to_ego(range_bin[:, None], azimuth_bin[None])  # [R'+1, A+1, 2]
+    ax.set_facecolor(_OUTSIDE_COLOR)
+    shown = values[first:last]
+    mesh = draw_tiles(ax, edges[..., 1], edges[..., 0], shown, color_limits)
+    # Seen from above with x ahead, left is left: y grows to the left.
+    ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, left [m]", ylabel="x, ahead [m]")
+    ax.set_aspect("equal")
+    if show_colorbar:
+        add_colorbar(mesh, ax, label)
+    return ax
+
+
+def draw_bev(
+    scene: Scene,
+    *,
+    ax: Axes | None = None,
+    extent: Extent = "roi",
+    color_limits: Limits = None,
+    show_labels: bool = True,
+    show_legend: bool = True,
+    show_colorbar: bool = True,
+) -> Axes:
+    """Draw one frame on the ground plane.
+
+    Args:
+        scene: The frame.
+        ax: Where to draw; a new figure by default. Its limits and aspect are set.
+        extent: "roi" shows the region of interest and its surroundings (the field of
+            view without one), "fov" the field of view; or x_min, x_max, y_min, y_max
+            in meters.
+        color_limits: Limits of the color bar; by default from the values shown.
+        show_labels: Write class and score next to the boxes.
+        show_legend: Explain the lines.
+        show_colorbar: Add a color bar.
+
+    Returns:
+        The axes; `.figure` is the figure.
+    """
+    ax = draw_map(
+        range_azimuth(scene.projection, scene.grid),
+        scene.grid,
+        ax=ax,
+        extent=_extent_m(scene.grid, scene.roi, extent),
+        color_limits=color_limits,
+        label=POWER_LABEL,
+        show_colorbar=show_colorbar,
+    )
+    _draw_over(ax, scene, lambda points: points[..., ::-1], show_labels, show_legend)
+    # The sensor, pointing ahead.
+    ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
+    return ax
+
+
+def draw_polar(
+    scene: Scene,
+    *,
+    ax: Axes | None = None,
+    color_limits: Limits = None,
+    show_labels: bool = True,
+    show_legend: bool = True,
+    show_colorbar: bool = True,
+) -> Axes:
+    """Draw one frame as the network sees it: range over azimuth, one tile per bin.
+
+    Straight box edges bend here; they are drawn bent. Arguments as in `draw_bev`.
+    """
+    ax = new_figure(6.0, 5.0).add_axes((0.11, 0.1, 0.74, 0.82)) if ax is None else ax
+    power = range_azimuth(scene.projection, scene.grid)
+    horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
+    vertical = bin_edges(scene.grid.range_m)
+    mesh = draw_tiles(ax, horizontal, vertical, power, color_limits)
+    ax.set_xlim(horizontal[0], horizontal[-1])
+    ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
+    ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
+    if show_colorbar:
+        add_colorbar(mesh, ax, POWER_LABEL)
+    _draw_over(ax, scene, to_polar, show_labels, show_legend)
+    return ax
+
+
+def draw_frame(scene: Scene) -> Figure:
+    """Figure of one frame: bird's-eye view, polar view and, if given, camera image.
+
+    Returns:
+        A figure of 12 by 6.4 inches; write it with `save_figure`.
+    """
+    figure = new_figure(12.0, 6.4)
+    untitled = dataclasses.replace(scene, title="")
+    bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
+    draw_bev(untitled, ax=bev_ax, show_legend=False)
+    has_image = scene.image is not None
+    height = 0.26 if has_image else 0.77
+    draw_polar(
+        untitled,
+        ax=figure.add_axes((0.57, 0.085, 0.41, height)),
+        show_labels=not has_image,
+        show_legend=False,
+        show_colorbar=False,
+    )
+    if has_image:
+        _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
+    figure.legend(
+        handles=_legend_handles(scene),
+        loc="lower center",
+        bbox_to_anchor=(0.765, 0.095 + height),
+        ncols=3,
+        fontsize=8,  # counts, threshold and the region's name fit
+        frameon=False,
+    )
+    if scene.title:
+        figure.suptitle(scene.title)
+    return figure
+
+
+def draw_scenes(
+    scenes: Sequence[Scene], *, columns: int = 4, zoom_m: float = 10.0
+) -> Figure:
+    """Figure of scenes side by side, each with its camera image above its map.
+
+    Args:
+        scenes: At least one; the legend is that of the first.
+        columns: Scenes per row.
+        zoom_m: Width and height in meters of what `Scene.zoom` magnifies.
+
+    Raises:
+        UserError: There are no scenes.
+    """
+    if not scenes:
+        raise UserError("no scenes to draw")
+    columns = min(columns, len(scenes))
+    width = _COLUMN_IN * columns
+    height = _ROW_IN * -(-len(scenes) // columns) + _FOOT_IN
+    figure = new_figure(width, height)
+    # One color scale for all, which the few strongest echoes exceed.
+    values = [range_azimuth(scene.projection, scene.grid).ravel() for scene in scenes]
+    low, high = np.nanpercentile(np.concatenate(values), _SCENE_PERCENTILES)
+    limits = (float(low), float(max(high, low + 1e-3)))
+    for index, scene in enumerate(scenes):
+        row, column = divmod(index, columns)
+        left, across = (column + 0.14) / columns, 0.83 / columns
+        base = height - _ROW_IN * (row + 1) - 0.05  # inches
+        above = None
+        if scene.image is not None:
+            place = (left, (base + 5.55) / height, across, 2.15 / height)
+            above = figure.add_axes(place)
+            # Labels are readable on the map; here they would hide the image.
+            _draw_view(above, scene, show_labels=False)
+        below = figure.add_axes((left, (base + 0.55) / height, across, 4.9 / height))
+        _draw_plain(below, dataclasses.replace(scene, title=""), limits)
+        if column:
+            below.set_ylabel("")
+        (above or below).set_title(scene.title, fontsize=11)
+        if scene.zoom is not None:
+            _magnify(below, scene, zoom_m, limits)
+    place = (1 - 3.3 / width, 0.42 / height, 2.7 / width, 0.11 / height)
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(*limits), COLOR_MAP),
+        cax=figure.add_axes(place),
+        orientation="horizontal",
+        extend="both",
+    )
+    bar.set_label(POWER_LABEL, fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    figure.legend(
+        handles=_legend_handles(scenes[0], show_counts=False),
+        loc="lower left",
+        bbox_to_anchor=(0.3 / width, 0.2 / height),
+        ncols=3 if columns > 1 else 1,
+        frameon=False,
+    )
+    return figure
+
+
+def _draw_plain(ax: Axes, scene: Scene, limits: Limits, **options: Any) -> None:
+    """Bird's-eye view without legend and color bar."""
+    draw_bev(
+        scene,
+        ax=ax,
+        color_limits=limits,
+        show_legend=False,
+        show_colorbar=False,
+        **options,
+    )
+
+
+def _magnify(ax: Axes, scene: Scene, size_m: float, limits: Limits) -> None:
+    """Mark a square on the map and show it larger in a corner."""
+    assert scene.zoom is not None
+    x, y = scene.zoom
+    half = size_m / 2
+    corner = (y - half, x - half)  # the axes show y to the left and x up
+    ax.add_patch(Rectangle(corner, size_m, size_m, fill=False, ec=ZOOM_COLOR, lw=1.5))
+    box = ax.get_window_extent()
+    inset = ax.inset_axes((0.60, 0.02, 0.38, 0.38 * box.width / box.height))
+    extent = (x - half, x + half, y - half, y + half)
+    untitled = dataclasses.replace(scene, title="", roi=None)
+    _draw_plain(inset, untitled, limits, extent=extent, show_labels=False)
+    inset.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    for spine in inset.spines.values():
+        spine.set(color=ZOOM_COLOR, lw=1.5)
+
+
+def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
+    """Camera image, with the boxes where a calibration is given."""
+    if scene.camera is None:
+        ax.imshow(np.asarray(scene.image))
+        ax.set_axis_off()
+        return
+    draw_camera(
+        scene.image,
+        scene.camera,
+        ground_truth=scene.ground_truth,
+        predictions=scene.predictions,
+        ax=ax,
+        show_labels=show_labels,
+    )
+
+
+def _extent_m(
+    grid: RadarGrid, roi: Sequence[float] | None, extent: Extent
+) -> tuple[float, float, float, float]:
+    """x_min, x_max, y_min, y_max of the figure."""
+    if not isinstance(extent, str):
+        x0, x1, y0, y1 = map(float, extent)
+        return x0, x1, y0, y1
+    far = grid.range_m[-1] + grid.range_step_m / 2
+    side = far * np.sin(min(grid.fov_azimuth_rad, np.pi / 2))
+    if extent == "fov" or roi is None:
+        return -_BEHIND_M, far, -side, side
+    _, x1, y0, y1 = roi[:4]
+    far = min(far, 1.08 * x1)
+    # Narrow regions would be unreadable slivers: show at least 3:4.
+    half = max(min(max(-y0, y1, 0.0) * 1.25, side), 0.37 * far)
+    return -_BEHIND_M, far, -half, half
+
+
+def _axes_for_extent(extent: Sequence[float]) -> Axes:
+    """Axes of a new figure that fit an extent, with room for color bar and legend."""
+    x0, x1, y0, y1 = extent
+    scale = min(5.5 / (x1 - x0), 6.0 / (y1 - y0))
+    width, height = scale * (y1 - y0), scale * (x1 - x0)
+    total = width + 1.75, height + 1.2
+    place = (0.65 / total[0], 0.55 / total[1], width / total[0], height / total[1])
+    return new_figure(*total).add_axes(place)
+
+
+def _draw_over(
+    ax: Axes,
+    scene: Scene,
+    to_axes: Callable[[np.ndarray], np.ndarray],
+    show_labels: bool,
+    show_legend: bool,
+) -> None:
+    """Region of interest, boxes with headings and labels, legend and title.
+
+    Args:
+        ax: Axes of a map; limits and aspect are final.
+        scene: The frame.
+        to_axes: Ground positions `[..., 2]` to data coordinates.
+        show_labels: Write class and score next to the boxes.
+        show_legend: Explain the lines.
+    """
+    ax.apply_aspect()
+    if scene.roi is not None:
+        x0, x1, y0, y1 = scene.roi[:4]
+        region = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 0, x1 - x0, y1 - y0, 0, 0]])
+        # White below the dashes: visible on dark and on bright ground.
+        ax.plot(
+            *to_axes(footprints(region, 200)[0]).T,
+            color=ROI_COLOR,
+            linewidth=1.4,
+            linestyle=(0, (5, 3)),
+            path_effects=halo(2.6, "white"),
+            zorder=3,
+        )
+    labels = []
+    for order, (style, boxes) in enumerate(scene.sets):
+        edges = to_axes(footprints(boxes.box, _POINTS_PER_EDGE))
+        marks = to_axes(_heading_marks(boxes.box))
+        widths = style.width * np.tile(line_scales(ax, edges, 8.0), 2)
+        draw_lines(ax, [*edges, *marks], style.color, widths, 4 + order)
+        outlines = np.concatenate([edges, marks], 1)
+        labels += [
+            Label(outline, text, style.text_color, style.side)
+            for outline, text in zip(outlines, label_texts(boxes), strict=True)
+        ]
+    if show_labels:
+        draw_labels(ax, labels)
+    handles = _legend_handles(scene)
+    if show_legend and handles:
+        ax.legend(
+            handles=handles,
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=len(handles),
+            fontsize=8,
+            frameon=False,
+            handlelength=1.6,
+        )
+    if scene.title:
+        ax.set_title(scene.title, pad=24 if show_legend else 6)
+
+
+def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:
+    """Segments from the middle of each front edge outwards: the echo stays visible."""
+    front = bev_corners(boxes)[:, [0, 3]].mean(1)
+    return np.stack([front, front + 0.7 * (front - boxes[:, :2])], 1)
+
+
+def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
+    """One handle per kind of line."""
+    handles = []
+    for style, boxes in scene.sets:
+        label = f"{style.name} ({len(boxes)})" if show_counts else style.name
+        if boxes.score is not None and scene.score_threshold is not None:
+            label += f", score from {scene.score_threshold:g}"
+        line = Line2D([], [], color=style.color, lw=style.width, label=label)
+        line.set_path_effects(halo(style.width + 1.4))
+        handles.append(line)
+    if scene.roi is not None:
+        named = [name for name, roi in ROIS.items() if roi == tuple(scene.roi)]
+        label = f"{named[0]} region" if named else "region of interest"
+        handles.append(Line2D([], [], color=ROI_COLOR, lw=1.4, ls="--", label=label))
+    return handles

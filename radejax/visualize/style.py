@@ -1,0 +1,282 @@
+"""What all figures share: colors, the frame to draw, axes helpers and saving.
+
+Figures are plain `matplotlib.figure.Figure` objects: nothing here touches pyplot, its
+backend or its list of open figures, so drawing works without a display, in threads
+and in notebooks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
+
+from radejax.core.errors import UserError
+from radejax.core.files import atomic_path
+from radejax.core.structures import Boxes
+from radejax.geometry.boxes import bev_corners
+from radejax.geometry.camera import CameraCalibration
+from radejax.geometry.radar_grid import RadarGrid
+
+# The brightest fifth is omitted: white boxes must stand out on the strongest echoes.
+COLOR_MAP = LinearSegmentedColormap.from_list(
+    "radar", matplotlib.colormaps["viridis"](np.linspace(0.0, 0.82, 256))
+)
+ROI_COLOR = "black"
+# The color-blind safe palette of Okabe and Ito, with a yellow that shows on paper.
+SERIES_COLORS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
+    *("#000000", "#8A6D00"),
+)
+
+
+class Style(NamedTuple):
+    """How one set of boxes is drawn.
+
+    Attributes:
+        name: Name in legends.
+        color: Color of lines.
+        text_color: Color of labels; thin strokes need more light than lines.
+        width: Width of lines in points.
+        side: Side of a box on a map where its label stands.
+    """
+
+    name: str
+    color: str
+    text_color: str
+    width: float
+    side: str
+
+
+GROUND_TRUTH = Style("ground truth", "white", "white", 1.9, "left")
+PREDICTION = Style("prediction", "#ff4d40", "#ff7d70", 1.3, "right")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """One frame to draw; every figure takes from it what it needs.
+
+    Attributes:
+        projection: `[R, A, D+E]` normalized log power of one frame.
+        grid: Grid of the projection.
+        ground_truth: Boxes of the frame in the radar frame, or None.
+        predictions: Boxes of the frame with scores, or None.
+        roi: x_min, x_max, y_min, y_max, z_min, z_max in meters, drawn as a dashed
+            rectangle; or None.
+        image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
+        camera: Calibration of the image, which draws the boxes on it; or None.
+        title: Title, such as sequence, frame and weather.
+        score_threshold: Threshold of the predictions shown, for the legend, or None.
+        zoom: x and y in meters of the place that `draw_scenes` magnifies, or None.
+        time_s: Seconds since the Unix epoch, for recordings; or None.
+
+    Raises:
+        UserError: The projection does not fit the grid, or boxes are of several frames.
+    """
+
+    projection: Any
+    grid: RadarGrid
+    ground_truth: Boxes | None = None
+    predictions: Boxes | None = None
+    roi: Sequence[float] | None = None
+    image: Any = None
+    camera: CameraCalibration | None = None
+    title: str = ""
+    score_threshold: float | None = None
+    zoom: tuple[float, float] | None = None
+    time_s: float | None = None
+
+    def __post_init__(self) -> None:
+        check_projection(self.projection, self.grid)
+        for style, boxes in self.sets:
+            if len(np.unique(boxes.frame)) > 1:
+                raise UserError(
+                    f"{style.name}: boxes of {len(np.unique(boxes.frame))} frames, "
+                    "expected those of one; select them with Boxes.take"
+                )
+
+    @property
+    def sets(self) -> list[tuple[Style, Boxes]]:
+        """Ground truth and predictions, where given, with their styles."""
+        return styled_sets(self.ground_truth, self.predictions)
+
+
+def styled_sets(
+    ground_truth: Boxes | None, predictions: Boxes | None
+) -> list[tuple[Style, Boxes]]:
+    """Those of both that are given, with their styles."""
+    pairs = (GROUND_TRUTH, ground_truth), (PREDICTION, predictions)
+    return [(style, boxes) for style, boxes in pairs if boxes is not None]
+
+
+def check_projection(projection: Any, grid: RadarGrid) -> np.ndarray:
+    """Return the projection as float32; raise `UserError` if it is not the grid's."""
+    values = np.asarray(projection, np.float32)
+    if values.shape != grid.projection_shape:
+        raise UserError(
+            f"projection has shape {values.shape}, the grid expects (range, azimuth, "
+            f"Doppler + elevation) = {grid.projection_shape}; pass one frame, without "
+            "a batch axis, and the grid that it was recorded on"
+        )
+    return values
+
+
+def label_texts(boxes: Boxes) -> list[str]:
+    """Class names, with the score where there is one."""
+    if boxes.score is None:
+        return list(boxes.cls)
+    pairs = zip(boxes.cls, boxes.score, strict=True)
+    return [f"{name} {score:.2f}" for name, score in pairs]
+
+
+def footprints(
+    boxes: Float[np.ndarray, "N 7"], points_per_edge: int = 1
+) -> Float[np.ndarray, "N {4*points_per_edge+1} 2"]:
+    """Closed outlines of boxes on the ground, counter-clockwise.
+
+    Args:
+        boxes: Boxes in the radar frame.
+        points_per_edge: Points on each edge; more than 1 where edges bend, as in a
+            polar view.
+
+    Returns:
+        x and y, starting at the front left corner.
+    """
+    corners = bev_corners(boxes)
+    following = np.roll(corners, -1, axis=1)
+    t = np.arange(points_per_edge)[:, None] / points_per_edge
+    edges = corners[:, :, None] * (1 - t) + following[:, :, None] * t  # [N, 4, P, 2]
+    points = edges.reshape(len(boxes), 4 * points_per_edge, 2)
+    return np.concatenate([points, corners[:, :1]], 1)
+
+
+def draw_tiles(
+    ax: Axes,
+    edges_x: Float[np.ndarray, "*edges_x"],
+    edges_y: Float[np.ndarray, "*edges_y"],
+    values: Float[np.ndarray, "rows columns"],
+    color_limits: tuple[float, float] | None = None,
+) -> Any:
+    """Draw one tile per value; the color limits follow from the values by default."""
+    low, high = color_limits or color_limits_of(values)
+    return ax.pcolormesh(
+        edges_x, edges_y, values, cmap=COLOR_MAP, vmin=low, vmax=high, rasterized=True
+    )
+
+
+def add_colorbar(mesh: Any, ax: Axes, label: str) -> None:
+    """Add a color bar as high as the axes, also where equal aspect shrinks them."""
+    cax = ax.inset_axes((1.02, 0.0, 0.035, 1.0))
+    ax.figure.colorbar(mesh, cax=cax, label=label)
+
+
+def draw_lines(
+    ax: Axes,
+    lines: Sequence[Float[np.ndarray, "_ 2"]],
+    color: str,
+    widths: Any,
+    zorder: float = 4.0,
+) -> None:
+    """Draw lines over a black rim of half a point, without changing the limits."""
+    for stroke, extra in (("black", 1.1), (color, 0.0)):
+        collection = LineCollection(
+            list(lines),
+            colors=stroke,
+            linewidths=np.asarray(widths) + extra,
+            capstyle="round",
+            zorder=zorder + (0.1 if stroke == color else 0.0),
+        )
+        ax.add_collection(collection, autolim=False)
+
+
+def line_scales(
+    ax: Axes, outlines: Iterable[Float[np.ndarray, "_ 2"]], full_pt: float
+) -> Float[np.ndarray, " N"]:
+    """Factors on line widths, 0.4 to 1: lines would fill boxes smaller than `full_pt`.
+
+    The size of a box is the shorter side of its outline's bounding rectangle on paper.
+    """
+    pixels = [np.ptp(ax.transData.transform(o), axis=0).min() for o in outlines]
+    size_pt = np.array(pixels) * 72 / ax.figure.dpi
+    return np.clip(size_pt / full_pt, 0.4, 1.0)
+
+
+def halo(width: float, color: str = "black") -> list:
+    """Path effects: an outline that keeps lines and text legible on any map."""
+    return [Stroke(linewidth=width, foreground=color), Normal()]
+
+
+class _NotebookFigure(Figure):
+    """A figure that Jupyter shows without pyplot and its backends."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=80)
+        return buffer.getvalue()
+
+
+def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
+    """Return an empty figure outside pyplot's list of open figures."""
+    return _NotebookFigure(figsize=(width_in, height_in), **{"dpi": 110, **options})
+
+
+def color_limits_of(values: np.ndarray) -> tuple[float, float]:
+    """Limits from the noise floor (20 %) to the strongest echoes (99.9 %).
+
+    Non-finite values are ignored; a constant map gets a range of one unit.
+    """
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(finite, [20.0, 99.9])
+    if high <= low:  # a few peaks on nothing, such as a heatmap
+        high = finite.max()
+    return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)
+
+
+def figure_format(path: pathlib.Path) -> str:
+    """Return the format of a figure file; raise `UserError` for unknown suffixes."""
+    suffix = path.suffix.lstrip(".").lower()
+    supported = FigureCanvasBase.get_supported_filetypes()
+    if suffix not in supported:
+        raise UserError(
+            f"cannot write a figure as {path.name!r}; suffixes: {sorted(supported)}"
+        )
+    return suffix
+
+
+def save_figure(
+    figure: Figure, path: str | os.PathLike, **options: Any
+) -> pathlib.Path:
+    """Write a figure completely or not at all.
+
+    Args:
+        figure: The figure.
+        path: Target; the suffix sets the format. Folders are created.
+        **options: Arguments of `Figure.savefig`, such as `dpi`.
+
+    Returns:
+        The path written.
+
+    Raises:
+        UserError: matplotlib cannot write the suffix.
+    """
+    path = pathlib.Path(path)
+    suffix = figure_format(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=suffix, **options)
+    return path
