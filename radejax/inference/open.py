@@ -29,7 +29,7 @@ from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
-from radejax.weights.state_dict import read_state_dict
+from radejax.weights.convert import read_content
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +107,7 @@ def load_torch(
     """
     content = path_or_state_dict
     if isinstance(content, str | os.PathLike):
-        content, _ = read_state_dict(content)
+        content, _ = read_content(content)
     settings: dict[str, Any] = {"azimuth_mapping": "stretched"}
     model: nn.Module
     if dinorade_torch.is_dinorade(content):
