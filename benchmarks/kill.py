@@ -26,7 +26,7 @@ import numpy as np
 
 from radejax.cli import entry
 from radejax.core.config import load_module
-from radejax.inference.open import load
+from radejax.inference.saved import load_model
 from radejax.runs import experiment
 from radejax.runs.sources import Sources
 
@@ -97,7 +97,7 @@ def stage(folder):
 def same(folder, a, b):
     """Names of what is not equal."""
     different = []
-    variables = [load(folder / run).variables for run in (a, b)]
+    variables = [load_model(folder / run).variables for run in (a, b)]
     equal = jax.tree.map(np.array_equal, *variables)
     different += ["parameters"] * (not all(jax.tree.leaves(equal)))
     losses = [

@@ -14,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
+from ml_collections import ConfigDict
 from tabulate import tabulate
 
 from radejax import models
@@ -24,13 +25,14 @@ from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import placeholder
+from radejax.inference.saved import SavedModel
 from radejax.models.parts import Call, calls_of
 from radejax.simulation.config import SimulationConfig
 
 STAGES = ("transfer", "projection", "network", "decode + NMS")
 
 
-def untrained(config: Mapping[str, Any], **overrides: Any) -> Detector:
+def untrained(config: ConfigDict, **overrides: Any) -> Detector:
     """Detector with random weights of a config, on the sensor that it is made for.
 
     Args:
@@ -50,7 +52,7 @@ def untrained(config: Mapping[str, Any], **overrides: Any) -> Detector:
     variables = jax.tree.map(
         lambda x: 0.05 * rng.standard_normal(x.shape, x.dtype), shapes
     )
-    return Detector.from_config(config, variables, grid, **overrides)
+    return Detector(SavedModel(config, grid, variables), **overrides)
 
 
 def measure(
@@ -91,7 +93,8 @@ def measure(
 def _measure(
     detector: Detector, batch: int, repeats: int, tesseract: bool, seed: int
 ) -> dict[str, Any]:
-    grid, device = detector.grid, detector.device
+    grid, mapping = detector.grid, detector.saved.config.data.azimuth_mapping
+    (device,) = detector.sharding.device_set
     shape = grid.shape_drea if tesseract else grid.projection_shape
     rng = np.random.default_rng(seed)
     frames = rng.standard_exponential((batch, *shape), np.float32)
@@ -100,7 +103,7 @@ def _measure(
     if detector.takes_camera:
         image, camera = placeholder(batch, detector.model)
         extra = image, camera.replace(is_valid=np.ones(batch, bool))
-    sized = detector.with_batch_sizes((batch,))  # no padding to another size
+    sized = detector.replace(batch_sizes=(batch,))  # no padding to another size
 
     map_function = jax.jit(
         lambda variables, *inputs: detector.model.apply(variables, *inputs, train=False)
@@ -108,7 +111,7 @@ def _measure(
     decode_function = jax.jit(
         functools.partial(
             decode,
-            grid=models.map_grid(grid, detector.model, detector.azimuth_mapping),
+            grid=models.map_grid(grid, detector.model, mapping),
             score_threshold=detector.score_threshold,
             nms_iou=detector.nms_iou,
             **detector.decode_options,

@@ -28,7 +28,7 @@ from radejax.evaluation.files.load import Source, load
 from radejax.evaluation.files.predictions import frame_keys
 from radejax.evaluation.report import bootstrap
 from radejax.evaluation.report.measure import repair_sizes
-from radejax.inference.open import load as open_model
+from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_of_run
 from radejax.runs.figures import frame_shares, mean_share
 from radejax.runs.sources import Sources

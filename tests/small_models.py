@@ -13,6 +13,7 @@ from radejax import Detector, models
 from radejax.core.config import base_config, load_module
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.saved import SavedModel
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 IMAGE_SIZE = (32, 48)
@@ -85,9 +86,17 @@ def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
 
 
 def detector(kind: str = "radar", **overrides: Any) -> Detector:
+    options = {"batch_sizes": (4,), "score_threshold": 0.1} | overrides
+    return Detector(saved(kind), **options)
+
+
+def saved(kind: str = "radar", **changes: Any) -> SavedModel:
+    """An untrained model; `changes` are fields of its config, dots as "__"."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
-    overrides = {"batch_sizes": (4,), "score_threshold": 0.1} | overrides
-    return Detector.from_config(config, _variables(kind), small_grid(), **overrides)
+    config.update_from_flattened_dict(
+        {name.replace("__", "."): value for name, value in changes.items()}
+    )
+    return SavedModel(config, small_grid(), _variables(kind))
 
 
 def projections(count: int) -> np.ndarray:

@@ -19,8 +19,8 @@ from radejax.data.records.embeddings import open_embeddings
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
 from radejax.inference.detector import Detector
-from radejax.inference.open import load
 from radejax.inference.predict import predict_dataset
+from radejax.inference.saved import load_model
 from radejax.models import build
 from radejax.runs import experiment
 from radejax.runs.data import Data, data_of_run
@@ -85,7 +85,7 @@ class _Data:
 
 def opened(workdir):
     """Model and data of a run."""
-    loaded = load(workdir)
+    loaded = load_model(workdir)
     return loaded, data_of_run(loaded, workdir)[1]
 
 
@@ -127,7 +127,7 @@ def embeddings(data, from_images, tmp_path_factory):
 
 def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
     config = small_config()
-    run = load(from_images)
+    run = load_model(from_images)
     given = image_backbone.load_image_backbone(data.backbone, build(config.model))
     backbone = run.variables["params"]["image_backbone"]
     for found, wanted in zip(
@@ -149,7 +149,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     assert len(found) == len(wanted) > 0
     np.testing.assert_allclose(found, wanted, rtol=2e-5)
     # Evaluated from the embeddings too: the backbone is nowhere.
-    assert "image_backbone" not in load(workdir).variables["params"]
+    assert "image_backbone" not in load_model(workdir).variables["params"]
     reports = [
         json.loads((w / "evaluation" / "metrics.json").read_text())
         for w in (workdir, from_images)
@@ -168,7 +168,7 @@ def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
     # No --image_backbone: the weights come with those that the run starts from.
     workdir = data.train("continued", init_from=str(from_images))
     assert (workdir / "evaluation" / "metrics.json").exists()
-    first, second = (load(w).variables for w in (from_images, workdir))
+    first, second = (load_model(w).variables for w in (from_images, workdir))
     for name, is_same in (("image_backbone", True), ("image_neck", False)):
         pairs = zip(
             jax.tree.leaves(first["params"][name]),
@@ -190,11 +190,11 @@ def test_a_backbone_that_is_gone_leaves_embedded_images(
     stored.write_text(text)
     shutil.rmtree(newest / "checksums")  # of a version without them
     with caplog.at_level(logging.WARNING):
-        run = load(copy)
+        run = load_model(copy)
     assert "image backbone" in caplog.text
     assert "is gone" in caplog.text
     assert "image_backbone" not in run.variables["params"]
-    again = load(copy, image_backbone=data.backbone)
+    again = load_model(copy, image_backbone=data.backbone)
     assert "image_backbone" in again.variables["params"]
 
 
@@ -257,7 +257,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
 ):
     run, own = opened(from_images)
     frames = list(own.split("test"))
-    detector = Detector.from_loaded(run, score_threshold=0.0)
+    detector = Detector(run, score_threshold=0.0)
 
     def boxes(frames):
         images = own.images(frames)

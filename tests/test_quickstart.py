@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from radejax.cli import main
-from radejax.inference.open import load
+from radejax.inference.saved import load_model
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
@@ -167,13 +167,12 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
 @pytest.mark.timeout(900)
 def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
     run = undisturbed[0] / "run"
-    expected = load(run)
+    expected = load_model(run)
     newest = max((run / "checkpoints").glob("[0-9]*"), key=lambda p: int(p.name))
     for path in (run / "checkpoints", newest):
-        found = load(path)
-        assert found.model == expected.model
+        found = load_model(path)
         assert found.grid == expected.grid
-        assert found.settings == expected.settings
+        assert found.config.to_json() == expected.config.to_json()
         jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
 
 

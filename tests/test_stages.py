@@ -42,7 +42,7 @@ def test_stages_add_up_and_are_shown(kind: str, stages: Any) -> None:
     assert "- image neck" in shares or kind == "radar"
     stages = [share for name, share in shares.items() if not name.startswith("- ")]
     assert sum(stages) == pytest.approx(100, abs=0.3)
-    assert detector.with_batch_sizes((2,))._run is detector._run
+    assert detector.replace(batch_sizes=(2,))._run is detector._run
 
 
 def test_untrained_models_are_those_of_their_configs(stages: Any) -> None:

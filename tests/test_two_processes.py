@@ -12,7 +12,7 @@ import chex
 import numpy as np
 import pytest
 
-from radejax.inference.open import load
+from radejax.inference.saved import load_model
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
@@ -117,7 +117,7 @@ def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
         [v for _, v in actual], [v for _, v in expected], rtol=1e-5
     )
     chex.assert_trees_all_close(
-        load(runs / run).variables, load(runs / "one").variables, atol=1e-6
+        load_model(runs / run).variables, load_model(runs / "one").variables, atol=1e-6
     )
     assert _aps(runs / run) == _aps(runs / "one")
 

@@ -63,6 +63,8 @@ def detect(
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
-    if "radar_alone" in count:
-        text += f"; {count['radar_alone']} without an image, from the radar alone"
+    if "radar_only" in count:
+        text += (
+            f"; {count['radar_alone']} without an image, predicted from the radar only"
+        )
     options.echo_result(as_json, {**count, "out": str(out)}, text)

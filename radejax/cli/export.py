@@ -20,26 +20,32 @@ from radejax.cli import entry, options
     show_default=True,
 )
 @click.option(
-    "--platforms", default="cpu,cuda,tpu", show_default=True, help="Of StableHLO."
+    "--platforms",
+    default="cpu,cuda,tpu",
+    show_default=True,
+    help="Of the StableHLO program.",
 )
 @click.option(
     "--image-backbone",
     type=options.EXISTING,
-    help="Weights of the image backbone, where SOURCE is without.",
+    help="Weights of the image backbone, if SOURCE has none.",
 )
 @click.option(
     "--with-backbone",
     is_flag=True,
-    help="Keep the image transformer's weights. DINOv3's may not be passed on.",
+    help="Keep the weights of the image transformer. DINOv3's license restricts "
+    "redistribution.",
 )
 @click.option(
     "--batch-size",
     type=options.COUNT,
     default=1,
     show_default=True,
-    help="Frames of a call, of ONNX files.",
+    help="Batch size of the ONNX files.",
 )
-@click.option("--half", is_flag=True, help="Store float16; of huggingface.")
+@click.option(
+    "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
+)
 def export(
     source: pathlib.Path,
     out: pathlib.Path,
@@ -53,26 +59,22 @@ def export(
 ) -> None:
     """Write a model as a folder that works elsewhere.
 
-    SOURCE is the work folder of a run, its checkpoints, one of them, an exported folder
-    or an official .pth file. "stablehlo" needs jax alone to run, for any batch size;
-    "onnx" is for ONNX Runtime and TensorRT, for one; "huggingface" is weights, config and
-    model card. Detector.from_checkpoint reads all.
+    SOURCE is the workdir of a run, its checkpoints, one of them, an exported folder or an
+    official .pth file. "stablehlo" runs with jax only, for any batch size; "onnx" is for
+    ONNX Runtime and TensorRT, for one batch size; "huggingface" is weights, config and
+    model card. Detector.from_checkpoint reads all of them.
 
     Example: radejax export runs/quickstart --out exported
     """
     from radejax.inference import export as exporting
     from radejax.inference.detector import Detector
-    from radejax.inference.open import load
 
     entry.set_up_jax()
-    loaded = load(source, image_backbone=image_backbone)
-    detector = Detector.from_loaded(loaded)
     done = exporting.export(
-        detector,
+        Detector.from_checkpoint(source, image_backbone=image_backbone),
         out,
         kind=kind,
         platforms=tuple(platforms.split(",")),
-        training_config=loaded.config,
         with_backbone=with_backbone,
         batch_size=batch_size,
         half=half,

@@ -28,7 +28,7 @@ from radejax.evaluation.files import kitti
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
-from radejax.inference.open import Step, load
+from radejax.inference.saved import Step
 
 PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
 """Names of the files that hold a frame."""
@@ -172,7 +172,7 @@ def detect_files(
 
     Returns:
         Counts "frames", "boxes" and "clipped", boxes of them with a size that was clipped,
-        and for a radar-camera model "radar_alone": frames without a label file, image
+        and for a radar-camera model "radar_only": frames without a label file, image
         or calibration.
 
     Raises:
@@ -182,16 +182,15 @@ def detect_files(
     """
     frames = chosen_frames(find_frames(paths), sequence_numbers, weather)
     _check_names(frames)
-    loaded = load(source, step=step, image_backbone=image_backbone)
-    detector = Detector.from_loaded(loaded)
+    detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
     chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
 
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or (loaded.run.get("data") or {}).get("labels")
-        version = loaded.config.data.label_version if loaded.config else "v2.1"
+        labels = labels or (detector.saved.run.get("data") or {}).get("labels")
+        version = detector.saved.config.data.label_version
         known = front_images(frames, detector, labels, version)
 
     if file_format == "kitti":
@@ -210,7 +209,7 @@ def detect_files(
             written += len(chunk)
             bar.update(len(chunk))
     if detector.takes_camera:
-        count["radar_alone"] = detector.num_radar_alone
+        count["radar_only"] = detector.num_radar_only
     return count
 
 

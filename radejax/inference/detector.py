@@ -1,4 +1,4 @@
-"""`Detector`: tensors in, boxes out, in one jitted call."""
+"""`Detector`: radar tensors in, boxes out, in one jitted call."""
 
 from __future__ import annotations
 
@@ -8,61 +8,49 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
+from jaxtyping import Shaped
 
 from radejax import models
-from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES, Array, Batch, Detections
+from radejax.core.errors import UserError, require
+from radejax.core.files import PathLike
+from radejax.core.structures import Array, Batch, Detections
 from radejax.data.cameras import CameraOptions
-from radejax.geometry.camera import Camera
-from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.inference import inputs as detector_inputs
-from radejax.inference.open import (
-    LoadedModel,
-    PathLike,
-    Step,
-    load,
-    load_torch,
-    settings_of_config,
-)
 from radejax.inference.program import detect
-from radejax.models.lifting import ReferencePoints
+from radejax.inference.saved import SavedModel, Step, load_model, load_torch
 
-EVERYWHERE = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
+UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 
 
 class Detector:
     """A trained model with everything between a radar tensor and boxes.
 
     One object may be shared by threads. Batches are padded to a few fixed sizes, so
-    that any number of frames compiles at most `len(batch_sizes)` programs per input
-    kind; thresholds and region can change without compiling again.
+    that any number of frames compiles at most `len(batch_sizes)` programs per kind of
+    input; thresholds and region can change without compiling again.
 
     Args:
-        model: From `radejax.models.build`.
-        variables: Its parameters and other collections.
-        grid: Of the sensor.
-        classes: Names in the order of the heatmap's channels.
-        decode_options: Static keyword arguments of `radejax.detection.decode.decode`:
-            max_detections, threshold_inclusive, per_class_nms, z0_m, raw_yaw,
-            clip_sizes; and roi, for calls and a detector that give none.
-        azimuth_mapping: "true", or "stretched" for official checkpoints.
-        score_threshold: Default of calls.
+        saved: From `load_model`.
+        sharding: Where batches are computed: `batch_sharding` of a mesh splits each over
+            its devices, on which the variables are replicated; JAX's default device if
+            None. In several processes each passes the same number of frames, a multiple
+            of its devices, and gets the detections of all.
+        score_threshold: Default of calls; of the config if None, as the next two.
         nms_iou: Default of calls.
-        roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, "narrow",
-            "wide" or None.
-        batch_sizes: Sizes that are compiled.
-        device: Where to run: a device or a platform, "cpu" or "gpu"; JAX's default
-            device if None.
-        dtype: Of the computation, "float32" or "bfloat16"; the model's own if None.
-        camera_options: How calibrations are used by a radar-camera model.
+        roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, "narrow" or
+            "wide".
+        dtype: Of the computation, "float32" or "bfloat16"; of the config if None.
+        batch_sizes: Sizes that are compiled, each per process.
 
     Attributes:
-        num_radar_alone: Frames that a radar-camera model has so far predicted without
-            an image.
+        num_radar_only: Frames so far, except of a `Batch`, that a radar-camera model
+            predicted without an image.
+        num_invalid_frames: Frames so far, of NumPy arrays, with values that no radar
+            power gives (NaN, infinite, decibels): their detections are meaningless.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
@@ -72,56 +60,55 @@ class Detector:
 
     def __init__(
         self,
-        model: nn.Module,
-        variables: Mapping[str, Any],
-        grid: RadarGrid,
+        saved: SavedModel,
+        sharding: Sharding | None = None,
         *,
-        classes: Sequence[str] = CLASSES,
-        decode_options: Mapping[str, Any] | None = None,
-        azimuth_mapping: AzimuthMapping = "true",
-        score_threshold: float = 0.3,
-        nms_iou: float = 0.3,
+        score_threshold: float | None = None,
+        nms_iou: float | None = None,
         roi: Sequence[float] | str | None = None,
-        batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
-        device: jax.Device | str | None = None,
         dtype: str | None = None,
-        camera_options: CameraOptions = CameraOptions(),  # noqa: B008, frozen
+        batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
     ) -> None:
-        self.model = model = model if dtype is None else models.with_dtype(model, dtype)
-        self.takes_camera = models.has_camera(model)
-        self.camera_options = camera_options
-        self.num_radar_alone = 0
-        self._impossible = detector_inputs.ImpossibleFrames()
+        config = saved.config.copy_and_resolve_references()
+        if score_threshold is not None:
+            config.decode.score_threshold = float(score_threshold)
+        if nms_iou is not None:
+            config.decode.nms_iou = float(nms_iou)
+        if roi is not None:
+            config.decode.roi = tuple(detector_inputs.named_region(roi))
+        if dtype is not None:
+            config.model.dtype = dtype
+        self.saved = dataclasses.replace(saved, config=config)
+        self.grid, self.step = saved.grid, saved.step
+        self.model: Any = self.saved.model
+        self.takes_camera = models.has_camera(self.model)
+        self.camera_options = CameraOptions.of_config(config.data)
+        self.classes = tuple(config.classes)
+        decode = dict(config.decode)
+        self.score_threshold: float = decode.pop("score_threshold")
+        self.nms_iou: float = decode.pop("nms_iou")
+        self.roi = decode.pop("roi")
+        self.decode_options: dict[str, Any] = decode
+        for name in ("score_threshold", "nms_iou"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, f"config.decode.{name}", value, "from 0 to 1")
+        self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
+        self.replicated = (
+            NamedSharding(self.sharding.mesh, PartitionSpec())
+            if isinstance(self.sharding, NamedSharding)
+            else self.sharding
+        )
+        devices: set[Any] = self.sharding.device_set
+        self.num_processes = len({device.process_index for device in devices})
+        self._set_batch_sizes(batch_sizes)
+        self.variables = jax.device_put(saved.variables, self.replicated)
+        self.num_radar_only = self.num_invalid_frames = 0
         self._lock = threading.Lock()
-        self.grid = grid
-        self.classes = tuple(classes)
-        self.score_threshold = score_threshold
-        self.nms_iou = nms_iou
-        self.step: int | None = None
-        self.device = detector_inputs.named_device(device)
-        self.variables = jax.device_put(variables, self.device)
-        self._batch_sizes = detector_inputs.checked_sizes(batch_sizes)
-        self.azimuth_mapping = azimuth_mapping
-        self.decode_options = {"max_detections": 100, **(decode_options or {})}
-        roi = self.decode_options.get("roi") if roi is None else roi
-        self.roi = detector_inputs.named_region(roi)
-        self._run = jax.jit(self.detect_function(), static_argnames="is_tesseract")
-
-    # Construction --------------------------------------------------------------------
-
-    @classmethod
-    def from_loaded(cls, loaded: LoadedModel, **overrides: Any) -> Detector:
-        """Detector of what `radejax.inference.open.load` returned."""
-        settings = {**loaded.settings, **overrides}
-        detector = cls(loaded.model, loaded.variables, loaded.grid, **settings)
-        detector.step = loaded.step
-        return detector
-
-    def __repr__(self) -> str:
-        grid = " x ".join(map(str, self.grid.shape_drea))
-        return (
-            f"Detector({type(self.model).__name__}, grid {grid}, classes "
-            f"{', '.join(self.classes)}, step {self.step}, on {self.device})"
+        # Every process gets all detections: they are small.
+        self._run = jax.jit(
+            self.detect_function(),
+            static_argnames="is_tesseract",
+            out_shardings=self.replicated,
         )
 
     @classmethod
@@ -131,92 +118,88 @@ class Detector:
         step: Step = None,
         *,
         image_backbone: PathLike | None = None,
-        **overrides: Any,
+        **options: Any,
     ) -> Detector:
         """Detector of a training run.
 
         Args:
-            path: Work folder of `train.py`.
-            step: Of the checkpoint, or "best"; the newest if None.
-            image_backbone: Weights of a frozen image backbone, where they are not at
-                the place any more that the run was trained from.
-            **overrides: Arguments of `Detector`.
+            path: Workdir of `train.py`; or anything else that `load_model` takes.
+            step: Step of the checkpoint, or "best"; the latest if None.
+            image_backbone: Weights of a frozen image backbone, if they are not where
+                the run was trained from.
+            **options: Arguments of `Detector`.
 
         Raises:
-            FileNotFoundError: No run or no such checkpoint there.
+            FileNotFoundError: There is no run, or no such checkpoint.
         """
-        loaded = load(path, step=step, image_backbone=image_backbone)
-        return cls.from_loaded(loaded, **overrides)
+        saved = load_model(path, step=step, image_backbone=image_backbone)
+        return cls(saved, **options)
 
     @classmethod
     def from_checkpoint(
-        cls,
-        path: PathLike,
-        *,
-        image_backbone: PathLike | None = None,
-        **overrides: Any,
+        cls, path: PathLike, *, image_backbone: PathLike | None = None, **options: Any
     ) -> Detector:
-        """Detector of a folder with a model, wherever it came from.
+        """Detector of an exported folder, or of one checkpoint without its run.
 
         Args:
-            path: What `radejax export` wrote, in either format; the `checkpoints`
-                folder of a run, or one step in it (without the rest of the run); or
-                the run itself.
-            image_backbone: Folder of DINOv3's weights, for packed radar-camera models,
-                which are without them.
-            **overrides: Arguments of `Detector`.
-
-        Raises:
-            FileNotFoundError: There is no model in that folder.
+            path: See `load_model`.
+            image_backbone: Weights of the image backbone, if the folder has none.
+            **options: Arguments of `Detector`.
         """
-        return cls.from_loaded(load(path, image_backbone=image_backbone), **overrides)
+        return cls(load_model(path, image_backbone=image_backbone), **options)
 
     @classmethod
     def from_torch(
         cls,
         path_or_state_dict: PathLike | Mapping[str, Any],
         *,
-        grid: RadarGrid | None = None,
         image_backbone: PathLike | None = None,
         model_overrides: Mapping[str, Any] | None = None,
-        **overrides: Any,
+        **options: Any,
     ) -> Detector:
         """Detector of an official RADE-Net or DinoRADE checkpoint.
 
         Args:
-            path_or_state_dict: `.pth` file, or mapping of names to arrays. Names with
-                `rad_backbone.` are DinoRADE's.
-            grid: K-Radar's if None.
-            image_backbone: Folder of DINOv3's weights, for DinoRADE checkpoints
-                without them.
-            model_overrides: For what names and shapes cannot tell.
-            **overrides: Arguments of `Detector`.
+            path_or_state_dict: File, or mapping of names to arrays, see `load_torch`.
+            image_backbone: Folder of DINOv3, for DinoRADE files without its weights.
+            model_overrides: Fields of the model that names and shapes do not determine.
+            **options: Arguments of `Detector`.
         """
-        loaded = load_torch(
-            path_or_state_dict, image_backbone=image_backbone, **(model_overrides or {})
+        overrides = model_overrides or {}
+        saved = load_torch(
+            path_or_state_dict, image_backbone=image_backbone, **overrides
         )
-        if grid is not None:
-            loaded = dataclasses.replace(loaded, grid=grid)
-        return cls.from_loaded(loaded, **overrides)
+        return cls(saved, **options)
 
-    @classmethod
-    def from_config(
-        cls,
-        config: Mapping[str, Any],
-        variables: Mapping[str, Any],
-        grid: RadarGrid,
-        **overrides: Any,
+    def __repr__(self) -> str:
+        grid = " x ".join(map(str, self.grid.shape_drea))
+        return (
+            f"Detector({type(self.model).__name__}, grid {grid}, classes "
+            f"{', '.join(self.classes)}, step {self.step}, on {self.sharding})"
+        )
+
+    def replace(
+        self,
+        *,
+        variables: Mapping[str, Any] | None = None,
+        batch_sizes: Sequence[int] | None = None,
     ) -> Detector:
-        """Detector with the model, thresholds and mapping that a config states."""
-        arguments = settings_of_config(config) | overrides
-        return cls(models.build(config["model"]), variables, grid, **arguments)
+        """The same detector with other variables or batch sizes, compiled together."""
+        other = copy.copy(self)
+        other._lock = threading.Lock()
+        other.num_radar_only = other.num_invalid_frames = 0
+        if variables is not None:
+            other.variables = jax.device_put(variables, self.replicated)
+        if batch_sizes is not None:
+            other._set_batch_sizes(batch_sizes)
+        return other
 
-    @property
-    def num_impossible(self) -> int:
-        """Frames so far with a cell that no power gives (NaN, infinite): their boxes mean
-        nothing. The first is warned of, of arrays on a device at a later call or here.
-        """
-        return self._impossible.total()
+    def _set_batch_sizes(self, sizes: Sequence[int]) -> None:
+        """Each rounded up to a multiple of the devices of this process."""
+        is_possible = len(sizes) > 0 and min(sizes, default=0) >= 1
+        require(is_possible, "batch_sizes", sizes, "integers of at least 1")
+        count = len(self.sharding.addressable_devices)
+        self._batch_sizes = sorted({-(-size // count) * count for size in sizes})
 
     # Use -----------------------------------------------------------------------------
 
@@ -230,96 +213,83 @@ class Detector:
         nms_iou: float | None = None,
         roi: Sequence[float] | str | None = None,
     ) -> Detections:
-        """Finds the objects in one frame or many.
+        """Detect the objects in one frame or many.
 
         Args:
-            frames: Projections `[B, R, A, D+E]` or `[R, A, D+E]` as
-                `radejax.data.projection.project` makes them; tesseracts
-                `[B, D, R, E, A]` or `[D, R, E, A]` in linear power, projected on the
-                device; the path of a tesseract or projection file; a list of such
-                arrays or paths; or a `Batch`, with its images and cameras. Arrays are
-                copied: their memory may be refilled after the call.
-            image: Left front images for radar-camera models: `[B, H, W, 3]` uint8, or
-                a list with one image, path or None a frame.
-            camera: Their calibration: one for all frames, or a list with one (or None)
-                a frame; see `radejax.inference.inputs.prepare`. Frames without image or
-                calibration are predicted from the radar alone and counted in
-                `num_radar_alone`, or are an error, as `camera_options` say.
-            score_threshold: Instead of the detector's own.
-            nms_iou: Likewise.
-            roi: Likewise; `(x0, x1, y0, y1, z0, z1)` in metres.
+            frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in
+                linear power, or one without B; paths of either, or a list of those; or
+                a `Batch`, whose image and camera are used.
+            image: For a radar-camera model: `[B, H, W, 3]` uint8, embedded images, or a
+                list of arrays, paths and None.
+            camera: One calibration for all frames, or a list of one per frame.
+            score_threshold: Of this call.
+            nms_iou: Of this call.
+            roi: Of this call.
 
         Returns:
-            Detections with a leading batch axis, also for a single frame.
+            Detections of B frames, on the device.
 
         Raises:
-            UserError: The shape fits neither, or frames of a list differ in shape;
-                says what was expected.
+            UserError: A shape or number is not as expected.
         """
-        if isinstance(frames, Batch):
-            image, camera = frames.image, frames.camera
-            frames = frames.projection
-        radar, is_tesseract = detector_inputs.radar_batch(frames, self.grid)
-        num_frames = radar.shape[0]
-        if num_frames == 0:
-            raise UserError("no frames: the batch is empty")
-        self._impossible.look(radar, is_tesseract)
-        given = radar, *self._camera_inputs(image, camera, num_frames)
+        inputs: Any
+        if isinstance(frames, Batch):  # checked when it was made
+            is_tesseract = False
+            inputs = frames.projection, frames.image, frames.camera
+        else:
+            radar, is_tesseract = detector_inputs.radar_batch(frames, self.grid)
+            inputs = radar, *self._camera_inputs(image, camera, len(radar))
+            num_invalid = detector_inputs.count_invalid(
+                radar, is_tesseract, warn=not self.num_invalid_frames
+            )
+            with self._lock:
+                self.num_invalid_frames += num_invalid
+        detector_inputs.check_backbone(inputs[1], self.variables)
         roi = self.roi if roi is None else detector_inputs.named_region(roi)
         settings = (
             np.float32(
                 self.score_threshold if score_threshold is None else score_threshold
             ),
             np.float32(self.nms_iou if nms_iou is None else nms_iou),
-            np.asarray(EVERYWHERE if roi is None else roi, np.float32),
+            np.asarray(UNBOUNDED_ROI if roi is None else roi, np.float32),
         )
-        largest = self._batch_sizes[-1]
         parts = []
-        for start in range(0, num_frames, largest):
-            chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], given)
-            count = chunk[0].shape[0]
-            size = next(s for s in self._batch_sizes if s >= count)
-            chunk = jax.tree.map(
-                lambda x, s=size: detector_inputs.pad_batch(x, s), chunk
-            )
-            chunk = jax.tree.map(self._to_device, chunk)
-            found = self._run(
-                self.variables, *chunk, *settings, is_tesseract=is_tesseract
-            )
-            parts.append(jax.tree.map(lambda x, n=count: x[:n], found))
+        largest = self._batch_sizes[-1]
+        for start in range(0, len(inputs[0]), largest):
+            chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], inputs)
+            parts.append(self._detect(chunk, settings, is_tesseract))
         if len(parts) == 1:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def warmup(
-        self, batch_size: int = 1, *, tesseract: bool = False, image: bool | None = None
-    ) -> Detector:
-        """Compiles for a batch size, so that the first real call is fast.
+    def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
+        """Images and cameras as arrays; counts the frames without."""
+        if not self.takes_camera:
+            if image is None and camera is None:
+                return None, None
+            raise UserError("image and camera are given, but the model is radar-only")
+        image, camera, num_missing = detector_inputs.prepare(
+            image, camera, num_frames, self.model, self.camera_options
+        )
+        with self._lock:
+            self.num_radar_only += num_missing
+        return image, camera
 
-        Args:
-            batch_size: Of the calls to come.
-            tesseract: They give tesseracts, not projections.
-            image: They give images; None: if the model takes them.
-        """
-        shape = self.grid.shape_drea if tesseract else self.grid.projection_shape
-        inputs: tuple[Any, ...] = (np.zeros((batch_size, *shape), np.float32),)
-        if self.takes_camera and image in (None, True):
-            pictures, camera = detector_inputs.placeholder(batch_size, self.model)
-            inputs += pictures, camera.replace(is_valid=np.ones(batch_size, bool))
-        jax.block_until_ready(self(*inputs))
-        return self
-
-    def with_batch_sizes(self, batch_sizes: Sequence[int]) -> Detector:
-        """The same detector compiling other batch sizes; weights are shared."""
-        other = copy.copy(self)
-        other._batch_sizes = detector_inputs.checked_sizes(batch_sizes)
-        other._impossible = detector_inputs.ImpossibleFrames()
-        return other
+    def _detect(self, inputs: Any, settings: Any, is_tesseract: bool) -> Detections:
+        """Detections of at most the largest batch size."""
+        count = inputs[0].shape[0]
+        size = next(size for size in self._batch_sizes if size >= count)
+        inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
+        found = self._run(self.variables, *inputs, *settings, is_tesseract=is_tesseract)
+        if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
+            # Devices that share cores miss each other where batches pile up.
+            jax.block_until_ready(found)
+        return found if count == size else jax.tree.map(lambda x: x[:count], found)
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
         """Detections of one item after the other, each started before the last ends.
 
-        Reading and projecting the next item overlap with the device's work on this.
+        Reading and projecting the next item overlap with the work of the device.
 
         Args:
             frames: Items as `__call__` takes them first; a tuple is frames, image and
@@ -328,15 +298,30 @@ class Detector:
         """
         pending = None
         for item in frames:
-            inputs = item if isinstance(item, tuple) else (item,)
-            started = self(*inputs, **settings)
+            started = self(*(item if isinstance(item, tuple) else (item,)), **settings)
             if pending is not None:
                 yield pending
             pending = started
         if pending is not None:
             yield pending
 
-    # Inside --------------------------------------------------------------------------
+    def warmup(
+        self, batch_size: int = 1, *, tesseract: bool = False, image: bool | None = None
+    ) -> Detector:
+        """Compile for a batch size, so that the first call is fast.
+
+        Args:
+            batch_size: Of the calls to come.
+            tesseract: They pass tesseracts, not projections.
+            image: They pass images; None: if the model takes them.
+        """
+        shape = self.grid.shape_drea if tesseract else self.grid.projection_shape
+        inputs: tuple[Any, ...] = (np.zeros((batch_size, *shape), np.float32),)
+        if self.takes_camera and image in (None, True):
+            images, camera = detector_inputs.placeholder(batch_size, self.model)
+            inputs += images, camera.replace(is_valid=np.ones(batch_size, bool))
+        jax.block_until_ready(self(*inputs))
+        return self
 
     def detect_function(self) -> Callable[..., Detections]:
         """The pure function that is jitted: `detect` of this model and options.
@@ -344,13 +329,14 @@ class Detector:
         Its arguments are variables, frames, image, camera (or None, None), score
         threshold, NMS IoU, region `[6]`, and the keyword `is_tesseract`.
         """
-        grid = models.map_grid(self.grid, self.model, self.azimuth_mapping)
+        mapping = self.saved.config.data.azimuth_mapping
+        grid = models.map_grid(self.grid, self.model, mapping)
 
         def function(
-            variables: Mapping[str, Any],
+            variables: Any,
             frames: jax.Array,
             image: jax.Array | None,
-            camera: Camera | ReferencePoints | None,
+            camera: Any,
             score_threshold: jax.Array,
             nms_iou: jax.Array,
             roi: jax.Array,
@@ -367,33 +353,23 @@ class Detector:
 
         return function
 
-    def _camera_inputs(
-        self,
-        image: detector_inputs.Images | None,
-        camera: detector_inputs.Calibrations | None,
-        num_frames: int,
-    ) -> tuple[Array | None, Camera | ReferencePoints | None]:
-        """Images and cameras as arrays; counts the frames without."""
-        if not self.takes_camera:
-            if image is None and camera is None:
-                return None, None
-            raise UserError("image and camera are given, but the model is radar alone")
-        image, camera, num_missing = detector_inputs.prepare(
-            image, camera, num_frames, self.model, self.camera_options
-        )
-        detector_inputs.check_backbone(image, self.variables)
-        with self._lock:
-            self.num_radar_alone += num_missing
-        return image, camera
-
-    def _to_device(self, x: Any) -> jax.Array:
-        """Copy on the device: the caller may refill its memory at once.
+    def put(self, x: Shaped[Any, "b ..."]) -> Shaped[jax.Array, "B ..."]:
+        """Copy the rows of this process to the devices; the caller may then reuse `x`.
 
         On CPU `device_put` shares aligned memory whatever `may_alias` says; elsewhere
         the transfer reads it after the call returns.
         """
         if not isinstance(x, np.ndarray):
-            return jax.device_put(x, self.device)
-        if self.device.platform == "cpu":
-            return jax.device_put(x.copy(), self.device)
-        return jax.block_until_ready(jax.device_put(x, self.device))
+            return jax.device_put(x, self.sharding)
+        is_cpu = jax.default_backend() == "cpu"
+        x = x.copy() if is_cpu else x
+        placed = jax.make_array_from_process_local_data(self.sharding, x)
+        return placed if is_cpu else jax.block_until_ready(placed)
+
+
+def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
+    """Repeat the last frame up to a batch size."""
+    if x.shape[0] == size:
+        return x
+    xp: Any = np if isinstance(x, np.ndarray) else jnp
+    return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0], 0)])

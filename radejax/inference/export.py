@@ -1,29 +1,30 @@
-"""Models as folders without this package: StableHLO, ONNX, or Hugging Face's files.
+"""Models as folders that work without radejax: StableHLO, ONNX, Hugging Face.
 
-All formats hold `config.json` and `model.safetensors`, which
-`Detector.from_checkpoint` reads back.
+All formats hold `config.json` and `model.safetensors`, which `load_model` reads.
+docs/deploy.md says how to use each of them.
 """
 
 from __future__ import annotations
 
+import logging
 import pathlib
-import shutil
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import flatbuffers
 import jax
 import jax.export  # not a part of `import jax`
 import jax.numpy as jnp
 from flax import traverse_util
-from ml_collections import ConfigDict
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.data.encoding import to_float
 from radejax.geometry.camera import Camera
-from radejax.inference import export_onnx, exported_loader, packed
+from radejax.inference import exported_loader
 from radejax.inference.detector import Detector
-from radejax.inference.packed import BACKBONE
+from radejax.inference.saved import save_model
+from radejax.models.dinorade import IMAGE_BACKBONE
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
@@ -39,6 +40,31 @@ CAMERA_SHAPES = {
 }
 """Float fields of `radejax.geometry.camera.Camera`, beside the bool `is_valid`."""
 
+SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
+RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
+
+_README = """---
+library_name: radejax
+pipeline_tag: object-detection
+tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
+---
+
+# {name}: 3D object detection in 4D radar tensors
+
+Format: {format}. Classes: {classes}. Input: projections [B, {shape}]. `config.json` holds
+the config, the axes of the sensor and what is left out ({left_out}); `model.safetensors` the
+weights. Use: `radejax.Detector.from_checkpoint(folder)`, or {use}; inputs and outputs are
+described in docs/deploy.md of radejax.{backbone}
+
+{origin}
+"""
+_USE = {
+    "stablehlo": "`from load import load; detect = load()`, which needs `pip install jax "
+    "flatbuffers`",
+    "onnx": "ONNX Runtime with `detector.onnx`, or `network.onnx` before decoding",
+    "huggingface": "download the folder from the Hub first",
+}
+
 
 def export(
     detector: Detector,
@@ -46,36 +72,34 @@ def export(
     *,
     kind: str = "stablehlo",
     platforms: Sequence[str] = PLATFORMS,
-    training_config: ConfigDict | None = None,
     with_backbone: bool = False,
     batch_size: int = 1,
     half: bool = False,
 ) -> dict[str, Any]:
-    """Writes a folder with the model; existing files of the same names are replaced.
+    """Write a folder with the model; existing files of the same names are replaced.
 
     Args:
         detector: What to export, with its thresholds as defaults.
-        folder: Made if missing.
-        kind: "stablehlo": program, weights and `load.py`, which needs jax and numpy
-            alone; "onnx": network, and network with decoding and NMS, for one batch
-            size; "huggingface": weights, config and model card.
-        platforms: That StableHLO shall run on: of `KNOWN_PLATFORMS`; "gpu" is CUDA.
-        training_config: Kept in `config.json`.
-        with_backbone: Keep the image transformer's weights, see `write_packed`.
+        folder: Created if missing.
+        kind: "stablehlo": program, weights and `load.py`, which needs jax, flatbuffers
+            and numpy only; "onnx": network, and network with decoding and NMS, for one
+            batch size; "huggingface": weights, config and model card.
+        platforms: Platforms of StableHLO, of `KNOWN_PLATFORMS`; "gpu" is CUDA.
+        with_backbone: Keep the weights of the image transformer, see `save_model`.
         batch_size: Frames of a call of the ONNX files.
-        half: Store float16; "huggingface" alone.
+        half: Store float16; only of "huggingface".
 
     Returns:
         "kind", "folder", "bytes" and "left_out".
 
     Raises:
-        UserError: An unknown kind or platform; ONNX without jax2onnx; half
-            of a program, which takes float32 weights.
+        UserError: An unknown kind or platform; ONNX without jax2onnx; half with
+            a program, which takes float32 weights.
     """
     if kind not in FORMATS:
         raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
     if half and kind != "huggingface":
-        raise UserError("--half: a program takes float32; give --format huggingface")
+        raise UserError("--half is only supported with --format huggingface")
     platforms = _checked_platforms(platforms)
     folder = pathlib.Path(folder)
     programs: dict[str, bytes] = {}
@@ -83,37 +107,44 @@ def export(
         program = stablehlo(detector, platforms, with_backbone=with_backbone)
         programs = {PROGRAM_FILE: program}
     elif kind == "onnx":
-        if detector.takes_camera and detector.model.vit is not None and with_backbone:
-            raise UserError(
-                "the image transformer does not convert to ONNX: leave --with-backbone, "
-                "and give the file embedded images (docs/deploy.md)"
-            )
-        variables, is_embedded = _exported_variables(detector, with_backbone)
-        shapes = _input_shapes(detector, batch_size, is_embedded)
-        programs = export_onnx.onnx_files(detector, variables, shapes)
-    content = packed.write_packed(
+        programs = onnx_files(detector, batch_size, with_backbone=with_backbone)
+    content = save_model(
+        detector.saved,
         folder,
-        detector,
-        training_config=training_config,
         with_backbone=with_backbone,
         half=half,
         programs=programs,
     )
     if kind == "stablehlo":
-        _copy_loader(folder)
-        text = _program_readme(detector, platforms)
-    elif kind == "onnx":
-        text = _onnx_readme(detector, batch_size)
-    else:
-        text = _model_card(detector, content, half)
-    files.write_text(folder / "README.md", text)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        loader = pathlib.Path(exported_loader.__file__)
+        files.write_text(folder / "load.py", loader.read_text())
+    files.write_text(folder / "README.md", _readme(detector, kind, content["left_out"]))
     return {
         "kind": kind,
         "folder": str(folder),
-        "bytes": size,
+        "bytes": sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()),
         "left_out": content["left_out"],
     }
+
+
+def _readme(detector: Detector, kind: str, left_out: Sequence[str]) -> str:
+    config = detector.saved.config
+    is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
+    return _README.format(
+        name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
+        format=kind,
+        classes=", ".join(detector.classes),
+        shape=", ".join(map(str, detector.grid.projection_shape)),
+        left_out=", ".join(left_out) or "nothing",
+        use=_USE[kind],
+        backbone="\nThe license of the frozen DINOv3 weights restricts redistribution: "
+        "download them from their owner and pass `image_backbone=FOLDER`."
+        * bool(left_out),
+        origin="Trained on simulated data only: no use on frames of a real radar."
+        if is_simulated
+        else "Before publishing, check the license of the data that the weights were "
+        "trained on\n(K-Radar: CC BY-NC-ND).",
+    )
 
 
 def _checked_platforms(platforms: Sequence[str]) -> tuple[str, ...]:
@@ -125,209 +156,128 @@ def _checked_platforms(platforms: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def stablehlo(
-    detector: Detector,
-    platforms: Sequence[str] = PLATFORMS,
-    *,
-    with_backbone: bool = False,
-) -> bytes:
-    """The serialised program: weights, inputs, thresholds -> dictionary of arrays.
-
-    Inputs are projections `[B, R, A, D+E]`, and for a radar-camera model also images
-    and a dictionary of the camera's fields. B is symbolic. Without the backbone the
-    images are embedded ones.
-
-    Raises:
-        UserError: Weights that are not float32.
-    """
-    variables, is_embedded = _exported_variables(detector, with_backbone)
-    flat = traverse_util.flatten_dict(variables, sep="/")
-    if odd := sorted(name for name, x in flat.items() if x.dtype != jnp.float32):
-        raise UserError(f"weights must be float32 to be exported; {odd[0]} is not")
-    function = detector.detect_function()
-
-    def program(
-        weights: Mapping[str, Any], inputs: tuple[Any, ...], *settings: Any
-    ) -> dict[str, jax.Array]:
-        projection, *rest = inputs
-        image, camera = rest if rest else (None, None)
-        if camera is not None:
-            camera = Camera(**camera)
-        tree = traverse_util.unflatten_dict(weights, sep="/")
-        found = function(tree, projection, image, camera, *settings, is_tesseract=False)
-        names = ("boxes", "scores", "classes", "is_valid", "num_truncated")
-        return {name: getattr(found, name) for name in names}
-
-    (batch,) = jax.export.symbolic_shape("b")
-
-    inputs = _input_shapes(detector, batch, is_embedded)
-    weights = {name: _array(*x.shape) for name, x in flat.items()}
-    exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
-        weights, inputs, _array(), _array(), _array(6)
-    )
-    return bytes(exported.serialize())
+# Programs ----------------------------------------------------------------------------
 
 
 def _array(*shape: Any, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, dtype)
 
 
-def _exported_variables(
-    detector: Detector, with_backbone: bool
-) -> tuple[dict[str, Any], bool]:
-    """What the file holds, and whether its images are embedded ones."""
+def _exported(
+    detector: Detector, batch: Any, with_backbone: bool
+) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """Variables of a program, and shapes of its inputs.
+
+    Inputs are projections, and of a radar-camera model images (embedded ones without
+    the backbone) and a dictionary of the fields of the camera.
+    """
     variables = {name: dict(tree) for name, tree in detector.variables.items()}
-    is_embedded = detector.takes_camera and not (
-        with_backbone or detector.model.vit is None
-    )
-    if is_embedded:
-        variables["params"].pop(BACKBONE, None)
-    return variables, is_embedded
-
-
-def _input_shapes(detector: Detector, batch: Any, is_embedded: bool) -> tuple[Any, ...]:
-    """Of projections, and for a camera of images and the fields of `Camera`."""
     projection = _array(batch, *detector.grid.projection_shape)
     if not detector.takes_camera:
-        return (projection,)
+        return variables, (projection,)
     model = detector.model
     image = _array(batch, *model.image_size, 3, dtype=jnp.uint8)
-    if is_embedded:
+    if not (with_backbone or model.vit is None):
+        variables["params"].pop(IMAGE_BACKBONE, None)
         image = _array(batch, *model.feature_shape)
     camera = {name: _array(batch, *s) for name, s in CAMERA_SHAPES.items()}
-    return projection, image, camera | {"is_valid": _array(batch, dtype=jnp.bool_)}
+    camera["is_valid"] = _array(batch, dtype=jnp.bool_)
+    return variables, (projection, image, camera)
 
 
-def _copy_loader(folder: pathlib.Path) -> None:
-    """`load.py`, and the pure-Python library that `jax.export` reads files with."""
-    files.write_text(
-        folder / "load.py", pathlib.Path(exported_loader.__file__).read_text()
+def _detect(
+    detector: Detector, variables: Any, inputs: Sequence[Any], settings: Sequence[Any]
+) -> dict[str, jax.Array]:
+    """The detector on inputs as `_exported` shapes them; the program of both formats."""
+    projection, *rest = inputs
+    image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
+    function = detector.detect_function()
+    found = function(
+        variables, projection, image, camera, *settings, is_tesseract=False
     )
-    source = pathlib.Path(flatbuffers.__file__).parent
-    target = folder / "third_party" / "flatbuffers"
-    target.mkdir(parents=True, exist_ok=True)
-    for path in source.glob("*.py"):
-        shutil.copyfile(path, target / path.name)
+    return {name: getattr(found, name) for name in RESULTS}
 
 
-def _program_readme(detector: Detector, platforms: Sequence[str]) -> str:
-    grid = detector.grid
-    shape = ", ".join(map(str, grid.projection_shape))
-    return f"""# A radar detector as a program
+def stablehlo(
+    detector: Detector,
+    platforms: Sequence[str] = PLATFORMS,
+    *,
+    with_backbone: bool = False,
+) -> bytes:
+    """The serialized program: weights, inputs, settings -> dictionary of arrays.
 
-`detector.stablehlo` goes from radar projections to boxes, network, decoding and rotated
-NMS included, for any batch size, on {", ".join(platforms)}. It needs `jax` and `numpy`:
+    The batch size is symbolic. Without the backbone the images are embedded ones.
+    """
+    (batch,) = jax.export.symbolic_shape("b")
+    variables, inputs = _exported(detector, batch, with_backbone)
+    flat = traverse_util.flatten_dict(variables, sep="/")
 
-```python
-from load import load
-detect = load()
-found = detect(projection)   # [B, {shape}] float32
-```
+    def program(weights: Any, inputs: Any, *settings: Any) -> dict[str, jax.Array]:
+        tree = traverse_util.unflatten_dict(weights, sep="/")
+        return _detect(detector, tree, inputs, settings)
 
-`found` is a dictionary of arrays with {detector.decode_options["max_detections"]} rows a
-frame: `boxes` [B, K, 7] (x, y, z, l, w, h, yaw; metres and radians, x forward, y left, z
-up, seen from the radar), `scores` [B, K], `classes` [B, K] (indices into `classes` of
-`config.json`), `is_valid` [B, K] (True where a row is a detection) and `num_truncated` [B]
-(peaks that found no row). `detect` also takes `score_threshold`, `nms_iou` and `roi`
-(x0, x1, y0, y1, z0, z1 in metres).
-
-A projection is the maximum of the power over elevation ({grid.num_doppler} Doppler
-channels) and over Doppler ({grid.num_elevation} elevation channels), on a logarithmic
-scale: `radejax.data.projection.project`. The sensor's axes are in `config.json` under
-`grid`.
-{_camera_text(detector)}
-| file | content |
-|---|---|
-| `detector.stablehlo` | the program, written by `jax.export` |
-| `model.safetensors` | its weights, float32 |
-| `config.json` | model, grid, classes, thresholds, training config |
-| `load.py` | the loader |
-| `third_party/flatbuffers` | pure Python, Apache-2.0; jax reads the program with it |
-
-`radejax.Detector.from_checkpoint(folder)` reads the same folder.
-"""
+    weights = {name: _array(*x.shape) for name, x in flat.items()}
+    settings = [_array(*shape) for shape in SETTINGS.values()]
+    exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
+        weights, inputs, *settings
+    )
+    return bytes(exported.serialize())
 
 
-def _onnx_readme(detector: Detector, batch_size: int) -> str:
-    shape = ", ".join(map(str, detector.grid.projection_shape))
-    camera = _camera_text(detector)
-    if camera:
-        camera += (
-            "Here each field is an input of its own: `camera_intrinsics` and so on.\n"
+def onnx_files(
+    detector: Detector, batch_size: int, *, with_backbone: bool = False
+) -> dict[str, bytes]:
+    """`network.onnx` and, with decoding and rotated NMS, `detector.onnx`.
+
+    Raises:
+        UserError: jax2onnx is not installed, or the image transformer is to be kept.
+    """
+    if with_backbone and getattr(detector.model, "vit", None) is not None:
+        raise UserError(
+            "the image backbone cannot be exported to ONNX: drop --with-backbone and "
+            "feed precomputed embeddings (docs/deploy.md)"
         )
-    return f"""# A radar detector as ONNX files
+    try:
+        from jax2onnx import to_onnx
+    except ModuleNotFoundError as error:
+        raise UserError(
+            'format "onnx" needs jax2onnx: pip install "radejax[onnx]"'
+        ) from error
 
-| file | from | to |
-|---|---|---|
-| `network.onnx` | `projection` | `heatmap_logits`, `box_params`: before decoding |
-| `detector.onnx` | `projection` and settings | detections, as below |
+    variables, shapes = _exported(detector, batch_size, with_backbone)
+    leaves, tree = jax.tree.flatten(shapes)
+    names = ["projection", "image"][: len(shapes)]
+    names += [f"camera_{name}" for name in sorted(shapes[2])] if shapes[2:] else []
 
-```python
-import numpy as np, onnxruntime
-session = onnxruntime.InferenceSession("detector.onnx")
-everywhere = np.array([-1e9, 1e9] * 3, np.float32)   # x0, x1, y0, y1, z0, z1 in metres
-settings = {{"score_threshold": np.float32(0.3), "nms_iou": np.float32(0.3), "roi": everywhere}}
-boxes, scores, classes, is_valid, num_truncated = session.run(
-    None, {{"projection": x, **settings}})   # x [{batch_size}, {shape}] float32
-```
+    def network(*arrays: jax.Array) -> list[jax.Array]:
+        projection, *rest = jax.tree.unflatten(tree, arrays)
+        camera = [rest[0], Camera(**rest[1])] if rest else []
+        inputs = to_float(projection), *camera
+        maps: Any = detector.model.apply(variables, *inputs, train=False)
+        return [maps.heatmap_logits, maps.box_params]
 
-Rows, units and the projection are those of `docs/deploy.md` of radejax; `config.json` has
-grid, classes and thresholds. `radejax.Detector.from_checkpoint(folder)` reads this folder.
-{camera}"""
+    def program(*arrays: jax.Array) -> list[jax.Array]:
+        inputs = jax.tree.unflatten(tree, arrays[: len(leaves)])
+        found = _detect(detector, variables, inputs, arrays[len(leaves) :])
+        return list(found.values())
 
+    def convert(function: Any, extra: Mapping[str, Any], results: Any) -> bytes:
+        given = leaves + [_array(*shape) for shape in extra.values()]
+        outputs = list(results)
+        model = to_onnx(
+            function, given, input_names=[*names, *extra], output_names=outputs
+        )
+        return model.SerializeToString()
 
-def _camera_text(detector: Detector) -> str:
-    if not detector.takes_camera:
-        return ""
-    size = detector.model.image_size
-    return f"""
-The model takes a camera: `detect(projection, image, camera)` with images
-[B, {size[0]}, {size[1]}, 3] uint8, or what the image backbone made of them
-[B, {", ".join(map(str, detector.model.feature_shape))}] float32 if `config.json` lists it
-under `left_out`, and `camera` a dictionary of arrays: `cam_from_ego` [B, 3, 4],
-`intrinsics` [B, 4], `distortion` [B, 5], `max_radius` [B], `size_px` [B, 2] (float32) and
-`is_valid` [B] (bool, False: no image, radar alone), the fields of
-`radejax.geometry.camera.Camera`.
-"""
-
-
-def _model_card(detector: Detector, content: Mapping[str, Any], half: bool) -> str:
-    simulation = (content["training_config"] or {}).get("simulation") or {}
-    origin = (
-        "Before publishing, check the licence of the data that the weights were trained on\n"
-        "(K-Radar: CC BY-NC-ND)."
-    )
-    if simulation.get("scenes") == "procedural":
-        origin = "Trained on simulated data alone: it does not know real radar frames."
-    name = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}[content["model"]["name"]]
-    left_out = ""
-    if content["left_out"]:
-        left_out = """
-The frozen DINOv3 weights are not part of this repository: their licence restricts passing
-them on. Download them from their owner and name the folder:
-
-```python
-detector = radejax.Detector.from_checkpoint("this folder", image_backbone="dinov3 folder")
-```
-"""
-    return f"""---
-library_name: radejax
-pipeline_tag: object-detection
-tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
----
-
-# {name}
-
-3D object detection in 4D radar tensors. Classes: {", ".join(detector.classes)}.
-
-```python
-import radejax
-detector = radejax.Detector.from_checkpoint("this folder")
-detector(projection).to_list()   # [B, {", ".join(map(str, detector.grid.projection_shape))}]
-```
-{left_out}
-`config.json` holds the model, the sensor's grid, the decoding thresholds and the training
-config; `model.safetensors` the weights, float{16 if half else 32}, by their names in Flax.
-
-{origin}
-"""
+    log = logging.getLogger("onnx_ir")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it warns of every shape that is not static
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
+            return {
+                "network.onnx": convert(network, {}, ("heatmap_logits", "box_params")),
+                "detector.onnx": convert(program, SETTINGS, RESULTS),
+            }
+    finally:
+        log.setLevel(level)

@@ -1,4 +1,7 @@
-"""Boxes from radar with jax and numpy alone: python load.py projection.npy [...]."""
+"""Boxes from radar without radejax: python load.py projection.npy [...].
+
+It needs `pip install jax flatbuffers`.
+"""
 
 import hashlib
 import json
@@ -6,17 +9,19 @@ import pathlib
 import sys
 
 import jax
+import jax.export
 import numpy as np
 
 FOLDER = pathlib.Path(__file__).resolve().parent
-sys.path.append(str(FOLDER / "third_party"))  # flatbuffers, with which jax.export reads
 
 
 def read_file(path: pathlib.Path, sha256: str) -> bytes:
     """Content of a file; `ValueError` if it is not what was exported."""
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise ValueError(f"{path}: damaged, its sha256 is not the one in config.json")
+        raise ValueError(
+            f"{path}: corrupted, its sha256 differs from the one in config.json"
+        )
     return data
 
 
@@ -34,7 +39,7 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     folder = pathlib.Path(folder)
     config = json.loads((folder / "config.json").read_text())
     data = {name: read_file(folder / name, x) for name, x in config["sha256"].items()}
-    config = config["decode"]
+    config = config["config"]["decode"]
     run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)
     weights = jax.device_put(read_weights(data["model.safetensors"]), device)
 

@@ -1,6 +1,6 @@
-"""Frames, images and calibrations as people hold them, made into a model's arrays.
+"""Frames, images and calibrations as users have them, made into arrays of a model.
 
-What comes out is what `data.pipeline` puts into `Batch.image` and `Batch.camera`.
+The results are what `data.pipeline` puts into `Batch.image` and `Batch.camera`.
 """
 
 from __future__ import annotations
@@ -8,14 +8,12 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
-import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Real, Shaped, UInt8
+from jaxtyping import Bool, Real, UInt8
 
 from radejax.core.errors import UserError
 from radejax.core.structures import ROIS, Array
@@ -48,24 +46,29 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bo
     Args:
         frames: Projections or tesseracts, one array or a list of them, or the path of
             a file or several; see `Detector`.
-        grid: Of the sensor.
+        grid: Axes of the sensor.
 
     Returns:
         `[B, R, A, D+E]` or `[B, D, R, E, A]`, and whether they are tesseracts.
 
     Raises:
-        UserError: The shape fits neither, a list is empty, or its shapes differ.
+        UserError: The shape is of neither, or there is no frame.
     """
     if isinstance(frames, PathLike):
         frames = [frames]
     if isinstance(frames, Sequence):
-        frames = _stack_frames(frames, grid)
+        if not frames:
+            raise UserError("no frames: the list is empty")
+        frames = np.stack(
+            [read_frame(x, grid) if isinstance(x, PathLike) else x for x in frames]
+        )
     shape = tuple(np.shape(frames))
     projection, tesseract = grid.projection_shape, grid.shape_drea
     for expected, is_tesseract in ((projection, False), (tesseract, True)):
-        if shape[-len(expected) :] == expected and len(shape) - len(expected) < 2:
-            is_batch = len(shape) > len(expected)
-            return frames if is_batch else frames[None], is_tesseract
+        if shape == expected:
+            return frames[None], is_tesseract
+        if shape[1:] == expected and shape[0]:
+            return frames, is_tesseract
     raise UserError(
         f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
         f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
@@ -76,89 +79,31 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bo
 _MAX_DECIBELS = 300.0
 
 
-def _num_impossible(frames: Real[Array, "B ..."], is_tesseract: bool) -> Any:
-    """Number of frames that are no linear power (a tesseract), or no level of it.
+def count_invalid(
+    frames: Real[Any, "B ..."], is_tesseract: bool, *, warn: bool = True
+) -> int:
+    """Number of frames whose values are not a linear power, or a level of a projection.
 
-    Decibels are neither: noise alone spans more than they do, with cells below 1.
+    Decibels are neither: noise alone spans more than they do, with bins below 1. Arrays
+    on a device are not checked, nor is uint8, of which every value is a level.
     """
+    if not isinstance(frames, np.ndarray) or frames.dtype == np.uint8:
+        return 0
     axes = tuple(range(1, frames.ndim))
     low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
-    limits = (
-        (0.0, np.finfo(np.float32).max) if is_tesseract else (-MAX_LEVEL, MAX_LEVEL)
-    )
-    is_power = (low >= limits[0]) & (high <= limits[1])
+    limit = np.finfo(np.float32).max if is_tesseract else MAX_LEVEL
+    lowest = 0.0 if is_tesseract else -MAX_LEVEL
     is_decibels = (low > 1.0) & (high <= _MAX_DECIBELS)
-    return (~is_power | is_decibels).sum()
-
-
-_num_on_device = jax.jit(_num_impossible, static_argnums=1)
-
-
-class ImpossibleFrames:
-    """Counts frames with cells that no power gives, NaN for example; warns of the first.
-
-    Arrays on a device are looked at there and nothing waits for them: their number is
-    fetched in a later call that finds it computed, or when the total is asked for.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._total, self._started = 0, list[tuple[Any, int]]()
-
-    def look(self, frames: Real[Any, "B ..."], is_tesseract: bool) -> None:
-        """Looks at the frames of `radar_batch`; traced ones (`jit`) have no values."""
-        if frames.dtype == np.uint8:  # of records: every value is a level
-            return
-        if isinstance(frames, np.ndarray):
-            count = _num_impossible(frames, is_tesseract)
-        elif isinstance(frames, jax.Array) and not isinstance(frames, jax.core.Tracer):
-            count = _num_on_device(frames, is_tesseract)
-        else:
-            return
-        with self._lock:
-            self._started.append((count, len(frames)))
-        self.total(waits=False)
-
-    def total(self, *, waits: bool = True) -> int:
-        """Number so far; without waiting, of what is computed."""
-        with self._lock:
-            started, self._started = self._started, []
-            for count, num_frames in started:
-                # Its type lacks `is_ready`.
-                if not waits and isinstance(count, jax.Array) and not count.is_ready():  # type: ignore[attr-defined]
-                    self._started.append((count, num_frames))
-                elif found := int(count):
-                    if self._total == 0:
-                        _log.warning(
-                            "%d of %d frames have cells that are NaN, infinite or "
-                            "otherwise no linear radar power (decibels?), or level "
-                            "of a projection: their boxes mean nothing "
-                            "(further ones are counted in num_impossible)",
-                            found,
-                            num_frames,
-                        )
-                    self._total += found
-            return self._total
-
-
-def _stack_frames(
-    frames: Sequence[Any], grid: RadarGrid
-) -> Shaped[np.ndarray, "B ..."]:
-    """One array of the frames of a list: paths or arrays."""
-    arrays = [
-        read_frame(frame, grid) if isinstance(frame, PathLike) else np.asarray(frame)
-        for frame in frames
-    ]
-    if not arrays:
-        raise UserError("no frames: the list is empty")
-    shapes = {array.shape: i for i, array in reversed(list(enumerate(arrays)))}
-    if len(shapes) > 1:
-        first, *_, other = sorted(shapes, key=shapes.__getitem__)
-        raise UserError(
-            f"frames of one call must have one shape: frame 0 has {list(first)}, "
-            f"frame {shapes[other]} has {list(other)}"
+    count = int((~((low >= lowest) & (high <= limit)) | is_decibels).sum())
+    if count and warn:
+        _log.warning(
+            "%d of %d frames contain NaN, Inf or out-of-range values (expected linear "
+            "power or its projection; is the input in decibels?). Their detections are "
+            "meaningless; further ones are counted in num_invalid_frames",
+            count,
+            len(frames),
         )
-    return np.stack(arrays)
+    return count
 
 
 def prepare(
@@ -172,10 +117,10 @@ def prepare(
 
     Args:
         image: `[B, H, W, 3]` uint8 (or `[H, W, 3]` of the only frame), what
-            `model.embed` made of it, or a list with one image, path or None a frame.
-        camera: One calibration for all frames or a list with one (or None) a frame:
-            `CameraCalibration`, path of K-Radar's file of one, or `Camera`. Also a
-            batch of `Camera`, or `ReferencePoints`.
+            `model.embed` made of it, or a list with one image, path or None per frame.
+        camera: One calibration for all frames or a list with one (or None) per frame:
+            `CameraCalibration`, path of a file of K-Radar, or `Camera`. Also a batch of
+            `Camera`, or `ReferencePoints`.
         num_frames: B.
         model: Has `image_size` and `feature_shape`.
         options: How calibrations are used.
@@ -185,8 +130,8 @@ def prepare(
         the number of frames without an image. Without any image both are None.
 
     Raises:
-        UserError: A size or number is not what was expected, image or camera is given
-            alone, or an image is missing where that is not allowed.
+        UserError: A size or number is not as expected, image or camera is given without
+            the other, or an image is missing where that is not allowed.
     """
     if (image is None) != (camera is None):
         given, lacking = ("image", "camera") if camera is None else ("camera", "image")
@@ -196,20 +141,19 @@ def prepare(
         return None, None, num_frames
     image, has_image = _images(image, num_frames, model, options.resize)
     camera = _cameras(camera, num_frames, model, options)
-    if isinstance(camera, ReferencePoints):
-        has_image = has_image & _host(camera.has_image, num_frames)
-        camera = camera.replace(has_image=has_image)
-    else:
-        has_image = has_image & _host(camera.is_valid, num_frames)
-        camera = camera.replace(is_valid=has_image)
+    name = "has_image" if isinstance(camera, ReferencePoints) else "is_valid"
+    own = getattr(camera, name)
+    if own is not None:
+        has_image = has_image & np.asarray(own, bool).reshape(num_frames)
     _check_missing(~has_image, options)
+    camera = camera.replace(**{name: has_image})
     return image, camera, int((~has_image).sum())
 
 
 def placeholder(
     num_frames: int, model: Any
 ) -> tuple[UInt8[np.ndarray, "{num_frames} H W 3"], Camera]:
-    """Black images and a camera that looks nowhere, of the shapes of real ones."""
+    """Black images and a camera that sees nothing, of the shapes of real ones."""
     image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
     return image, stack_cameras([no_camera(model.image_size)] * num_frames)
 
@@ -217,17 +161,17 @@ def placeholder(
 def check_backbone(
     image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
 ) -> None:
-    """`UserError` for images themselves where variables lack the backbone's weights.
+    """`UserError` for images if the variables lack the weights of the backbone.
 
     Args:
         image: `[B, H, W, 3]`, what the backbone made of it, or None.
-        variables: Of a model.
+        variables: Variables of a model.
     """
     is_raw = image is not None and image.shape[-1] == 3
     if is_raw and IMAGE_BACKBONE not in variables["params"]:
         raise UserError(
             "these weights are without the image backbone: give "
-            "image_backbone=FOLDER with DINOv3's, or embedded images"
+            "image_backbone=FOLDER with the weights of DINOv3, or embedded images"
         )
 
 
@@ -236,50 +180,38 @@ def _check_missing(is_missing: Bool[np.ndarray, " B"], options: CameraOptions) -
         raise UserError(
             f"{int(is_missing.sum())} of {is_missing.size} frames have no image or "
             f"calibration, the first is frame {int(is_missing.argmax())} of the batch; "
-            "config.data.camera.allow_missing takes the radar alone instead"
+            "config.data.camera.allow_missing=True predicts them from the radar only"
         )
-
-
-def _host(mask: Any, num_frames: int) -> Bool[np.ndarray, " {num_frames}"]:
-    """A mask on the host; None is True for all."""
-    if mask is None:
-        return np.ones(num_frames, bool)
-    return np.asarray(mask, bool).reshape(num_frames)
 
 
 def _images(
     image: Any, num_frames: int, model: Any, resize: bool
 ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
+    """Images as one array, and which of them are not None."""
     has_image = np.ones(num_frames, bool)
     if isinstance(image, PathLike):
         image = [image]
     if isinstance(image, Sequence):
         _check_count("images", len(image), num_frames)
+        has_image = np.array([one is not None for one in image])
         images = [
             read_left_image(pathlib.Path(one), model.image_size, resize=resize)
             if isinstance(one, PathLike)
             else one
             for one in image
         ]
-        has_image = np.array([one is not None for one in images])
-        if not has_image.any():
-            return placeholder(num_frames, model)[0], has_image
-        like = np.asarray(images[int(has_image.argmax())])
-        images = [np.zeros_like(like) if one is None else one for one in images]
-        if shapes := {np.shape(one) for one in images} - {like.shape}:
-            raise UserError(
-                f"images of different sizes: {like.shape} and {shapes.pop()}"
-            )
-        image = np.stack(images)
+        black = np.zeros((*model.image_size, 3), np.uint8)
+        like = next((np.asarray(one) for one in images if one is not None), black)
+        empty = np.zeros_like(like)
+        image = np.stack([empty if one is None else one for one in images])
     if np.ndim(image) == 3:
         image = image[None]
     possible = ((*model.image_size, 3), model.feature_shape)
-    if np.ndim(image) != 4 or tuple(image.shape[1:]) not in possible:
-        expected = " or embedded ".join(str(["B", *shape]) for shape in possible)
+    if tuple(image.shape[1:]) not in possible:
         raise UserError(
-            f"image has shape {list(np.shape(image))}, expected {expected}".replace(
-                "'", ""
-            )
+            f"image has shape {list(np.shape(image))}, expected images [B, H, W, 3] = "
+            f"[B, {', '.join(map(str, possible[0]))}] or embedded ones "
+            f"[B, {', '.join(map(str, possible[1]))}]"
         )
     _check_count("images", image.shape[0], num_frames)
     is_float = np.issubdtype(image.dtype, np.floating) or image.dtype == "bfloat16"
@@ -330,7 +262,8 @@ def _one_camera(camera: Any, options: CameraOptions) -> Camera:
         return camera
     raise UserError(
         f"camera is a {type(camera).__name__}, expected a CameraCalibration, a Camera, "
-        "the path of K-Radar's cam_*.yml or None, one for all frames or one a frame"
+        "the path of a cam_*.yml file of K-Radar or None, one for all frames or one "
+        "per frame"
     )
 
 
@@ -339,35 +272,10 @@ def _check_count(what: str, found: int, expected: int) -> None:
         raise UserError(f"{found} {what} for {expected} frames")
 
 
-def named_region(roi: Sequence[float] | str | None) -> Sequence[float] | None:
+def named_region(roi: Sequence[float] | str) -> tuple[float, ...]:
     """Limits of a region that may be named."""
     if isinstance(roi, str) and roi in ROIS:
-        return ROIS[roi]
-    if roi is not None and (isinstance(roi, str) or len(roi) != 6):
+        return tuple(ROIS[roi])
+    if isinstance(roi, str) or len(roi) != 6:
         raise UserError(f"roi {roi!r}, expected narrow, wide or x0, x1, y0, y1, z0, z1")
-    return roi
-
-
-def named_device(device: jax.Device | str | None) -> jax.Device:
-    """A device that may be named by its platform."""
-    try:
-        return jax.devices(device)[0] if not isinstance(device, jax.Device) else device
-    except RuntimeError as error:
-        there = ", ".join(sorted({d.platform for d in jax.devices()}))
-        raise UserError(f"device {device!r} is not there, found {there}") from error
-
-
-def checked_sizes(sizes: Sequence[int]) -> tuple[int, ...]:
-    """Batch sizes in order; `UserError` for none, or one that is not positive."""
-    if not isinstance(sizes, Sequence) or not sizes or min(sizes) < 1:
-        raise UserError(f"batch_sizes {sizes}, expected numbers of at least 1: (1, 8)")
-    return tuple(sorted(sizes))
-
-
-def pad_batch(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
-    """Repeats the last frame up to a batch size."""
-    missing = size - x.shape[0]
-    if missing == 0:
-        return x
-    xp = np if isinstance(x, np.ndarray) else jnp
-    return xp.concatenate([x, xp.repeat(x[-1:], missing, 0)])
+    return tuple(roi)

@@ -40,7 +40,7 @@ from radejax.data.records.projections import (
     skipped_frames,
 )
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.packed import LoadedModel
+from radejax.inference.saved import SavedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.sources import DataPaths, Sources, check_folders
 from radejax.simulation.dataset import simulate_dataset
@@ -312,7 +312,7 @@ def _tell_what_is_held_out(data: Data) -> None:
 
 
 def data_of_run(
-    loaded: LoadedModel, workdir: pathlib.Path, other: Sources | None = None
+    loaded: SavedModel, workdir: pathlib.Path, other: Sources | None = None
 ) -> tuple[ConfigDict, Data]:
     """A run's data, or others in their place, and its config with their label version.
 
@@ -324,7 +324,6 @@ def data_of_run(
         FileNotFoundError: A folder is not there.
     """
     config, own = loaded.config, loaded.run.get("data")
-    assert config is not None  # of a run there is one
     own = own and DataPaths.from_dict(own)
     paths = own if other is None else other.paths(own)
     if paths is None:

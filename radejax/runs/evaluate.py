@@ -24,12 +24,13 @@ from radejax.evaluation.files.load import tables_from_frames
 from radejax.evaluation.protocols import RECOMMENDED
 from radejax.evaluation.report.measure import Options, rare_classes
 from radejax.evaluation.report.report import Report, write_report
-from radejax.inference.open import PathLike, Step, load
-from radejax.inference.predict import Predictor, predict_dataset
+from radejax.inference.detector import Detector
+from radejax.inference.predict import predict_dataset
+from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import check_config, figures
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.sources import Sources
-from radejax.training import processes
+from radejax.training import processes, sharding
 
 _log = logging.getLogger(__name__)
 
@@ -70,10 +71,9 @@ def evaluate(
         UserError: No frames of the split, or images to exchange.
     """
     frames, seen = _frames(data, split, exchange_images)
-    predictor = make_predictor(config, model, data)
-    predictor.update(variables)
     size, images = config.evaluation.batch_size, data.images(seen)
-    predictions = predict_dataset(predictor, data.records, seen, size, images=images)
+    detector = make_detector(config, data, variables)
+    predictions = predict_dataset(detector, data.records, seen, size, images=images)
 
     def write(folder: pathlib.Path) -> Report:
         source = {"step": step, **source_of(data, split, exchange_images)}
@@ -144,7 +144,7 @@ def evaluate_run(
         split: "test", "validation", "train", "all" or a split file.
         out: Folder of the results; `evaluation` in the work folder if None,
             `evaluation_<name>` for other data, and with `_validation` for that split.
-        image_backbone: Weights of a frozen backbone, see `inference.open.load`.
+        image_backbone: Weights of a frozen backbone, see `load_model`.
         exchange_images: Seed; every frame gets the image and camera of another one, a
             control of what a radar-camera model knows from the images. `out` then ends
             in `_exchanged`.
@@ -161,12 +161,10 @@ def evaluate_run(
             no data and none are given; other data do not fit the run, or `out` has
             results on others. Or a change that is impossible.
     """
-    loaded = load(workdir, step=step, image_backbone=image_backbone)
+    loaded = load_model(workdir, step=step, image_backbone=image_backbone)
     workdir = pathlib.Path(workdir).absolute()
-    if loaded.config is None:
-        raise UserError(
-            f"{workdir} has no config of a run: give a work folder of train.py"
-        )
+    if not loaded.run:
+        raise UserError(f"{workdir} is not a run: give a workdir of train.py")
     config, options = _changed(loaded.config, changes)
     config, data = data_of_run(
         dataclasses.replace(loaded, config=config), workdir, other
@@ -294,20 +292,17 @@ def with_images_exchanged(frames: FrameSequence, seed: int) -> list[LabelledFram
     return exchanged
 
 
-def make_predictor(
+def make_detector(
     config: ConfigDict,
-    model: nn.Module,
     data: Data,
+    variables: Mapping[str, Any],
     mesh: jax.sharding.Mesh | None = None,
-) -> Predictor:
-    """Predictor of all that evaluations keep, still without variables."""
-    return Predictor(
-        model,
-        data.records.grid,
-        classes=config.classes,
-        decode={**config.decode, "score_threshold": _lowest_score(config)},
-        azimuth_mapping=config.data.azimuth_mapping,
-        mesh=mesh,
+) -> Detector:
+    """Detector of all that evaluations keep, over all devices unless a mesh is given."""
+    return Detector(
+        SavedModel(config, data.records.grid, variables),
+        sharding.batch_sharding(mesh or sharding.make_mesh()),
+        score_threshold=_lowest_score(config),
     )
 
 

@@ -16,7 +16,7 @@ from radejax.core import files
 from radejax.core.config import renewed
 from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence
-from radejax.inference.open import PathLike, StartingWeights, starting_weights
+from radejax.inference.saved import PathLike, StartingWeights, starting_weights
 from radejax.losses.detection import NmsAssignment
 from radejax.runs import check_config
 from radejax.runs.data import Data, open_data
@@ -86,7 +86,7 @@ def run(
     folder = default_workdir(workdir, name)
     with claimed(folder, config):
         weights = starting_weights(
-            model, init_from, sources.image_backbone, sources.embeddings
+            config.model, init_from, sources.image_backbone, sources.embeddings
         )
         data = open_data(config, model, sources)
         has_test = len(data.split("test")) > 0
@@ -150,7 +150,7 @@ def train(
         files.write_json(folder / "run.json", info)
     validation = None
     if config.train.evaluate_every_epochs:
-        validation = Validation(config, model, data)
+        validation = Validation(config, data)
     return loop.train(
         model,
         weights.variables,

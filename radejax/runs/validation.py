@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import flax.linen as nn
 import jax
 import numpy as np
 from ml_collections import ConfigDict
@@ -24,7 +23,7 @@ from radejax.evaluation.report.measure import measure, repair_sizes
 from radejax.inference.predict import predict_dataset
 from radejax.runs.check_config import check_best_metric
 from radejax.runs.data import Data
-from radejax.runs.evaluate import make_predictor, report_options
+from radejax.runs.evaluate import make_detector, report_options
 from radejax.runs.figures import FrameDrawer
 from radejax.training import processes
 from radejax.training.state import TrainState
@@ -40,7 +39,6 @@ class Validation:
     Args:
         config: Of the run; `evaluation`, `decode`, `watch` and `train.best_metric` are
             read.
-        model: That is trained.
         data: Of the run.
         mesh: All devices if None.
 
@@ -51,7 +49,6 @@ class Validation:
     def __init__(
         self,
         config: ConfigDict,
-        model: nn.Module,
         data: Data,
         mesh: jax.sharding.Mesh | None = None,
     ) -> None:
@@ -65,7 +62,7 @@ class Validation:
                 "train.evaluate_every_epochs=0"
             )
         self._images = data.images(self._frames)
-        self._predictor = make_predictor(config, model, data, mesh)
+        self._detector = make_detector(config, data, {}, mesh)
 
     @functools.cached_property
     def _tables(self) -> tuple[Columns, Columns]:
@@ -111,19 +108,15 @@ class Validation:
     def _predict(
         self, variables: Mapping[str, Any], should_stop: Callable[[], bool] | None
     ) -> dict[str, np.ndarray]:
-        self._predictor.update(variables)
-        try:
-            return predict_dataset(
-                self._predictor,
-                self._records,
-                self._frames,
-                self._config.evaluation.batch_size,
-                images=self._images,
-                progress=False,
-                should_stop=should_stop,
-            )
-        finally:
-            self._predictor.update(None)  # the state's own arrays go on to be donated
+        return predict_dataset(
+            self._detector.replace(variables=variables),
+            self._records,
+            self._frames,
+            self._config.evaluation.batch_size,
+            images=self._images,
+            progress=False,
+            should_stop=should_stop,
+        )
 
     def _is_best_metric(self, result: Any) -> bool:
         name = result.metric.split("/")[0]

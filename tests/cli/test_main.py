@@ -17,7 +17,7 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import write
 from radejax.data.kradar.labels import Label
 from radejax.evaluation.files import kitti
-from radejax.inference import packed as checkpoint_files
+from radejax.inference.saved import save_model
 
 from .. import small_models
 
@@ -56,7 +56,7 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["simulate", "--out", "x", "--workers", "0"], "0 is not in the range"),
         (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
         (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),
-        (["demo", "--out", "demo"], "cannot write a picture as 'demo'; suffixes: ["),
+        (["demo", "--out", "demo"], "cannot write a figure as 'demo'; suffixes: ["),
         (["overlay", "1", "--data", ".", "--out", "."], "'.' is a directory"),
         (["export", ".", "--out", __file__], "is a file"),
         (["detect", ".", "--model", ".", "--out", __file__], "is a file"),
@@ -165,7 +165,7 @@ def test_evaluate_takes_flags_as_its_script_does(
 
 def test_export_takes_an_exported_folder(tmp_path: pathlib.Path) -> None:
     packed = tmp_path / "packed"
-    checkpoint_files.write_packed(packed, small_models.detector())
+    save_model(small_models.saved(), packed)
     done = _run(
         "export", packed, "--out", tmp_path / "hub", "--format", "huggingface", "--json"
     )

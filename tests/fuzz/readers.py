@@ -24,8 +24,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import kitti, predictions
 from radejax.evaluation.files.load import Source, load
 from radejax.geometry.camera import CameraCalibration
-from radejax.inference import open as model_files
-from radejax.inference.packed import write_packed
+from radejax.inference.saved import load_model, save_model
 from radejax.runs import evaluate, seeds, workdir
 from radejax.runs.data import DataPaths
 from radejax.simulation import dataset
@@ -34,11 +33,9 @@ from radejax.training.checkpoints import Checkpoints
 from radejax.training.watch import _Jsonl
 from radejax.visualize.curves import read_metrics
 from radejax.weights import dinov3_hf, radenet_torch
-from radejax.weights.convert import write_state_dict
 
 from .. import small_models as small
 from ..data.conftest import make_labels, write_kradar
-from ..torch_files import write_pth
 from .engine import Reader
 
 Folder = pathlib.Path
@@ -257,14 +254,7 @@ def _read_workdir(folder: Folder) -> None:
 
 
 def _packed(folder: Folder, kind: str) -> None:
-    config = small.radar_config() if kind == "radar" else small.camera_config()
-    write_packed(
-        folder, small.detector(kind), training_config=config, with_backbone=True
-    )
-    if kind == "radar":  # as of 0.2: with a checksum nothing damaged is parsed
-        content = files.read_json(folder / "config.json")
-        del content["sha256"]
-        files.write_json(folder / "config.json", content)
+    save_model(small.saved(kind), folder, with_backbone=True)
 
 
 def _dinov3(folder: Folder) -> None:
@@ -273,11 +263,7 @@ def _dinov3(folder: Folder) -> None:
 
 def _torch(folder: Folder, suffix: str) -> None:
     detector = small.detector()
-    state = radenet_torch.save(detector.model, detector.variables)
-    if suffix == ".pth":
-        write_pth(folder / f"a{suffix}", state)
-    else:
-        write_state_dict(folder / f"a{suffix}", state)
+    radenet_torch.save(detector.model, detector.variables, folder / f"a{suffix}")
 
 
 def _read_torch(folder: Folder, suffix: str) -> None:
@@ -372,12 +358,10 @@ READERS: dict[str, Reader] = {
     "work folder": Reader(
         _workdir, _read_workdir, "*.json", "*.jsonl", "*.csv", count=200, writes=True
     ),
-    "packed": Reader(lambda f: _packed(f, "radar"), model_files.load, "*", count=60),
-    "packed camera": Reader(
-        lambda f: _packed(f, "camera"), model_files.load, "*", count=20
-    ),
+    "packed": Reader(lambda f: _packed(f, "radar"), load_model, "*", count=60),
+    "packed camera": Reader(lambda f: _packed(f, "camera"), load_model, "*", count=20),
     "dinov3": Reader(_dinov3, dinov3_hf.load, "*", count=60),
     **_kinds("torch", (".pth", ".npz", ".safetensors"), _torch, _read_torch, "a*", 20),
-    "checkpoint": Reader(_checkpoints, model_files.load, "checkpoints/**/*", count=5),
+    "checkpoint": Reader(_checkpoints, load_model, "checkpoints/**/*", count=5),
 }
 """By name; the order is that of the tables."""

@@ -13,7 +13,6 @@ from radejax.data.cameras import CameraOptions
 from radejax.evaluation.files.load import Source
 from radejax.evaluation.files.load import load as load_tables
 from radejax.evaluation.files.predictions import write_table
-from radejax.inference import packed
 from radejax.inference.detect_files import (
     chosen_frames,
     detect_files,
@@ -21,7 +20,7 @@ from radejax.inference.detect_files import (
     front_images,
     output_name,
 )
-from radejax.inference.open import load
+from radejax.inference.saved import load_model, save_model
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 from .. import small_models as small
@@ -90,7 +89,7 @@ def test_a_folder_named_twice_is_one(
 
 def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
     detector = small.detector(batch_sizes=(2,))  # as below
-    packed.write_packed(tmp_path / "packed", detector)
+    save_model(detector.saved, tmp_path / "packed")
     frames = small.projections(3)
     for i, frame in enumerate(frames):
         path = tmp_path / "data" / "7" / "DERA_tesseract" / f"DERA_tesseract_{i:05}.npy"
@@ -128,10 +127,8 @@ def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
     order, kitti_order = np.argsort(found["score"]), np.argsort(kitti["score"])
     for name in ("frame", "box", "cls"):
         np.testing.assert_array_equal(found[name][order], kitti[name][kitti_order])
-    with pytest.raises(
-        UserError, match=r"step best of .*packed, which holds one model"
-    ):
-        load(tmp_path / "packed", step="best")
+    with pytest.raises(UserError, match=r"packed holds one model .* step=best"):
+        load_model(tmp_path / "packed", step="best")
 
 
 def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:

@@ -1,5 +1,6 @@
 """Images and calibrations of every kind become the same arrays; what lacks is counted."""
 
+import dataclasses
 import pathlib
 from typing import Any
 
@@ -79,16 +80,16 @@ def test_missing_images_are_predicted_from_the_radar_and_counted(
     calibration = small.calibration()
     whole = fusion(projection, image, calibration)
     alone = fusion(projection)
-    before = fusion.num_radar_alone
+    before = fusion.num_radar_only
     some = fusion(projection, [image[0], None, image[2]], calibration)
-    assert fusion.num_radar_alone == before + 1
+    assert fusion.num_radar_only == before + 1
     other = fusion(projection, image, [calibration, None, calibration])
-    assert fusion.num_radar_alone == before + 2
+    assert fusion.num_radar_only == before + 2
     for i, expected in enumerate((whole, alone, whole)):
         row = jax.tree.map(lambda x, i=i: x[i], expected)
         _equal(jax.tree.map(lambda x, i=i: x[i], some), row)
         _equal(jax.tree.map(lambda x, i=i: x[i], other), row)
-    strict = small.detector("camera", camera_options=CameraOptions(allow_missing=False))
+    strict = Detector(small.saved("camera", data__camera__allow_missing=False))
     with pytest.raises(UserError, match=r"1 of 3 frames .* the first is frame 1"):
         strict(projection, [image[0], None, image[2]], calibration)
     with pytest.raises(UserError, match="3 of 3 frames"):
@@ -103,13 +104,10 @@ def test_embedded_images_and_weights_without_the_backbone(fusion: Detector) -> N
     _equal(fusion(projection, features, small.calibration()), expected)
     params = dict(fusion.variables["params"])
     del params["image_backbone"]
-    lean = Detector(
-        fusion.model,
-        {**fusion.variables, "params": params},
-        fusion.grid,
-        score_threshold=0.1,
-        batch_sizes=(4,),
+    saved = dataclasses.replace(
+        small.saved("camera"), variables={**fusion.variables, "params": params}
     )
+    lean = Detector(saved, score_threshold=0.1, batch_sizes=(4,))
     _equal(lean(projection, features, small.calibration()), expected)
     with pytest.raises(
         UserError, match="without the image backbone: give image_backbone"
@@ -153,7 +151,7 @@ def test_what_does_not_fit_is_named(
 
 
 def test_a_radar_model_takes_no_image() -> None:
-    with pytest.raises(UserError, match="radar alone"):
+    with pytest.raises(UserError, match="radar-only"):
         small.detector()(small.projections(1), small.images(1), small.calibration())
 
 

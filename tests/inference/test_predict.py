@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -15,8 +14,9 @@ from radejax.data.records.job import project_dataset
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
+from radejax.inference.saved import SavedModel
 from radejax.runs.data import Data
-from radejax.runs.evaluate import make_predictor
+from radejax.runs.evaluate import make_detector
 from radejax.runs.sources import DataPaths
 from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -65,15 +65,14 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
 
 
-def _predictor(setup: SimpleNamespace, mesh: jax.sharding.Mesh | None = None) -> Any:
-    predictor = make_predictor(setup.config, setup.model, setup.data, mesh)
-    predictor.update(setup.variables)
-    return predictor
-
-
 def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
-    predictor = _predictor(setup, sharding.make_mesh(num_devices))
-    return predict_dataset(predictor, setup.records, setup.frames, 3, progress=False)
+    mesh = sharding.make_mesh(num_devices)
+    detector = make_detector(setup.config, setup.data, setup.variables, mesh)
+    return predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
+
+
+def _saved(setup: SimpleNamespace) -> SavedModel:
+    return SavedModel(setup.config, setup.records.grid, setup.variables)
 
 
 def _assert_same(actual: Any, expected: Any) -> None:
@@ -90,9 +89,7 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(
     assert set(expected["frame"]) == set(range(5))
     assert len(expected["frame"]) > 50
     _assert_same(_predict(setup, 8), expected)
-    detector = Detector.from_config(
-        setup.config, setup.variables, setup.records.grid, score_threshold=0.45
-    )
+    detector = Detector(_saved(setup), score_threshold=0.45)
     alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
     _assert_same(alone, expected)
 
@@ -108,11 +105,10 @@ def test_a_detector_sees_no_frames_that_are_not_there(setup: SimpleNamespace) ->
 
     class Spy(Detector):
         def __call__(self, frames: Any, *inputs: Any) -> Any:
-            seen.append(len(frames))
+            seen.append(len(frames.frame))
             return super().__call__(frames, *inputs)
 
-    spy = Spy.from_config(setup.config, setup.variables, setup.records.grid)
-    predict_dataset(spy, setup.records, setup.frames, 3, progress=False)
+    predict_dataset(Spy(_saved(setup)), setup.records, setup.frames, 3, progress=False)
     assert seen == [3, 2]
 
 
@@ -125,7 +121,7 @@ def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
 
     state = SimpleNamespace(eval_variables=setup.variables)
     with pytest.raises(processes.Stopped):
-        Validation(setup.config, setup.model, setup.data)(state, 7, should_stop)
+        Validation(setup.config, setup.data)(state, 7, should_stop)
     assert asked == [True]
 
 
@@ -139,8 +135,8 @@ def test_images_need_the_weights_of_the_backbone() -> None:
     detector_inputs.check_backbone(np.zeros((1, 4, 4, 16)), lacking)
 
 
-def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
-    predictor = _predictor(setup)
+def test_a_detector_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
+    detector = make_detector(setup.config, setup.data, setup.variables)
     projection = np.zeros((8, *setup.records.grid.projection_shape), np.float16)
     none = np.zeros((8, 0), np.float32)
     batch = Batch(
@@ -152,12 +148,12 @@ def test_a_predictor_says_that_the_backbone_is_missing(setup: SimpleNamespace) -
         image=np.zeros((8, 4, 4, 3), np.uint8),
     )
     with pytest.raises(UserError, match="without the image backbone"):
-        predictor(batch)
+        detector(batch)
 
 
 def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
     state = SimpleNamespace(eval_variables=setup.variables)
-    scores = Validation(setup.config, setup.model, setup.data)(state, 7)
+    scores = Validation(setup.config, setup.data)(state, 7)
     name = "validation/map_3d_iou30/coco101/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
     assert all("/simulated" in key for key in scores.values)
@@ -167,9 +163,7 @@ def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> N
     (picture,) = scores.pictures.values()
     assert picture.dtype == np.uint8
     assert picture.shape[2] == 3
-    alone = Validation(setup.config, setup.model, setup.data, sharding.make_mesh(1))(
-        state, 7
-    )
+    alone = Validation(setup.config, setup.data, sharding.make_mesh(1))(state, 7)
     assert alone.values == pytest.approx(scores.values)
 
 
@@ -177,4 +171,4 @@ def test_a_best_metric_that_is_not_measured_is_refused(setup: SimpleNamespace) -
     config = setup.config.copy_and_resolve_references()
     config.train.best_metric = "map_3d_iou70"
     with pytest.raises(UserError, match=r"'map_3d_iou70'.* map_3d_iou30, "):
-        Validation(config, setup.model, setup.data)
+        Validation(config, setup.data)

@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
-from radejax import models
 from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
-from radejax.inference.open import StartingWeights
+from radejax.inference.saved import StartingWeights
 from radejax.losses.detection import NmsAssignment
 from radejax.runs import experiment, validation
 from radejax.runs.sources import Sources
@@ -93,22 +92,20 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     assert stays(["1/a"], "0" * 64) != stays(["1/a"], "1" * 64)
 
 
-def test_labels_are_read_once_and_the_model_is_built_once(
+def test_labels_are_read_once(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """And the sequences that are held out choose the best checkpoint."""
     parsed: collections.Counter = collections.Counter()
-    built = []
-    parse, build = dataset.parse_label_file, models.build
+    parse = dataset.parse_label_file
 
     def count(*args: Any, where: str, **options: Any) -> Any:
         parsed[where] += 1
         return parse(*args, where=where, **options)
 
     monkeypatch.setattr(dataset, "parse_label_file", count)
-    monkeypatch.setattr(models, "build", lambda c: built.append(c) or build(c))
     mesh = sharding.make_mesh(1)
     monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
     config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
@@ -146,7 +143,6 @@ def test_labels_are_read_once_and_the_model_is_built_once(
         assert info["same"]["frames to train on"] == 4
     assert len(parsed) == 8
     assert set(parsed.values()) == {1}
-    assert len(built) == 1
 
 
 def test_a_batch_that_does_not_divide_is_told_before_anything_is_written(

@@ -15,7 +15,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.open import starting_weights
+from radejax.inference.saved import starting_weights
 from radejax.losses.detection import detection_loss
 from radejax.runs import check_config
 from radejax.training import loop, sharding
@@ -220,7 +220,7 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
     state = radenet_torch.save(tiny.model, official)
     torch.save({k: torch.tensor(v) for k, v in state.items()}, workdir / "best.pth")
-    variables = starting_weights(tiny.model, workdir / "best.pth").variables
+    variables = starting_weights(config.model, workdir / "best.pth").variables
     result = loop.train(
         tiny.model,
         variables,

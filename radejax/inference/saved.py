@@ -1,0 +1,432 @@
+"""Saved models: of a run, of an exported folder, of an official PyTorch file.
+
+All of them become one `SavedModel`. An exported folder has the files that the Hugging
+Face Hub expects:
+
+    config.json          the config of the run, the grid, checksums of the other files
+    model.safetensors    variables by name, "params/backbone/..."
+
+The weights of DINOv3 are never in it unless asked for: their license restricts
+redistribution.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import logging
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import flax.linen as nn
+import numpy as np
+import safetensors.numpy
+from flax import traverse_util
+from ml_collections import ConfigDict
+
+import radejax
+from radejax import models
+from radejax.core import files
+from radejax.core.config import base_config
+from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
+from radejax.core.structures import CLASSES
+from radejax.data.cameras import CameraOptions
+from radejax.data.records.embeddings import embeddings_sha256
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.lifting import OFFICIAL_OFFSET_M
+from radejax.training.checkpoints import Checkpoints
+from radejax.weights import dinorade_torch, image_backbone, radenet_torch
+from radejax.weights.state_dict import read_state_dict
+
+_log = logging.getLogger(__name__)
+
+CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+FORMAT = "radejax-2"
+
+Step = int | Literal["best"] | None
+"""Step of a checkpoint, "best" by the metric of the run, or None for the latest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedModel:
+    """A trained model and everything it needs to be used.
+
+    Attributes:
+        config: The config it was trained with; of official weights the one that
+            corresponds to them.
+        grid: Axes of the sensor.
+        variables: Parameters and other collections of the model, NumPy arrays.
+        step: Step of the checkpoint, or None.
+        run: Data and versions of the run, see `radejax.runs.workdir.run_info`; empty
+            for what is not a checkpoint.
+    """
+
+    config: ConfigDict
+    grid: RadarGrid
+    variables: Mapping[str, Any]
+    step: int | None = None
+    run: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def model(self) -> nn.Module:
+        """The Flax module, without parameters."""
+        return models.build(self.config.model)
+
+
+def load_model(
+    path: PathLike, *, step: Step = None, image_backbone: PathLike | None = None
+) -> SavedModel:
+    """Load the model of a run, a checkpoint, an exported folder or an official file.
+
+    A frozen image backbone is in no checkpoint: it is read from the files that the run
+    was trained with. If they do not exist, the model accepts embedded images only.
+
+    Args:
+        path: Workdir of a run, its `checkpoints`, one of them, a folder of
+            `radejax export`, or an official file, see `load_torch`.
+        step: Step of the checkpoint, with a workdir or its `checkpoints`.
+        image_backbone: Weights of the image backbone, instead of those of the run: the
+            DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
+
+    Raises:
+        FileNotFoundError: There is no model, or no such checkpoint.
+        UserError: A step of what holds one model only; the backbone is not the one that
+            the embeddings of the run are from.
+        DataError: A file is corrupted, or config and weights do not fit.
+    """
+    path = pathlib.Path(path).absolute()
+    if not path.exists():
+        raise FileNotFoundError(f"no such file or folder: {path}")
+    is_exported = (path / WEIGHTS_FILE).is_file()
+    if step is not None and (path.is_file() or is_exported or _is_checkpoint(path)):
+        raise UserError(f"{path} holds one model only, but step={step} is given")
+    if path.is_file():
+        return load_torch(path, image_backbone=image_backbone)
+    saved = _read_exported(path) if is_exported else _read_checkpoint(path, step)
+    return _with_backbone(saved, image_backbone)
+
+
+def load_torch(
+    path_or_state_dict: PathLike | Mapping[str, Any],
+    *,
+    image_backbone: PathLike | None = None,
+    **model_overrides: Any,
+) -> SavedModel:
+    """Load official RADE-Net or DinoRADE weights, on the grid of K-Radar.
+
+    Args:
+        path_or_state_dict: `.pth`, `.pt`, `.npz` or `.safetensors` file, or a mapping of
+            names to arrays. Names that begin with `rad_backbone.` are DinoRADE's.
+        image_backbone: Folder of DINOv3, for a DinoRADE file without its weights.
+        **model_overrides: Fields of the model that names and shapes do not determine.
+
+    Raises:
+        UserError: An image backbone is given, and the model is RADE-Net.
+        DataError: Tensors are missing, unexpected or of another shape.
+    """
+    content = path_or_state_dict
+    if isinstance(content, str | os.PathLike):
+        content, _ = read_state_dict(content)
+    config = base_config()
+    config.data.azimuth_mapping = "stretched"
+    config.decode.threshold_inclusive = False
+    model: nn.Module
+    if dinorade_torch.is_dinorade(content):
+        model, variables = dinorade_torch.load(
+            path_or_state_dict, dinov3=image_backbone, **model_overrides
+        )
+        options = CameraOptions("pinhole", OFFICIAL_OFFSET_M, calibration="common")
+        config.data.camera = ConfigDict(dataclasses.asdict(options))
+    elif image_backbone is not None:
+        raise UserError("image_backbone is given, but the model is RADE-Net")
+    else:
+        model, variables = radenet_torch.load(path_or_state_dict, **model_overrides)
+    config.model = ConfigDict(model_config(model))
+    config.classes = CLASSES[: config.model.num_classes]
+    return SavedModel(config, RadarGrid.kradar(), variables)
+
+
+# Exported folders --------------------------------------------------------------------
+
+
+def save_model(
+    saved: SavedModel,
+    folder: PathLike,
+    *,
+    with_backbone: bool = False,
+    half: bool = False,
+    programs: Mapping[str, bytes] | None = None,
+) -> dict[str, Any]:
+    """Write `config.json` and `model.safetensors`.
+
+    Args:
+        saved: What to write.
+        folder: Created if missing; existing files of the same names are replaced.
+        with_backbone: Keep the weights of the image transformer.
+        half: Store float16; `load_model` returns float32.
+        programs: Further files by name.
+
+    Returns:
+        The content of `config.json`.
+
+    Raises:
+        UserError: The image transformer was trained, so that the model is incomplete
+            without its weights.
+    """
+    folder = pathlib.Path(folder)
+    variables = {name: dict(tree) for name, tree in saved.variables.items()}
+    image = saved.config.model.get("image")
+    is_vit = image is not None and image.kind == "vit"
+    removed = None
+    if is_vit and not with_backbone:
+        removed = variables["params"].pop(IMAGE_BACKBONE, None)
+    if removed and not image.freeze:
+        raise UserError(
+            "the image backbone was fine-tuned, so its weights are required. If it "
+            "started from DINOv3, its license restricts redistribution; otherwise pass "
+            "--with-backbone"
+        )
+    is_incomplete = is_vit and IMAGE_BACKBONE not in variables["params"]
+    arrays = {
+        name: np.ascontiguousarray(value, np.float16 if half else None)
+        for name, value in traverse_util.flatten_dict(variables, sep="/").items()
+    }
+    contents = {
+        WEIGHTS_FILE: safetensors.numpy.save(arrays, {"format": "jax"}),
+        **(programs or {}),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in contents.items():
+        with files.atomic_write(folder / name) as file:
+            file.write(data)
+    description = {
+        "format": FORMAT,
+        "radejax": radejax.__version__,
+        "config": json.loads(saved.config.to_json()),
+        "grid": saved.grid.to_dict(),
+        "left_out": [f"params/{IMAGE_BACKBONE}"] if is_incomplete else [],
+        "sha256": {k: hashlib.sha256(v).hexdigest() for k, v in contents.items()},
+    }
+    files.write_json(folder / CONFIG_FILE, description)
+    return description
+
+
+def _read_exported(folder: pathlib.Path) -> SavedModel:
+    """Inverse of `save_model`."""
+    path, weights = folder / CONFIG_FILE, folder / WEIGHTS_FILE
+    content = files.read_json(path, dict[str, Any])
+    if content.get("format") != FORMAT:
+        raise DataError(
+            f"{path}: format is {content.get('format')!r}, expected {FORMAT!r}"
+        )
+    data = weights.read_bytes()
+    try:
+        if hashlib.sha256(data).hexdigest() != content["sha256"][WEIGHTS_FILE]:
+            raise DataError(
+                f"{weights} is corrupted or of another model: its sha256 differs from "
+                f"the one in {CONFIG_FILE}; export or download it again"
+            )
+        arrays = safetensors.numpy.load(data)
+        arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
+        variables = traverse_util.unflatten_dict(arrays, sep="/")
+        config = ConfigDict(content["config"], convert_dict=True)
+        saved = SavedModel(config, RadarGrid.from_dict(content["grid"]), variables)
+        image_backbone.check_fits(saved.model, variables, weights)
+        if len(config.classes) != config.model.num_classes:
+            raise DataError(
+                f"{len(config.classes)} classes, expected {config.model.num_classes} "
+                "(config.model.num_classes)"
+            )
+        return saved
+    # What a config that was edited by hand makes ConfigDict and the constructors raise.
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+# Checkpoints -------------------------------------------------------------------------
+
+
+def _is_checkpoint(path: pathlib.Path) -> bool:
+    return path.name.isdigit() and (path / "state").is_dir()
+
+
+def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
+    """Model of a workdir, its `checkpoints`, or one of them."""
+    if _is_checkpoint(path):
+        folder, step = path.parent, int(path.name)
+    elif (path / "checkpoints").is_dir():
+        folder = path / "checkpoints"
+    elif any(map(_is_checkpoint, path.iterdir())):
+        folder = path
+    elif (path / CONFIG_FILE).is_file():
+        raise FileNotFoundError(
+            f"no checkpoints in {path}: the run has not trained yet"
+        )
+    else:
+        raise FileNotFoundError(
+            f"no model in {path}: expected {CONFIG_FILE} and {WEIGHTS_FILE}, the workdir "
+            "of a run, its checkpoints, or one of them"
+        )
+    with Checkpoints(folder, read_only=True) as checkpoints:
+        chosen = checkpoints.best_step() if step == "best" else step
+        state, info, number = checkpoints.restore_variables(chosen)
+    params = state["ema_params"] if state.get("ema_params") else state["params"]
+    return SavedModel(
+        ConfigDict(info["config"], convert_dict=True),
+        RadarGrid.from_dict(info["grid"]),
+        {"params": params, **(state.get("model_state") or {})},
+        number,
+        info["run"],
+    )
+
+
+def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
+    """The same with the weights of its image backbone, where they are available."""
+    is_complete = IMAGE_BACKBONE in saved.variables["params"]
+    if "image" not in saved.config.model or (is_complete and given is None):
+        return saved
+    params = {**saved.variables["params"], **_find_backbone(saved, given)}
+    return dataclasses.replace(saved, variables={**saved.variables, "params": params})
+
+
+def _find_backbone(saved: SavedModel, given: PathLike | None) -> dict[str, Any]:
+    """`{"image_backbone": parameters}`, empty where they are not available.
+
+    In this order: what is given, what the run was trained with, what it started from.
+    """
+    data = saved.run.get("data") or {}
+    embeddings, start = data.get("embeddings"), saved.run.get("init_from")
+    source = given or data.get("image_backbone")
+    if given is None and source is not None and not pathlib.Path(source).exists():
+        _log.warning(
+            "image backbone weights not found at %s; the model accepts embedded images "
+            "only",
+            source,
+        )
+        source = None
+    if source is not None:
+        part = image_backbone.load_image_backbone(source, saved.model)
+    elif start is not None and pathlib.Path(start).exists() and not embeddings:
+        part = _fitting_variables(start, saved.config.model)
+    else:
+        return {}
+    if part is None or IMAGE_BACKBONE not in part["params"]:
+        return {}
+    params = part["params"][IMAGE_BACKBONE]
+    if source is not None and embeddings and pathlib.Path(embeddings).exists():
+        image_backbone.check_same_backbone(params, embeddings, source)
+    return {IMAGE_BACKBONE: params}
+
+
+# Weights that a training starts from -------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class StartingWeights:
+    """What a training starts from instead of random weights.
+
+    Attributes:
+        source: Path of `variables`, or None.
+        variables: Variables of the whole model, or None.
+        pretrained: A part that replaces random weights, or None.
+        frozen_sha256: Checksum of the frozen image backbone; None if there is none.
+    """
+
+    source: str | None = None
+    variables: Mapping[str, Any] | None = None
+    pretrained: Mapping[str, Any] | None = None
+    frozen_sha256: str | None = None
+
+
+def starting_weights(
+    config: Any,
+    init_from: PathLike | None = None,
+    image_backbone_path: PathLike | None = None,
+    embeddings: PathLike | None = None,
+) -> StartingWeights:
+    """Read the weights that are to be trained further or to stay frozen.
+
+    Args:
+        config: `config.model`.
+        init_from: What `load_model` takes; None initializes all weights randomly.
+        image_backbone_path: Weights of the image backbone, see
+            `image_backbone.load_image_backbone`.
+        embeddings: Folder of `radejax embed` that replaces the frozen part.
+
+    Raises:
+        UserError: They do not fit the model; names what differs.
+    """
+    model: Any = models.build(config)
+    variables = pretrained = digest = source = None
+    if init_from is not None:
+        source = str(pathlib.Path(init_from).absolute())
+        variables = _fitting_variables(init_from, config)
+    if variables is None or IMAGE_BACKBONE not in variables["params"]:
+        pretrained = image_backbone.load_image_backbone(
+            image_backbone_path, model, embeddings
+        )
+    if models.has_camera(model) and model.freeze:
+        if embeddings is not None:
+            digest = embeddings_sha256(embeddings)
+        else:
+            given = variables if pretrained is None else pretrained
+            assert given is not None  # without both there has been an error
+            digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
+    return StartingWeights(source, variables, pretrained, digest)
+
+
+def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
+    """Weights of another run or an official file, which must fit `config.model`."""
+    wanted = json.loads(config.to_json())
+    if pathlib.Path(path).is_dir():
+        other = load_model(path)
+        found = json.loads(other.config.model.to_json())
+        if lines := files.differences(found, wanted, "config.model"):
+            raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
+        return other.variables
+    if "image" in config:
+        _, variables = dinorade_torch.load(path)
+        image_backbone.check_fits(models.build(config), variables, path)
+        return variables
+    structure = {name: value for name, value in wanted.items() if name != "name"}
+    if structure["cbam"] == "off":
+        structure["cbam"] = None
+    return radenet_torch.load(path, **structure)[1]
+
+
+def model_config(model: nn.Module) -> dict[str, Any]:
+    """`config.model` of a module, until the importers return it themselves."""
+    from radejax.models import dinorade_config, radenet
+    from radejax.models.vit import ViT
+
+    any_model: Any = model
+    radar = getattr(model, "radar", model)
+    config = {name: getattr(radar, name) for name in radenet.FIELDS}
+    config |= {"name": "radenet", "cbam": config["cbam"] or "off"}
+    if radar is not model:
+        vit = any_model.vit or ViT()
+        image = {
+            "kind": "resnet50" if any_model.vit is None else "vit",
+            "size": any_model.image_size,
+            "freeze": any_model.freeze,
+            "standardize": any_model.standardize_image,
+            "resnet_width": any_model.resnet_width,
+        }
+        own = [k for k in dinorade_config.IMAGE_FIELDS if k not in image]
+        image |= {name: getattr(vit, name) for name in own}
+        axes = {
+            n: getattr(any_model.query_grid, n) for n in dinorade_config.AXES_FIELDS
+        }
+        fusion = dict(any_model.fusion)
+        config |= {
+            "name": "dinorade",
+            "image": image,
+            "fusion": fusion,
+            "query_grid": axes,
+        }
+    return json.loads(json.dumps(config))

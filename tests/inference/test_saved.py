@@ -1,0 +1,277 @@
+"""Every kind of model is loaded the same way, and exported folders hold all of it."""
+
+import dataclasses
+import json
+import pathlib
+import random
+from typing import Any
+
+import grain
+import jax
+import numpy as np
+import pytest
+import safetensors.numpy
+from ml_collections import ConfigDict
+
+from radejax import Detector, UserError, models
+from radejax.cli.demo import MODEL
+from radejax.core.config import base_config, load_module
+from radejax.core.errors import DataError
+from radejax.inference import exported_loader, saved
+from radejax.inference.saved import load_model, save_model, starting_weights
+from radejax.runs import workdir
+from radejax.training.checkpoints import Checkpoints
+from radejax.weights import radenet_torch
+from radejax.weights.image_backbone import weights_sha256
+
+from .. import small_models as small
+
+
+def _equal(a: Any, b: Any) -> None:
+    assert np.asarray(a.is_valid).any()
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+# Runs and official files -------------------------------------------------------------
+
+
+def _write_torch(path: pathlib.Path, **changes: Any) -> ConfigDict:
+    config = small.radar_config().model
+    config.update(doppler_bins=64, elevation_bins=37, num_groups=32)
+    config.update(widths=(32, 32), decoder_width=64, **changes)
+    model = models.build(config)
+    inputs = np.zeros((1, 16, 16, 101), np.float32)
+    shapes = jax.eval_shape(model.init, jax.random.key(0), inputs)
+    variables = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), shapes)
+    radenet_torch.save(model, variables, path)
+    return config
+
+
+def test_a_torch_file_is_loaded_like_a_folder(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "best.npz"
+    config = _write_torch(path)
+    loaded = load_model(path)
+    assert loaded.config.data.azimuth_mapping == "stretched"
+    assert (loaded.step, loaded.run) == (None, {})
+    assert loaded.grid.projection_shape == (256, 107, 101)
+    assert len(loaded.config.classes) == config.num_classes
+    with pytest.raises(UserError, match=r"holds one model only, but step=3 is given"):
+        load_model(path, step=3)
+    with pytest.raises(UserError, match="the model is RADE-Net"):
+        load_model(path, image_backbone=tmp_path)
+    weights = starting_weights(config, path).variables
+    jax.tree.map(np.testing.assert_array_equal, weights, loaded.variables)
+
+
+def test_a_run_that_has_not_trained_says_so(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such file or folder"):
+        Detector.from_checkpoint(tmp_path / "gone")
+    with pytest.raises(
+        FileNotFoundError, match=r"no model in .*: expected config\.json"
+    ):
+        load_model(tmp_path)
+    (tmp_path / "config.json").write_text(base_config().to_json())
+    with pytest.raises(FileNotFoundError, match=r"the run has not trained yet"):
+        Detector.from_workdir(tmp_path)
+
+
+def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(
+    tmp_path: pathlib.Path,
+) -> None:
+    """A checkpoint has its own config; a training compares its config with the folder's."""
+    config, grid = small.radar_config(), small.small_grid()
+    info = workdir.checkpoint_info(config, grid, {}, {})
+    state = {"params": small.detector().variables["params"]}
+    positions = iter(grain.MapDataset.range(9).to_iter_dataset())
+    with (
+        workdir.claimed(tmp_path, config),
+        Checkpoints(tmp_path / "checkpoints") as checkpoints,
+    ):
+        checkpoints.save(1, state, positions, info=info)
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    content["classes"].reverse()
+    path.write_text(json.dumps(content))
+    assert tuple(load_model(tmp_path).config.classes) == tuple(config.classes)
+    with (
+        pytest.raises(UserError, match="a run with another config: config"),
+        workdir.claimed(tmp_path, config),
+    ):
+        pass
+
+
+# Weights to start from ---------------------------------------------------------------
+
+
+def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> None:
+    model = small.saved()
+    save_model(model, tmp_path)
+    weights = starting_weights(model.config.model, init_from=tmp_path)
+    assert weights.source == str(tmp_path)
+    assert weights.pretrained is None
+    jax.tree.map(
+        np.testing.assert_array_equal, weights.variables, dict(model.variables)
+    )
+    other = small.saved(model__heatmap_prior=0.25).config.model
+    with pytest.raises(
+        UserError, match=r"do not fit: config\.model\.heatmap_prior is .* 0\.25 here"
+    ):
+        starting_weights(other, init_from=tmp_path)
+
+
+def test_without_anything_to_start_from_all_is_initialized() -> None:
+    config = small.radar_config().model
+    assert starting_weights(config) == saved.StartingWeights()
+    with pytest.raises(UserError, match="which has no camera"):
+        starting_weights(config, image_backbone_path="dinov3")
+
+
+def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> None:
+    model = small.saved("camera")
+    weights, config = model.variables["params"]["image_backbone"], model.config.model
+    save_model(model, tmp_path / "all", with_backbone=True)
+    found = starting_weights(config, tmp_path / "all")
+    assert found.pretrained is None
+    assert found.frozen_sha256 == weights_sha256(weights)
+    # Embeddings of the same backbone stand for it.
+    content = {"weights_sha256": found.frozen_sha256}
+    (tmp_path / "manifest.json").write_text(json.dumps(content))
+    embedded = starting_weights(config, embeddings=tmp_path)
+    assert embedded.frozen_sha256 == found.frozen_sha256
+    assert embedded.variables is embedded.pretrained is None
+    tuned = small.saved("camera", model__image__freeze=False).config.model
+    assert starting_weights(tuned).frozen_sha256 is None
+
+
+# Exported folders --------------------------------------------------------------------
+
+
+def test_an_exported_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> None:
+    model = small.saved(data__azimuth_mapping="stretched", seed=3)
+    detector = Detector(model, nms_iou=0.2, score_threshold=0.1, batch_sizes=(4,))
+    content = save_model(detector.saved, tmp_path)
+    assert content["left_out"] == []
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["config.json", "model.safetensors"]
+    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    assert loaded.model == detector.model
+    assert loaded.classes == detector.classes
+    assert loaded.grid == small.small_grid()  # exact in JSON
+    assert (loaded.nms_iou, loaded.score_threshold) == (0.2, 0.1)
+    _equal(loaded(small.projections(3)), detector(small.projections(3)))
+    assert load_model(tmp_path).config.to_json() == detector.saved.config.to_json()
+
+
+def test_a_model_stored_in_half_is_half_and_computes_in_float32(
+    tmp_path: pathlib.Path,
+) -> None:
+    for half in (False, True):
+        save_model(small.saved(), tmp_path / str(half), half=half)
+    sizes = [
+        (tmp_path / n / saved.WEIGHTS_FILE).stat().st_size for n in ("False", "True")
+    ]
+    assert sizes[1] < 0.6 * sizes[0]
+
+    def same(ours: Any, theirs: Any) -> None:
+        assert ours.dtype == np.float32
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-7)
+
+    found = load_model(tmp_path / "True").variables
+    jax.tree.map(same, found, dict(small.saved().variables))
+
+
+def test_the_demo_has_a_small_model_of_simulated_data() -> None:
+    assert sum(path.stat().st_size for path in MODEL.iterdir()) < 4e6
+    loaded = load_model(MODEL)
+    card = (MODEL / "README.md").read_text()
+    assert "imulated data" in card
+    assert "CC BY" not in card
+    assert loaded.config.simulation.scenes == "procedural"  # nothing of K-Radar in it
+    assert loaded.grid.projection_shape == (64, 56, 25)
+
+
+@pytest.mark.slow
+def test_an_exported_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> None:
+    detector = small.detector("camera")
+    content = save_model(detector.saved, tmp_path)
+    assert content["left_out"] == ["params/image_backbone"]
+    names = safetensors.numpy.load_file(tmp_path / "model.safetensors")
+    assert not any("image_backbone" in name for name in names)
+    inputs = small.projections(2), small.images(2), small.calibration()
+    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    _equal(loaded(inputs[0]), detector(inputs[0]))
+    with pytest.raises(UserError, match="give"):
+        loaded(*inputs)
+    save_model(detector.saved, tmp_path, with_backbone=True)
+    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    _equal(loaded(*inputs), detector(*inputs))
+    assert loaded.camera_options == detector.camera_options
+    with pytest.raises(UserError, match="--with-backbone"):
+        save_model(small.saved("camera", model__image__freeze=False), tmp_path)
+
+
+def test_bfloat16_computes_close_to_float32() -> None:
+    full, half = small.detector(), small.detector(dtype="bfloat16")
+    assert half.model.dtype == "bfloat16"
+    inputs = small.projections(1)
+    a, b = (np.asarray(d(inputs).scores[0, 0]) for d in (full, half))
+    assert a != b
+    assert a == pytest.approx(b, abs=0.02)
+    leaf = jax.tree.leaves(half.variables)[0]
+    assert leaf.dtype == np.float32
+    with pytest.raises(UserError, match="dtype is 'float16'"):
+        small.detector(dtype="float16")
+
+
+def test_a_flipped_bit_of_the_weights_is_found(tmp_path: pathlib.Path) -> None:
+    programs = {"detector.stablehlo": b"a program"}
+    save_model(small.saved(), tmp_path, programs=programs)
+    path, draw = tmp_path / "model.safetensors", random.Random(0)
+    content = path.read_bytes()
+    for bit in draw.sample(range(8 * len(content)), 20):
+        corrupted = bytearray(content)
+        corrupted[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(corrupted)
+        with pytest.raises(DataError, match=r"model\.safetensors is corrupted or of"):
+            load_model(tmp_path)
+        with pytest.raises(ValueError, match=r"model\.safetensors: corrupted"):
+            exported_loader.load(tmp_path)
+    path.write_bytes(content)
+    (tmp_path / "detector.stablehlo").write_bytes(b"e program")
+    with pytest.raises(ValueError, match=r"detector\.stablehlo: corrupted"):
+        exported_loader.load(tmp_path)
+
+
+def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> None:
+    save_model(small.saved(), tmp_path)
+    path = tmp_path / "config.json"
+    content = json.loads(path.read_text())
+    config = content["config"]
+    for change, message in (
+        ({"format": "other"}, "format is 'other'"),
+        ({"config": {**config, "classes": ["Sedan"]}}, "1 classes, expected 5"),
+        ({"config": {**config, "model": {**config["model"], "neck": "x"}}}, "neck is"),
+        ({"config": {**config, "model": 3}}, "config.json: "),
+        ({"config": {"a.b": 1}}, "dots in field names"),
+        ({"config": None}, "config.json: "),
+        ({"grid": {}}, "range_m"),
+        ({"sha256": {}}, "config.json: "),
+    ):
+        path.write_text(json.dumps(content | change))
+        with pytest.raises(DataError, match=message):
+            load_model(tmp_path)
+    wider = dataclasses.replace(small.saved(), variables={"params": {}})
+    save_model(wider, tmp_path)
+    with pytest.raises(DataError, match=r"do not fit config\.model"):
+        load_model(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("radenet", x) for x in ("base", "paper", "official", "stem", "sedan")]
+    + [("dinorade", x) for x in ("rc", "rcw", "rcw_resnet50", "official", "r")],
+)
+def test_a_config_in_json_makes_the_same_model(name: str, options: str) -> None:
+    config = load_module(small.CONFIGS / f"{name}.py").get_config(options).model
+    again = ConfigDict(json.loads(config.to_json()), convert_dict=True)
+    assert models.build(again) == models.build(config)
