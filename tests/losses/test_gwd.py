@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from radejax.losses import gwd as G
 
-ROOTS = ("eigh", "closed_form")
 # The released code has NaN or finite but wrong gradients here (see losses_make.py).
 NO_REFERENCE_GRADIENT = {
     "both_square",
@@ -22,20 +21,20 @@ NO_REFERENCE_GRADIENT = {
 NO_SQRT_GRADIENT = NO_REFERENCE_GRADIENT | {"identical", "nearly_identical"}
 COLUMN = {"none": "none", "sqrt": "sqrt", "log1p": "log"}
 
-distance = jax.jit(G.gwd, static_argnames="root")
-loss = jax.jit(G.gwd_loss, static_argnames=("transform", "root"))
+distance = jax.jit(G.gwd)
+loss = jax.jit(G.gwd_loss, static_argnames="transform")
 
 
-@partial(jax.jit, static_argnames="root")
-def distance_and_grad(a, b, root="eigh"):
-    values, pull = jax.vjp(lambda a: G.gwd(a, b, root=root), a)
+@jax.jit
+def distance_and_grad(a, b):
+    values, pull = jax.vjp(lambda a: G.gwd(a, b), a)
     return values, pull(jnp.ones_like(values))[0]
 
 
-@partial(jax.jit, static_argnames=("transform", "root"))
-def loss_grad(a, b, transform="sqrt", root="eigh"):
+@partial(jax.jit, static_argnames="transform")
+def loss_grad(a, b, transform="sqrt"):
     """Gradients of every pair's loss with respect to its first box."""
-    return jax.grad(lambda a: G.gwd_loss(a, b, transform=transform, root=root).sum())(a)
+    return jax.grad(lambda a: G.gwd_loss(a, b, transform=transform).sum())(a)
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +57,14 @@ def box(x=0.0, y=0.0, length=4.0, width=2.0, yaw=0.0):
     return np.array([x, y, 0, length, width, 1.5, np.sin(yaw), np.cos(yaw)], np.float32)
 
 
+def gaussian_root(boxes):
+    """Square root S of the covariance of boxes, `[N, 2, 2]`."""
+    heading = np.stack([boxes[:, 7], boxes[:, 6]], -1)
+    across = np.stack([-boxes[:, 6], boxes[:, 7]], -1)
+    axes = np.stack([heading, across], -1)
+    return axes * boxes[:, None, 3:5] / 2 @ axes.swapaxes(1, 2)
+
+
 def random_boxes(rng, count):
     boxes = rng.normal(0, 2, (count, 8))
     boxes[:, 3:6] = rng.uniform(0.3, 9, (count, 3))
@@ -66,29 +73,23 @@ def random_boxes(rng, count):
     return boxes
 
 
-@pytest.mark.parametrize("root", ROOTS)
-def test_by_hand(root):
+def test_by_hand():
     # Shifted by (3, 4); half lengths 2 and 3 along one axis; widths exchanged.
-    assert float(distance(box(), box(3, 4), root=root)) == 25
-    np.testing.assert_allclose(distance(box(), box(length=6), root=root), 1, rtol=1e-6)
+    assert float(distance(box(), box(3, 4))) == 25
+    np.testing.assert_allclose(distance(box(), box(length=6)), 1, rtol=1e-6)
     turned = box(yaw=np.pi / 2)
-    np.testing.assert_allclose(distance(box(), turned, root=root), 2, rtol=1e-6)
+    np.testing.assert_allclose(distance(box(), turned), 2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("root", ROOTS)
-def test_distance_of_the_released_code(pairs, root):
-    found = distance(pairs["pred"], pairs["gt"], root=root)
+def test_distance_of_the_released_code(pairs):
+    found = distance(pairs["pred"], pairs["gt"])
     error = np.abs(found - pairs["gwd_f64"]) / scale(pairs).clip(1e-6)
-    # Zero sizes: the released clamp of eigenvalues, absent from the closed form.
-    kept = rows(pairs, () if root == "eigh" else ("zero_size", "zero_yaw_vector"))
-    assert error[kept].max() < 1e-6
-    assert np.abs(found - pairs["gwd_f64"])[~kept].max(initial=0) < 1e-5
+    assert error.max() < 1e-6
 
 
 @pytest.mark.parametrize("transform", COLUMN)
-@pytest.mark.parametrize("root", ROOTS)
-def test_loss_of_the_released_code(pairs, root, transform):
-    found = loss(pairs["pred"], pairs["gt"], transform=transform, root=root)
+def test_loss_of_the_released_code(pairs, transform):
+    found = loss(pairs["pred"], pairs["gt"], transform=transform)
     expected = pairs[f"loss_{COLUMN[transform]}_f64"]
     reference_is_nan = ~np.isfinite(expected)
     assert reference_is_nan.sum() <= 10
@@ -99,13 +100,12 @@ def test_loss_of_the_released_code(pairs, root, transform):
 
 
 @pytest.mark.parametrize("transform", [None, *COLUMN])
-@pytest.mark.parametrize("root", ROOTS)
-def test_gradient_of_the_released_code(pairs, root, transform):
+def test_gradient_of_the_released_code(pairs, transform):
     if transform is None:
-        _, grad = distance_and_grad(pairs["pred"], pairs["gt"], root=root)
+        _, grad = distance_and_grad(pairs["pred"], pairs["gt"])
         expected = pairs["gwd_grad_f64"]
     else:
-        grad = loss_grad(pairs["pred"], pairs["gt"], transform, root)
+        grad = loss_grad(pairs["pred"], pairs["gt"], transform)
         expected = pairs[f"grad_{COLUMN[transform]}_f64"]
     assert np.isfinite(grad).all()
     kept = rows(
@@ -115,9 +115,8 @@ def test_gradient_of_the_released_code(pairs, root, transform):
     assert (np.abs(grad - expected) < tolerance)[kept].all()
 
 
-@pytest.mark.parametrize("root", ROOTS)
-def test_closed_form_gradient_where_the_released_one_is_wrong(pairs, root):
-    _, grad = distance_and_grad(pairs["pred"], pairs["gt"], root=root)
+def test_closed_form_gradient_where_the_released_one_is_wrong(pairs):
+    _, grad = distance_and_grad(pairs["pred"], pairs["gt"])
     expected = pairs["gwd_closed_form_grad_f64"]
     kept = rows(pairs, ("zero_size", "zero_yaw_vector"))
     size = np.maximum(np.abs(expected[kept]).max(1, keepdims=True), 1)
@@ -134,7 +133,7 @@ def test_golden_pairs_are_the_reference(pairs, shared):
 def test_roots_of_the_released_code(pairs):
     # It puts the width where we put the length: the same root, turned by 90 degrees.
     turn = np.array([[0, -1], [1, 0]])
-    found = turn @ np.asarray(G.gaussian_root(jnp.asarray(pairs["pred"]))) @ turn.T
+    found = turn @ gaussian_root(pairs["pred"]) @ turn.T
     np.testing.assert_allclose(found, pairs["sigma_pred_f64"], atol=1e-4, rtol=1e-5)
     trace = G.trace_of_root_2x2(
         *jnp.asarray(pairs["inner"].reshape(-1, 4).T[[0, 1, 3]])
@@ -143,13 +142,12 @@ def test_roots_of_the_released_code(pairs):
     np.testing.assert_allclose(trace, expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("root", ROOTS)
-def test_double_precision_against_scipy(root):
+def test_double_precision_against_scipy():
     rng = np.random.default_rng(0)
     a, b = random_boxes(rng, 20), random_boxes(rng, 20)
     with jax.enable_x64(True):
-        found = np.asarray(G.gwd(jnp.asarray(a), jnp.asarray(b), root=root))
-        sa, sb = (np.asarray(G.gaussian_root(jnp.asarray(x))) for x in (a, b))
+        found = np.asarray(G.gwd(jnp.asarray(a), jnp.asarray(b)))
+    sa, sb = gaussian_root(a), gaussian_root(b)
     for i in range(20):
         root_term = scipy.linalg.sqrtm(sa[i] @ sb[i] @ sb[i] @ sa[i]).real
         expected = np.trace(sa[i] @ sa[i] + sb[i] @ sb[i] - 2 * root_term)
@@ -170,15 +168,13 @@ def smooth_pairs():
 
 
 @pytest.mark.parametrize("transform", COLUMN)
-@pytest.mark.parametrize("root", ROOTS)
-def test_gradients_by_finite_differences(root, transform):
+def test_gradients_by_finite_differences(transform):
     a, b = smooth_pairs()
     step = 1e-5 * np.eye(8)[:, None, :]  # [8, 1, 8]
     with jax.enable_x64(True):
-        found = loss_grad(a, b, transform, root)
+        found = loss_grad(a, b, transform)
         plus, minus = (
-            np.asarray(loss(a + s, b[None], transform=transform, root=root))
-            for s in (step, -step)
+            np.asarray(loss(a + s, b[None], transform=transform)) for s in (step, -step)
         )
     np.testing.assert_allclose(found, (plus - minus).T / 2e-5, atol=1e-7)
 
@@ -209,22 +205,22 @@ numbers = st.tuples(
 
 
 @settings(deadline=None, max_examples=60)
-@given(numbers, numbers, st.sampled_from(ROOTS))
-def test_symmetric_and_not_negative(a, b, root):
+@given(numbers, numbers)
+def test_symmetric_and_not_negative(a, b):
     a, b = box(*a), box(*b)
-    forth, back = distance(a, b, root=root), distance(b, a, root=root)
+    forth, back = distance(a, b), distance(b, a)
     assert forth >= 0
     np.testing.assert_allclose(forth, back, rtol=1e-5, atol=1e-10)
 
 
 @settings(deadline=None, max_examples=60)
-@given(numbers, st.sampled_from(ROOTS))
-def test_exactly_zero_at_identity_with_zero_gradient(a, root):
+@given(numbers)
+def test_exactly_zero_at_identity_with_zero_gradient(a):
     a = box(*a)
-    value, grad = distance_and_grad(a, a, root=root)
+    value, grad = distance_and_grad(a, a)
     assert value == 0
     np.testing.assert_array_equal(grad, 0)
-    np.testing.assert_allclose(loss(a, a, root=root), 1 - 1 / 1.65, rtol=1e-6)
+    np.testing.assert_allclose(loss(a, a), 1 - 1 / 1.65, rtol=1e-6)
 
 
 @settings(deadline=None, max_examples=60)
@@ -289,24 +285,23 @@ DEGENERATE = np.array(
 
 
 @pytest.mark.parametrize(
-    ("root", "transform", "dtype"),
+    ("transform", "dtype"),
     [
-        ("eigh", "none", jnp.float32),
-        ("eigh", "sqrt", jnp.float32),
-        ("eigh", "sqrt", jnp.bfloat16),
-        ("eigh", "log1p", jnp.float32),
-        ("closed_form", "sqrt", jnp.float32),
+        ("none", jnp.float32),
+        ("sqrt", jnp.float32),
+        ("sqrt", jnp.bfloat16),
+        ("log1p", jnp.float32),
     ],
 )
-def test_degenerate_boxes_give_finite_values_and_gradients(root, transform, dtype):
+def test_degenerate_boxes_give_finite_values_and_gradients(transform, dtype):
     a, b = np.broadcast_arrays(DEGENERATE[:, None], DEGENERATE[None])
     a, b = jnp.asarray(a, dtype), jnp.asarray(b, dtype)
-    values = loss(a, b, transform=transform, root=root)
+    values = loss(a, b, transform=transform)
     assert values.shape == (10, 10)
     assert values.dtype == jnp.float32
     assert np.isfinite(values).all()
     assert (values >= 1 - 1 / 1.65 - 1e-6).all()
-    grads = np.asarray(loss_grad(a, b, transform, root), np.float32)
+    grads = np.asarray(loss_grad(a, b, transform), np.float32)
     assert np.isfinite(grads).all()
 
 
@@ -315,7 +310,6 @@ def test_degenerate_boxes_give_finite_values_and_gradients(root, transform, dtyp
     ("call", "message"),
     [
         (lambda a: G.gwd(a[..., :7], a), r"must be \[..., 8\], got \(2, 7\)"),
-        (lambda a: G.gwd(a, a, root="cholesky"), "'eigh' or 'closed_form', got"),
         (lambda a: G.gwd_loss(a, a, transform="log"), "'none', 'sqrt' or 'log1p', got"),
     ],
 )
