@@ -18,7 +18,7 @@ from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.dataset import DATA_SETS
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.losses.detection import BOX_LOSSES
+from radejax.losses.detection import LOSSES
 from radejax.models.backbone import BACKBONES
 from radejax.models.heads import HEADS
 from radejax.models.neck import NECKS
@@ -32,7 +32,7 @@ from . import small_models as small
 from .evaluation.scenes import random_scene
 
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "extending.md"
-NAMES = (NECKS, HEADS, BACKBONES, BOX_LOSSES, DATA_SETS, PROTOCOLS)
+NAMES = (NECKS, HEADS, BACKBONES, LOSSES, DATA_SETS, PROTOCOLS)
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.S)
 
 

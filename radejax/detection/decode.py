@@ -1,14 +1,14 @@
 """From a detector's maps to boxes: peaks, box parameters, rotated NMS.
 
 Everything is one pure function of fixed shapes: K rows per frame, a mask of those in
-use, and a count of the peaks that found no row.
+use, and the number of detections that were truncated.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import chex
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int, Num, Real
 
-from radejax.core.errors import UserError
+from radejax.core.errors import require
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -25,13 +25,47 @@ from radejax.geometry.radar_grid import RadarGrid
 
 Scalar = float | Float[jax.Array, ""]
 Roi = Real[Array, "6"] | Sequence[Scalar]
+RawYaw = Literal["nms", "always", "never"]
+Boxes8 = Float[jax.Array, "*batch 8"]
+
+
+@dataclasses.dataclass(frozen=True)
+class DecodeOptions:
+    """Arguments of `decode` as `config.decode` has them.
+
+    Raises:
+        UserError: A value is out of range.
+    """
+
+    max_detections: int = 100
+    score_threshold: float = 0.3
+    threshold_inclusive: bool = True
+    nms_iou: float = 0.3
+    per_class_nms: bool = False
+    roi: tuple[float, ...] | None = None
+    raw_yaw: RawYaw = "nms"
+    clip_sizes: bool = True
+
+    def __post_init__(self) -> None:
+        def check(name: str, holds: bool, expected: str) -> None:
+            require(holds, f"config.decode.{name}", getattr(self, name), expected)
+
+        check("max_detections", self.max_detections >= 1, "an integer of at least 1")
+        for name in ("score_threshold", "nms_iou"):
+            check(name, 0 <= getattr(self, name) <= 1, "a number from 0 to 1")
+        is_roi = self.roi is None or (
+            len(self.roi) == 6 and np.isfinite(self.roi).all()
+        )
+        check("roi", bool(is_roi), "six numbers x0, x1, y0, y1, z0, z1, or None")
+        kinds = get_args(RawYaw)
+        check("raw_yaw", self.raw_yaw in kinds, f"one of {kinds}")
 
 
 class Peaks(struct.PyTreeNode):
     """The strongest heatmap peaks of a batch, by descending score, before NMS.
 
     Attributes:
-        cell: `[B, P, 2]` int32 range and azimuth bins.
+        bins: `[B, P, 2]` int32 range and azimuth bins.
         boxes: `[B, P, 8]` boxes decoded there, yaw vector as regressed.
         scores: `[B, P]`; 0 where not `is_valid`.
         classes: `[B, P]` int32.
@@ -39,7 +73,7 @@ class Peaks(struct.PyTreeNode):
         num_found: `[B]` int32 peaks above the threshold (and in the region), in all.
     """
 
-    cell: jax.Array
+    bins: jax.Array
     boxes: jax.Array
     scores: jax.Array
     classes: jax.Array
@@ -59,7 +93,7 @@ def decode(
     per_class_nms: bool = False,
     threshold_inclusive: bool = False,
     z0_m: Scalar = 0.0,
-    raw_yaw: Literal["nms", "always", "never"] = "nms",
+    raw_yaw: RawYaw = "nms",
     clip_sizes: bool = True,
 ) -> Detections:
     """Boxes of a batch of detection maps.
@@ -73,7 +107,7 @@ def decode(
         maps: Heatmap logits and box parameters, any float dtype; scores are computed
             in float32.
         grid: The grid of the maps.
-        max_detections: K, rows of the result.
+        max_detections: K, rows of the result; at most as many as the maps have bins.
         score_threshold: Peaks must score above it.
         nms_iou: Of two boxes overlapping this much or more the weaker is dropped.
         pre_nms: Peaks that enter NMS at most, the strongest; default 2 K.
@@ -83,7 +117,7 @@ def decode(
             reading; the released code's is exclusive).
         z0_m: Height added to the regressed z: the paper's sensor height.
         raw_yaw: Where the length of the regressed (sin, cos) scales the footprint of a
-            box: "nms" alone; "always", so that results have that length and width, and
+            box: only in "nms"; "always", so that results have that length and width, and
             a short vector shrinks a box in every overlap, as in the released NMS and
             evaluator; "never".
         clip_sizes: Sizes are `MIN_SIZE_M` at least; the released code's may be negative.
@@ -94,7 +128,6 @@ def decode(
 
     Raises:
         ValueError: Shapes of maps and grid differ, or a size is not positive.
-        UserError: `raw_yaw` is something else.
 
     Examples:
         >>> grid = RadarGrid.reduced(
@@ -106,7 +139,11 @@ def decode(
         >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
         ([[1, -1, -1, -1]], 0.8808)
     """
-    _check_options(max_detections, raw_yaw)
+    if max_detections < 1 or raw_yaw not in get_args(RawYaw):
+        raise ValueError(
+            f"max_detections must be at least 1, got {max_detections}, and raw_yaw one "
+            f"of {get_args(RawYaw)}, got {raw_yaw!r}"
+        )
     peaks = find_peaks(
         maps,
         grid,
@@ -172,10 +209,10 @@ def find_peaks(
         >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
         >>> jitted = jax.jit(find_peaks, static_argnames=("grid", "max_peaks"))
         >>> peaks = jitted(maps, grid, max_peaks=4, score_threshold=0.3)
-        >>> peaks.cell[0, 0].tolist(), int(peaks.classes[0, 0]), int(peaks.num_found[0])
+        >>> peaks.bins[0, 0].tolist(), int(peaks.classes[0, 0]), int(peaks.num_found[0])
         ([5, 3], 1, 1)
     """
-    _check_shapes(maps, grid)
+    check_maps(maps, grid)
     if max_peaks < 1:
         raise ValueError(f"at least 1 peak must enter NMS, got {max_peaks}")
     num_azimuth = maps.heatmap_logits.shape[2]
@@ -189,15 +226,15 @@ def find_peaks(
     if roi is not None:
         best = jnp.where(_in_roi(maps.box_params, grid, roi, z0_m), best, 0.0)
     best = best.reshape(best.shape[0], -1)  # [B, R * A]
-    top, cell = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
+    top, flat = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
     is_valid = top > 0
-    at = jax.vmap(lambda values, cell: values[cell])
-    classes = jnp.argmax(at(_flat_cells(scores), cell), -1)  # the first of equals
-    params = at(_flat_cells(maps.box_params), cell).astype(jnp.float32)
-    cell = jnp.stack([cell // num_azimuth, cell % num_azimuth], -1)
+    at = jax.vmap(lambda values, flat: values[flat])
+    classes = jnp.argmax(at(_flat_bins(scores), flat), -1)  # the first of equals
+    params = at(_flat_bins(maps.box_params), flat).astype(jnp.float32)
+    bins = jnp.stack([flat // num_azimuth, flat % num_azimuth], -1)
     return Peaks(
-        cell=cell,
-        boxes=boxes_at(params, cell, grid, z0_m),
+        bins=bins,
+        boxes=boxes_at(params, bins, grid, z0_m),
         scores=top,
         classes=classes.astype(jnp.int32),
         is_valid=is_valid,
@@ -206,16 +243,16 @@ def find_peaks(
 
 
 def boxes_at(
-    params: Float[jax.Array, "*cells 8"],
-    cell: Int[jax.Array, "*cells 2"],
+    params: Float[jax.Array, "*bins 8"],
+    bins: Int[jax.Array, "*bins 2"],
     grid: RadarGrid,
     z0_m: Scalar = 0.0,
-) -> Float[jax.Array, "*cells 8"]:
+) -> Float[jax.Array, "*bins 8"]:
     """Boxes described by the parameters of given bins.
 
     Args:
         params: `[..., 8]` raw dx, dy, dz, l, w, h, sin, cos.
-        cell: `[..., 2]` integer range and azimuth bins.
+        bins: `[..., 2]` integer range and azimuth bins.
         grid: The grid of the maps.
         z0_m: Height added to dz.
 
@@ -230,27 +267,23 @@ def boxes_at(
         >>> boxes_at(jnp.ones((1, 8)), jnp.array([[10, 53]]), grid, z0_m=0.5)[0, 2:4].tolist()
         [1.5, 1.0]
     """
-    chex.assert_shape(params, (*cell.shape[:-1], 8))
-    chex.assert_axis_dimension(cell, -1, 2)
+    chex.assert_shape(params, (*bins.shape[:-1], 8))
+    chex.assert_axis_dimension(bins, -1, 2)
     params = params.astype(jnp.float32)
-    range_m = jnp.asarray(grid.range_m, jnp.float32)[cell[..., 0]]
-    cos = jnp.asarray(np.cos(grid.azimuth_rad), jnp.float32)[cell[..., 1]]
-    sin = jnp.asarray(np.sin(grid.azimuth_rad), jnp.float32)[cell[..., 1]]
+    range_m = jnp.asarray(grid.range_m, jnp.float32)[bins[..., 0]]
+    cos = jnp.asarray(np.cos(grid.azimuth_rad), jnp.float32)[bins[..., 1]]
+    sin = jnp.asarray(np.sin(grid.azimuth_rad), jnp.float32)[bins[..., 1]]
     center = jnp.stack([range_m * cos, -range_m * sin, jnp.zeros_like(sin) + z0_m], -1)
     return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
 
 
-def _with_raw_footprint(
-    boxes: Float[jax.Array, "*batch 8"],
-) -> Float[jax.Array, "*batch 8"]:
+def _with_raw_footprint(boxes: Boxes8) -> Boxes8:
     """Length and width multiplied by the length of the yaw vector."""
     norm = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
     return boxes.at[..., 3:5].multiply(norm)
 
 
-def _with_positive_sizes(
-    boxes: Float[jax.Array, "*batch 8"],
-) -> Float[jax.Array, "*batch 8"]:
+def _with_positive_sizes(boxes: Boxes8) -> Boxes8:
     """Sizes clipped from below."""
     return boxes.at[..., 3:6].max(MIN_SIZE_M)
 
@@ -296,7 +329,7 @@ def _compact(
     is_valid = at(keep, order)
     num_kept = jnp.sum(keep, axis=-1, dtype=jnp.int32)
     num_entered = jnp.sum(peaks.is_valid, axis=-1, dtype=jnp.int32)
-    detections = Detections(
+    return Detections(
         boxes=jnp.where(
             is_valid[..., None], boxes7_from_8(at(peaks.boxes, order)), 0.0
         ),
@@ -307,40 +340,14 @@ def _compact(
         - num_entered
         + jnp.maximum(num_kept - max_detections, 0),
     )
-    missing = max_detections - order.shape[1]
-    return _pad_rows(detections, missing) if missing > 0 else detections
 
 
-def _pad_rows(detections: Detections, count: int) -> Detections:
-    """`count` empty rows appended, for K larger than the map has bins."""
-
-    def pad(values: jax.Array, fill: float) -> jax.Array:
-        widths = [(0, 0), (0, count)] + [(0, 0)] * (values.ndim - 2)
-        return jnp.pad(values, widths, constant_values=fill)
-
-    return dataclasses.replace(
-        detections,
-        boxes=pad(detections.boxes, 0),
-        scores=pad(detections.scores, 0),
-        classes=pad(detections.classes, -1),
-        is_valid=pad(detections.is_valid, False),
-    )
-
-
-def _flat_cells(values: Num[jax.Array, "B R A C"]) -> Num[jax.Array, "B R*A C"]:
+def _flat_bins(values: Num[jax.Array, "B R A C"]) -> Num[jax.Array, "B R*A C"]:
     return values.reshape(values.shape[0], -1, values.shape[-1])
 
 
-def _check_options(max_detections: int, raw_yaw: str) -> None:
-    if max_detections < 1:
-        raise ValueError(f"max_detections must be at least 1, got {max_detections}")
-    if raw_yaw not in ("nms", "always", "never"):
-        raise UserError(
-            f'decode.raw_yaw is {raw_yaw!r}, expected "nms", "always" or "never"'
-        )
-
-
-def _check_shapes(maps: DetectionMaps, grid: RadarGrid) -> None:
+def check_maps(maps: DetectionMaps, grid: RadarGrid) -> None:
+    """Raise `ValueError` where shapes of maps and grid differ."""
     logits, params = maps.heatmap_logits.shape, maps.box_params.shape
     expected = (grid.num_range, grid.num_azimuth)
     if len(logits) != 4 or params != (*logits[:3], 8):

@@ -1,4 +1,4 @@
-"""Rotated non-maximum suppression of a fixed number of boxes."""
+"""Rotated non-maximum suppression and matching of padded sets of boxes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from jaxtyping import Bool, Float, Int
 
 from radejax.geometry.rotated_iou import bev_iou
 
+Boxes = Float[jax.Array, "*batch K _"]
+Mask = Bool[jax.Array, "*batch K"]
+Threshold = float | Float[jax.Array, ""]
+
 
 def rotated_nms(
-    boxes: Float[jax.Array, "*batch K _"],
-    is_valid: Bool[jax.Array, "*batch K"],
-    iou_threshold: float | Float[jax.Array, ""],
+    boxes: Boxes,
+    is_valid: Mask,
+    iou_threshold: Threshold,
     *,
     classes: Int[jax.Array, "*batch K"] | None = None,
-) -> Bool[jax.Array, "*batch K"]:
+) -> Mask:
     """Which boxes survive greedy bird's-eye-view non-maximum suppression.
 
     In order of the rows, a box is kept unless it overlaps a box kept before:
@@ -50,9 +54,7 @@ def rotated_nms(
     return greedy_suppression(overlaps, is_valid)
 
 
-def greedy_suppression(
-    overlaps: Bool[jax.Array, "*batch K K"], is_valid: Bool[jax.Array, "*batch K"]
-) -> Bool[jax.Array, "*batch K"]:
+def greedy_suppression(overlaps: Bool[jax.Array, "*batch K K"], is_valid: Mask) -> Mask:
     """The greedy choice for a given overlap relation, rows by descending score.
 
     Instead of K steps one after the other, all rows are decided together from the
@@ -76,7 +78,7 @@ def greedy_suppression(
     chex.assert_shape(overlaps, (*is_valid.shape, is_valid.shape[-1]))
     before = jnp.triu(overlaps, 1)  # [i, j]: i would suppress j
 
-    def decide(keep: Bool[jax.Array, "*batch K"]) -> Bool[jax.Array, "*batch K"]:
+    def decide(keep: Mask) -> Mask:
         return is_valid & ~jnp.any(before & keep[..., :, None], axis=-2)
 
     def changed(state: tuple[jax.Array, jax.Array]) -> Bool[jax.Array, ""]:
@@ -88,3 +90,43 @@ def greedy_suppression(
         (decide(is_valid), is_valid),
     )
     return keep
+
+
+def match_boxes(
+    predicted: Float[jax.Array, "K _"],
+    is_predicted: Bool[jax.Array, " K"],
+    objects: Float[jax.Array, "N _"],
+    is_object: Bool[jax.Array, " N"],
+    *,
+    iou_threshold: Threshold = 0.0,
+) -> tuple[Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
+    """Match each prediction with the object it overlaps most on the ground plane.
+
+    Args:
+        predicted: `[K, 7]` or `[K, 8]` boxes.
+        is_predicted: `[K]` bool, False for padding.
+        objects: `[N, 7]` or `[N, 8]` boxes.
+        is_object: `[N]` bool, False for padding.
+        iou_threshold: Only overlaps strictly greater count.
+
+    Returns:
+        `[K]` int32 row of the object, 0 without one, and `[K]` bool, True where there is
+        one. Several predictions may have the same object.
+
+    Raises:
+        AssertionError: The arrays do not have one row per prediction and object.
+
+    Examples:
+        >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [9.0, 0, 0, 4, 2, 1, 0]])
+        >>> all_valid = jnp.array([True, True])
+        >>> object_idx, _ = jax.jit(match_boxes)(cars[::-1], all_valid, cars, all_valid)
+        >>> object_idx.tolist()
+        [1, 0]
+    """
+    chex.assert_rank([predicted, objects], 2)
+    chex.assert_shape(is_predicted, predicted.shape[:1])
+    chex.assert_shape(is_object, objects.shape[:1])
+    iou = bev_iou(predicted, objects)  # [K, N]
+    allowed = is_predicted[:, None] & is_object[None, :] & (iou > iou_threshold)
+    iou = jnp.where(allowed, iou, 0.0)
+    return jnp.argmax(iou, axis=1).astype(jnp.int32), jnp.max(iou, axis=1) > 0

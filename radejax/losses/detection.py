@@ -2,51 +2,33 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, Num
 
-from radejax.core.errors import UserError
+from radejax.core.errors import require
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.detection.decode import boxes_at, find_peaks, suppress
-from radejax.detection.matching import match_boxes
+from radejax.detection.decode import boxes_at, check_maps, find_peaks, suppress
+from radejax.detection.nms import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
 Assignment = Literal["center", "nms"]
-Pairs = tuple[
-    Float[jax.Array, "B M 8"], Float[jax.Array, "B M 8"], Bool[jax.Array, "B M"]
-]
-"""Predictions and their objects, and where they count; M objects, or peaks after NMS."""
-
-BoxLoss = Callable[
-    [Float[jax.Array, "B N 8"], Float[jax.Array, "B N 8"]], Float[jax.Array, "B N"]
-]
-BOX_LOSSES: dict[str, BoxLoss] = {
-    "smooth_l1": lambda predicted, wanted: jnp.mean(smooth_l1(predicted - wanted), -1)
-}
-"""Losses of predicted boxes and their objects, `[B, N, 8]` each, by name: `[B, N]`. The
-Gaussian Wasserstein distance, which has options, and the focal loss come on top."""
-
-Scalar = float | Num[jax.Array, ""]
-Weights = Mapping[str, Scalar]
-_WEIGHTS: Weights = MappingProxyType({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0})
-
-
-def loss_names() -> tuple[str, ...]:
-    """Parts that the loss may have: what `weights` may name.
-
-    Examples:
-        >>> loss_names()
-        ('focal', 'gwd', 'smooth_l1')
-    """
-    return ("focal", "gwd", *BOX_LOSSES)
+Number = float | Num[jax.Array, ""]
+Scalar = Num[jax.Array, ""]
+Weights = Mapping[str, Number]
+Maps = Float[jax.Array, "B R A C"]
+Boxes8 = Float[jax.Array, "B N 8"]
+Mask = Bool[jax.Array, "B N"]
+FrameMask = Bool[jax.Array, " B"] | None
 
 
 class NmsAssignment(NamedTuple):
@@ -62,11 +44,76 @@ class NmsAssignment(NamedTuple):
     """
 
     max_peaks: int = 128
-    score_threshold: Scalar = 0.3
-    nms_iou: Scalar = 0.3
-    match_iou: Scalar = 0.0
+    score_threshold: Number = 0.3
+    nms_iou: Number = 0.3
+    match_iou: Number = 0.0
     threshold_inclusive: bool = False
     per_class: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class LossOptions:
+    """Options of `detection_loss`: the fields of `config.loss`, and `nms`.
+
+    Attributes:
+        heatmap_sigma_mode: Target shape, see `gaussian_heatmap`.
+        heatmap_sigma_bins: Standard deviation of targets in bins, for "fixed".
+        gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
+        gwd_tau: Likewise.
+        normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released:
+            raw). Smooth L1 always sees it raw, which teaches the network its length.
+        assignment: "center": boxes at each object's own bin (as released); "nms": those
+            that survive NMS with the object that they overlap most (the paper).
+        weights: Weights of losses by their name in `LOSSES`; a loss without a weight is
+            not computed.
+        normalize: Divide each loss by its own value, held constant: gradients have the
+            ratio `weights`, the total is constant, losses of 0 add nothing.
+        z0_m: Sensor height, added to the regressed z.
+        nms: Which predicted boxes have an object, for "nms".
+
+    Raises:
+        UserError: A value is out of range. Traced numbers are not checked.
+    """
+
+    heatmap_sigma_mode: SigmaMode = "fixed"
+    heatmap_sigma_bins: float = 3.0
+    gwd_transform: Transform = "sqrt"
+    gwd_tau: float = 1.65
+    normalize_yaw: bool = False
+    assignment: Assignment = "center"
+    weights: Weights = dataclasses.field(
+        default_factory=lambda: {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
+    )
+    normalize: bool = True
+    z0_m: Number = 0.0
+    nms: NmsAssignment = NmsAssignment()  # noqa: RUF009, immutable
+
+    def __post_init__(self) -> None:
+        for name, kind in (
+            ("heatmap_sigma_mode", SigmaMode),
+            ("gwd_transform", Transform),
+            ("assignment", Assignment),
+        ):
+            choices = get_args(kind)
+            self._check(name, choices.__contains__, f"one of {choices}")
+        for name in ("heatmap_sigma_bins", "gwd_tau"):
+            self._check(name, lambda value: 0 < value < math.inf, "a number above 0")
+        self._check("z0_m", math.isfinite, "a finite number")
+        names = ", ".join(LOSSES)
+        expected = f"numbers of at least 0, not all 0, for some of {names}"
+        self._check("weights", _are_weights, expected)
+
+    def _check(self, name: str, holds: Callable[[Any], bool], expected: str) -> None:
+        value = getattr(self, name)
+        if not isinstance(value, jax.core.Tracer):
+            require(holds(value), f"config.loss.{name}", value, expected)
+
+
+def _are_weights(weights: Weights) -> bool:
+    numbers = [w for w in weights.values() if not isinstance(w, jax.core.Tracer)]
+    are_in_range = all(0 <= weight < math.inf for weight in numbers)
+    is_any = any(numbers) or len(numbers) < len(weights)
+    return set(weights) <= set(LOSSES) and are_in_range and is_any
 
 
 def detection_loss(
@@ -74,19 +121,10 @@ def detection_loss(
     batch: Batch,
     grid: RadarGrid,
     *,
-    heatmap_sigma_mode: SigmaMode = "fixed",
-    heatmap_sigma_bins: float = 3.0,
-    gwd_transform: Transform = "sqrt",
-    gwd_tau: float = 1.65,
-    normalize_yaw: bool = False,
-    assignment: Assignment = "center",
-    weights: Weights = _WEIGHTS,
-    normalize: bool = True,
-    z0_m: Scalar = 0.0,
-    is_frame_valid: Bool[jax.Array, " B"] | None = None,
-    nms: NmsAssignment = NmsAssignment(),  # noqa: B008, immutable
-) -> tuple[Float[jax.Array, ""], dict[str, Num[jax.Array, ""]]]:
-    """Weighted sum of the losses that `weights` names, and its parts; in float32.
+    is_frame_valid: FrameMask = None,
+    **options: Any,
+) -> tuple[Float[jax.Array, ""], dict[str, Scalar]]:
+    """Weighted sum of the losses that `weights` names, and its terms; in float32.
 
     Losses of boxes are means over the matched ones of a frame (0 without any), then over
     all frames of the batch, sharded or not.
@@ -95,27 +133,16 @@ def detection_loss(
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
         batch: Ground truth: `boxes`, `classes`, `is_valid` are read.
         grid: The grid of the maps (padded where they are).
-        heatmap_sigma_mode: Target shape, see `gaussian_heatmap`.
-        heatmap_sigma_bins: Standard deviation of targets in bins, for "fixed".
-        gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
-        gwd_tau: Likewise.
-        normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released: raw).
-            Smooth L1 always sees it raw, which teaches the network its length.
-        assignment: "center": boxes at each object's own bin (as released); "nms": those
-            that survive NMS with the object that they overlap most (the paper).
-        weights: Of some of `loss_names()`; a part without one is not computed.
-        normalize: Divide each part by its own value, held constant: gradients of the
-            parts have the ratio `weights`, the total is constant, parts of 0 add nothing.
-        z0_m: Sensor height, added to the regressed z.
         is_frame_valid: `[B]` bool, False for frames that only fill up a batch.
-        nms: Which predicted boxes have an object, for "nms".
+        **options: Fields of `LossOptions`.
 
     Returns:
-        Scalar total, and scalars by name: the raw parts, their `weighted_sum`,
+        Scalar total, and scalars by name: the raw losses, their `weighted_sum`,
         `num_objects`, `num_positive` (bins), `num_matched` (boxes).
 
     Raises:
-        UserError: Unknown option or part; or shapes of maps, batch and grid disagree.
+        UserError: An option is out of range.
+        ValueError: Shapes of maps, batch and grid disagree.
 
     References:
         RADE-Net, equation (17).
@@ -128,34 +155,200 @@ def detection_loss(
         >>> float(loss(maps, batch, RadarGrid.kradar())[0])
         4.0
     """
-    check_weights(weights)
-    _check(maps, batch, grid, assignment)
-    boxes, is_valid = _objects(batch, is_frame_valid)
-    logits = maps.heatmap_logits
-    draw = partial(
-        gaussian_heatmap, sigma_mode=heatmap_sigma_mode, sigma_bins=heatmap_sigma_bins
+    chosen = LossOptions(**options)
+    check_maps(maps, grid)
+    shape = batch.boxes.shape
+    if len(shape) != 3 or shape[0] != len(maps.heatmap_logits) or shape[2] != 8:
+        raise ValueError(
+            f"batch.boxes must be [{len(maps.heatmap_logits)}, N, 8] for these maps, "
+            f"got {shape}"
+        )
+    is_valid = jnp.asarray(batch.is_valid)
+    if is_frame_valid is not None:
+        is_valid &= is_frame_valid[:, None]
+    # Padding rows may hold anything; NaN times 0 would reach the gradients.
+    boxes = jnp.where(is_valid[..., None], batch.boxes.astype(jnp.float32), 0.0)
+    target = gaussian_heatmap(
+        boxes,
+        batch.classes,
+        is_valid,
+        grid,
+        num_classes=maps.heatmap_logits.shape[-1],
+        sigma_mode=chosen.heatmap_sigma_mode,
+        sigma_bins=chosen.heatmap_sigma_bins,
     )
-    target = draw(boxes, batch.classes, is_valid, grid, num_classes=logits.shape[-1])
-    pair = _pairs_at_centers if assignment == "center" else partial(_after_nms, nms)
-    predicted, wanted, is_matched = pair(maps, boxes, is_valid, grid, z0_m)
-    losses = BOX_LOSSES | {"gwd": partial(_gwd, gwd_tau, gwd_transform, normalize_yaw)}
-    parts = {}
-    for name in weights:
-        if name == "focal":
-            parts[name] = focal_loss(logits, target, is_frame_valid=is_frame_valid)
-            continue
-        values = losses[name](predicted, wanted)
-        parts[name] = _mean_of_frames(values, is_matched, is_frame_valid)
-    total = _weighted_sum(parts, weights, normalize)
-    parts["weighted_sum"] = _weighted_sum(parts, weights, False)
+    assign = (
+        _at_centers
+        if chosen.assignment == "center"
+        else partial(_after_nms, chosen.nms)
+    )
+    predicted, expected, is_matched = assign(maps, boxes, is_valid, grid, chosen.z0_m)
+    row = is_matched[..., None]
+    pairs = Pairs(
+        maps.heatmap_logits,
+        target,
+        # One harmless box in place of both boxes of an unmatched row, without gradient.
+        jnp.where(row, predicted, 1.0),
+        jnp.where(row, expected, 1.0),
+        is_matched,
+        is_frame_valid,
+    )
+    terms = {name: LOSSES[name](pairs, chosen) for name in chosen.weights}
+    total = _weighted_sum(terms, chosen.weights, chosen.normalize)
+    terms["weighted_sum"] = _weighted_sum(terms, chosen.weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
-    parts |= {f"num_{k}": jnp.sum(of, dtype=jnp.int32) for k, of in counted.items()}
-    return total, parts
+    terms |= {f"num_{k}": jnp.sum(of, dtype=jnp.int32) for k, of in counted.items()}
+    return total, terms
+
+
+# Terms -------------------------------------------------------------------------------
+
+
+class Pairs(NamedTuple):
+    """Predictions and what they are compared with.
+
+    Attributes:
+        logits: `[B, R, A, C]` heatmap logits.
+        target: `[B, R, A, C]` target heatmap.
+        predicted: `[B, N, 8]` predicted boxes; N objects, or peaks after NMS.
+        expected: `[B, N, 8]` their objects.
+        is_matched: `[B, N]` where a predicted box has an object.
+        is_frame_valid: `[B]` False for frames that only fill up a batch; None for all.
+    """
+
+    logits: Maps
+    target: Maps
+    predicted: Boxes8
+    expected: Boxes8
+    is_matched: Mask
+    is_frame_valid: FrameMask
+
+    def mean(self, values: Float[jax.Array, "B N"]) -> Float[jax.Array, ""]:
+        """Mean of `[B, N]` values over the matched boxes of a frame, then over frames."""
+        total = jnp.sum(jnp.where(self.is_matched, values, 0.0), axis=1)
+        per_frame = total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1)
+        if self.is_frame_valid is None:
+            return jnp.mean(per_frame)
+        num_frames = jnp.sum(self.is_frame_valid, dtype=jnp.float32)
+        return jnp.sum(per_frame * self.is_frame_valid) / jnp.maximum(num_frames, 1.0)
+
+
+def _focal(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
+    del options
+    return focal_loss(pairs.logits, pairs.target, is_frame_valid=pairs.is_frame_valid)
+
+
+def _gwd(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
+    predicted = pairs.predicted
+    if options.normalize_yaw:
+        predicted = _with_unit_yaw(predicted)
+    tau, transform = options.gwd_tau, options.gwd_transform
+    return pairs.mean(gwd_loss(predicted, pairs.expected, tau, transform))
+
+
+def _smooth_l1(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
+    del options
+    return pairs.mean(jnp.mean(smooth_l1(pairs.predicted - pairs.expected), -1))
+
+
+LOSSES: dict[str, Callable[[Pairs, LossOptions], Float[jax.Array, ""]]] = {
+    "focal": _focal,
+    "gwd": _gwd,
+    "smooth_l1": _smooth_l1,
+}
+"""Terms of the loss by name: what `weights` may name."""
+
+
+def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batch"]:
+    """Quadratic below 1, linear above: `[...]` -> `[...]`.
+
+    `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
+    loses the digits of small differences.
+
+    Examples:
+        >>> smooth_l1(jnp.array([0.5, 3.0])).tolist()
+        [0.125, 2.5]
+    """
+    size = jnp.abs(difference)
+    return jnp.where(size < 1.0, 0.5 * size * size, size - 0.5)
+
+
+def _with_unit_yaw(boxes: Boxes8) -> Boxes8:
+    """Yaw vectors scaled to length 1; (0, 0) stays, with a finite gradient."""
+    yaw = boxes[..., 6:8]
+    square = jnp.sum(yaw * yaw, axis=-1, keepdims=True)
+    is_long = square > 1e-12
+    length = jnp.sqrt(jnp.where(is_long, square, 1.0))
+    return jnp.concatenate([boxes[..., :6], yaw / length], axis=-1)
+
+
+def _weighted_sum(
+    terms: Mapping[str, Scalar], weights: Weights, normalize: bool
+) -> Float[jax.Array, ""]:
+    total = jnp.zeros((), jnp.float32)
+    for name, weight in weights.items():
+        term = terms[name]
+        if normalize:
+            constant = jax.lax.stop_gradient(term)
+            term = term / jnp.where(constant > 0, constant, 1.0)
+        total = total + weight * term
+    return total
+
+
+# Assignment --------------------------------------------------------------------------
+
+Assigned = tuple[Boxes8, Boxes8, Mask]
+"""Predicted boxes, their objects, and which have one."""
+
+
+def _at_centers(
+    maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid, z0_m: Number
+) -> Assigned:
+    """Predictions at the objects' own bins."""
+    bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
+    return _boxes_at(maps, bins, grid, z0_m), boxes, is_valid
+
+
+def _after_nms(
+    nms: NmsAssignment,
+    maps: DetectionMaps,
+    boxes: Boxes8,
+    is_valid: Mask,
+    grid: RadarGrid,
+    z0_m: Number,
+) -> Assigned:
+    """Predictions that survive NMS, and the objects that they overlap."""
+    # Which boxes are compared is a choice, not a function to differentiate.
+    peaks = find_peaks(
+        jax.lax.stop_gradient(maps),
+        grid,
+        max_peaks=nms.max_peaks,
+        score_threshold=nms.score_threshold,
+        threshold_inclusive=nms.threshold_inclusive,
+        z0_m=z0_m,
+    )
+    keep = suppress(peaks, nms.nms_iou, per_class=nms.per_class)
+    match = jax.vmap(partial(match_boxes, iou_threshold=nms.match_iou))
+    object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
+    expected = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, object_idx)
+    return _boxes_at(maps, peaks.bins, grid, z0_m), expected, is_matched
+
+
+def _boxes_at(
+    maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid, z0_m: Number
+) -> Boxes8:
+    """Predicted boxes at given bins of every frame."""
+    # One gather per frame, so that a batch axis sharded over devices stays local.
+    gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
+    return boxes_at(gather(maps.box_params, bins), bins, grid, z0_m)
+
+
+_WEIGHTS = MappingProxyType({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0})
 
 
 def whole_batch_loss(
     parts: dict[str, Num[jax.Array, " P"]],
-    num_bins: Scalar | Int[jax.Array, " P"],
+    num_bins: Number | Int[jax.Array, " P"],
     weights: Weights = _WEIGHTS,
     normalize: bool = True,
 ) -> tuple[
@@ -199,165 +392,3 @@ def whole_batch_loss(
     whole["weighted_sum"] = _weighted_sum(whole, weights, False)
     counts = {k: jnp.sum(v, axis=0) for k, v in parts.items() if k.startswith("num_")}
     return shares, total, whole | counts
-
-
-def _objects(
-    batch: Batch, is_frame_valid: Bool[jax.Array, " B"] | None
-) -> tuple[Float[jax.Array, "B N 8"], Bool[jax.Array, "B N"]]:
-    """Boxes as float32, and where they are objects."""
-    is_valid = jnp.asarray(batch.is_valid)
-    if is_frame_valid is not None:
-        is_valid &= is_frame_valid[:, None]
-    # Padding rows may hold anything; NaN times 0 would reach the gradients.
-    boxes = jnp.where(is_valid[..., None], batch.boxes.astype(jnp.float32), 0.0)
-    return boxes, is_valid
-
-
-def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batch"]:
-    """Quadratic below 1, linear above: `[...]` -> `[...]`.
-
-    `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
-    loses the digits of small differences.
-
-    Examples:
-        >>> smooth_l1(jnp.array([0.5, 3.0])).tolist()
-        [0.125, 2.5]
-    """
-    size = jnp.abs(difference)
-    return jnp.where(size < 1.0, 0.5 * size * size, size - 0.5)
-
-
-def _pairs_at_centers(
-    maps: DetectionMaps,
-    boxes: Float[jax.Array, "B N 8"],
-    is_valid: Bool[jax.Array, "B N"],
-    grid: RadarGrid,
-    z0_m: Scalar,
-) -> Pairs:
-    """Predictions at the objects' own bins."""
-    cell = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
-    predicted = boxes_at(_params_at(maps.box_params, cell), cell, grid, z0_m)
-    return _neutral(predicted, boxes, is_valid)
-
-
-def _after_nms(
-    nms: NmsAssignment,
-    maps: DetectionMaps,
-    boxes: Float[jax.Array, "B N 8"],
-    is_valid: Bool[jax.Array, "B N"],
-    grid: RadarGrid,
-    z0_m: Scalar,
-) -> Pairs:
-    """Predictions that survive NMS, and the objects that they overlap."""
-    # Which boxes are compared is a choice, not a function to differentiate.
-    fixed = jax.lax.stop_gradient(maps)
-    peaks = find_peaks(
-        fixed,
-        grid,
-        max_peaks=nms.max_peaks,
-        score_threshold=nms.score_threshold,
-        threshold_inclusive=nms.threshold_inclusive,
-        z0_m=z0_m,
-    )
-    keep = suppress(peaks, nms.nms_iou, per_class=nms.per_class)
-
-    match = partial(match_boxes, iou_threshold=nms.match_iou)
-    matches = jax.vmap(match)(peaks.boxes, keep, boxes, is_valid)
-    wanted = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, matches.object_idx)
-    params = _params_at(maps.box_params, peaks.cell)
-    predicted = boxes_at(params, peaks.cell, grid, z0_m)
-    return _neutral(predicted, wanted, matches.is_matched)
-
-
-def _params_at(
-    params: Float[jax.Array, "B R A 8"], cell: Int[jax.Array, "B N 2"]
-) -> Float[jax.Array, "B N 8"]:
-    """One gather per frame, so that a batch axis sharded over devices stays local."""
-    return jax.vmap(lambda params, cell: params[cell[:, 0], cell[:, 1]])(params, cell)
-
-
-def _neutral(
-    predicted: Float[jax.Array, "B N 8"],
-    wanted: Float[jax.Array, "B N 8"],
-    is_matched: Bool[jax.Array, "B N"],
-) -> Pairs:
-    """Both boxes of unmatched rows replaced by one harmless box, without gradient."""
-    row = is_matched[..., None]
-    return jnp.where(row, predicted, 1.0), jnp.where(row, wanted, 1.0), is_matched
-
-
-def _gwd(
-    tau: float,
-    transform: Transform,
-    normalize_yaw: bool,
-    predicted: Float[jax.Array, "B N 8"],
-    wanted: Float[jax.Array, "B N 8"],
-) -> Float[jax.Array, "B N"]:
-    predicted = _with_unit_yaw(predicted) if normalize_yaw else predicted
-    return gwd_loss(predicted, wanted, tau, transform)
-
-
-def _with_unit_yaw(boxes: Float[jax.Array, "B N 8"]) -> Float[jax.Array, "B N 8"]:
-    """Yaw vectors scaled to length 1; (0, 0) stays, with a finite gradient."""
-    yaw = boxes[..., 6:8]
-    square = jnp.sum(yaw * yaw, axis=-1, keepdims=True)
-    is_long = square > 1e-12
-    length = jnp.sqrt(jnp.where(is_long, square, 1.0))
-    return jnp.concatenate([boxes[..., :6], yaw / length], axis=-1)
-
-
-def _mean_of_frames(
-    values: Float[jax.Array, "B N"],
-    is_counted: Bool[jax.Array, "B N"],
-    is_frame_valid: Bool[jax.Array, " B"] | None,
-) -> Float[jax.Array, ""]:
-    """Mean over the counted rows of a frame, then over frames."""
-    total = jnp.sum(jnp.where(is_counted, values, 0.0), axis=1)
-    per_frame = total / jnp.maximum(jnp.sum(is_counted, axis=1), 1)
-    if is_frame_valid is None:
-        return jnp.mean(per_frame)
-    num_frames = jnp.sum(is_frame_valid, dtype=jnp.float32)
-    return jnp.sum(per_frame * is_frame_valid) / jnp.maximum(num_frames, 1.0)
-
-
-def _weighted_sum(
-    parts: Mapping[str, Num[jax.Array, ""]], weights: Weights, normalize: bool
-) -> Float[jax.Array, ""]:
-    total = jnp.zeros((), jnp.float32)
-    for name, weight in weights.items():
-        part = parts[name]
-        if normalize:
-            constant = jax.lax.stop_gradient(part)
-            part = part / jnp.where(constant > 0, constant, 1.0)
-        total = total + weight * part
-    return total
-
-
-def check_weights(weights: Weights) -> None:
-    """`UserError` for weights of no part, or of one that there is not.
-
-    Examples:
-        >>> check_weights({"focal": 2.0, "gwd": 1.0})
-    """
-    unknown = [name for name in weights if name not in loss_names()]
-    if unknown or not weights:
-        raise UserError(
-            f"config.loss.weights has {unknown[0] if unknown else 'no part'!r}, expected "
-            f"some of {', '.join(loss_names())}"
-        )
-
-
-def _check(maps: DetectionMaps, batch: Batch, grid: RadarGrid, assignment: str) -> None:
-    if assignment not in ("center", "nms"):
-        raise ValueError(f"assignment must be 'center' or 'nms', got {assignment!r}")
-    logits, boxes = maps.heatmap_logits.shape, batch.boxes.shape
-    if logits[1:3] != (grid.num_range, grid.num_azimuth):
-        raise ValueError(
-            f"maps have {logits[1]} x {logits[2]} range x azimuth bins, the grid "
-            f"{grid.num_range} x {grid.num_azimuth}: pass the grid of the maps "
-            "(grid.padded(...) where the model pads and does not crop)"
-        )
-    if len(boxes) != 3 or boxes[0] != logits[0] or boxes[2] != 8:
-        raise ValueError(
-            f"batch.boxes must be [{logits[0]}, N, 8] for these maps, got {boxes}"
-        )

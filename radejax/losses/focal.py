@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import chex
 import jax
@@ -14,12 +14,15 @@ from radejax.core.structures import Array
 from radejax.geometry.radar_grid import RadarGrid
 
 SigmaMode = Literal["fixed", "adaptive", "anisotropic"]
+Maps = Float[jax.Array, "B R A C"]
+Bins = Float[jax.Array, "*bins"]
+PerObject = Float[jax.Array, "*objects"]
 
 # Logits of the bounds [1e-6, 1 - 1e-6] to which probabilities are clipped, as float32
 # rounds them: 1 - 1e-6 becomes 1 - 1.013e-6.
 _LOWEST = float(np.log(1e-6) - np.log1p(-1e-6))
 _HIGHEST = float(-np.log(17 * 2.0**-24) + np.log1p(-17 * 2.0**-24))
-_SMALLEST_SIGMA = 1e-3  # bins; an object of zero size is a single bin
+_MIN_SIGMA = 1e-3  # bins; an object of zero size is a single bin
 
 
 def gaussian_heatmap(
@@ -72,10 +75,10 @@ def gaussian_heatmap(
     chex.assert_equal_shape_prefix([boxes, classes, is_valid], boxes.ndim - 1)
     chex.assert_equal_rank([classes, is_valid])
     boxes = boxes.astype(jnp.float32)
-    cell = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [..., N, 2]
+    bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [..., N, 2]
     sigma_range, sigma_azimuth = _sigmas(boxes, sigma_mode, sigma_bins)
-    range_profile = _profile(cell[..., 0], sigma_range, grid.num_range)
-    azimuth_profile = _profile(cell[..., 1], sigma_azimuth, grid.num_azimuth)
+    range_profile = _profile(bins[..., 0], sigma_range, grid.num_range)
+    azimuth_profile = _profile(bins[..., 1], sigma_azimuth, grid.num_azimuth)
     one_hot = jax.nn.one_hot(classes, num_classes) * is_valid[..., None]
     # Zero weight is not enough against NaN boxes in padding rows.
     range_profile = jnp.where(is_valid[..., None], range_profile, 0.0)
@@ -94,8 +97,8 @@ def gaussian_heatmap(
 
 
 def focal_loss(
-    logits: Float[jax.Array, "B R A C"],
-    target: Float[jax.Array, "B R A C"],
+    logits: Maps,
+    target: Maps,
     alpha: float = 2,
     gamma: float = 4,
     is_frame_valid: Bool[jax.Array, " B"] | None = None,
@@ -145,11 +148,8 @@ def focal_loss(
 
 
 def focal_loss_per_bin(
-    logits: Float[jax.Array, "*bins"],
-    target: Float[jax.Array, "*bins"],
-    alpha: float = 2,
-    gamma: float = 4,
-) -> Float[jax.Array, "*bins"]:
+    logits: Bins, target: Bins, alpha: float = 2, gamma: float = 4
+) -> Bins:
     """The terms that `focal_loss` sums: `[...]` and `[...]` -> `[...]` float32.
 
     log p and log(1 - p) are taken from the logits: log(1 - sigmoid(x)) rounds to 0 or
@@ -172,7 +172,7 @@ def focal_loss_per_bin(
 
 def _sigmas(
     boxes: Float[jax.Array, "*objects _"], sigma_mode: str, sigma_bins: float
-) -> tuple[Float[jax.Array, "*objects"], Float[jax.Array, "*objects"]]:
+) -> tuple[PerObject, PerObject]:
     """Standard deviations along range and azimuth, in bins: `[..., N]` each."""
     length, width = boxes[..., 3], boxes[..., 4]
     if sigma_mode == "fixed":
@@ -183,16 +183,13 @@ def _sigmas(
         along_range, along_azimuth = length / 6, width / 6
     else:
         raise ValueError(
-            f"sigma_mode must be 'fixed', 'adaptive' or 'anisotropic', got {sigma_mode!r}"
+            f"sigma_mode must be one of {get_args(SigmaMode)}, got {sigma_mode!r}"
         )
-    return (
-        jnp.maximum(along_range, _SMALLEST_SIGMA),
-        jnp.maximum(along_azimuth, _SMALLEST_SIGMA),
-    )
+    return jnp.maximum(along_range, _MIN_SIGMA), jnp.maximum(along_azimuth, _MIN_SIGMA)
 
 
 def _profile(
-    center: Int[jax.Array, "*objects"], sigma: Float[jax.Array, "*objects"], size: int
+    center: Int[jax.Array, "*objects"], sigma: PerObject, size: int
 ) -> Float[jax.Array, "*objects {size}"]:
     """Unnormalised Gaussians over `size` bins: `[...]` centers -> `[..., size]`."""
     bins = jnp.arange(size, dtype=jnp.float32)

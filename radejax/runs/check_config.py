@@ -15,7 +15,7 @@ from radejax.core.errors import UserError
 from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, VISIBILITY_FLAGS
 from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.losses.detection import loss_names
+from radejax.losses.detection import LOSSES
 from radejax.simulation.config import SimulationConfig
 
 
@@ -100,7 +100,7 @@ def _where(rule: Rule, text: str, fits: Callable[[Any], bool]) -> Rule:
 def _are_weights(value: Any) -> bool:
     """By name; or of focal, GWD and smooth L1 in a row, as in earlier versions."""
     if isinstance(value, Mapping):
-        is_known, value = set(value) <= set(loss_names()), tuple(value.values())
+        is_known, value = set(value) <= set(LOSSES), tuple(value.values())
     else:
         is_known = _several(_NOT_NEGATIVE, 3).holds(value)
     return is_known and all(map(_NOT_NEGATIVE.holds, value)) and any(value)
@@ -187,7 +187,7 @@ RULES: dict[str, Rule] = {
     "loss.normalize_yaw": _BOOL,
     "loss.assignment": _one_of("center", "nms"),
     "loss.weights": Rule(
-        f"numbers of at least 0, not all 0, by names of {', '.join(loss_names())}",
+        f"numbers of at least 0, not all 0, by names of {', '.join(LOSSES)}",
         lambda value: _are_weights(value),
     ),
     "loss.normalize": _BOOL,

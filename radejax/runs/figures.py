@@ -22,7 +22,7 @@ from radejax.data.kradar.sequences import WEATHERS
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource, record_positions
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import loss_names
+from radejax.losses.detection import LOSSES
 from radejax.runs.data import Data
 from radejax.visualize import curves
 from radejax.visualize.draw import draw_frame, draw_scenes
@@ -136,7 +136,7 @@ def draw_curves(
     if not (workdir / "metrics.jsonl").exists():
         return
     series = curves.read_metrics(workdir / "metrics.jsonl")
-    keys = [name for name in loss_names() if name in series]
+    keys = [name for name in LOSSES if name in series]
     if keys:
         title = workdir.name + (", simulated" if is_simulated else "")
         save_figure(curves.draw_training(series, keys, title), path)

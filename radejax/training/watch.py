@@ -26,7 +26,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog  # type: ignore[attr-
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.losses.detection import loss_names
+from radejax.losses.detection import LOSSES
 from radejax.training import processes
 from radejax.training.checkpoints import BEST
 from radejax.training.clock import StepClock, seconds_since_start
@@ -121,7 +121,7 @@ class Watch:
         with self.timing("compute"):  # the metrics have to be waited for
             values = {k: float(np.asarray(v)) for k, v in metrics.items()}
         speed = self._speed(step)
-        text = [f"{k} {v:.4g}" for k, v in values.items() if k in loss_names()]
+        text = [f"{k} {v:.4g}" for k, v in values.items() if k in LOSSES]
         if speed:
             text.append(f"{speed['frames_per_s']:.1f} frames/s")
             text.append(f"wait {speed['data_wait_share']:.0%}")

@@ -1,3 +1,4 @@
+import dataclasses
 from functools import partial
 
 import jax
@@ -7,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.core.config import load_config
+from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
@@ -102,7 +103,7 @@ def test_boxes_before_nms_of_the_released_code(case):
         np.testing.assert_allclose(peaks.boxes[frame, :count], boxes[:, :8], atol=2e-5)
         np.testing.assert_allclose(peaks.scores[frame, :count], boxes[:, 8], atol=1e-6)
         np.testing.assert_array_equal(peaks.classes[frame, :count], boxes[:, 9])
-        np.testing.assert_array_equal(peaks.cell[frame, :count], boxes[:, [11, 10]])
+        np.testing.assert_array_equal(peaks.bins[frame, :count], boxes[:, [11, 10]])
 
 
 def test_detections_of_the_released_code(case):
@@ -189,7 +190,7 @@ def test_peaks_equal_the_definition(seed, inclusive):
     found = zip(
         peaks.scores[0, :count].tolist(),
         peaks.classes[0, :count].tolist(),
-        *peaks.cell[0, :count].T.tolist(),
+        *peaks.bins[0, :count].T.tolist(),
         strict=True,
     )
     assert list(found) == [(float(s), c, i, j) for s, c, i, j in expected]
@@ -273,7 +274,7 @@ def test_more_rows_than_bins():
     found = decode(
         maps_of(logits, params), GRID, max_detections=300, score_threshold=0.3
     )
-    assert found.boxes.shape == (1, 300, 7)
+    assert found.boxes.shape == (1, GRID.num_range * GRID.num_azimuth, 7)
     assert found.classes[0, -1] == -1
     assert int(found.is_valid.sum()) == 6
 
@@ -421,6 +422,28 @@ def test_bfloat16_maps_and_saturated_or_missing_numbers():
 
 
 @pytest.mark.wrong_types
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_detections", 0),
+        ("score_threshold", 1.5),
+        ("score_threshold", np.nan),
+        ("nms_iou", -0.1),
+        ("roi", (0.0, 1.0)),
+        ("roi", (0.0, 1.0, 0.0, 1.0, 0.0, np.inf)),
+        ("raw_yaw", "yes"),
+    ],
+)
+def test_options_out_of_range_are_refused(name, value):
+    with pytest.raises(UserError, match=rf"config\.decode\.{name} is .*, expected"):
+        D.DecodeOptions(**{name: value})
+
+
+def test_options_are_those_of_the_config():
+    assert dataclasses.asdict(D.DecodeOptions()) == base_config().decode.to_dict()
+
+
+@pytest.mark.wrong_types
 def test_wrong_shapes_are_refused():
     logits, params, _, _ = scattered()
     run = partial(D.decode, max_detections=4, score_threshold=0.3)
@@ -434,7 +457,7 @@ def test_wrong_shapes_are_refused():
         run(maps_of(logits, params), GRID, pre_nms=0)
     with pytest.raises(ValueError, match=r"roi must be \[6\]"):
         run(maps_of(logits, params), GRID, roi=np.zeros(4))
-    with pytest.raises(UserError, match=r"decode\.raw_yaw is 'yes', expected"):
+    with pytest.raises(ValueError, match=r"raw_yaw one of .*, got 'yes'"):
         run(maps_of(logits, params), GRID, raw_yaw="yes")
 
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from radejax.detection.decode import boxes_at
-from radejax.detection.matching import match_boxes
-from radejax.detection.nms import greedy_suppression, rotated_nms
+from radejax.detection.nms import greedy_suppression, match_boxes, rotated_nms
 from radejax.geometry.camera import Camera, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.geometry.rotated_iou import bev_iou, iou_3d
