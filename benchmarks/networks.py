@@ -28,7 +28,7 @@ from radejax.models.lifting import ReferencePoints, static_reference_points
 from radejax.models.vit import rotary_angles
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step
-from radejax.weights import radenet_names, radenet_torch
+from radejax.weights import convert, radenet_torch
 
 CONFIGS = pathlib.Path(__file__).parents[1] / "configs"
 GRID = RadarGrid.kradar()
@@ -76,33 +76,22 @@ def network(path, dtype, **fields):
 
 def torch_state(model, variables):
     """Tensors of a `DinoRade` by the names of `torch_dinorade.DinoRade`."""
-    named = radenet_names.torch_names(model.radar)
-    necks = radenet_names.neck_names("dilated")
-    state = {}
-    for path, value in flax.traverse_util.flatten_dict(variables["params"]).items():
-        *modules, leaf = path
-        leaf = {"kernel": "weight", "scale": "weight"}.get(leaf, leaf)
-        if modules[:1] == ["image_fusion"]:
-            modules = modules[1:]
-        if modules[0] in ("radar_neck", "camera_neck"):
-            modules = [modules[0], necks["/".join(modules[1:])]]
-        name = named.get(path, ".".join((*modules, leaf)))
-        if modules[:2] == ["image_backbone", "layers"]:
-            rest = ".".join((*modules[2:], leaf))
-            state |= {
-                f"image_backbone.layers.{i}.{rest}": x.T for i, x in enumerate(value)
-            }
-        elif modules[-1] == "patch_embed" and leaf == "weight":  # flat patches
-            size = model.vit.patch_size
-            state[name] = value.reshape(size, size, 3, -1).transpose(3, 2, 0, 1)
-        elif modules[-1] in ("up_1", "up_2") and leaf == "weight":
-            state[name] = value.transpose(2, 3, 0, 1)
-        else:
-            state[name] = radenet_names.to_torch_layout(name, value)
-    stats = flax.traverse_util.flatten_dict(variables["batch_stats"])
-    for (*modules, leaf), value in stats.items():
-        state[".".join((*modules, f"running_{leaf}"))] = value
-        state[".".join((*modules, "num_batches_tracked"))] = np.array(0)
+    radar, params = model.radar, dict(variables["params"])
+    names = radenet_torch.module_names(len(radar.widths), radar.heads)
+    for part in ("radar_neck", "camera_neck"):
+        names |= radenet_torch.neck_names(f"image_fusion/{part}", f"{part}.neck")
+    for path in flax.traverse_util.flatten_dict(params):
+        module = path[:-1] if path[-1] in ("kernel", "scale", "bias") else path
+        name = ".".join(module).removeprefix("image_fusion.")
+        name = name.replace("image_backbone.layers", "image_backbone.layers.{}")
+        names.setdefault("/".join(module), name)
+    backbone, size = params["image_backbone"], model.vit.patch_size
+    patches = dict(backbone["patch_embed"])
+    patches["kernel"] = patches["kernel"].reshape(size, size, 3, -1)
+    params["image_backbone"] = {**backbone, "patch_embed": patches}
+    state = convert.to_torch(names, {**variables, "params": params})
+    for name in [n for n in state if n.endswith(".running_var")]:
+        state[name.replace("running_var", "num_batches_tracked")] = np.array(0)
     rows, columns, channels = model.feature_shape
     vit = model.vit
     angles = rotary_angles(rows, columns, channels // vit.num_heads, vit.rope_theta)

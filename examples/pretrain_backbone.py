@@ -9,7 +9,7 @@ before the detector is trained, and stays as it is. It learns from images alone,
 scenes of another seed than the data set's, what of each class every patch shows and how
 near it is, which the renderer knows; no detection label enters. The folder is one of
 Hugging Face's DINOv3 format; with `--config configs/quickstart_fusion.py:resnet50` it has
-a `resnet50.pth` with torchvision's names. Average precision by class tells, on scenes of a
+a `resnet50.safetensors` with torchvision's names. Average precision by class tells, on scenes of a
 third seed, how well patches that show an object are told from the others.
 """
 
@@ -55,7 +55,7 @@ CONFIG = (
 SEEDS = (2_000_003, 3_000_017)
 """Added to the seed of the data: of scenes to learn from, of those to be tested on."""
 
-REPORT, RESNET_FILE = "pretraining.json", "resnet50.pth"
+REPORT, RESNET_FILE = "pretraining.json", "resnet50.safetensors"
 PIXELS_SHOWN = 4
 """From so many pixels of a class on, a patch shows it."""
 NEAR_M = 10.0
@@ -259,7 +259,7 @@ def pretrain(
 
     Args:
         config: Of a radar-camera model, with a `simulation` section.
-        out: Folder; Hugging Face's DINOv3 format, or `resnet50.pth`.
+        out: Folder; Hugging Face's DINOv3 format, or `resnet50.safetensors`.
         images: To learn from.
         held_out: Images to be tested on.
         epochs: Times that each is seen.

@@ -6,24 +6,31 @@ RADE-Net's), `image_neck.*`, `fusion.*` and `image_backbone.*`.
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
-from radejax.core.errors import DataError, UserError
+from radejax import models
+from radejax.core.config import load_config
+from radejax.core.errors import DataError
 from radejax.core.files import PathLike
-from radejax.models.dinorade import DinoRade
-from radejax.models.lifting import LiftingAxes
-from radejax.models.radenet import FIELDS as RADAR_FIELDS
-from radejax.models.radenet import RadeNet
-from radejax.models.vit import ViT
+from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.weights import dinov3_hf, radenet_torch, resnet_torch
-from radejax.weights.state_dict import StateDictReader, read_state_dict, to_numpy
+from radejax.weights.convert import (
+    from_torch,
+    holds,
+    read_state_dict,
+    to_numpy,
+    variable_shapes,
+)
+from radejax.weights.image_backbone import check_same_vit
 
-_RADAR_PARTS = {"rad_backbone.": "backbone.", "rad_neck.": "neck.", "head.": "head."}
-_FUSION_FIELDS = ("num_heads", "dropout", "chunk_size", "out_of_view")
-_UNUSED = (r"fusion\.output_proj\.",)  # built by the released code, never called
+PART = "rad_backbone."
+"""Start of names by which a state dict of DinoRADE is recognized."""
+
+# In models without CBAM as well; built by the released code and never called; of DINOv3's
+# pretraining.
+_UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\.|.*\.mask_token$"
 
 
 def load(
@@ -36,227 +43,161 @@ def load(
 
     Project with `CameraCalibration.from_kradar(file,
     radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see
-    `radejax.models.lifting`. Maps stay on the padded grid, which for official weights
+    `radejax.models.lifting`. The maps keep the padded grid, which for official weights
     is `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:
-        state_dict_or_path: Tensors by name, or a file: `.pth`, `.pt`, `.npz` or
-            `.safetensors`; may be nested, and names may have a prefix.
+        state_dict_or_path: Tensors by name, or a file, see `convert.read_state_dict`.
         dinov3: Folder with the image backbone, if the checkpoint has none. Without
             either the model can be applied to embedded images only.
-        **model_overrides: Fields of the radar branch (`RadeNet`), or `num_heads`,
-            `dropout`, `chunk_size`, `invalid` of the fusion.
+        **model_overrides: Fields of the radar branch (`config.model`) or of the fusion
+            (`config.model.fusion`) that names and shapes do not show.
 
     Returns:
         The model, and `{"params": ..., "batch_stats": ...}` in float32.
 
     Raises:
         FileNotFoundError: There is no such file.
-        UserError: An override is unknown.
-        DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
+        UserError: An override is unknown or impossible.
+        DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
-    content, source = read_state_dict(state_dict_or_path)
-    tensors = _find(content, source)
-    known = set(RADAR_FIELDS) | set(_FUSION_FIELDS)
-    if unknown := sorted(set(model_overrides) - known):
-        raise UserError(f"unknown model fields {unknown}; available: {sorted(known)}")
-    problems: list[str] = []
-    radar, params = _load_radar(tensors, model_overrides, problems)
-    rest = {
-        name: value
-        for name, value in tensors.items()
-        if not name.startswith(tuple(_RADAR_PARTS))
-    }
-    reader = StateDictReader(without_lora(rest), source)
-    fusion = fusion_fields(rest, model_overrides)
-    params["image_fusion"] = read_fusion(reader, fusion)
-    vit, image_params, stats = read_image(reader, rest)
-    params.update(image_params)
-    try:
-        reader.finish(ignored=_UNUSED)
-    except DataError as error:
-        problems.append(str(error))
-    if problems:
-        raise DataError("; ".join(problems))
+    config, variables = read(state_dict_or_path, dinov3=dinov3, **model_overrides)
+    return cast(DinoRade, models.build(config)), variables
+
+
+def read(
+    state_dict_or_path: Mapping[str, Any] | PathLike,
+    *,
+    dinov3: PathLike | None = None,
+    **model_overrides: Any,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """`config.model` and variables from an official checkpoint; see `load`."""
+    tensors, source = read_state_dict(state_dict_or_path, PART)
+    tensors = without_lora(tensors)
+    config = load_config("dinorade:official").model.to_dict()
+    fusion = config["fusion"]
+    radenet_torch.check_overrides(model_overrides, config | fusion)
+    of_fusion = {k: v for k, v in model_overrides.items() if k in fusion}
+    of_radar = {k: v for k, v in model_overrides.items() if k not in fusion}
+    config |= radenet_torch.infer_config(tensors, source, of_radar, "rad_")
+    fusion |= infer_fusion(tensors, of_fusion)
+    names = radenet_torch.module_names(len(config["widths"]), config["heads"], "rad_")
+    names |= fusion_names()
+    if any(name.startswith("image_backbone.frozen_layers.") for name in tensors):
+        # The released code feeds its ResNet colors in [0, 1].
+        config["image"] |= {"kind": "resnet50", "standardize": False}
+        names |= resnet_names()
+    else:
+        names |= CAMERA_NECK | dinov3_hf.module_names(IMAGE_BACKBONE)
+        tensors = dinov3_hf.with_prefix_tokens(_plain_backbone(tensors), IMAGE_BACKBONE)
     if dinov3 is not None:
-        vit, variables = dinov3_hf.load(dinov3)
-        params["image_backbone"] = variables["params"]
-    model = DinoRade(
-        radar=radar,
-        vit=vit,
-        fusion=fusion,
-        query_grid=LiftingAxes.official(),
-        # The released code feeds its ResNet colours in [0, 1].
-        standardize_image=vit is not None,
-    )
-    return model, {"params": params, "batch_stats": {"image_neck": stats}}
+        vit, backbone = dinov3_hf.load(dinov3)
+        config["image"] |= dinov3_hf.image_fields(vit)
+        tensors = {k: v for k, v in tensors.items() if not k.startswith(IMAGE_BACKBONE)}
+    elif config["image"]["kind"] == "vit":
+        config["image"] |= _infer_vit(tensors, source)
+    model = models.build(config)
+    shapes = variable_shapes(model)
+    if not any(name.startswith(IMAGE_BACKBONE) for name in tensors):
+        shapes = {k: s for k, s in shapes.items() if f"/{IMAGE_BACKBONE}/" not in k}
+    variables = from_torch(names, shapes, tensors, source, _UNUSED)
+    if dinov3 is not None:
+        check_same_vit(vit, model.vit, dinov3)
+        variables["params"][IMAGE_BACKBONE] = backbone["params"]
+    return config, variables
 
 
-# Radar -------------------------------------------------------------------------------
+def is_dinorade(content: Any) -> bool:
+    """Whether a state dict, or a checkpoint that holds one, is DinoRADE's."""
+    return holds(content, PART)
 
 
-def _load_radar(
-    tensors: Mapping[str, Any], overrides: Mapping[str, Any], problems: list[str]
-) -> tuple[RadeNet, dict[str, Any]]:
-    """Radar branch through RADE-Net's loader, whose complaints are gathered."""
-    renamed = {
-        ours + name.removeprefix(theirs): value
-        for theirs, ours in _RADAR_PARTS.items()
-        for name, value in tensors.items()
-        if name.startswith(theirs)
-    }
-    fields = {k: v for k, v in overrides.items() if k in RADAR_FIELDS}
-    try:
-        model, variables = radenet_torch.load(renamed, **fields)
-    except DataError as error:
-        problems.append(f"radar branch (rad_backbone, rad_neck, head): {error}")
-        return RadeNet(5), {}
-    return model, dict(variables["params"])
-
-
-# Fusion ------------------------------------------------------------------------------
-
-
-def fusion_fields(
+def infer_fusion(
     tensors: Mapping[str, Any], overrides: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Settings that names and shapes show; the rest as released."""
-    heads = overrides.get("num_heads", 4)
-    logits = tensors.get("fusion.deform_attn.attention_weights.bias")
-    samples = 4 * heads if logits is None else logits.shape[0]
+    """Fields of `config.model.fusion` that names and shapes show, and the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
     fields = {
-        "num_heads": heads,
-        "num_points": samples // heads,
-        "num_elevation": 10,
         "weighting": "cnn" if has_weights else "off",
-        "gate": "bin",
-        "out_of_view": "official",
         "necks": any(n.startswith("fusion.rad_neck.") for n in tensors),
-        "dropout": 0.1,
-        "chunk_size": 0,
     }
-    return fields | {k: v for k, v in overrides.items() if k in _FUSION_FIELDS}
+    samples = tensors.get("fusion.deform_attn.attention_weights.bias")
+    if samples is not None:
+        fields["num_points"] = samples.shape[0] // overrides.get("num_heads", 4)
+    return fields | dict(overrides)
 
 
-def read_fusion(reader: StateDictReader, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of `Fusion` with the given fields."""
-    width, samples = 128, fields["num_heads"] * fields["num_points"]
-    sizes = {"sampling_offsets": 2 * samples, "attention_weights": samples}
-    sizes |= {"value_proj": width, "output_proj": width}
-    params = {
-        "attention": {
-            name: reader.linear(f"fusion.deform_attn.{name}", width, size)
-            for name, size in sizes.items()
-        },
-        "gate_hidden": reader.linear("fusion.fusion_gate.0", 2 * width, width // 2),
-        "gate_out": reader.linear("fusion.fusion_gate.2", width // 2, 1),
+def _infer_vit(tensors: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Fields of `config.model.image` that the backbone's tensors show, if it has any."""
+    start = f"{IMAGE_BACKBONE}."
+    shapes = {
+        name.removeprefix(start): tuple(value.shape)
+        for name, value in tensors.items()
+        if name.startswith(start)
     }
-    if fields["weighting"] == "cnn":
-        params["weighting"] = _read_weighting(reader, fields["num_elevation"])
-    if fields["necks"]:
-        params["radar_neck"] = _read_neck(reader, "fusion.rad_neck", width)
-        params["camera_neck"] = _read_neck(reader, "fusion.cam_neck", width)
-    return params
-
-
-def _read_weighting(reader: StateDictReader, num_elevation: int) -> dict[str, Any]:
-    prefix, widths = "fusion.weighting_network", (37, 32, 64, 32)
-    params = {}
-    for i, (size_in, size_out) in enumerate(itertools.pairwise(widths), 1):
-        at = 3 * (i - 1)  # convolution, normalisation, ReLU
-        params[f"conv_{i}"] = reader.conv(f"{prefix}.{at}", size_in, size_out, 3)
-        params[f"norm_{i}"] = reader.norm(f"{prefix}.{at + 1}", size_out)
-    out = reader.conv(f"{prefix}.9", widths[-1], num_elevation, 1)
-    params["out"] = {"kernel": out["kernel"][0, 0], "bias": out["bias"]}
-    return params
-
-
-def _read_neck(reader: StateDictReader, prefix: str, width: int) -> dict[str, Any]:
-    """A dilated neck of `radejax.models.neck`."""
-    params = {}
-    for i in range(3):
-        name = f"{prefix}.neck.{i}"
-        params[f"block_{i + 1}"] = {
-            "conv_1": {
-                "conv": reader.conv(f"{name}.conv1.conv", width, width, 3),
-                "norm": reader.norm(f"{name}.conv1.gn", width),
-            },
-            "conv_2": reader.conv(f"{name}.conv2", width, width, 3),
-            "norm": reader.norm(f"{name}.gn", width),
-        }
-    return params
-
-
-# Image -------------------------------------------------------------------------------
-
-
-def read_image(
-    reader: StateDictReader, tensors: Mapping[str, Any]
-) -> tuple[ViT | None, dict[str, Any], dict[str, Any]]:
-    """Backbone's model (None: ResNet), parameters, statistics of the neck."""
-    if any(n.startswith("image_backbone.frozen_layers.") for n in tensors):
-        return None, *_read_resnet(reader)
-    width = 128
-    weight = tensors.get("image_neck.channel_proj.weight")
-    channels = 384 if weight is None else weight.shape[1]
-    names = {"up_1": "fpn_layer1", "up_2": "fpn_layer2", "refine": "refine"}
-    neck = {"proj": reader.linear("image_neck.channel_proj", channels, width)}
-    stats = {}
-    for ours, theirs in names.items():
-        name = f"image_neck.{theirs}"
-        read = reader.conv if ours == "refine" else reader.conv_transpose
-        neck[ours] = read(f"{name}.0", width, width, 3 if ours == "refine" else 4)
-        neck[f"{ours}_norm"] = reader.norm(f"{name}.1", width)
-        stats[f"{ours}_norm"] = reader.running(f"{name}.1", width)
-    params = {"image_neck": neck}
-    vit = ViT()
-    backbone = {
-        match[1]: reader.give_away(name)
-        for name in reader.names
-        if (match := _BACKBONE.match(name))
+    if not shapes:
+        return {}
+    try:
+        hidden, _, patch, _ = shapes["embeddings.patch_embeddings.weight"]
+        mlp_dim, _ = shapes["layer.0.mlp.up_proj.weight"]
+        _, prefix, _ = shapes["embeddings.cls_token"]
+    except (KeyError, ValueError):
+        raise DataError(
+            f"{source}: {start}* are not the tensors of a DINOv3 ViT"
+        ) from None
+    layers = {name.split(".")[1] for name in shapes if name.startswith("layer.")}
+    return {
+        "hidden_size": hidden,
+        "num_layers": len(layers),
+        "num_heads": hidden // 64,  # all DINOv3 models have heads of 64 channels
+        "mlp_dim": mlp_dim,
+        "patch_size": patch,
+        "num_registers": prefix - 1,
+        "gated_mlp": "layer.0.mlp.gate_proj.weight" in shapes,
     }
-    if backbone:
-        vit = _infer_vit(backbone)
-        params["image_backbone"] = dinov3_hf.to_params(vit, backbone, "image_backbone")
-    return vit, params, stats
 
 
-_BACKBONE = re.compile(r"image_backbone\.(?:base_model\.model\.)?(?:model\.)?(.*)")
+# Names -------------------------------------------------------------------------------
+
+CAMERA_NECK = {"image_neck/proj": "image_neck.channel_proj"}
+for _ours, _theirs in (
+    ("up_1", "fpn_layer1"),
+    ("up_2", "fpn_layer2"),
+    ("refine", "refine"),
+):
+    CAMERA_NECK[f"image_neck/{_ours}"] = f"image_neck.{_theirs}.0"
+    CAMERA_NECK[f"image_neck/{_ours}_norm"] = f"image_neck.{_theirs}.1"
 
 
-def _infer_vit(tensors: Mapping[str, Any]) -> ViT:
-    patch = tensors.get("embeddings.patch_embeddings.weight")
-    layers = [int(m[1]) for n in tensors if (m := re.match(r"layer\.(\d+)\.", n))]
-    up = tensors.get("layer.0.mlp.up_proj.weight")
-    if patch is None or up is None or not layers:
-        raise DataError("image_backbone: not the tensors of a DINOv3 ViT")
-    registers = tensors.get("embeddings.register_tokens")
-    gated = "layer.0.mlp.gate_proj.weight" in tensors
-    return ViT(
-        hidden_size=patch.shape[0],
-        num_layers=max(layers) + 1,
-        num_heads=patch.shape[0] // 64,  # all DINOv3 models have heads of 64 channels
-        mlp_dim=up.shape[0],
-        patch_size=patch.shape[2],
-        num_registers=0 if registers is None else registers.shape[1],
-        gated_mlp=gated,
-        activation="silu" if gated else "gelu",
-    )
+def fusion_names() -> dict[str, str]:
+    """Torch's module by module of ours, of the fusion."""
+    attention = ("sampling_offsets", "attention_weights", "value_proj", "output_proj")
+    names = {f"attention/{name}": f"deform_attn.{name}" for name in attention}
+    names |= {"gate_hidden": "fusion_gate.0", "gate_out": "fusion_gate.2"}
+    for i in (1, 2, 3):  # convolution, normalization, ReLU
+        names[f"weighting/conv_{i}"] = f"weighting_network.{3 * i - 3}"
+        names[f"weighting/norm_{i}"] = f"weighting_network.{3 * i - 2}"
+    names["weighting/out"] = "weighting_network.9"
+    names |= radenet_torch.neck_names("radar_neck", "rad_neck.neck")
+    names |= radenet_torch.neck_names("camera_neck", "cam_neck.neck")
+    return {f"image_fusion/{k}": f"fusion.{v}" for k, v in names.items()}
 
 
-def _read_resnet(reader: StateDictReader) -> tuple[dict[str, Any], dict[str, Any]]:
+def resnet_names() -> dict[str, str]:
+    """Torch's module by module of ours, of the image branch with a ResNet-50."""
     # Positions in the released Sequential: stem, its norm, ReLU, pooling, stages.
-    names = tuple(f"image_backbone.frozen_layers.{i}" for i in (0, 1, 4, 5, 6))
-    trunk = resnet_torch.read_trunk(reader, names)
-    neck, stats = resnet_torch.read_last_stage(reader, "image_backbone.layer4")
-    neck["proj"] = reader.conv(
-        "image_backbone.projection", 2048, 128, 1, use_bias=False
-    )
-    return {"image_backbone": trunk, "image_neck": neck}, stats
+    conv, norm, *stages = (f"image_backbone.frozen_layers.{i}" for i in (0, 1, 4, 5, 6))
+    last = "image_backbone.layer4"
+    names = resnet_torch.module_names(conv, norm, (*stages, last))
+    return names | {"image_neck/proj": "image_backbone.projection"}
 
 
-_LORA = re.compile(r"(.*)\.lora_([AB])\.[^.]+\.weight$")
+def _plain_backbone(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Without what PEFT and transformers put before the backbone's own names."""
+    start = re.compile(r"image_backbone\.(base_model\.model\.)?(model\.)?")
+    return {
+        start.sub("image_backbone.", name): value for name, value in tensors.items()
+    }
 
 
 def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
@@ -268,7 +209,7 @@ def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
     merged: dict[str, Any] = {}
     pairs: dict[str, dict[str, Any]] = {}
     for name, value in tensors.items():
-        if match := _LORA.match(name):
+        if match := re.match(r"(.*)\.lora_([AB])\.[^.]+\.weight$", name):
             pairs.setdefault(match[1], {})[match[2]] = to_numpy(value)
         else:
             merged[name.replace(".base_layer.", ".")] = value
@@ -278,32 +219,3 @@ def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
             raise DataError(f"{name}: an adapter without both halves and a weight")
         merged[weight] = to_numpy(merged[weight]) + pair["B"] @ pair["A"]
     return merged
-
-
-# Files -------------------------------------------------------------------------------
-
-
-def is_dinorade(content: Any) -> bool:
-    """Whether a state dict, or a checkpoint that holds one, is DinoRADE's."""
-    if not isinstance(content, Mapping):
-        return False
-    return any(
-        (isinstance(name, str) and "rad_backbone." in name) or is_dinorade(value)
-        for name, value in content.items()
-    )
-
-
-def _find(content: Any, source: str) -> dict[str, Any]:
-    """The DinoRADE state dict in a checkpoint, without prefixes of its names."""
-    if isinstance(content, Mapping):
-        for name in content:
-            if isinstance(name, str) and "rad_backbone." in name:
-                prefix = name[: name.index("rad_backbone.")]
-                return {str(k).removeprefix(prefix): v for k, v in content.items()}
-        for value in content.values():
-            if isinstance(value, Mapping):
-                try:
-                    return _find(value, source)
-                except DataError:
-                    continue
-    raise DataError(f"{source} has no DinoRADE state dict (no tensor rad_backbone.*)")

@@ -1,32 +1,31 @@
 """DINOv3 weights as Hugging Face distributes them, to Flax and back, without torch.
 
-The weights are gated and their licence restricts passing them on: download them
+The weights are gated and their license restricts passing them on: download them
 yourself, and keep them out of checkpoints that are published.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
-import re
 from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
 from radejax.core import files
 from radejax.core.archives import read_safetensors
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
-from radejax.weights.state_dict import StateDictReader
+from radejax.weights.convert import from_torch, shapes_of, to_torch
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 
-_LAYER = re.compile(r"layer\.\d+\.")
-_PREFIX = "model."  # transformers 5 saves some models with it
 _FIELDS = {
     "hidden_size": "hidden_size",
     "num_hidden_layers": "num_layers",
@@ -42,6 +41,7 @@ _FIELDS = {
     "mlp_bias": "mlp_bias",
     "layerscale_value": "layer_scale",
 }
+"""Our name of each field of Hugging Face's config."""
 
 _LAYER_NAMES = {
     "norm_1": "norm1",
@@ -56,18 +56,7 @@ _LAYER_NAMES = {
     "gate": "mlp.gate_proj",
     "down": "mlp.down_proj",
 }
-
-_SIZES = (
-    "hidden_size",
-    "num_hidden_layers",
-    "num_attention_heads",
-    "intermediate_size",
-    "patch_size",
-    "num_register_tokens",
-)
-_FLAGS = ("use_gated_mlp", "proj_bias", "mlp_bias")
-_NUMBERS = ("rope_theta", "layer_norm_eps", "layerscale_value")
-_MOST = 65536  # of any size: the largest DINOv3 has an mlp of 8192
+_TOKENS = ("embeddings.cls_token", "embeddings.register_tokens")
 
 
 def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]:
@@ -79,13 +68,13 @@ def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]
             `dtype`, `attention`, `remat`.
 
     Returns:
-        The model, and `{"params": ...}` with float32 arrays. Applied to normalised
+        The model, and `{"params": ...}` with float32 arrays. Applied to normalized
         images it gives transformers' `last_hidden_state`.
 
     Raises:
         FileNotFoundError: The folder or one of its files is missing.
-        DataError: A file is damaged, or tensors are missing, unexpected or
-            mis-shaped; all are listed.
+        DataError: A file is corrupted, or tensors are missing, unexpected or of another
+            shape; all are listed.
         UserError: The folder holds another kind of model, or an override is unknown.
     """
     folder = pathlib.Path(folder)
@@ -101,11 +90,11 @@ def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]
     return model, {"params": to_params(model, read_safetensors(path), str(path))}
 
 
-def save(model: ViT, params: Mapping[str, Any], folder: str | pathlib.Path) -> None:
+def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
     """Writes a model as a folder that `load`, and transformers, read.
 
     Args:
-        model: Says what the parameters belong to.
+        model: Its fields go into `config.json`.
         params: Its parameters, as of `load(folder)[1]["params"]`.
         folder: Made if missing; files in it are replaced.
     """
@@ -122,56 +111,87 @@ def save(model: ViT, params: Mapping[str, Any], folder: str | pathlib.Path) -> N
 
 
 def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
-    """The model a Hugging Face `config.json` describes.
+    """The model that a Hugging Face `config.json` describes.
 
     Raises:
         UserError: It is not a DINOv3 ViT, a field is missing, of a wrong type, out of
             range or not supported, or an override is unknown.
     """
-    if config.get("model_type") != "dinov3_vit":
-        raise UserError(
-            f"model_type is {config.get('model_type')!r}, expected 'dinov3_vit'"
-        )
+    kind = config.get("model_type")
+    require(kind == "dinov3_vit", "model_type", kind, "'dinov3_vit'")
     if missing := sorted(set(_FIELDS) - set(config)):
         raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
-    _check_values(config)
-    if config["hidden_act"] not in ("gelu", "silu"):
-        raise UserError(
-            f"hidden_act is {config['hidden_act']!r}, expected 'gelu' or 'silu'"
-        )
-    fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
+    defaults = {field.name: field.default for field in dataclasses.fields(ViT)}
+    fields = {}
+    for theirs, ours in _FIELDS.items():
+        fields[ours] = config[theirs]
+        _check_value(theirs, config[theirs], type(defaults[ours]))
+    channels, heads = fields["hidden_size"], fields["num_heads"]
+    require(
+        channels % heads == 0 and channels // heads % 4 == 0,
+        "DINOv3 config: hidden_size, num_attention_heads",
+        (channels, heads),
+        "heads of a multiple of 4 channels",
+    )
     fields["qkv_bias"] = tuple(
         bool(config.get(f"{name}_bias", default))
         for name, default in (("query", True), ("key", False), ("value", True))
     )
-    known = set(ViT.__dataclass_fields__) - {"parent", "name"}
+    known = set(defaults) - {"parent", "name"}
     if unknown := sorted(set(model_overrides) - known):
         raise UserError(f"unknown ViT fields {unknown}; available: {sorted(known)}")
     return ViT(**(fields | model_overrides))
 
 
-def _check_values(config: Mapping[str, Any]) -> None:
-    """`UserError` for a value of a wrong type or out of range."""
-    for name in _FIELDS:
-        value, least = config[name], 0 if name == "num_register_tokens" else 1
-        if name in _SIZES:
-            fits = type(value) is int and least <= value <= _MOST
-            expected = f"an integer from {least} to {_MOST}"
-        elif name in _FLAGS:
-            fits, expected = isinstance(value, bool), "true or false"
-        elif name in _NUMBERS:
-            fits = type(value) in (int, float) and 0 < value < float("inf")
-            expected = "a finite number above 0"
-        else:
-            continue
-        if not fits:
-            raise UserError(f"DINOv3 config: {name} is {value!r}, expected {expected}")
-    channels, heads = config["hidden_size"], config["num_attention_heads"]
-    if channels % heads or (channels // heads) % 4:
-        raise UserError(
-            f"DINOv3 config: hidden_size is {channels} and num_attention_heads {heads}, "
-            "expected heads of a multiple of 4 channels"
-        )
+def _check_value(name: str, value: Any, kind: type) -> None:
+    least = 0 if name == "num_register_tokens" else 1
+    holds, expected = {
+        int: (
+            type(value) is int and least <= value <= 65536,
+            f"an integer from {least} to 65536",
+        ),
+        float: (
+            type(value) in (int, float) and 0 < value < float("inf"),
+            "a finite number above 0",
+        ),
+        bool: (type(value) is bool, "true or false"),
+        str: (value in ("gelu", "silu"), "'gelu' or 'silu'"),
+    }[kind]
+    require(holds, f"DINOv3 config: {name}", value, expected)
+
+
+def image_fields(model: ViT) -> dict[str, Any]:
+    """Fields of `config.model.image` that a backbone has."""
+    names = ["hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size"]
+    names += ["num_registers", "gated_mlp"]
+    return {name: getattr(model, name) for name in names}
+
+
+def module_names(part: str = "") -> dict[str, str]:
+    """Hugging Face's module by module of ours, for `convert`.
+
+    Args:
+        part: Of a detector that the model is: "image_backbone".
+    """
+    names = {"prefix_tokens": _TOKENS[0], "norm": "norm"}
+    names["patch_embed"] = "embeddings.patch_embeddings"
+    names |= {f"layers/{ours}": f"layer.{{}}.{x}" for ours, x in _LAYER_NAMES.items()}
+    return {
+        f"{part}/{k}".strip("/"): f"{part}.{v}".strip(".") for k, v in names.items()
+    }
+
+
+def with_prefix_tokens(tensors: Mapping[str, Any], part: str = "") -> dict[str, Any]:
+    """With the register tokens behind the class token, as one tensor."""
+    cls_name, registers_name = (f"{part}.{name}".strip(".") for name in _TOKENS)
+    tensors = dict(tensors)
+    cls, registers = tensors.get(cls_name), tensors.get(registers_name)
+    if cls is not None and registers is not None:
+        tokens = [np.asarray(x, np.float32) for x in (cls, registers)]
+        if tokens[0].ndim == tokens[1].ndim == 3 and tokens[0].shape[1] == 1:
+            del tensors[registers_name]
+            tensors[cls_name] = np.concatenate(tokens, 1)
+    return tensors
 
 
 def to_params(
@@ -180,91 +200,34 @@ def to_params(
     """Parameters of `model` from DINOv3 tensors by name.
 
     Raises:
-        DataError: There are more or fewer layers than the model has; tensors are
-            missing, unexpected or mis-shaped; all are listed.
+        DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
-    tensors = {name.removeprefix(_PREFIX): t for name, t in tensors.items()}
-    num_layers = len({n.split(".")[1] for n in tensors if _LAYER.match(n)})
-    if num_layers != model.num_layers:
-        raise DataError(
-            f"{source}: has {num_layers} layers, expected {model.num_layers}, as "
-            f"num_hidden_layers of {CONFIG_FILE} says"
-        )
-    reader = StateDictReader(tensors, source)
-    channels = model.hidden_size
-    patches = reader.conv(
-        "embeddings.patch_embeddings", 3, channels, model.patch_size
-    )  # kernel [patch, patch, 3, C]: rows, columns, colours, as patches are flattened
-    patches["kernel"] = patches["kernel"].reshape(-1, channels)
-    prefix = [
-        reader.take(f"embeddings.{name}", (1, count, channels))
-        for name, count in (
-            ("cls_token", 1),
-            ("register_tokens", model.num_registers),
-        )
-        if count or f"embeddings.{name}" in reader
+    # transformers 5 saves some models with a prefix.
+    tensors = {name.removeprefix("model."): t for name, t in tensors.items()}
+    tensors = with_prefix_tokens(tensors)
+    # The mask token is used in pretraining only.
+    ignored = r"embeddings\.mask_token$"
+    return from_torch(module_names(), _shapes(model), tensors, source, ignored)[
+        "params"
     ]
-    layers = [_layer(reader, model, f"layer.{i}.") for i in range(model.num_layers)]
-    params = {
-        "prefix_tokens": np.concatenate(prefix, 1),
-        "patch_embed": patches,
-        "layers": jax.tree.map(lambda *leaves: np.stack(leaves), *layers),
-        "norm": reader.norm("norm", channels),
-    }
-    # The mask token serves pretraining only.
-    reader.finish(ignored=(r"embeddings\.mask_token$",))
-    return params
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """DINOv3 tensors by name of the parameters of `model`: inverse of `to_params`."""
-    params = jax.tree.map(np.asarray, dict(params))
-    channels, size = model.hidden_size, model.patch_size
-    tensors = {"embeddings.mask_token": np.zeros((1, 1, channels), np.float32)}
-    tensors["embeddings.cls_token"] = params["prefix_tokens"][:, :1]
-    if model.num_registers:
-        tensors["embeddings.register_tokens"] = params["prefix_tokens"][:, 1:]
-
-    def put(name: str, part: Mapping[str, np.ndarray]) -> None:
-        for field, array in part.items():
-            is_bias = field == "bias"
-            tensors[f"{name}.{'bias' if is_bias else 'weight'}"] = array.T
-
+    size, params = model.patch_size, dict(params)
     patches = dict(params["patch_embed"])
-    kernel = patches.pop("kernel").reshape(size, size, 3, channels)
-    put("embeddings.patch_embeddings", patches)
-    tensors["embeddings.patch_embeddings.weight"] = kernel.transpose(3, 2, 0, 1)
-    put("norm", params["norm"])
-    for index in range(model.num_layers):
-        layer = jax.tree.map(lambda x, i=index: x[i], params["layers"])
-        for ours, part in layer.items():
-            name = f"layer.{index}.{_LAYER_NAMES[ours]}"
-            if ours.startswith("scale"):
-                tensors[name] = part
-            else:
-                put(name, part)
-    return {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+    patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
+    tensors = to_torch(module_names(), {"params": params | {"patch_embed": patches}})
+    tokens = tensors[_TOKENS[0]]
+    tensors[_TOKENS[0]] = np.ascontiguousarray(tokens[:, :1])
+    if model.num_registers:
+        tensors[_TOKENS[1]] = np.ascontiguousarray(tokens[:, 1:])
+    mask = np.zeros((1, 1, model.hidden_size), np.float32)
+    return tensors | {"embeddings.mask_token": mask}
 
 
-def _layer(reader: StateDictReader, model: ViT, prefix: str) -> dict[str, Any]:
-    channels, hidden = model.hidden_size, model.mlp_dim
-
-    def name(ours: str) -> str:
-        return prefix + _LAYER_NAMES[ours]
-
-    def linear(ours: str, size_in: int, size_out: int, bias: bool) -> dict[str, Any]:
-        return reader.linear(name(ours), size_in, size_out, use_bias=bias)
-
-    layer: dict[str, Any] = {}
-    for ours in ("norm_1", "norm_2"):
-        layer[ours] = reader.norm(name(ours), channels)
-    for ours in ("scale_1", "scale_2"):
-        layer[ours] = reader.take(name(ours), (channels,))
-    layer["out"] = linear("out", channels, channels, model.proj_bias)
-    layer["up"] = linear("up", channels, hidden, model.mlp_bias)
-    layer["down"] = linear("down", hidden, channels, model.mlp_bias)
-    for ours, bias in zip(("query", "key", "value"), model.qkv_bias, strict=True):
-        layer[ours] = linear(ours, channels, channels, bias)
-    if model.gated_mlp:
-        layer["gate"] = linear("gate", channels, hidden, model.mlp_bias)
-    return layer
+def _shapes(model: ViT) -> dict[str, tuple[int, ...]]:
+    image = jax.ShapeDtypeStruct(
+        (1, model.patch_size, model.patch_size, 3), jnp.float32
+    )
+    return shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))

@@ -8,20 +8,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
-import flax.traverse_util
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
 from radejax.data.records.embeddings import embeddings_sha256
-from radejax.models import dinorade_config
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.models.lifting import ReferencePoints
 from radejax.models.vit import ViT
 from radejax.weights import dinov3_hf, resnet_torch
+from radejax.weights.convert import shapes_of, variable_shapes
 
 # Fields of a ViT that are not its weights' own.
 _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
@@ -69,7 +66,9 @@ def load_image_backbone(
     if model.vit is None:
         part = resnet_torch.load(path, model.resnet_width)
     else:
-        part = {"params": {IMAGE_BACKBONE: _load_dinov3(path, model.vit)}}
+        vit, variables = dinov3_hf.load(path)
+        check_same_vit(vit, model.vit, path)
+        part = {"params": {IMAGE_BACKBONE: variables["params"]}}
     if embeddings is not None:
         params = dict(part["params"])
         check_same_backbone(params.pop(IMAGE_BACKBONE), embeddings, path)
@@ -87,43 +86,23 @@ def check_same_backbone(params: Any, embeddings: PathLike, source: PathLike) -> 
         )
 
 
-def _load_dinov3(path: PathLike, configured: ViT) -> Any:
-    """Parameters of the backbone in a Hugging Face folder."""
-    model, variables = dinov3_hf.load(path)
-    for name in (field.name for field in dataclasses.fields(model)):
-        found, wanted = getattr(model, name), getattr(configured, name)
-        if name in _FREE_FIELDS or found == wanted:
-            continue
-        is_field = name in dinorade_config.IMAGE_FIELDS
-        where = f"config.model.image.{name}" if is_field else "the configured one"
-        raise UserError(
-            f"{path}: the backbone has {name} = {found}, {where} is {wanted}"
-        )
-    return variables["params"]
+def check_same_vit(found: ViT, configured: ViT, source: PathLike) -> None:
+    """`UserError` unless a backbone's weights are those of the configured one."""
+    for name in (field.name for field in dataclasses.fields(ViT)):
+        ours, theirs = getattr(configured, name), getattr(found, name)
+        if name not in _FREE_FIELDS and ours != theirs:
+            is_field = name in dinov3_hf.image_fields(found)
+            where = f"config.model.image.{name}" if is_field else "the configured one"
+            raise UserError(
+                f"{source}: the backbone has {name} = {theirs}, {where} is {ours}"
+            )
 
 
 def check_fits(
     model: nn.Module, variables: Mapping[str, Any], source: PathLike
 ) -> None:
     """`UserError` unless variables are those of a model; the backbone may be missing."""
-    radar = model.radar if models.has_camera(model) else model
-    bins, channels = radar.pad_multiple, radar.doppler_bins + radar.elevation_bins
-
-    def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((1, *shape), dtype)
-
-    inputs: list[jax.ShapeDtypeStruct | ReferencePoints] = [array(bins, bins, channels)]
-    if radar is not model:
-        queries = (bins, bins, model.query_grid.num_elevation)
-        points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
-        inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]
-    wanted = jax.eval_shape(model.init, jax.random.key(0), *inputs)
-
-    def shapes(tree: Any) -> dict[str, Any]:
-        flat = flax.traverse_util.flatten_dict(dict(tree), sep="/")
-        return {name: tuple(leaf.shape) for name, leaf in flat.items()}
-
-    wanted, found = shapes(wanted), shapes(variables)
+    wanted, found = variable_shapes(model), shapes_of(variables)
     differing = [
         f"{name} is {found.get(name, 'missing')}, expected {wanted.get(name, 'none')}"
         for name in sorted(set(wanted) | set(found))

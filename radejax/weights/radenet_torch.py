@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import collections
-import dataclasses
-import pathlib
-import re
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, cast
 
-import flax
 import numpy as np
-import safetensors.numpy
 
+from radejax import models
+from radejax.core.config import load_config
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.models.radenet import FIELDS, RadeNet, from_config
-from radejax.weights import torch_file
-from radejax.weights.radenet_names import (
-    from_torch_layout,
+from radejax.models.radenet import RadeNet
+from radejax.weights.convert import (
+    from_torch,
+    read_state_dict,
+    to_torch,
     to_torch_layout,
-    torch_names,
-    torch_shapes,
+    torch_name,
+    variable_shapes,
+    write_state_dict,
 )
-from radejax.weights.state_dict import is_tensor, read_state_dict, shorten, to_numpy
 
 StateDict = Mapping[str, Any]
+
+PART = "backbone."
+"""Start of names by which a state dict of RADE-Net is recognized."""
+
+_UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # in official models without CBAM as well
 
 
 def load(
@@ -33,16 +35,15 @@ def load(
 ) -> tuple[RadeNet, dict[str, Any]]:
     """Model and variables from an official checkpoint.
 
-    The configuration follows from names and shapes, except where those cannot tell:
-    the released model without CBAM still has its tensors (`cbam=None` switches it
-    off), and nothing shows `num_groups` (32). Maps stay on the padded grid, which for
-    official weights is `RadarGrid.kradar().padded(8, "stretched")`.
+    The maps keep the padded grid, which for official weights is
+    `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:
-        state_dict_or_path: Mapping from names to arrays (NumPy or torch), or a file:
-            `.pth`, `.pt` (read without torch), `.npz` or `.safetensors`. It may be
-            nested in a training checkpoint, and names may have a prefix ("module.").
-        **model_overrides: Fields of `RadeNet` that replace what was worked out.
+        state_dict_or_path: Mapping from names to arrays (NumPy or torch), or a file, see
+            `convert.read_state_dict`.
+        **model_overrides: Fields of `config.model` that names and shapes do not show:
+            the released model without CBAM still has its tensors (`cbam=None` switches
+            it off), and `num_groups` (32).
 
     Returns:
         The model, and `{"params": ...}` with float32 arrays.
@@ -50,38 +51,45 @@ def load(
     Raises:
         FileNotFoundError: There is no such file.
         UserError: An override is no field of the model or impossible.
-        DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
+        DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
-    content, source = read_state_dict(state_dict_or_path)
-    tensors = _find_state_dict(content, source)
-    if unknown := sorted(set(model_overrides) - set(FIELDS)):
-        raise UserError(f"unknown model fields {unknown}; available: {sorted(FIELDS)}")
-    model = from_config(infer_config(tensors, **model_overrides))
-    return model, {"params": _to_params(model, tensors, source)}
+    config, variables = read(state_dict_or_path, **model_overrides)
+    return cast(RadeNet, models.build(config)), variables
+
+
+def read(
+    state_dict_or_path: StateDict | PathLike, **model_overrides: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """`config.model` and variables from an official checkpoint; see `load`."""
+    tensors, source = read_state_dict(state_dict_or_path, PART)
+    config = load_config("radenet:official").model.to_dict()
+    check_overrides(model_overrides, config)
+    config |= infer_config(tensors, source, model_overrides)
+    model = models.build(config)
+    shapes = variable_shapes(model)
+    names = module_names(len(config["widths"]), config["heads"])
+    return config, from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
 
 def save(
-    model: RadeNet,
-    variables: Mapping[str, Any],
-    path: str | pathlib.Path | None = None,
+    model: RadeNet, variables: Mapping[str, Any], path: PathLike | None = None
 ) -> dict[str, np.ndarray]:
     """State dict that the official code loads: inverse of `load`.
 
-    The released model has CBAM tensors even where it does not use them; a model
-    without CBAM gets untrained ones, so that a strict load succeeds there.
+    The official model has CBAM tensors even where it does not use them; a model without
+    CBAM gets untrained ones, so that a strict load succeeds there.
 
     Args:
         model: The model the variables belong to.
         variables: `{"params": ...}`.
-        path: Where to write it: `.pth`, `.pt`, `.npz` or `.safetensors`. None only
-            returns it.
+        path: Where to write it, see `convert.write_state_dict`. None only returns it.
 
     Returns:
         NumPy arrays by official name.
 
     Raises:
         UserError: `cbam="paper"`, or a center or scale of the input, has no official
-            counterpart, or the file's ending is unknown.
+            counterpart; or the file cannot be written.
     """
     if model.cbam == "paper":
         raise UserError(
@@ -90,210 +98,196 @@ def save(
     if (model.input_center, model.input_scale) != (0.0, 1.0):
         # Not to be put into the first weights either: maps are padded with zeros.
         raise UserError(
-            f"the official code's network sees the projection as it is; this model's has "
+            "the official code's network takes the projection as it is; this model has "
             f"input_center={model.input_center} and input_scale={model.input_scale}: "
             "train with 0 and 1 to save it for that code"
         )
-    path = None if path is None else pathlib.Path(path)
-    if path is not None and path.suffix not in _WRITERS:
-        raise UserError(f"{path}: unknown ending; available: {sorted(_WRITERS)}")
-    params = flax.traverse_util.flatten_dict(dict(variables["params"]))
-    state = {}
-    for ours, name in torch_names(model).items():
-        value = to_torch_layout(name, np.asarray(params[ours], np.float32))
-        state[name] = np.ascontiguousarray(value)
-    for name, shape in _unused_shapes(model).items():
-        is_scale = len(shape) == 1 and name.endswith("weight")
-        state[name] = np.full(shape, float(is_scale), np.float32)
+    names = module_names(len(model.widths), model.heads)
+    state = to_torch(names, {"params": variables["params"]})
+    if model.cbam is None:
+        for name, shape in torch_shapes(model.clone(cbam="official")).items():
+            is_scale = len(shape) == 1 and name.endswith("weight")
+            state.setdefault(name, np.full(shape, float(is_scale), np.float32))
     if path is not None:
-        _WRITERS[path.suffix](path, state)
+        write_state_dict(path, state)
     return state
-
-
-def _unused_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
-    """Tensors that the official model has and does not use."""
-    if model.cbam is not None:
-        return {}
-    official = torch_shapes(model.clone(cbam="official"))
-    used = set(torch_names(model).values())
-    return {name: shape for name, shape in official.items() if name not in used}
-
-
-def _to_params(model: RadeNet, tensors: StateDict, source: str) -> dict[str, Any]:
-    expected = torch_shapes(model)
-    unused = _unused_shapes(model)
-    problems = [
-        f"missing {name} {s}" for name, s in expected.items() if name not in tensors
-    ]
-    problems += [
-        f"unexpected {name} {tuple(value.shape)}"
-        for name, value in tensors.items()
-        if name not in expected and name not in unused
-    ]
-    problems += [
-        f"mis-shaped {name}: {tuple(tensors[name].shape)}, expected {shape}"
-        for name, shape in expected.items()
-        if name in tensors and tuple(tensors[name].shape) != shape
-    ]
-    if problems:
-        raise DataError(
-            f"{source} does not fit {_model_text(model)}; {len(problems)} problems: "
-            + shorten(problems, "; ")
-        )
-    flat = {
-        path: np.array(
-            from_torch_layout(name, to_numpy(tensors[name])), np.float32, order="C"
-        )
-        for path, name in torch_names(model).items()
-    }
-    return flax.traverse_util.unflatten_dict(flat)
-
-
-def _model_text(model: RadeNet) -> str:
-    """One line with the fields that decide about parameters."""
-    names = ["widths", "decoder_width", "num_classes", "cbam", "input_stem"]
-    names += ["neck", "heads"]
-    return f"RadeNet({', '.join(f'{n}={getattr(model, n)!r}' for n in names)})"
 
 
 # Configuration -----------------------------------------------------------------------
 
 
-def infer_config(tensors: StateDict, **overrides: Any) -> dict[str, Any]:
-    """Model config that names and shapes of official tensors show.
+def infer_config(
+    tensors: StateDict, source: str, overrides: StateDict, prefix: str = ""
+) -> dict[str, Any]:
+    """Fields of `config.model` that names and shapes show, and the overrides.
 
-    Where tensors disagree the most frequent size wins, so that one damaged tensor is
-    reported as such.
+    Args:
+        tensors: By official name.
+        source: What error messages call them.
+        overrides: Fields of `config.model`, which hold instead.
+        prefix: Of "backbone.", "neck.": "rad_" in DinoRADE.
 
     Raises:
+        DataError: A tensor that shows a size is missing.
         UserError: The input has other than 101 channels and no stem to show how many
             are Doppler; override `doppler_bins` and `elevation_bins`.
     """
-    shapes = {name: tuple(value.shape) for name, value in tensors.items()}
-    levels = {int(m[1]) for n in shapes if (m := _ENCODER.match(n))}
-    if levels != set(range(1, len(levels) + 1)):
-        raise DataError(
-            "not a state dict of RADE-Net: its encoder blocks are numbered "
-            f"{sorted(levels)[-3:]}, expected 1 to {len(levels)}"
-        )
+
+    def size(name: str, axis: int) -> int:
+        shape = tuple(getattr(tensors.get(name), "shape", ()))
+        if axis >= len(shape):
+            raise DataError(
+                f"{source}: not a state dict of RADE-Net, without a tensor {name}"
+            )
+        return int(shape[axis])
+
+    backbone, levels = f"{prefix}backbone", 0
+    while (
+        f"{backbone}.encoder_block_{levels + 1}.double_conv.0.single_conv.0.bias"
+        in tensors
+    ):
+        levels += 1
     widths = tuple(
-        _common_size(shapes, f"backbone.encoder_block_{i}.", 0)
-        for i in range(1, len(levels) + 1)
+        size(f"{backbone}.encoder_block_{i}.double_conv.0.single_conv.0.bias", 0)
+        for i in range(1, max(levels, 1) + 1)
     )
-    heads = "expanded" if "head.heatmap_head.head.6.weight" in shapes else "default"
-    last_head = f"head.heatmap_head.head.{9 if heads == 'expanded' else 3}."
-    has_cbam = any(name.startswith("backbone.cbam_") for name in shapes)
-    shown = {
-        "num_classes": _common_size(shapes, last_head, 0),
-        "widths": widths,
-        "decoder_width": _common_size(
-            shapes, f"backbone.decoder_block_{len(widths)}.", 0
+    is_expanded = "head.heatmap_head.head.6.weight" in tensors
+    fields: dict[str, Any] = {
+        "num_classes": size(
+            f"head.heatmap_head.head.{9 if is_expanded else 3}.bias", 0
         ),
-        "cbam": "official" if has_cbam else None,
-        "neck": _infer_neck(shapes),
-        "heads": heads,
+        "widths": widths,
+        "decoder_width": size(
+            f"{backbone}.decoder_block_{levels}.double_conv.0.single_conv.0.bias", 0
+        ),
+        "cbam": "official" if f"{backbone}.cbam_" in "\n".join(tensors) else "off",
+        "neck": _infer_neck(tensors, f"{prefix}neck.neck.0.", source),
+        "heads": "expanded" if is_expanded else "default",
         "pad_multiple": 2 ** len(widths),
     }
-    if None in (shown["num_classes"], shown["decoder_width"], *widths) or not widths:
-        raise DataError(
-            "not a state dict of RADE-Net: encoder, decoder or head are missing; its "
-            f"names are {_some_names(shapes)}"
+    stem = f"{backbone}.transform_input"
+    fields["input_stem"] = f"{stem}.doppler_conv.0.weight" in tensors
+    if fields["input_stem"]:
+        fields["doppler_bins"] = size(f"{stem}.doppler_conv.0.weight", 1)
+        fields["elevation_bins"] = size(f"{stem}.elevation_conv.0.weight", 1)
+    elif not {"doppler_bins", "elevation_bins"} <= set(overrides) and (
+        (channels := size(f"{backbone}.start_conv.weight", 1)) != 101
+    ):
+        raise UserError(
+            f"{source}: the model reads {channels} channels and nothing shows how many "
+            "are Doppler; give doppler_bins and elevation_bins"
         )
-    fields = {f.name: f.default for f in dataclasses.fields(RadeNet)}
-    defaults = {name: fields[name] for name in FIELDS}
-    shown |= _infer_input(shapes, overrides)
-    return {"name": "radenet"} | defaults | shown | overrides
+    overrides = {
+        k: "off" if k == "cbam" and v is None else v for k, v in overrides.items()
+    }
+    return fields | overrides
 
 
-def _infer_neck(shapes: Mapping[str, Any]) -> str:
-    found = {n.split(".")[3] for n in shapes if n.startswith("neck.neck.0.")}
-    known = {"dilated": "conv1", "plain": "conv"}
-    kinds = [kind for kind, part in known.items() if part in found]
-    if not kinds and found:
-        raise DataError(
-            f"neck.neck.0 has {', '.join(sorted(found))}, expected conv1 (neck 'dilated') "
-            "or conv ('plain')"
-        )
-    return kinds[0] if kinds else "plain"
+def _infer_neck(tensors: StateDict, block: str, source: str) -> str:
+    for kind, conv in (("dilated", "conv1.conv"), ("plain", "conv")):
+        if f"{block}{conv}.weight" in tensors:
+            return kind
+    found = sorted(n for n in tensors if n.startswith(block))
+    raise DataError(
+        f"{source}: {block}* has {', '.join(found[:5]) or 'no tensors'}, expected conv1 "
+        "(neck 'dilated') or conv ('plain')"
+    )
 
 
-_ENCODER = re.compile(r"backbone\.encoder_block_([0-9]{1,9})\.")
+def check_overrides(overrides: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    """`UserError` for names that are no field of the model."""
+    if unknown := sorted(set(overrides) - set(known)):
+        raise UserError(f"unknown model fields {unknown}; available: {sorted(known)}")
 
 
-def _infer_input(
-    shapes: Mapping[str, tuple[int, ...]], overrides: Mapping[str, Any]
-) -> dict[str, Any]:
-    stem = "backbone.transform_input."
-    doppler = _common_size(shapes, f"{stem}doppler_conv.0.weight", 1)
-    elevation = _common_size(shapes, f"{stem}elevation_conv.0.weight", 1)
-    has_stem = any(name.startswith(stem) for name in shapes)
-    if doppler is None or elevation is None:
-        channels = _common_size(shapes, "backbone.start_conv.weight", 1) or 101
-        doppler, elevation = 64, 37
-        is_given = {"doppler_bins", "elevation_bins"} <= set(overrides)
-        if channels != doppler + elevation and not is_given:
-            raise UserError(
-                f"the model reads {channels} channels and nothing shows how many are "
-                "Doppler; give doppler_bins and elevation_bins"
-            )
+# Names -------------------------------------------------------------------------------
+
+
+def module_names(levels: int, heads: str, prefix: str = "") -> dict[str, str]:
+    """Official module by module of ours, for `convert`.
+
+    Args:
+        levels: Of the encoder.
+        heads: Kind, "expanded" or "default".
+        prefix: Of "backbone" and "neck": "rad_" in DinoRADE.
+    """
+    names = backbone_names(levels, f"{prefix}backbone")
+    names |= neck_names("neck", f"{prefix}neck.neck")
+    return names | head_names(3 if heads == "expanded" else 1)
+
+
+def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
+    """Shape of every official tensor that a model uses, by its official name."""
+    names = module_names(len(model.widths), model.heads)
     return {
-        "input_stem": has_stem,
-        "doppler_bins": doppler,
-        "elevation_bins": elevation,
+        # A broadcast scalar has the shape without the memory.
+        torch_name(names, path): to_torch_layout(path, np.broadcast_to(0, shape)).shape
+        for path, shape in variable_shapes(model).items()
     }
 
 
-def _common_size(
-    shapes: Mapping[str, tuple[int, ...]], prefix: str, axis: int
-) -> int | None:
-    sizes = [s[axis] for n, s in shapes.items() if n.startswith(prefix) and s[axis:]]
-    return collections.Counter(sizes).most_common(1)[0][0] if sizes else None
+def _norm_conv(ours: str, theirs: str, conv: str, norm: str) -> dict[str, str]:
+    return {f"{ours}/conv": f"{theirs}.{conv}", f"{ours}/norm": f"{theirs}.{norm}"}
 
 
-# Files -------------------------------------------------------------------------------
+def double_conv_names(ours: str, theirs: str) -> dict[str, str]:
+    """A `DoubleConvResidual`."""
+    names = {f"{ours}/shortcut": f"{theirs}.adjust_input"}
+    for i in (1, 2):
+        block = f"{theirs}.double_conv.{i - 1}.single_conv"
+        names |= _norm_conv(f"{ours}/conv_{i}", block, "0", "1")
+    return names
 
 
-_WRITERS: dict[str, Callable[[pathlib.Path, dict[str, np.ndarray]], object]] = {
-    ".pth": torch_file.write,
-    ".pt": torch_file.write,
-    # NumPy would have `allow_pickle`, which no tensor is named, a bool.
-    ".npz": lambda path, state: np.savez(path, **state),  # type: ignore[arg-type]
-    # `save_file` would write for the owner alone.
-    ".safetensors": lambda path, state: path.write_bytes(safetensors.numpy.save(state)),
-}
+def cbam_names(ours: str, theirs: str) -> dict[str, str]:
+    """A `CBAM`."""
+    names = {
+        f"{ours}/channel/squeeze": f"{theirs}.channel_attention.fc1",
+        f"{ours}/channel/excite": f"{theirs}.channel_attention.fc2",
+        f"{ours}/spatial/conv": f"{theirs}.spatial_attention.convolution",
+    }
+    for end in ("start", "end"):
+        block = f"{theirs}.{end}_conv.single_conv"
+        names |= _norm_conv(f"{ours}/{end}", block, "0", "1")
+    return names
 
 
-def _find_state_dict(content: Any, source: str) -> dict[str, Any]:
-    """The one RADE-Net state dict in a checkpoint, without prefixes of its names."""
-    found = list(_state_dicts(content, ""))
-    if len(found) != 1:
-        where = [key or "(top level)" for key, _ in found]
-        if found:
-            raise UserError(f"{source} has several state dicts, {where}; pass one")
-        names = _some_names(content) if isinstance(content, Mapping) else type(content)
-        raise DataError(f"{source} has no RADE-Net state dict; it holds {names}")
-    tensors = found[0][1]
-    prefixes = collections.Counter(
-        name[: match.start(1)] for name in tensors if (match := _PART.search(name))
-    )
-    prefix = prefixes.most_common(1)[0][0]
-    return {name.removeprefix(prefix): value for name, value in tensors.items()}
+def backbone_names(levels: int, theirs: str = "backbone") -> dict[str, str]:
+    """The U-Net."""
+    names = {"backbone/start": f"{theirs}.start_conv"}
+    for part in ("doppler", "elevation", "mix"):
+        conv = f"{theirs}.transform_input.{part}_conv"
+        names |= _norm_conv(f"backbone/stem/{part}", conv, "0", "1")
+    for i in (1, 2):
+        conv = f"{theirs}.bottleneck.conv{i}"
+        names |= double_conv_names(f"backbone/bottleneck_{i}", conv)
+    for i in range(1, levels + 1):
+        for part in ("encoder", "decoder"):
+            conv = f"{theirs}.{part}_block_{i}"
+            names |= double_conv_names(f"backbone/{part}_{i}", conv)
+        names |= cbam_names(f"backbone/cbam_{i}", f"{theirs}.cbam_{i}")
+        names[f"backbone/upsample_{i}"] = f"{theirs}.upsample_{i}.upsample"
+    return names
 
 
-_PART = re.compile(r"(?:^|\.)((?:backbone|neck|head)\.)")
+def neck_names(ours: str, theirs: str) -> dict[str, str]:
+    """A neck of either kind; the plain one has `conv`, the dilated `conv_1`, `conv_2`."""
+    names: dict[str, str] = {}
+    for i in (1, 2, 3):
+        block, conv = f"{ours}/block_{i}", f"{theirs}.{i - 1}"
+        names |= _norm_conv(block, conv, "conv", "gn")
+        names |= _norm_conv(f"{block}/conv_1", f"{conv}.conv1", "conv", "gn")
+        names[f"{block}/conv_2"] = f"{conv}.conv2"
+    return names
 
 
-def _state_dicts(content: Any, key: str) -> Any:
-    if not isinstance(content, Mapping):
-        return
-    tensors = {n: v for n, v in content.items() if is_tensor(n, v)}
-    if any(map(_PART.search, tensors)):
-        yield key, tensors
-        return
-    for name, value in content.items():
-        yield from _state_dicts(value, f"{key}.{name}".removeprefix("."))
-
-
-def _some_names(mapping: Mapping[str, Any]) -> str:
-    names = [str(name) for name in mapping]
-    return f"{names[:5]}{' and others' if len(names) > 5 else ''}"
+def head_names(convs: int) -> dict[str, str]:
+    """Both heads, of some convolutions before the last."""
+    names: dict[str, str] = {}
+    for ours, theirs in (("heatmap", "heatmap_head.head"), ("box", "reg_head.head")):
+        # Convolution, normalization and activation each take a number.
+        for i in range(convs):
+            block = f"heads/{ours}/conv_{i + 1}"
+            names |= _norm_conv(block, f"head.{theirs}", str(3 * i), str(3 * i + 1))
+        names[f"heads/{ours}/out"] = f"head.{theirs}.{3 * convs}"
+    return names

@@ -2,25 +2,52 @@
 
 from __future__ import annotations
 
-import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 
-from radejax.core.errors import DataError
 from radejax.core.files import PathLike
-from radejax.weights import torch_file
-from radejax.weights.state_dict import StateDictReader, read_state_dict
+from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
+from radejax.weights.convert import (
+    from_torch,
+    read_state_dict,
+    shapes_of,
+    to_torch,
+    write_state_dict,
+)
 
-_TRUNK = ("conv1", "bn1", "layer1", "layer2", "layer3")
 DEPTHS = (3, 4, 6, 3)
-WIDTH = 64
+
+
+def module_names(
+    conv: str = "conv1",
+    norm: str = "bn1",
+    stages: tuple[str, ...] = ("layer1", "layer2", "layer3", "layer4"),
+) -> dict[str, str]:
+    """Torch's module by module of ours, for `convert`.
+
+    Args:
+        conv: First convolution.
+        norm: Its normalization.
+        stages: Prefixes of the four stages; the last one is part of our neck.
+    """
+    names = {"image_backbone/stem_conv": conv, "image_backbone/stem_norm": norm}
+    for stage, (theirs, depth) in enumerate(zip(stages, DEPTHS, strict=True), 1):
+        ours = "image_neck/" if stage == 4 else f"image_backbone/stage_{stage}_"
+        for i in range(depth):
+            block = f"{ours}block_{i + 1}"
+            for k in (1, 2, 3):
+                names[f"{block}/conv_{k}"] = f"{theirs}.{i}.conv{k}"
+                names[f"{block}/norm_{k}"] = f"{theirs}.{i}.bn{k}"
+            names[f"{block}/conv_shortcut"] = f"{theirs}.{i}.downsample.0"
+            names[f"{block}/norm_shortcut"] = f"{theirs}.{i}.downsample.1"
+    return names
 
 
 def load(
-    state_dict_or_path: Mapping[str, Any] | PathLike, width: int = WIDTH
+    state_dict_or_path: Mapping[str, Any] | PathLike, width: int = 64
 ) -> dict[str, Any]:
     """Variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 
@@ -32,108 +59,38 @@ def load(
         `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}`,
         without the 1x1 projection, which is DinoRADE's own: for
         `radejax.training.state.with_pretrained`. Of a file of `save`, which has no
-        last stage, "image_backbone" alone.
+        last stage, only "image_backbone".
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: Tensors are missing, unexpected or mis-shaped; all are listed.
+        DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
-    tensors, source = read_state_dict(state_dict_or_path)
-    if not isinstance(tensors, Mapping):
-        raise DataError(f"{source} holds {type(tensors).__name__}, not a state dict")
-    reader = StateDictReader(tensors, source)
-    part: dict[str, Any] = {
-        "params": {"image_backbone": read_trunk(reader, _TRUNK, width)}
-    }
-    if any(name.startswith("layer4.") for name in reader.names):
-        params, stats = read_last_stage(reader, "layer4", width)
-        part["params"]["image_neck"] = params
-        part["batch_stats"] = {"image_neck": stats}
-    reader.finish(ignored=(r"fc\.",))
-    return part
+    tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
+    shapes = _shapes(width)
+    if not any(name.startswith("layer4.") for name in tensors):
+        shapes = {k: s for k, s in shapes.items() if "/image_neck/" not in k}
+    return from_torch(module_names(), shapes, tensors, source, r"fc\.")
 
 
 def save(params: Mapping[str, Any], path: PathLike) -> None:
     """Writes the parameters of a `ResNetTrunk` under torchvision's names."""
-    params, tensors = jax.tree.map(np.asarray, dict(params)), {}
-    theirs = {"scale": "weight", "bias": "bias", "mean": "running_mean"}
-    theirs["var"] = "running_var"
-
-    def put(conv: str, norm: str, kernel: np.ndarray, fixed: Mapping[str, Any]) -> None:
-        tensors[f"{conv}.weight"] = kernel.transpose(3, 2, 0, 1)
-        tensors.update({f"{norm}.{theirs[key]}": fixed[key] for key in theirs})
-
-    put(*_TRUNK[:2], params["stem_conv"]["kernel"], params["stem_norm"])
-    for stage, name in enumerate(_TRUNK[2:], 1):
-        for i in range(DEPTHS[stage - 1]):
-            block = params[f"stage_{stage}_block_{i + 1}"]
-            for key, (conv, norm, *_) in _layers(stage, i).items():
-                kernel, fixed = block[f"conv_{key}"]["kernel"], block[f"norm_{key}"]
-                put(f"{name}.{i}.{conv}", f"{name}.{i}.{norm}", kernel, fixed)
-    contiguous = {name: np.ascontiguousarray(x) for name, x in tensors.items()}
-    torch_file.write(pathlib.Path(path), contiguous)
+    trunk = {"params": {"image_backbone": params}}
+    write_state_dict(path, to_torch(module_names(), trunk))
 
 
-def read_trunk(
-    reader: StateDictReader, names: tuple[str, ...], width: int = WIDTH
-) -> dict[str, Any]:
-    """Parameters of `ResNetTrunk`; `names` of stem, its norm and three stages."""
-    conv, norm, *stages = names
-    params = {
-        "stem_conv": reader.conv(conv, 3, width, 7, use_bias=False),
-        "stem_norm": _frozen_norm(reader, norm, width),
+def _shapes(width: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of trunk and last stage."""
+    key, image = jax.random.key(0), jnp.zeros((1, STRIDE, STRIDE, 3))
+    features = jnp.zeros((1, 1, 1, 16 * width))
+    trunk = jax.eval_shape(ResNetTrunk(width).init, key, image)
+    neck = jax.eval_shape(
+        ResNetNeck(width=width).init, key, features, jnp.ones(1, bool)
+    )
+    parts = {"image_backbone": trunk, "image_neck": neck}
+    return {
+        f"{kind}/{part}/{path}": shape
+        for part, variables in parts.items()
+        for kind, leaves in variables.items()
+        for path, shape in shapes_of(leaves).items()
+        if not path.startswith("proj/")
     }
-    for stage, (name, depth) in enumerate(zip(stages, DEPTHS, strict=False), 1):
-        for i in range(depth):
-            convs, norms = _bottleneck(reader, f"{name}.{i}", stage, i, width)
-            fixed = {k: _frozen_norm(reader, *v) for k, v in norms.items()}
-            params[f"stage_{stage}_block_{i + 1}"] = convs | fixed
-    return params
-
-
-def read_last_stage(
-    reader: StateDictReader, name: str, width: int = WIDTH
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parameters and running statistics of `ResNetNeck`'s blocks."""
-    params, stats = {}, {}
-    for i in range(DEPTHS[3]):
-        convs, norms = _bottleneck(reader, f"{name}.{i}", 4, i, width)
-        key = f"block_{i + 1}"
-        params[key] = convs | {k: reader.norm(*v) for k, v in norms.items()}
-        stats[key] = {k: reader.running(*v) for k, v in norms.items()}
-    return params, stats
-
-
-def _layers(
-    stage: int, index: int, width: int = WIDTH
-) -> dict[str, tuple[str, str, int, int, int]]:
-    """Names, widths and taps of a block's convolutions and normalisations."""
-    inside = width * 2 ** (stage - 1)
-    out = 4 * inside
-    before = out if index else (width if stage == 1 else out // 2)
-    layers = {
-        "1": ("conv1", "bn1", before, inside, 1),
-        "2": ("conv2", "bn2", inside, inside, 3),
-        "3": ("conv3", "bn3", inside, out, 1),
-    }
-    if index == 0:
-        layers["shortcut"] = ("downsample.0", "downsample.1", before, out, 1)
-    return layers
-
-
-def _bottleneck(
-    reader: StateDictReader, name: str, stage: int, index: int, width: int
-) -> tuple[dict[str, Any], dict[str, tuple[str, int]]]:
-    """Convolutions of a block, and names and widths of its normalisations."""
-    convs, norms = {}, {}
-    for key, layer in _layers(stage, index, width).items():
-        conv, norm, size_in, size_out, taps = layer
-        convs[f"conv_{key}"] = reader.conv(
-            f"{name}.{conv}", size_in, size_out, taps, use_bias=False
-        )
-        norms[f"norm_{key}"] = (f"{name}.{norm}", size_out)
-    return convs, norms
-
-
-def _frozen_norm(reader: StateDictReader, name: str, features: int) -> dict[str, Any]:
-    return reader.norm(name, features) | reader.running(name, features)

@@ -1,12 +1,8 @@
-"""Reads and writes PyTorch's `.pth` files without PyTorch.
+"""A reader of PyTorch's `.pth` files (zip format, torch 1.6 and later) without torch.
 
-The pickle inside such a file is never allowed to run code: every name it asks for is
-either one of a few containers and tensor builders defined here, or becomes an inert
-`Opaque` object. So a checkpoint that carries a whole training configuration can be
-read, and a malicious one cannot do anything.
-
-Both formats are read: the zip archive (torch 1.6 and later) and the older stream of
-pickles. bfloat16 becomes float32, which holds it exactly; NumPy has no such type.
+A pickle can run any code. This reader executes only the pickle instructions that torch
+writes for state dicts, and builds only containers, numbers, strings and arrays: whatever
+else a file names is an error, as under `torch.load(..., weights_only=True)`.
 """
 
 from __future__ import annotations
@@ -15,267 +11,199 @@ import io
 import math
 import os
 import pathlib
-import struct
+import pickle
 import zipfile
-from collections.abc import Mapping
-from typing import Any, BinaryIO, Literal
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, one_line
-from radejax.weights.torch_pickle import (
-    BFLOAT16,
-    STORAGE_DTYPES,
-    Storage,
-    Tensor,
-    Unpickler,
-)
+from radejax.core.files import PathLike
 
-Order = Literal["<", ">"]
-
-_LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
-_LEGACY_PROTOCOL = 1001
-
-_MAX_DEPTH, _MAX_VALUES = 64, 100_000
-_FACTOR, _MAX_PICKLE = 4, 1 << 20
-"""Bytes of the content for each byte of the file: storages may be shared; and of a
-pickle that is deflated."""
+_DTYPES = {
+    "DoubleStorage": "float64",
+    "FloatStorage": "float32",
+    "HalfStorage": "float16",
+    "BFloat16Storage": "bfloat16",
+    "LongStorage": "int64",
+    "IntStorage": "int32",
+    "ShortStorage": "int16",
+    "CharStorage": "int8",
+    "ByteStorage": "uint8",
+    "BoolStorage": "bool",
+}
+_MAX_DIMS = 16
 
 
-class _File:
-    """Reads no further than a file reaches: a length that is claimed takes no memory."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self._size = file, os.fstat(file.fileno()).st_size
-        self.readline = file.readline
-
-    def read(self, size: int) -> bytes:
-        return self._file.read(min(size, self._size - self._file.tell()))
-
-
-def read(path: str | pathlib.Path) -> Any:
+def read(path: PathLike) -> Any:
     """Content of a `.pth` file, with NumPy arrays for tensors.
 
     Args:
-        path: A file written by `torch.save`.
+        path: A file written by `torch.save`: a state dict, or a checkpoint of plain
+            containers and numbers around one.
 
     Returns:
-        The saved object: containers, numbers, strings, arrays (contiguous copies),
-        and `Opaque` for anything else. OrderedDicts are dicts.
+        Dicts, lists, tuples, numbers, strings and read-only arrays; bfloat16 becomes
+        float32, which represents it exactly.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: It is not a torch file, or damaged; the message names it.
+        DataError: It is no torch file, corrupted, or holds other objects.
     """
     path = pathlib.Path(path)
     with path.open("rb") as file:
         start = file.read(4)
-        file.seek(0)
-        try:
-            if start == b"PK\x03\x04":
-                content = _read_zip(path)
-            elif start[:1] == b"\x80":
-                content = _read_legacy(_File(file))
-            else:
-                raise DataError(f"not a torch file (starts with {start!r})")
-            return _Resolver(os.path.getsize(path)).resolve(content)
-        except DataError as error:
-            raise DataError(f"{path}: {one_line(error)}") from None
-        # What a damaged pickle or archive raises is not limited to one family.
-        except Exception as error:
-            raise DataError(f"{path}: damaged torch file ({one_line(error)})") from None
-
-
-def write(path: str | pathlib.Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Writes a state dict that `torch.load(path, weights_only=True)` reads.
-
-    Args:
-        path: File to write.
-        arrays: Tensors by name, float32 or any other type that torch has.
-
-    Raises:
-        ValueError: torch has no such type.
-    """
-    path = pathlib.Path(path)
-    names = {np.dtype(v): k for k, v in STORAGE_DTYPES.items() if v != BFLOAT16}
-    body = [b"\x80\x02}("]
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-        root = path.stem or "archive"
-        for key, (name, value) in enumerate(arrays.items()):
-            value = np.asarray(value, order="C")
-            if value.dtype not in names:
-                raise ValueError(f"torch has no dtype {value.dtype} ({name})")
-            body.append(_pickle_text(name))
-            body.append(_pickle_tensor(value, str(key), names[value.dtype]))
-            little = value.astype(value.dtype.newbyteorder("<"), copy=False)
-            archive.writestr(f"{root}/data/{key}", little.tobytes())
-        archive.writestr(f"{root}/data.pkl", b"".join([*body, b"u."]))
-        archive.writestr(f"{root}/byteorder", "little")
-        archive.writestr(f"{root}/version", "3\n")
-
-
-# Reading -----------------------------------------------------------------------------
-
-
-def _read_zip(path: pathlib.Path) -> Any:
-    budget = _FACTOR * os.path.getsize(path) + _MAX_PICKLE
-
-    def read(name: str) -> bytes:
-        nonlocal budget
-        content = read_member(archive, name, max_bytes=budget)
-        budget -= len(content)
-        return content
-
-    with open_zip(path, "a torch file") as archive:
-        names = set(archive.namelist())
-        pickles = [n for n in names if n.endswith("/data.pkl") and n.count("/") == 1]
-        if len(pickles) != 1:
-            raise DataError("not a torch file (a zip archive without data.pkl)")
-        root = pickles[0].removesuffix("data.pkl")
-        order: Order = "<"
-        if f"{root}byteorder" in names and read(f"{root}byteorder") == b"big":
-            order = ">"
-        storages: dict[str, Storage] = {}
-        content = Unpickler(io.BytesIO(read(pickles[0])), storages).load()
-        for key, storage in storages.items():
-            data = read(f"{root}data/{key}")
-            storage.values = _decode(data, storage, order, key)
-    return content
-
-
-def _read_legacy(file: _File) -> Any:
-    storages: dict[str, Storage] = {}
-
-    def load() -> Any:
-        return Unpickler(file, storages).load()
-
-    if load() != _LEGACY_MAGIC:
-        raise DataError("not a torch file (a pickle without torch's magic number)")
-    if (protocol := load()) != _LEGACY_PROTOCOL:
-        raise DataError(f"unknown version {protocol!r} of the old torch format")
-    order: Order = "<" if load().get("little_endian", True) else ">"
-    content = load()
-    for key in load():
-        if key not in storages:
-            raise DataError(f"storage {key} belongs to no tensor")
-        storage = storages[key]
-        (size,) = struct.unpack(f"{order}q", file.read(8))
-        if size != storage.size:
-            raise DataError(f"storage {key} has {size} values, not {storage.size}")
-        data = file.read(size * _raw_dtype(storage, order).itemsize)
-        storage.values = _decode(data, storage, order, key)
-    return content
-
-
-def _raw_dtype(storage: Storage, order: Order) -> np.dtype:
-    raw = np.uint16 if storage.dtype == BFLOAT16 else storage.dtype
-    return np.dtype(raw).newbyteorder(order)
-
-
-def _decode(data: bytes, storage: Storage, order: Order, key: str) -> np.ndarray:
-    dtype = _raw_dtype(storage, order)
-    if len(data) < storage.size * dtype.itemsize:
+    if start != b"PK\x03\x04":
         raise DataError(
-            f"storage {key} has {len(data)} bytes, expected "
-            f"{storage.size * dtype.itemsize}"
+            f"{path}: starts with {start!r}, expected a zip archive of torch 1.6 or "
+            "later: load it there and write it with torch.save"
         )
-    values = np.frombuffer(data, dtype, storage.size)
-    if storage.dtype == BFLOAT16:
-        # The upper half of a float32.
-        return (values.astype(np.uint32) << 16).view(np.float32)
-    return values.astype(dtype.newbyteorder("="), copy=False)
+    try:
+        with open_zip(path, "a torch file") as archive:
+            names = archive.namelist()
+            pickles = [
+                n for n in names if n.endswith("/data.pkl") and n.count("/") == 1
+            ]
+            if len(pickles) != 1:
+                raise DataError(f"has {len(pickles)} members data.pkl, expected one")
+            return _Unpickler(archive, pickles[0].removesuffix("data.pkl")).load()
+    except DataError as error:
+        raise DataError(f"{path}: {one_line(error)}") from None
+    # What a corrupted pickle raises is not limited to one family.
+    except Exception as error:
+        raise DataError(f"{path}: corrupted torch file ({one_line(error)})") from None
 
 
-class _Resolver:
-    """Replaces tensors in nested containers by arrays, within limits.
-
-    A pickle names the same container or storage many times at no cost; here each time
-    costs.
-    """
-
-    def __init__(self, file_size: int) -> None:
-        self._bytes = _FACTOR * file_size
-        self._values = _MAX_VALUES
-
-    def resolve(self, value: Any, depth: int = 0) -> Any:
-        """The value without tensors of torch."""
-        self._values -= 1
-        if depth > _MAX_DEPTH or self._values < 0:
-            raise DataError(
-                f"containers nested more than {_MAX_DEPTH} deep, or more than "
-                f"{_MAX_VALUES} values"
-            )
-        if isinstance(value, Tensor):
-            array = _view(value)
-            self._bytes -= array.nbytes
-            if self._bytes < 0:
-                raise DataError("its tensors have far more bytes than the file")
-            return array
-        if isinstance(value, Mapping):
-            return {k: self.resolve(item, depth + 1) for k, item in value.items()}
-        if isinstance(value, list | tuple):
-            return type(value)([self.resolve(item, depth + 1) for item in value])
-        return value
+class _Storage(NamedTuple):
+    values: np.ndarray
 
 
-def _view(tensor: Tensor) -> np.ndarray:
-    values, shape = tensor.storage.values, tensor.shape
-    if values is None:
-        raise DataError("a tensor has no values in the file")
-    if math.prod(shape) > values.size:
-        raise DataError(f"a tensor of shape {shape} of a storage of {values.size}")
+def _rebuild_tensor(
+    storage: _Storage,
+    offset: int,
+    shape: tuple[int, ...],
+    strides: tuple[int, ...],
+    requires_grad: object = None,
+    hooks: object = None,
+    metadata: object = None,
+) -> np.ndarray:
+    """A view of a storage, after checking that it lies inside."""
+    if not isinstance(storage, _Storage) or max(len(shape), len(strides)) > _MAX_DIMS:
+        raise DataError("a tensor without a storage or of more than 16 axes")
+    if any(type(n) is not int or n < 0 for n in (offset, *shape, *strides)):
+        raise DataError("a tensor whose shape, offset or strides are no sizes")
+    values = storage.values
     if math.prod(shape) == 0:
         return np.zeros(shape, values.dtype)
-    last = tensor.offset + sum(
-        (n - 1) * s for n, s in zip(shape, tensor.strides, strict=True)
-    )
-    if min(tensor.offset, *shape, *tensor.strides, 0) < 0 or last >= values.size:
-        raise DataError(f"a tensor of shape {shape} reaches outside its storage")
-    strides = [s * values.itemsize for s in tensor.strides]
-    view = np.lib.stride_tricks.as_strided(values[tensor.offset :], shape, strides)
-    return np.array(view, order="C")
+    last = offset + sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
+    if math.prod(shape) > values.size or last >= values.size:
+        raise DataError(f"a tensor {shape} reaches outside its storage {values.shape}")
+    steps = [s * values.itemsize for s in strides]
+    return np.lib.stride_tricks.as_strided(values[offset:], shape, steps)
 
 
-# Writing: the few pickle instructions that a state dict needs -------------------------
+def _rebuild_parameter(
+    data: np.ndarray, requires_grad: object, hooks: object
+) -> np.ndarray:
+    return data
 
 
-def _pickle_text(text: str) -> bytes:
-    data = text.encode()
-    return b"X" + struct.pack("<I", len(data)) + data
+def _new_dict() -> dict[str | int, Any]:
+    """An OrderedDict, which torch fills by further instructions."""
+    return {}
 
 
-def _pickle_int(value: int) -> bytes:
-    if value < 2**31:
-        return b"J" + struct.pack("<i", value)
-    return b"\x8a\x08" + struct.pack("<q", value)
+_ALLOWED: dict[tuple[str, str], Any] = {
+    ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
+    ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
+    ("collections", "OrderedDict"): _new_dict,
+} | {("torch", name): dtype for name, dtype in _DTYPES.items()}
+
+_OPCODES = (
+    pickle.PROTO + pickle.STOP + pickle.MARK + pickle.NONE + pickle.NEWTRUE
+    + pickle.NEWFALSE + pickle.BININT + pickle.BININT1 + pickle.BININT2 + pickle.LONG1
+    + pickle.BINFLOAT + pickle.BINUNICODE + pickle.EMPTY_TUPLE + pickle.TUPLE
+    + pickle.TUPLE1 + pickle.TUPLE2 + pickle.TUPLE3 + pickle.EMPTY_LIST + pickle.APPEND
+    + pickle.APPENDS + pickle.EMPTY_DICT + pickle.BINPUT + pickle.LONG_BINPUT
+    + pickle.BINGET + pickle.LONG_BINGET + pickle.GLOBAL + pickle.REDUCE
+    + pickle.BINPERSID
+)  # fmt: skip
+"""Instructions of a state dict, and none that hashes or calls arbitrary objects."""
 
 
-def _pickle_ints(values: tuple[int, ...]) -> bytes:
-    return b"(" + b"".join(map(_pickle_int, values)) + b"t"
+# In Python: the one in C allocates the memo that a file claims, and has no dispatch.
+class _Unpickler(pickle._Unpickler):
+    """Executes the allowed instructions on the allowed names."""
 
+    dispatch: ClassVar[dict[int, Callable[..., None]]] = {
+        code: pickle._Unpickler.dispatch[code] for code in _OPCODES
+    }
 
-def _pickle_tensor(value: np.ndarray, key: str, storage: str) -> bytes:
-    """`_rebuild_tensor_v2(storage, 0, shape, strides, False, OrderedDict())`."""
-    strides = tuple(s // value.itemsize for s in value.strides)
-    persistent_id = b"".join(
-        [
-            b"(",
-            _pickle_text("storage"),
-            f"ctorch\n{storage}\n".encode(),
-            _pickle_text(key),
-            _pickle_text("cpu"),
-            _pickle_int(value.size),
-            b"tQ",
-        ]
-    )
-    return b"".join(
-        [
-            b"ctorch._utils\n_rebuild_tensor_v2\n(",
-            persistent_id,
-            _pickle_int(0),
-            _pickle_ints(value.shape),
-            _pickle_ints(strides),
-            b"\x89ccollections\nOrderedDict\n)RtR",
-        ]
-    )
+    stack: list[Any]
+    pop_mark: Callable[[], list[Any]]
+
+    def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
+        self._archive, self._root = archive, root
+        # Members together take memory in proportion to the file, whatever they claim.
+        self._budget = 4 * os.path.getsize(str(archive.filename)) + (1 << 20)
+        has_order = f"{root}byteorder" in archive.namelist()
+        is_big = has_order and self._member("byteorder") == b"big"
+        self._order: Literal["<", ">"] = ">" if is_big else "<"
+        self._storages: dict[str, _Storage] = {}
+        super().__init__(io.BytesIO(self._member("data.pkl")))
+
+    def _member(self, name: str) -> bytes:
+        content = read_member(self._archive, self._root + name, max_bytes=self._budget)
+        self._budget -= len(content)
+        return content
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ALLOWED:
+            raise DataError(
+                f"holds {module}.{name}, which is not read: save the state dict, "
+                "torch.save(model.state_dict(), ...)"
+            )
+        return _ALLOWED[module, name]
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        """A storage by `("storage", dtype, key, device, size)`."""
+        kind, dtype, key, _, size = pid
+        if kind != "storage" or dtype not in _DTYPES.values() or type(key) is not str:
+            raise DataError("a tensor without a storage of numbers")
+        if key not in self._storages:
+            self._storages[key] = _Storage(self._values(key, dtype, size))
+        return self._storages[key]
+
+    def _values(self, key: str, dtype: str, size: int) -> np.ndarray:
+        raw = np.dtype("uint16" if dtype == "bfloat16" else dtype)
+        data = self._member(f"data/{key}")
+        if not 0 <= size * raw.itemsize <= len(data):
+            raise DataError(f"storage {key} has {len(data)} bytes for {size} {dtype}")
+        values = np.frombuffer(data, raw.newbyteorder(self._order))[:size]
+        if dtype == "bfloat16":  # the upper half of a float32
+            return (values.astype(np.uint32) << 16).view(np.float32)
+        return values.astype(raw, copy=False)
+
+    def _ignore_state(self) -> None:
+        """BUILD: the `_metadata` of a state dict; no object here has a state."""
+        self.stack.pop()
+
+    def _set_item(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._update([key, value])
+
+    def _set_items(self) -> None:
+        self._update(self.pop_mark())
+
+    def _update(self, items: list[Any]) -> None:
+        """Keys are checked first: hashing nested tuples takes unlimited time."""
+        target, keys = self.stack[-1], items[::2]
+        if type(target) is not dict or any(type(k) not in (str, int) for k in keys):
+            raise DataError("a dict whose keys are neither names nor integers")
+        target.update(zip(keys, items[1::2], strict=True))
+
+    dispatch[pickle.BUILD[0]] = _ignore_state
+    dispatch[pickle.SETITEM[0]] = _set_item
+    dispatch[pickle.SETITEMS[0]] = _set_items

@@ -33,9 +33,11 @@ from radejax.training.checkpoints import Checkpoints
 from radejax.training.watch import _Jsonl
 from radejax.visualize.curves import read_metrics
 from radejax.weights import dinov3_hf, radenet_torch
+from radejax.weights.convert import write_state_dict
 
 from .. import small_models as small
 from ..data.conftest import make_labels, write_kradar
+from ..torch_files import write_pth
 from .engine import Reader
 
 Folder = pathlib.Path
@@ -263,7 +265,11 @@ def _dinov3(folder: Folder) -> None:
 
 def _torch(folder: Folder, suffix: str) -> None:
     detector = small.detector()
-    radenet_torch.save(detector.model, detector.variables, folder / f"a{suffix}")
+    state = radenet_torch.save(detector.model, detector.variables)
+    if suffix == ".pth":
+        write_pth(folder / f"a{suffix}", state)
+    else:
+        write_state_dict(folder / f"a{suffix}", state)
 
 
 def _read_torch(folder: Folder, suffix: str) -> None:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.weights.radenet_names import from_torch_layout, to_torch_layout
+from radejax.models.layers import Upsample
+from radejax.weights.convert import to_our_layout, to_torch_layout
 
 
 @pytest.fixture(scope="session")
@@ -25,13 +26,15 @@ def run_like_torch(radenet_golden):
         """`names`: torch module by our path; returns the output, channels first."""
         x = jnp.asarray(x_bchw.transpose(0, 2, 3, 1))
         shapes = jax.eval_shape(module.init, jax.random.key(0), x)["params"]
+        root = "upsample_1" if isinstance(module, Upsample) else "module"
         params = {}
         for path, leaf in flax.traverse_util.flatten_dict(shapes).items():
             suffix = "bias" if path[-1] == "bias" else "weight"
             name = ".".join(filter(None, (names["/".join(path[:-1])], suffix)))
-            shape = to_torch_layout(name, np.broadcast_to(0, leaf.shape)).shape
+            ours = "/".join((root, *path))
+            shape = to_torch_layout(ours, np.broadcast_to(0, leaf.shape)).shape
             value = radenet_golden["seeded_tensor"](name, shape)
-            params[path] = from_torch_layout(name, value)
+            params[path] = to_our_layout(ours, value)
         params = flax.traverse_util.unflatten_dict(params)
         y = jax.jit(module.apply)({"params": params}, x, **kwargs)
         return np.asarray(y).transpose(0, 3, 1, 2)

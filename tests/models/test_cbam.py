@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from radejax.models.cbam import CBAM, ChannelAttention, SpatialAttention
-from radejax.weights.radenet_names import _cbam
+from radejax.weights.radenet_torch import cbam_names
 
-NAMES = {k.removeprefix("m/"): v.removeprefix("m.") for k, v in _cbam("m", "m").items()}
+NAMES = {k[2:]: v[2:] for k, v in cbam_names("m", "m").items()}
 
 
 @pytest.mark.parametrize("case", ["channel_attention", "channel_attention_small"])

@@ -16,7 +16,7 @@ from radejax.models.layers import (
     max_pool,
     uniform_fan_in,
 )
-from radejax.weights.radenet_names import _double_conv
+from radejax.weights.radenet_torch import double_conv_names
 
 
 def strip(names, ours, theirs):
@@ -29,7 +29,7 @@ def strip(names, ours, theirs):
 
 def test_double_conv_residual_equals_official(module_case, run_like_torch):
     x, expected = module_case("double_conv_residual")
-    names = strip(_double_conv("m", "m"), "m", "m")
+    names = strip(double_conv_names("m", "m"), "m", "m")
     actual = run_like_torch(DoubleConvResidual(64, 32), names, x)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 

@@ -27,7 +27,6 @@ from radejax.training import sharding
 from radejax.training.start import Plan, compile_step
 from radejax.training.state import TrainState, create_state
 from radejax.weights import dinorade_torch, dinov3_hf, radenet_torch
-from radejax.weights.radenet_names import torch_shapes
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SEED = 1234
@@ -143,7 +142,10 @@ def test_radenet_trains_as_released(
 ) -> None:
     config = load_module(CONFIGS / "radenet.py").get_config("official")
     model = models.build(config.model)
-    tensors = {n: make.seeded_tensor(n, s) for n, s in torch_shapes(model).items()}
+    tensors = {
+        n: make.seeded_tensor(n, s)
+        for n, s in radenet_torch.torch_shapes(model).items()
+    }
     _, variables = radenet_torch.load(tensors)
     state, measured = train(config, model, variables, frames, 12)
     maps = jax.jit(model.apply)(state.eval_variables, frames.projection[:1])

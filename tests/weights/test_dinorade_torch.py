@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.config import load_module
+from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.camera import CameraCalibration
+from radejax.models import build
 from radejax.models.camera_neck import CameraNeck
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import (
@@ -21,8 +22,14 @@ from radejax.models.lifting import (
     WeightingNetwork,
     static_reference_points,
 )
-from radejax.weights import dinorade_torch
-from radejax.weights.state_dict import StateDictReader
+from radejax.weights import dinorade_torch, dinov3_hf
+from radejax.weights.convert import (
+    from_torch,
+    shapes_of,
+    to_torch_layout,
+    torch_name,
+    variable_shapes,
+)
 
 
 def golden_recipes():
@@ -47,6 +54,11 @@ def end_to_end_tensors(shared):
 def part(shared, name, prefix):
     tensors = RECIPES.seeded_state_dict(listing(shared, name))
     return {prefix + key: value for key, value in tensors.items()}
+
+
+def below(part, names):
+    """Names of a part by itself."""
+    return {k.removeprefix(f"{part}/"): v for k, v in names.items()}
 
 
 def released_geometry(shared):
@@ -85,11 +97,11 @@ def radar_cube():
 def test_released_camera_neck(shared):
     file = np.load(shared / "fixtures" / "dinorade" / "camneck.npz")
     tensors = part(shared, "camneck", "image_neck.")
-    reader = StateDictReader(tensors, "camneck")
-    _, params, stats = dinorade_torch.read_image(reader, tensors)
-    reader.finish()
-    variables = {"params": params["image_neck"], "batch_stats": stats}
-    out = jax.jit(CameraNeck().apply)(variables, patch_tokens(), jnp.ones(1, bool))
+    inputs = patch_tokens(), jnp.ones(1, bool)
+    shapes = shapes_of(jax.eval_shape(CameraNeck().init, jax.random.key(0), *inputs))
+    names = below("image_neck", dinorade_torch.CAMERA_NECK)
+    variables = from_torch(names, shapes, tensors, "camneck")
+    out = jax.jit(CameraNeck().apply)(variables, *inputs)
     chex.assert_shape(out, (1, 180, 320, 128))
     out = np.asarray(out[0])
     np.testing.assert_allclose(sampled(file, out), file["output"], atol=2e-5)
@@ -102,23 +114,27 @@ def test_released_camera_neck(shared):
 def test_released_fusion(shared):
     file = np.load(shared / "fixtures" / "dinorade" / "fusion.npz")
     tensors = part(shared, "fusion", "fusion.")
-    reader = StateDictReader(tensors, "fusion")
-    fields = dinorade_torch.fusion_fields(tensors, {})
+    fields = load_config("dinorade:official").model.fusion.to_dict()
+    fields |= dinorade_torch.infer_fusion(tensors, {})
     assert fields["weighting"] == "cnn"
     assert not fields["necks"]
-    params = dinorade_torch.read_fusion(reader, fields)
-    reader.finish(ignored=(r"fusion\.output_proj",))
-    variables = {"params": params}
     radar = channels_last(RECIPES.normal_input(122, (1, 128, 256, 112)))
     camera = channels_last(RECIPES.normal_input(123, (1, 128, 180, 320)))
     elevation = np.pad(radar_cube()[..., 64:], ((0, 0), (0, 0), (0, 5), (0, 0)))
     reference = released_geometry(shared)
 
+    inputs = radar, elevation, camera, reference
+    shapes = jax.eval_shape(Fusion(**fields).init, jax.random.key(0), *inputs)
+    names = below("image_fusion", dinorade_torch.fusion_names())
+    variables = from_torch(
+        names, shapes_of(shapes), tensors, "fusion", r"fusion\.output_proj"
+    )
+
     @jax.jit
     def run(variables, *inputs):
         return Fusion(**fields).apply(variables, *inputs, mutable="intermediates")
 
-    out, state = run(variables, radar, elevation, camera, reference)
+    out, state = run(variables, *inputs)
     out, gate = np.asarray(out[0]), state["intermediates"]["camera_share"][0][0]
     np.testing.assert_allclose(sampled(file, out), file["output"], atol=2e-4)
     np.testing.assert_allclose(gate, file["gate"], atol=1e-4)
@@ -133,7 +149,7 @@ def test_released_fusion(shared):
     expected = file["reduced"].transpose(1, 2, 0)[is_clear]
     np.testing.assert_allclose(actual, expected, atol=1e-3)
     weights = jax.jit(WeightingNetwork(10, "cnn").apply)(
-        {"params": params["weighting"]}, elevation
+        {"params": variables["params"]["weighting"]}, elevation
     )[0]
     np.testing.assert_allclose(
         sampled(file, np.asarray(weights), "elevation_rows", "elevation_cols"),
@@ -196,37 +212,43 @@ def vit_tensors(prefix):
     return {prefix + k: RECIPES.seeded_tensor(k, s) for k, s in shapes.items()}
 
 
-def test_image_backbone_with_adapters():
-    tensors = vit_tensors("image_backbone.base_model.model.")
-    plain_query = None
-    with_adapters = {}
-    for name, value in tensors.items():
-        if name.endswith("q_proj.weight"):
-            plain_query = value
-            stem = name.removesuffix(".weight")
-            down = RECIPES.seeded_tensor("lora_a", (2, 64))
-            up = RECIPES.seeded_tensor("lora_b", (64, 2))
-            with_adapters[f"{stem}.base_layer.weight"] = value
-            with_adapters[f"{stem}.lora_A.default.weight"] = down
-            with_adapters[f"{stem}.lora_B.default.weight"] = up
-        elif name.endswith("q_proj.bias"):
-            with_adapters[name.replace(".bias", ".base_layer.bias")] = value
-        else:
-            with_adapters[name] = value
-    with_adapters |= {
-        "image_neck.channel_proj.weight": np.zeros((128, 64), np.float32),
-    }
-    merged = dinorade_torch.without_lora(with_adapters)
-    reader = StateDictReader(merged, "test")
-    vit, params, _ = dinorade_torch.read_image(reader, merged)
+def test_image_backbone_with_adapters(shared):
+    tensors = dict(end_to_end_tensors(shared))
+    prefix = "image_backbone.base_model.model."
+    tensors |= vit_tensors(prefix)
+    tensors["image_neck.channel_proj.weight"] = np.zeros((128, 64), np.float32)
+    query = f"{prefix}layer.0.attention.q_proj"
+    down = RECIPES.seeded_tensor("lora_a", (2, 64))
+    up = RECIPES.seeded_tensor("lora_b", (64, 2))
+    plain = tensors.pop(f"{query}.weight")
+    tensors[f"{query}.base_layer.weight"] = plain
+    tensors[f"{query}.base_layer.bias"] = tensors.pop(f"{query}.bias")
+    tensors[f"{query}.lora_A.default.weight"] = down
+    tensors[f"{query}.lora_B.default.weight"] = up
+    model, variables = dinorade_torch.load(tensors)
+    vit = model.vit
     assert (vit.hidden_size, vit.num_layers, vit.num_heads, vit.mlp_dim) == (
         64,
         1,
         1,
         96,
     )
-    query = params["image_backbone"]["layers"]["query"]["kernel"][0]
-    np.testing.assert_allclose(query, (plain_query + up @ down).T, atol=1e-6)
+    backbone = variables["params"]["image_backbone"]
+    kernel = backbone["layers"]["query"]["kernel"][0]
+    np.testing.assert_allclose(kernel, (plain + up @ down).T, atol=1e-6)
+    registers = tensors[f"{prefix}embeddings.register_tokens"]
+    np.testing.assert_array_equal(backbone["prefix_tokens"][:, 1:], registers)
+
+
+def test_a_folder_in_place_of_the_backbone(shared, make, tmp_path):
+    folder = make.write_tiny_folder(tmp_path)
+    tensors = dict(end_to_end_tensors(shared))
+    tensors["image_neck.channel_proj.weight"] = np.zeros((128, 96), np.float32)
+    config, variables = dinorade_torch.read(tensors, dinov3=folder)
+    vit, expected = dinov3_hf.load(folder)
+    assert build(config).vit == vit
+    found = variables["params"]["image_backbone"]
+    chex.assert_trees_all_equal(found, expected["params"])
 
 
 def test_all_problems_are_listed(shared):
@@ -239,19 +261,46 @@ def test_all_problems_are_listed(shared):
         dinorade_torch.load(tensors)
     message = str(error.value)
     for text in (
-        "radar branch",
-        "bottleneck.conv1.double_conv.0.single_conv.0.bias",
-        "1 missing: fusion.fusion_gate.2.bias",
-        "1 unexpected: fusion.pos_embed",
-        "image_neck.refine.0.bias is [3], expected [128]",
+        "4 problems",
+        "missing rad_backbone.bottleneck.conv1.double_conv.0.single_conv.0.bias",
+        "missing fusion.fusion_gate.2.bias",
+        "unexpected fusion.pos_embed",
+        "image_neck.refine.0.bias is float32(3,), expected (128,)",
     ):
         assert text in message
 
 
 def test_other_content_is_refused(tmp_path):
-    with pytest.raises(DataError, match=r"no DinoRADE state dict"):
+    with pytest.raises(
+        DataError, match=r"expected one state dict with tensors rad_backbone"
+    ):
         dinorade_torch.load({"backbone.start_conv.weight": np.zeros(3)})
     with pytest.raises(FileNotFoundError):
         dinorade_torch.load(tmp_path / "nothing.pth")
     with pytest.raises(UserError, match=r"unknown model fields \['depth'\]"):
         dinorade_torch.load({"rad_backbone.x": np.zeros(3)}, depth=3)
+
+
+def test_resnet_in_place_of_the_transformer(shared):
+    """Its names are those of torchvision's in the released Sequential."""
+    tensors = dict(end_to_end_tensors(shared))
+    for name in [n for n in tensors if n.startswith("image_neck.")]:
+        del tensors[name]
+    config = load_config("dinorade:official,rcw_resnet50").model
+    model = build(config)
+    shapes = variable_shapes(model)
+    names = dinorade_torch.resnet_names()
+    expected = {}
+    for path, shape in shapes.items():
+        if path.split("/")[1] in ("image_backbone", "image_neck"):
+            name = torch_name(names, path)
+            shape = to_torch_layout(path, np.broadcast_to(0, shape)).shape
+            expected[name] = RECIPES.seeded_tensor(name, shape)
+    assert expected["image_backbone.frozen_layers.0.weight"].shape == (64, 3, 7, 7)
+    assert expected["image_backbone.projection.weight"].shape == (128, 2048, 1, 1)
+    loaded, variables = dinorade_torch.load(tensors | expected)
+    assert loaded.vit is None
+    assert not loaded.standardize_image
+    kernel = variables["params"]["image_neck"]["block_2"]["conv_2"]["kernel"]
+    theirs = expected["image_backbone.layer4.1.conv2.weight"]
+    np.testing.assert_array_equal(kernel[0, 2, 5, 7], theirs[7, 5, 0, 2])

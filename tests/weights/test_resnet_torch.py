@@ -1,14 +1,19 @@
 """Tests of radejax.weights.resnet_torch."""
 
+import importlib.util
+
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
 from radejax.models.resnet import ResNetNeck, ResNetTrunk
-from radejax.weights import resnet_torch, torch_file
+from radejax.weights import resnet_torch
+from radejax.weights.convert import read_content, write_state_dict
+
+from ..torch_files import write_pth
 
 
 def torchvision_shapes():
@@ -133,20 +138,16 @@ def test_files_and_their_problems(tensors, tmp_path):
     broken = dict(tensors)
     del broken["layer3.5.bn2.weight"]
     broken["avgpool.weight"] = np.zeros(2, np.float32)
-    torch_file.write(path, broken)
-    with pytest.raises(
-        DataError, match=r"resnet50.pth.*1 missing: layer3.5.bn2.weight"
-    ):
+    write_pth(path, broken)
+    with pytest.raises(DataError) as error:
         resnet_torch.load(path)
-    with pytest.raises(DataError, match=r"1 unexpected: avgpool.weight"):
-        resnet_torch.load(path)
-    torch_file.write(path, tensors)
-    assert set(resnet_torch.load(path)) == {"params", "batch_stats"}
+    assert "resnet50.pth does not fit, 2 problems: missing layer3.5.bn2" in str(error)
+    assert "unexpected avgpool.weight" in str(error)
     with pytest.raises(FileNotFoundError):
         resnet_torch.load(tmp_path / "nothing.pth")
 
 
-def test_a_trunk_alone_is_written_and_read(tmp_path):
+def test_a_trunk_by_itself_is_written_and_read(tmp_path):
     trunk = ResNetTrunk(width=4)
     shapes = jax.eval_shape(trunk.init, jax.random.key(0), jnp.zeros((1, 16, 16, 3)))
     rng = np.random.default_rng(2)
@@ -154,16 +155,27 @@ def test_a_trunk_alone_is_written_and_read(tmp_path):
         lambda leaf: rng.standard_normal(leaf.shape).astype(np.float32),
         shapes["params"],
     )
-    path = tmp_path / "resnet50.pth"
+    path = tmp_path / "resnet50.safetensors"
     resnet_torch.save(params, path)
     loaded = resnet_torch.load(path, width=4)
     assert loaded.keys() == {"params"}
     chex.assert_trees_all_equal(loaded["params"], {"image_backbone": params})
     # Its names are torchvision's: what another program would look for.
-    tensors = torch_file.read(path)
-    wanted = {
+    names = set(read_content(path)[0])
+    expected = {
         n for n in torchvision_shapes() if n.split(".")[0] not in ("layer4", "fc")
     }
-    assert set(tensors) == {n for n in wanted if not n.endswith("num_batches_tracked")}
-    with pytest.raises(DataError, match=r"conv1.weight is .4, 3, 7, 7., expected .64"):
+    assert names == {n for n in expected if not n.endswith("num_batches_tracked")}
+    with pytest.raises(DataError, match=r"conv1.weight is float32.4, 3, 7, 7., expect"):
         resnet_torch.load(path)
+
+
+def test_torch_writes_what_it_reads_or_says_that_it_is_missing(tmp_path):
+    tensors = {"a": np.arange(6, dtype=np.float32)}
+    path = tmp_path / "a.pth"
+    if importlib.util.find_spec("torch") is None:
+        with pytest.raises(UserError, match=r"needs torch, .*write \.safetensors"):
+            write_state_dict(path, tensors)
+        return
+    write_state_dict(path, tensors)
+    np.testing.assert_array_equal(read_content(path)[0]["a"], tensors["a"])

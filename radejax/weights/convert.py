@@ -1,0 +1,277 @@
+"""Conversion of PyTorch tensors by name to Flax variables, in both directions.
+
+A model is described by one table from our modules to those of torch, such as
+`{"backbone/start": "backbone.start_conv"}`. Names of leaves and layouts follow from it:
+
+| leaf | torch | layout there |
+|---|---|---|
+| kernel of a convolution `[k, k, in, out]` | weight | `[out, in, k, k]` |
+| kernel of `upsample_*`, `up_*` `[k, k, in, out]` | weight | `[in, out, k, k]` |
+| kernel of a linear layer `[in, out]` | weight | `[out, in]`, or a 1x1 convolution |
+| scale, bias | weight, bias | as here |
+| mean, var | running_mean, running_var | as here |
+
+`{}` in a name of torch is the index of a layer: such layers are stacked here.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors.numpy
+
+from radejax import models
+from radejax.core.archives import read_npz, read_safetensors
+from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
+from radejax.models.lifting import ReferencePoints
+from radejax.weights import torch_file
+
+Names = Mapping[str, str]
+"""Module of torch, "backbone.start_conv", by our module, "backbone/start"."""
+
+Shapes = Mapping[str, tuple[int, ...]]
+"""Shape of each variable by its path, "params/backbone/start/kernel"."""
+
+_LEAVES = {
+    "kernel": "weight",
+    "scale": "weight",
+    "bias": "bias",
+    "mean": "running_mean",
+    "var": "running_var",
+}
+_TRANSPOSED = re.compile(r"(^|/)(upsample|up)_\d+/kernel$")
+_SHOWN = 20
+
+
+def from_torch(
+    names: Names,
+    shapes: Shapes,
+    tensors: Mapping[str, Any],
+    source: PathLike,
+    ignored: str = r"\Z",
+) -> dict[str, Any]:
+    """Variables of a model from tensors by name.
+
+    Args:
+        names: Table of the model; it may have modules that the model is without.
+        shapes: Of the variables wanted.
+        tensors: NumPy, JAX or torch arrays.
+        source: What error messages call them.
+        ignored: Pattern of names (from the start) that may be left over.
+
+    Returns:
+        Nested variables in float32.
+
+    Raises:
+        DataError: Tensors are missing, unexpected or of another shape; all are listed.
+        UserError: The table lacks a module: torch's code has no such part.
+    """
+    left, problems = dict(tensors), []
+
+    def take(name: str, path: str, shape: tuple[int, ...]) -> np.ndarray | None:
+        if name not in left:
+            problems.append(f"missing {name}")
+            return None
+        value = to_numpy(left.pop(name))
+        ours = to_our_layout(path, value)
+        if ours.ndim == 4 and len(shape) == 2:  # a 1x1 convolution, or patches
+            ours = ours.reshape(-1, ours.shape[-1])
+        is_number = value.dtype.kind in "biuf" or value.dtype.name == "bfloat16"
+        if ours.shape != shape or not is_number:
+            expected = to_torch_layout(path, np.broadcast_to(0, shape)).shape
+            problems.append(
+                f"{name} is {value.dtype}{value.shape}, expected {expected}"
+            )
+            return None
+        return np.array(ours, np.float32, order="C")
+
+    flat: dict[str, Any] = {}
+    for path, shape in shapes.items():
+        name = torch_name(names, path)
+        if "{}" in name:
+            layers = [take(name.format(i), path, shape[1:]) for i in range(shape[0])]
+            flat[path] = None if problems else np.stack(layers)  # type: ignore[arg-type]
+        else:
+            flat[path] = take(name, path, shape)
+    problems += [
+        f"unexpected {name}"
+        for name in left
+        if not re.match(ignored, name) and not name.endswith(".num_batches_tracked")
+    ]
+    if problems:
+        shown = "; ".join(problem[:160] for problem in sorted(problems)[:_SHOWN])
+        raise DataError(f"{source} does not fit, {len(problems)} problems: {shown}")
+    return flax.traverse_util.unflatten_dict(flat, sep="/")
+
+
+def to_torch(names: Names, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Tensors by name: inverse of `from_torch`, but for 1x1 convolutions."""
+    tensors = {}
+    for path, leaf in flax.traverse_util.flatten_dict(variables, sep="/").items():
+        name, value = torch_name(names, path), np.asarray(leaf, np.float32)
+        stack = enumerate(value) if "{}" in name else [(0, value)]
+        for i, part in stack:
+            part = to_torch_layout(path, part)
+            tensors[name.format(i)] = np.ascontiguousarray(part)
+    return tensors
+
+
+def torch_name(names: Names, path: str) -> str:
+    """Name in torch of a variable of ours, "params/backbone/start/kernel".
+
+    Raises:
+        UserError: The table lacks it.
+    """
+    module, _, leaf = path.partition("/")[2].rpartition("/")
+    if (whole := f"{module}/{leaf}".strip("/")) in names:  # a parameter by itself
+        return names[whole]
+    if module not in names:
+        raise UserError(f"{module} has no counterpart in the released code")
+    return f"{names[module]}.{_LEAVES[leaf]}"
+
+
+def to_torch_layout(path: str, value: np.ndarray) -> np.ndarray:
+    """A variable of ours in the layout of torch."""
+    if path.endswith("kernel") and value.ndim == 4:
+        is_transposed = _TRANSPOSED.search(path)
+        return value.transpose((2, 3, 0, 1) if is_transposed else (3, 2, 0, 1))
+    return value.T if path.endswith("kernel") else value
+
+
+def to_our_layout(path: str, value: np.ndarray) -> np.ndarray:
+    """Inverse of `to_torch_layout`."""
+    if path.endswith("kernel") and value.ndim == 4:
+        is_transposed = _TRANSPOSED.search(path)
+        return value.transpose((2, 3, 0, 1) if is_transposed else (2, 3, 1, 0))
+    return value.T if path.endswith("kernel") else value
+
+
+def variable_shapes(model: nn.Module) -> dict[str, tuple[int, ...]]:
+    """Shape of every variable of a detector by its path, without creating any."""
+    radar = model.radar if models.has_camera(model) else model
+    bins, channels = radar.pad_multiple, radar.doppler_bins + radar.elevation_bins
+
+    def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, *shape), dtype)
+
+    inputs: list[Any] = [array(bins, bins, channels)]
+    if radar is not model:
+        queries = (bins, bins, model.query_grid.num_elevation)
+        points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
+        inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]
+    return shapes_of(jax.eval_shape(model.init, jax.random.key(0), *inputs))
+
+
+def shapes_of(variables: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Shape of every leaf by its path."""
+    flat = flax.traverse_util.flatten_dict(dict(variables), sep="/")
+    return {path: tuple(leaf.shape) for path, leaf in flat.items()}
+
+
+# Files -------------------------------------------------------------------------------
+
+
+def read_state_dict(
+    content_or_path: Mapping[str, Any] | PathLike, part: str
+) -> tuple[dict[str, Any], str]:
+    """The state dict in a file or checkpoint, without prefixes of its names.
+
+    Args:
+        content_or_path: Tensors by name, or a checkpoint that holds them under one key;
+            or a file: `.pth`, `.pt` (read without torch), `.npz` or `.safetensors`.
+        part: Start of one of its names, "backbone."; what precedes it, such as
+            "module.", is taken off all names.
+
+    Returns:
+        Tensors by name, and what error messages call them.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is corrupted, or has no such state dict or several.
+    """
+    content, source = read_content(content_or_path)
+    found = _state_dicts(content, part)
+    if len(found) != 1:
+        what = f"{len(found)} state dicts ({', '.join(found)})" if found else "none"
+        raise DataError(
+            f"{source}: expected one state dict with tensors {part}*, found {what}"
+        )
+    (tensors,) = found.values()
+    start = _start(part)
+    prefix = next(m[1] for name in tensors if (m := start.match(str(name))))
+    return {str(k).removeprefix(prefix): v for k, v in tensors.items()}, source
+
+
+def holds(content: Any, part: str) -> bool:
+    """Whether content of a file has a state dict with such a part."""
+    return bool(_state_dicts(content, part))
+
+
+def read_content(content_or_path: Any) -> tuple[Any, str]:
+    """Content as it is, and what error messages call it; see `read_state_dict`."""
+    if not isinstance(content_or_path, str | os.PathLike):
+        return content_or_path, "state dict"
+    path = pathlib.Path(content_or_path)
+    readers = {".npz": read_npz, ".safetensors": read_safetensors}
+    return readers.get(path.suffix, torch_file.read)(path), str(path)
+
+
+def _start(part: str) -> re.Pattern[str]:
+    return re.compile(rf"((?:.*\.)?){re.escape(part)}")
+
+
+def _state_dicts(content: Any, part: str) -> dict[str, Mapping[Any, Any]]:
+    """Mappings with such names, by their key: the content itself, or directly in it."""
+    if not isinstance(content, Mapping):
+        return {}
+    inside = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
+    start = _start(part)
+    return {
+        key: mapping
+        for key, mapping in ({"the whole": content} | inside).items()
+        if any(isinstance(name, str) and start.match(name) for name in mapping)
+    }
+
+
+def write_state_dict(path: PathLike, tensors: Mapping[str, np.ndarray]) -> None:
+    """Writes tensors by name: `.pth` or `.pt` by torch, `.safetensors`, or `.npz`.
+
+    Raises:
+        UserError: The ending is another, or torch is not installed.
+    """
+    path = pathlib.Path(path)
+    if path.suffix == ".safetensors":
+        path.write_bytes(safetensors.numpy.save(dict(tensors)))
+    elif path.suffix == ".npz":
+        np.savez(path, **tensors)  # type: ignore[arg-type]
+    elif path.suffix in (".pth", ".pt"):
+        try:
+            import torch
+        except ImportError:
+            raise UserError(
+                f"{path}: writing {path.suffix} needs torch, which is not installed; "
+                "write .safetensors"
+            ) from None
+        torch.save({name: torch.from_numpy(x) for name, x in tensors.items()}, path)
+    else:
+        raise UserError(
+            f"{path}: unknown ending; available: .pth, .pt, .safetensors, .npz"
+        )
+
+
+def to_numpy(tensor: Any) -> np.ndarray:
+    """A NumPy array of a NumPy, JAX or torch tensor; bfloat16 of torch is float32."""
+    if hasattr(tensor, "detach"):  # torch, which need not be importable
+        tensor = tensor.detach().cpu()
+        return (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).numpy()
+    return np.asarray(tensor)
