@@ -41,7 +41,7 @@ from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
-from radejax.weights.state_dict import read_state_dict
+from radejax.weights.convert import read_content
 
 _log = logging.getLogger(__name__)
 
@@ -131,13 +131,12 @@ def load_torch(
     """
     content = path_or_state_dict
     if isinstance(content, str | os.PathLike):
-        content, _ = read_state_dict(content)
+        content, _ = read_content(content)
     config = base_config()
     config.data.azimuth_mapping = "stretched"
     config.decode.threshold_inclusive = False
-    model: nn.Module
     if dinorade_torch.is_dinorade(content):
-        model, variables = dinorade_torch.load(
+        model, variables = dinorade_torch.read(
             path_or_state_dict, dinov3=image_backbone, **model_overrides
         )
         options = CameraOptions("pinhole", OFFICIAL_OFFSET_M, calibration="common")
@@ -145,8 +144,8 @@ def load_torch(
     elif image_backbone is not None:
         raise UserError("image_backbone is given, but the model is RADE-Net")
     else:
-        model, variables = radenet_torch.load(path_or_state_dict, **model_overrides)
-    config.model = ConfigDict(model_config(model))
+        model, variables = radenet_torch.read(path_or_state_dict, **model_overrides)
+    config.model = ConfigDict(model)
     config.classes = CLASSES[: config.model.num_classes]
     return SavedModel(config, RadarGrid.kradar(), variables)
 
@@ -390,43 +389,8 @@ def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
             raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
         return other.variables
     if "image" in config:
-        _, variables = dinorade_torch.load(path)
+        _, variables = dinorade_torch.read(path)
         image_backbone.check_fits(models.build(config), variables, path)
         return variables
     structure = {name: value for name, value in wanted.items() if name != "name"}
-    if structure["cbam"] == "off":
-        structure["cbam"] = None
-    return radenet_torch.load(path, **structure)[1]
-
-
-def model_config(model: nn.Module) -> dict[str, Any]:
-    """`config.model` of a module, until the importers return it themselves."""
-    from radejax.models import dinorade_config, radenet
-    from radejax.models.vit import ViT
-
-    any_model: Any = model
-    radar = getattr(model, "radar", model)
-    config = {name: getattr(radar, name) for name in radenet.FIELDS}
-    config |= {"name": "radenet", "cbam": config["cbam"] or "off"}
-    if radar is not model:
-        vit = any_model.vit or ViT()
-        image = {
-            "kind": "resnet50" if any_model.vit is None else "vit",
-            "size": any_model.image_size,
-            "freeze": any_model.freeze,
-            "standardize": any_model.standardize_image,
-            "resnet_width": any_model.resnet_width,
-        }
-        own = [k for k in dinorade_config.IMAGE_FIELDS if k not in image]
-        image |= {name: getattr(vit, name) for name in own}
-        axes = {
-            n: getattr(any_model.query_grid, n) for n in dinorade_config.AXES_FIELDS
-        }
-        fusion = dict(any_model.fusion)
-        config |= {
-            "name": "dinorade",
-            "image": image,
-            "fusion": fusion,
-            "query_grid": axes,
-        }
-    return json.loads(json.dumps(config))
+    return radenet_torch.read(path, **structure)[1]
