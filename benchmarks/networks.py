@@ -125,7 +125,6 @@ def step_of(config, model, variables, batch, precision):
     state = create_state(
         jax.tree.map(jnp.array, variables),
         optimizer,
-        batch_size=len(batch.frame),
         use_ema=False,
         is_frozen=getattr(model, "is_frozen", None),
     )

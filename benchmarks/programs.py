@@ -100,7 +100,6 @@ def train_step(config, grid, size):
     create = functools.partial(
         create_state,
         optimizer=optimizer,
-        batch_size=size,
         use_ema=False,
         is_frozen=getattr(model, "is_frozen", None),
     )

@@ -26,11 +26,9 @@ from radejax.cli import entry
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.runs.experiment import loss_options
 from radejax.runs.workdir import checkpoint_info, claimed
 from radejax.simulation.config import plain
-from radejax.training import loop, sharding
-from radejax.training.start import Plan
+from radejax.training import distributed, loop
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -74,12 +72,7 @@ def train_online(
     workdir = pathlib.Path(workdir).absolute()
     with claimed(workdir, config):
         batch_size = config.train.batch_size
-        sharding.check_batch_size(
-            batch_size,
-            sharding.make_mesh(),
-            "train.batch_size",
-            config.train.gradient_accumulation_steps,
-        )
+        distributed.check_batch_size(batch_size, distributed.make_mesh())
         batches = OnlineBatches(
             simulation,
             batch_size=batch_size,
@@ -90,25 +83,18 @@ def train_online(
         _log.info("%d frames to draw from, simulated anew", len(batches.frame_names))
         model = models.build(config.model)
         return loop.train(
+            config,
             model,
-            None,
             batches.loader(),
             models.map_grid(batches.grid, model, config.data.azimuth_mapping),
             workdir,
-            Plan(
-                options=config.train,
-                loss=loss_options(config),
-                watch=config.logging,
-                seed=config.seed,
-                info=checkpoint_info(
-                    config,
-                    batches.grid,
-                    {"online_sequences": num_sequences},
-                    {"number of sequences": num_sequences},
-                ),
-                steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
-                frame_names=batches.frame_names,
+            info=checkpoint_info(
+                config,
+                batches.grid,
+                {"online_sequences": num_sequences},
+                {"number of sequences": num_sequences},
             ),
+            steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
         )
 
 

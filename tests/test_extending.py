@@ -26,7 +26,7 @@ from radejax.runs import check_config, experiment
 from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import Sources
-from radejax.training import sharding
+from radejax.training import distributed
 
 from . import small_models as small
 from .evaluation.scenes import random_scene
@@ -137,8 +137,8 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through the doors: one step, a checkpoint, its evaluation on the same data."""
-    mesh = sharding.make_mesh(1)
-    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    mesh = distributed.make_mesh(1)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     sources = Sources(data=(str(root),))
     experiment.run(_config(), name="toy", workdir=folder, sources=sources)

@@ -26,7 +26,7 @@ from radejax.runs import experiment
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import DataPaths, Sources
-from radejax.training import sharding
+from radejax.training import distributed
 from radejax.weights import image_backbone
 
 pytestmark = pytest.mark.slow  # several programs to compile
@@ -92,9 +92,9 @@ def opened(workdir):
 @pytest.fixture(scope="module", autouse=True)
 def one_device():
     """Eight fake devices on few cores compile slowly; that is tested elsewhere."""
-    mesh = sharding.make_mesh(1)
+    mesh = distributed.make_mesh(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sharding, "make_mesh", lambda *_: mesh)
+        patch.setattr(distributed, "make_mesh", lambda *_: mesh)
         yield
 
 

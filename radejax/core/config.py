@@ -226,8 +226,10 @@ def _train() -> ConfigDict:
             "weight_decay": 0.01,
             "warmup_steps": 0,
             "gradient_clip_norm": placeholder(float),
-            "ema_decay": placeholder(float),  # of a moving average of the parameters
-            "gradient_accumulation_steps": 1,  # parts of a batch, one after the other
+            "ema_decay": placeholder(
+                float
+            ),  # moving average of the parameters, per batch
+            "gradient_accumulation_steps": 1,  # batches per update of the parameters
             "parameter_sharding": "replicated",  # "fsdp"
             "log_every_steps": 20,
             "checkpoint_every_steps": 500,

@@ -17,7 +17,7 @@ from radejax.data.frame_table import make_table
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource
 from radejax.inference.detector import Detector
-from radejax.training import processes
+from radejax.training import distributed
 
 
 def predict_dataset(
@@ -47,7 +47,7 @@ def predict_dataset(
 
     Raises:
         UserError: There are no frames.
-        processes.Stopped: `should_stop` returned True.
+        distributed.Stopped: `should_stop` returned True.
     """
     if not len(frames):
         raise UserError("no frames to detect objects in")
@@ -76,12 +76,12 @@ def predict_dataset(
     def batches() -> Iterator[Batch]:
         for batch in make_loader(table, options):
             if should_stop is not None and should_stop():
-                raise processes.Stopped
+                raise distributed.Stopped
             started.append(gather(detector.put(batch.frame)))
             yield batch
 
     parts: list[dict[str, np.ndarray]] = []
-    show = progress and processes.is_main()
+    show = progress and distributed.is_main()
     with tqdm.tqdm(total=len(frames), desc="detect", disable=not show) as bar:
         for found in detector.stream(batches()):
             frame = np.asarray(started.pop(0))  # -1 where a batch was padded

@@ -44,7 +44,7 @@ from radejax.inference.saved import SavedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.sources import DataPaths, Sources, check_folders
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import processes
+from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
@@ -133,7 +133,7 @@ class Data:
         Raises:
             UserError: No frames, records of something else, or no space left.
         """
-        processes.main_first(
+        distributed.main_first(
             lambda: job.project_dataset(
                 self.frames, self.paths.records, retry_skipped=False
             )
@@ -244,7 +244,7 @@ class Data:
 def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     """Simulates if the config says so, projects what has no record yet, opens all.
 
-    One process of several writes before the others read, see `processes.main_first`.
+    One process of several writes before the others read, see `distributed.main_first`.
 
     Args:
         config: Of the run.
@@ -371,7 +371,7 @@ def existing_roots(
     if simulation is not None:
         root = _simulated_root(simulation, roots)
         values = dict(simulation)
-        processes.main_first(lambda: simulate_dataset(values, root))
+        distributed.main_first(lambda: simulate_dataset(values, root))
         return (root,)
     if not roots:
         raise UserError(

@@ -30,7 +30,7 @@ from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import check_config, figures
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.sources import Sources
-from radejax.training import processes, sharding
+from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
@@ -116,7 +116,7 @@ def evaluate(
         placed = [place / path.relative_to(folder) for path in made.files]
         return dataclasses.replace(made, files=placed)
 
-    return processes.main_only(report)
+    return distributed.main_only(report)
 
 
 def _rare_classes(config: ConfigDict, data: Data) -> tuple[tuple[str, str], ...]:
@@ -301,7 +301,7 @@ def make_detector(
     """Detector of all that evaluations keep, over all devices unless a mesh is given."""
     return Detector(
         SavedModel(config, data.records.grid, variables),
-        sharding.batch_sharding(mesh or sharding.make_mesh()),
+        distributed.batch_sharding(mesh or distributed.make_mesh()),
         score_threshold=_lowest_score(config),
     )
 

@@ -17,15 +17,13 @@ from radejax.core.config import renewed
 from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence
 from radejax.inference.saved import PathLike, StartingWeights, starting_weights
-from radejax.losses.detection import NmsAssignment
 from radejax.runs import check_config
 from radejax.runs.data import Data, open_data
 from radejax.runs.evaluate import evaluate
 from radejax.runs.sources import Sources
 from radejax.runs.validation import Validation
 from radejax.runs.workdir import checkpoint_info, claimed, default_workdir, run_info
-from radejax.training import loop, processes, sharding
-from radejax.training.start import Plan
+from radejax.training import distributed, loop
 
 _log = logging.getLogger(__name__)
 
@@ -76,12 +74,7 @@ def run(
     started = time.perf_counter()
     check_config.check(config)
     config = ConfigDict(renewed(config.to_dict()))
-    sharding.check_batch_size(
-        config.train.batch_size,
-        sharding.make_mesh(),
-        "config.train.batch_size",
-        config.train.gradient_accumulation_steps,
-    )
+    distributed.check_batch_size(config.train.batch_size, distributed.make_mesh())
     model = models.build(config.model)  # what cannot be built fails first
     folder = default_workdir(workdir, name)
     with claimed(folder, config):
@@ -146,47 +139,26 @@ def train(
         )
     loader = data.training_batches(frames, config.train, config.seed)
     info = run_info(folder, data.paths, weights.source)
-    if processes.is_main():
+    if distributed.is_main():
         files.write_json(folder / "run.json", info)
     validation = None
     if config.train.evaluate_every_epochs:
         validation = Validation(config, data)
+    grid = data.records.grid
+    same = _what_stays(frames, weights)
     return loop.train(
+        config,
         model,
-        weights.variables,
         loader,
-        models.map_grid(data.records.grid, model, config.data.azimuth_mapping),
+        models.map_grid(grid, model, config.data.azimuth_mapping),
         folder,
-        Plan(
-            options=config.train,
-            loss=loss_options(config),
-            watch=config.logging,
-            seed=config.seed,
-            info=checkpoint_info(
-                config, data.records.grid, info, _what_stays(frames, weights)
-            ),
-            steps_per_epoch=len(frames) // config.train.batch_size,
-            pretrained=weights.pretrained,
-            trace_folder=profile,
-            frame_names=[frame.key for frame in frames],
-        ),
+        info=checkpoint_info(config, grid, info, same),
+        steps_per_epoch=len(frames) // config.train.batch_size,
+        variables=weights.variables,
+        pretrained=weights.pretrained,
         evaluate=validation,
+        profile=profile,
     )
-
-
-def loss_options(config: ConfigDict) -> dict[str, Any]:
-    """Keyword arguments of `detection_loss`.
-
-    Boxes that "nms" compares with objects are those that decoding would find.
-    """
-    decode = config.decode
-    nms = NmsAssignment(
-        score_threshold=decode.score_threshold,
-        threshold_inclusive=decode.threshold_inclusive,
-        nms_iou=decode.nms_iou,
-        per_class=decode.per_class_nms,
-    )
-    return {**config.loss.to_dict(), "nms": nms}
 
 
 def _what_stays(frames: FrameSequence, weights: StartingWeights) -> dict[str, Any]:

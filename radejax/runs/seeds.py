@@ -17,7 +17,7 @@ from radejax.core import files
 from radejax.core.errors import DataError, require
 from radejax.runs.experiment import run
 from radejax.runs.workdir import PathLike, default_workdir
-from radejax.training import processes
+from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ def run_seeds(
             )
             break
         tables[seed] = read_aps(folder / "evaluation" / "metrics.csv")
-    if tables and processes.is_main():
+    if tables and distributed.is_main():
         rows = summarize(tables)
         files.write_json(workdir / "seeds.json", rows)
         files.write_text(workdir / "seeds.txt", to_text(rows, list(tables)))

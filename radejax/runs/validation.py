@@ -25,9 +25,9 @@ from radejax.runs.check_config import check_best_metric
 from radejax.runs.data import Data
 from radejax.runs.evaluate import make_detector, report_options
 from radejax.runs.figures import FrameDrawer
-from radejax.training import processes
+from radejax.training import distributed
+from radejax.training.metric_logger import Scores
 from radejax.training.state import TrainState
-from radejax.training.watch import Scores
 
 
 class Validation:
@@ -78,7 +78,7 @@ class Validation:
         """Scores of the state's (averaged) parameters.
 
         Raises:
-            processes.Stopped: `should_stop`, asked at every batch, said so.
+            distributed.Stopped: `should_stop`, asked at every batch, said so.
         """
         found = self._predict(state.eval_variables, should_stop)
         predictions, _ = repair_sizes(found, self._options.invalid_sizes)
@@ -102,7 +102,7 @@ class Validation:
                 values[f"validation/{result.metric}/{result.cls}"] = result.ap
             if self._is_best_metric(result) and not math.isnan(result.ap):
                 best = result.ap
-        pictures = processes.main_only(lambda: self._draw(predictions)) or {}
+        pictures = distributed.main_only(lambda: self._draw(predictions)) or {}
         return Scores(values, best, pictures)
 
     def _predict(

@@ -32,7 +32,7 @@ from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.sources import DataPaths, saved_path
 from radejax.simulation.config import default_config
-from radejax.training import processes
+from radejax.training import distributed
 
 
 def default_workdir(workdir: PathLike | None, name: str) -> pathlib.Path:
@@ -51,7 +51,7 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
             configuration; names the fields that differ.
     """
     with contextlib.ExitStack() as held:
-        processes.main_only(
+        distributed.main_only(
             lambda: held.enter_context(
                 files.lock(
                     workdir / "lock",
@@ -60,14 +60,14 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
                 )
             )
         )
-        processes.main_first(lambda: _claim(workdir, config))
+        distributed.main_first(lambda: _claim(workdir, config))
         yield
 
 
 def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     """Keeps the config; compares it with that of the run, if there are checkpoints."""
     path = workdir / "config.json"
-    if processes.is_main() and not any(workdir.glob("checkpoints/*")):
+    if distributed.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
     before: dict[str, Any] = {}  # of what earlier versions have fewer fields
     if "camera" in config.data:

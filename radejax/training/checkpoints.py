@@ -1,14 +1,15 @@
 """Checkpoints of a run: state, position in the data, configuration and metrics.
 
-Written by orbax: in the background, to a temporary folder that gets its final name
-only when whole, with checksums that are verified when it is restored. Where the newest
-does not restore, training uses the one before and sets those after it aside with a
-warning; whoever reads for inference is told which one is whole.
+Orbax writes them in the background, to a temporary folder that gets its final name when
+it is complete. Checksums of the arrays are saved with them and verified when they are
+restored.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import logging
 import pathlib
 import shutil
@@ -17,101 +18,33 @@ from typing import Any
 
 import grain
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import files
 from radejax.core.errors import DataError, one_line
-from radejax.training import checksums, processes, sharding
+from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
 BEST = "best"
 """Name of the metric that decides which checkpoint is best; higher is better."""
 
-_METRICS = "metrics"
-_DAMAGED_TEXT = (ValueError, TypeError, LookupError, RecursionError)
-
 _VARIABLES = ("params", "ema_params", "model_state")
-
-_NO_NEWS = (
-    "tracked_metric",  # most checkpoints are not evaluated
-    "read_only",  # as asked for
-    "read only",
-    "Metadata file does not exist",  # of a kind that we do not write
-)
-
-
-def _is_worth_telling(record: logging.LogRecord) -> bool:
-    """False for orbax's warnings of what is meant to be, and of what we say ourselves."""
-    if record.exc_info and record.exc_info[1] and files.is_no_space(record.exc_info[1]):
-        return False  # with the traceback of each of its threads
-    return not any(text in str(record.msg) for text in _NO_NEWS)
-
-
-def _best_of(metrics: Mapping[str, float]) -> float:
-    return metrics[BEST]
-
-
-def _which_is_damaged(folder: pathlib.Path, error: Exception) -> str:
-    """What to tell of a folder whose steps orbax cannot list."""
-    damaged = []
-    for found in ocp.path.step.standard_name_format().find_all(folder):
-        try:
-            _ = found.commit_timestamp
-        except _DAMAGED_TEXT:
-            damaged.append(found.step)
-    names = ", ".join(map(str, sorted(damaged)))
-    return (
-        f"{folder}: the file _CHECKPOINT_METADATA of checkpoint {names} is damaged "
-        f"({one_line(error)}); move that folder away, the others stay usable"
-    )
-
-
-class _Manager(ocp.CheckpointManager):
-    """Orbax's, for which a checkpoint with damaged metrics was not evaluated.
-
-    Attributes:
-        damaged: Its step, and what is wrong.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.damaged: dict[int, str] = {}
-        super().__init__(*args, **kwargs)
-
-    def metrics(self, step: int) -> Any:
-        """Overrides orbax's, which its other methods ask."""
-        try:
-            found = super().metrics(step)
-            if found is not None:
-                float(found[BEST])
-                saved = checksums.read(pathlib.Path(self.directory, f"{step}")) or {}
-                if _METRICS in saved:
-                    sums = {_METRICS: checksums.of_values(found)}
-                    checksums.check(sums, saved, "part")
-        # What damaged text makes json and the lines above raise.
-        except _DAMAGED_TEXT as error:
-            if step not in self.damaged:
-                _log.warning(
-                    "the metrics of checkpoint %d are damaged: it counts as not evaluated",
-                    step,
-                )
-            self.damaged[step] = str(error).strip().split("\n")[0]
-            return None
-        return found
 
 
 class Checkpoints:
-    """The checkpoints of one work folder, to be used in a `with` block.
+    """The checkpoints of one workdir, to be used in a `with` block.
 
     Args:
-        folder: Made if missing.
+        folder: Created if missing.
         max_to_keep: The newest few are kept, and the best; None keeps all.
         read_only: For evaluation: nothing is written or cleaned up.
 
     Raises:
-        DataError: The file that describes a step is damaged; names it.
+        DataError: The files that describe the steps are corrupted.
     """
 
     def __init__(
@@ -127,7 +60,6 @@ class Checkpoints:
             get_metric_fn=_best_of, n=1, keep_checkpoints_without_metrics=False
         )
         kept = policies.AnyPreservationPolicy([newest, best])
-        logging.getLogger("absl").addFilter(_is_worth_telling)
         options = ocp.CheckpointManagerOptions(
             preservation_policy=None if read_only else kept,
             best_fn=_best_of,
@@ -137,10 +69,13 @@ class Checkpoints:
             enable_async_checkpointing=not read_only,
         )
         try:
-            self._manager = _Manager(self.folder, options=options)
-        # Orbax reads what describes each step before it knows any of them.
-        except _DAMAGED_TEXT as error:
-            raise DataError(_which_is_damaged(self.folder, error)) from None
+            self._manager = ocp.CheckpointManager(self.folder, options=options)
+        # Orbax reads the description and the metrics of every step first.
+        except (ValueError, TypeError, LookupError) as error:
+            raise DataError(
+                f"{self.folder}: a description or the metrics of a checkpoint are "
+                f"corrupted ({one_line(error)}); move that checkpoint away"
+            ) from None
 
     def steps(self) -> list[int]:
         """Steps of the finished checkpoints, oldest first."""
@@ -152,14 +87,7 @@ class Checkpoints:
 
         Raises:
             FileNotFoundError: None was evaluated.
-            DataError: Metrics are damaged: the best one is not known.
         """
-        for step in self.steps():
-            if reason := self._manager.damaged.get(step):
-                raise DataError(
-                    f"{self.folder}: the metrics of checkpoint {step} are damaged "
-                    f"({reason}), which one is best is not known: name a step"
-                )
         best = self._manager.best_step()
         if best is None:
             raise FileNotFoundError(
@@ -180,7 +108,7 @@ class Checkpoints:
         """Starts to save; returns as soon as the arrays are copied.
 
         Args:
-            step: Name of the checkpoint; one that exists is left as it is.
+            step: Name of the checkpoint; an existing one is not replaced.
             state: Pytree of arrays.
             data_iterator: The grain iterator whose next batch belongs to `step`.
             info: Plain values: configuration, versions.
@@ -192,13 +120,11 @@ class Checkpoints:
         if step in self._manager.all_steps():
             return
         sums = {
-            "state": checksums.of_arrays(state),
-            "info": checksums.of_values(dict(info)),
-            "data": checksums.of_values(data_iterator.get_state()),
+            "arrays": array_checksums(state),
+            "info": _text_checksum(dict(info)),
+            "data": _text_checksum(data_iterator.get_state()),
         }
-        if metrics:
-            sums[_METRICS] = checksums.of_values(dict(metrics))
-        with self._told_if_full():
+        with self._disk_full():
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
@@ -216,29 +142,15 @@ class Checkpoints:
         Raises:
             DiskFullError: Earlier checkpoints stay intact.
         """
-        with self._told_if_full():
+        with self._disk_full():
             self._manager.wait_until_finished()
-
-    @contextlib.contextmanager
-    def _told_if_full(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception:
-            free = shutil.disk_usage(self.folder).free / 2**20
-            message = (
-                f"no space left for a checkpoint in {self.folder} ({free:.0f} MiB "
-                "free); earlier checkpoints are intact, free some and run the same "
-                "command again"
-            )
-            with files.disk_full(self.folder, message):
-                raise
 
     def restore(
         self, state: Any, data_iterator: Any
     ) -> tuple[Any, dict[str, Any], int] | None:
-        """Restores the newest checkpoint that is whole.
+        """Restores the newest checkpoint that is whole, with a warning for newer ones.
 
-        Newer ones are set aside, to be looked at; they will be saved anew.
+        Corrupted checkpoints are moved to a folder next to this one.
 
         Args:
             state: Pytree of `jax.ShapeDtypeStruct` with the shardings wanted, which
@@ -246,34 +158,31 @@ class Checkpoints:
             data_iterator: Set to the position that was saved.
 
         Returns:
-            State, the `info` saved with it, and step; None where there is no checkpoint.
+            State, the `info` saved with it, and step; None without any checkpoint.
 
         Raises:
-            DataError: There are checkpoints, and none restores; they stay as they are.
+            DataError: There are checkpoints, and none is whole; they stay as they are.
         """
-        failed: list[int] = []
+        corrupted: list[int] = []
         steps = self.steps()
         for step in reversed(steps):
-            restored, reason = None, "another process could not read it"
+            found, reason = None, "another process could not read it"
+            args = ocp.args.Composite(
+                state=ocp.args.StandardRestore(state), info=ocp.args.JsonRestore()
+            )
             try:
-                restored = self._manager.restore(
-                    step,
-                    args=ocp.args.Composite(
-                        state=ocp.args.StandardRestore(state),
-                        info=ocp.args.JsonRestore(),
-                    ),
-                )
-                self._verify(step, restored["state"], restored["info"])
+                found = self._manager.restore(step, args=args)
+                self._verify(step, found["state"], found["info"])
                 self._restore_position(step, data_iterator)
-            # Whatever a damaged file makes orbax, tensorstore or json raise.
+            # A corrupted file makes orbax, tensorstore or json raise anything.
             except Exception as error:
-                restored, reason = None, str(error).strip().split("\n")[0]
-            if processes.all_agree(restored is not None) and restored is not None:
-                for damaged in failed:
-                    self._set_aside(damaged)
-                return restored["state"], restored["info"], step
-            _log.warning("checkpoint %d does not restore: %s", step, reason)
-            failed.append(step)
+                found, reason = None, one_line(error)
+            if distributed.all_agree(found is not None) and found is not None:
+                distributed.main_only(lambda: self._move_away(corrupted))
+                self._manager.reload()
+                return found["state"], found["info"], step
+            _log.warning("checkpoint %d is corrupted: %s", step, reason)
+            corrupted.append(step)
         if steps:
             raise DataError(
                 f"none of the checkpoints {steps} in {self.folder} restores; move that "
@@ -282,7 +191,7 @@ class Checkpoints:
         return None
 
     def restore_variables(self, step: int | None = None) -> tuple[Any, dict, int]:
-        """What inference needs of a state, and the configuration, as saved.
+        """Variables of a model, without the state of the optimizer.
 
         Args:
             step: The newest if None.
@@ -293,7 +202,7 @@ class Checkpoints:
 
         Raises:
             FileNotFoundError: No checkpoint, or not that step.
-            DataError: It is damaged; names the newest that is whole.
+            DataError: It is corrupted.
         """
         steps = self.steps()
         if not steps:
@@ -305,32 +214,18 @@ class Checkpoints:
             )
         try:
             return *self._read_variables(step), step
-        # Whatever a damaged file makes orbax, tensorstore or json raise.
+        # A corrupted file makes orbax, tensorstore or json raise anything.
         except Exception as error:
-            reason = str(error).strip().split("\n")[0]
-            whole = self._newest_whole([older for older in steps if older != step])
-            mend = (
-                "no other one is whole" if whole is None else f"step {whole} is whole"
-            )
             raise DataError(
-                f"checkpoint {step} in {self.folder} is damaged ({reason}); {mend}"
+                f"checkpoint {step} in {self.folder} is corrupted ({one_line(error)}); "
+                f"there are {steps}"
             ) from error
 
-    def _newest_whole(self, steps: list[int]) -> int | None:
-        """The last of some steps whose variables can be read."""
-        for step in reversed(steps):
-            with contextlib.suppress(Exception):  # as damaged as the one asked for
-                self._read_variables(step)
-                return step
-        return None
-
     def _read_variables(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Variables as NumPy arrays and `info` of a checkpoint that is there."""
         with ocp.PyTreeCheckpointer() as reader:
             folder = self.folder / str(step) / "state"
             saved = reader.metadata(folder).item_metadata.tree
-        # Whole on whatever devices there are; the optimizer's moments are not read.
-        whole = sharding.replicated(sharding.make_mesh())
+        whole = distributed.replicated(distributed.make_mesh())
         wanted = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole),
             {name: saved[name] for name in _VARIABLES if name in saved},
@@ -351,39 +246,46 @@ class Checkpoints:
         return jax.tree.map(np.asarray, state), found["info"]
 
     def _verify(self, step: int, state: Any, info: Mapping[str, Any]) -> None:
-        """`DataError` if what was restored is not what was saved."""
-        saved = checksums.read(self.folder / str(step))
-        if saved is not None:
-            checksums.check(checksums.of_arrays(state), saved["state"], "array")
-            checksums.check({"info": checksums.of_values(info)}, saved, "part")
+        """Raises `DataError` if what was restored is not what was saved."""
+        saved = self._checksums(step)
+        for name, value in array_checksums(state).items():
+            if saved["arrays"].get(name) != value:
+                raise DataError(f"the checksum of array {name} differs")
+        if saved["info"] != _text_checksum(info):
+            raise DataError("the checksum of its configuration differs")
 
     def _restore_position(self, step: int, data_iterator: Any) -> None:
-        """Sets the iterator to where it was, with any number of processes then and now.
+        """Sets the iterator to its saved position, for any number of processes.
 
-        All processes share each batch and stand at the same place, so that the file
-        of the first one is right for all.
+        All processes share each batch and are at the same position, so that the file of
+        the first one is right for all.
         """
         folder = self.folder / str(step) / "data"
-        saved = sorted(folder.glob("process_0-of-*.json"))
-        if not saved:
-            raise FileNotFoundError(f"no position in the data in {folder}")
-        position = files.read_json(saved[0])
-        known = checksums.read(self.folder / str(step))
-        if known is not None:
-            checksums.check({"data": checksums.of_values(position)}, known, "part")
+        position = files.read_json(next(folder.glob("process_0-of-*.json")))
+        if self._checksums(step)["data"] != _text_checksum(position):
+            raise DataError("the checksum of the position in the data differs")
         data_iterator.set_state(position)
 
-    def _set_aside(self, step: int) -> None:
-        """Renames a damaged checkpoint so that it can be looked at and saved anew."""
-        target = self.folder.with_name(self.folder.name + "_damaged") / str(step)
-        if processes.is_main():
-            if target.exists():
-                shutil.rmtree(target)
-            target.parent.mkdir(exist_ok=True)
-            (self.folder / str(step)).rename(target)
-            _log.warning("moved it to %s", target)
-        processes.all_agree(True)  # the others wait until it is gone
-        self._manager.reload()
+    def _checksums(self, step: int) -> Any:
+        return files.read_json(self.folder / str(step) / "checksums" / "metadata")
+
+    def _move_away(self, steps: list[int]) -> None:
+        """Renames corrupted checkpoints, so that these steps can be saved again."""
+        target = self.folder.with_name(f"{self.folder.name}_corrupted")
+        for step in steps:
+            shutil.rmtree(target / str(step), ignore_errors=True)
+            target.mkdir(exist_ok=True)
+            (self.folder / str(step)).rename(target / str(step))
+            _log.warning("moved checkpoint %d to %s", step, target)
+
+    @contextlib.contextmanager
+    def _disk_full(self) -> Iterator[None]:
+        message = (
+            f"no space left for a checkpoint in {self.folder}; earlier checkpoints are "
+            "intact, free some and run the same command again"
+        )
+        with files.disk_full(self.folder, message):
+            yield
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -393,8 +295,62 @@ class Checkpoints:
         self._manager.close()
 
 
+def _best_of(metrics: Mapping[str, float]) -> float:
+    return metrics[BEST]
+
+
 def abstract_state(state: Any, sharding: Any) -> Any:
     """Shapes, dtypes and wanted shardings of a state, to restore into."""
     return jax.tree.map(
         lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), state, sharding
     )
+
+
+# Checksums ---------------------------------------------------------------------------
+
+
+def array_checksums(tree: Any) -> dict[str, int]:
+    """A checksum of 32 bits for every array of a tree, by its path "params/conv/bias".
+
+    Each element, as an unsigned integer, is mixed with its position, and all are summed
+    modulo 2**32. A change of one element always changes the sum; other changes are missed
+    once in 2**32. The sums are computed where the arrays are, and are the same for every
+    placement over devices and processes.
+
+    Args:
+        tree: Arrays of numbers of at most 32 bits, or bool.
+    """
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    # One small program per shape: a program of all of them takes twice as long to compile.
+    sums = jax.device_get([_sum(leaf) for _, leaf in leaves])
+    # Paths of the restored dictionaries are those of the saved dataclasses and lists.
+    names = [jax.tree_util.keystr(p, simple=True, separator="/") for p, _ in leaves]
+    return dict(zip(names, map(int, sums), strict=True))
+
+
+def _text_checksum(values: Any) -> str:
+    """SHA-256 of plain values as JSON; bytes are taken as such a text."""
+    if isinstance(values, bytes):
+        values = json.loads(values)
+    text = json.dumps(values, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@jax.jit
+def _sum(array: jax.Array) -> jax.Array:
+    if array.dtype == bool:
+        array = array.astype(jnp.uint8)
+    bits = jnp.dtype(f"uint{8 * array.dtype.itemsize}")
+    values = jax.lax.bitcast_convert_type(array, bits).astype(jnp.uint32)
+    position = jnp.zeros(array.shape, jnp.uint32)
+    for axis, size in enumerate(array.shape):
+        place = jax.lax.broadcasted_iota(jnp.uint32, array.shape, axis)
+        position = position * jnp.uint32(size) + place
+    return jnp.sum(_mixed(values ^ _mixed(position + jnp.uint32(1))), dtype=jnp.uint32)
+
+
+def _mixed(x: jax.Array) -> jax.Array:
+    """A pseudo-random permutation of the 32-bit integers: the last step of murmur3."""
+    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
+    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
+    return x ^ (x >> 16)

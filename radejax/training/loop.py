@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
-import contextlib
+import collections
 import dataclasses
 import logging
 import pathlib
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
 import flax.linen as nn
 import jax
 import numpy as np
+from ml_collections import ConfigDict
 
-from radejax.core.errors import DataError
+from radejax.core import files
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import Batch
+from radejax.data.encoding import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.training import processes, sharding
-from radejax.training.checkpoints import Checkpoints
-from radejax.training.clock import Trace
-from radejax.training.start import Plan, compile_step, initial, restore
-from radejax.training.state import TrainState
-from radejax.training.watch import Scores, Watch
+from radejax.losses.detection import NmsAssignment
+from radejax.training import distributed
+from radejax.training.checkpoints import Checkpoints, abstract_state
+from radejax.training.metric_logger import LoggingOptions, MetricLogger, Scores
+from radejax.training.state import (
+    TrainOptions,
+    TrainState,
+    create_state,
+    with_pretrained,
+)
+from radejax.training.step import Metrics, Step, make_train_step
 
 _log = logging.getLogger(__name__)
+
+_STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +44,7 @@ class TrainResult:
     Attributes:
         state: Placed on the mesh.
         step: Steps taken in all, over every start of the run.
-        finished: False where a SIGTERM ended it, or its last evaluation, early; the
+        finished: False where a signal ended it, or its last evaluation, early; the
             state is saved.
     """
 
@@ -42,87 +54,220 @@ class TrainResult:
 
 
 Evaluate = Callable[[TrainState, int, Callable[[], bool]], Scores]
-"""Called with the state, its step, and what tells whether to stop; it then raises
-`processes.Stopped`. To be asked as often by every process."""
+"""Called with the state, its step, and a function that returns whether to stop; it then
+raises `distributed.Stopped`. Every process must call that function equally often."""
 
 
 def train(
+    config: ConfigDict,
     model: nn.Module,
-    variables: Mapping[str, Any] | None,
     loader: Any,
     grid: RadarGrid,
     workdir: str | pathlib.Path,
-    plan: Plan,
     *,
+    info: Mapping[str, Any],
+    steps_per_epoch: int,
+    variables: Mapping[str, Any] | None = None,
+    pretrained: Mapping[str, Any] | None = None,
     mesh: jax.sharding.Mesh | None = None,
     evaluate: Evaluate | None = None,
+    profile: str = "",
 ) -> TrainResult:
-    """Trains until the epochs of the plan are done, from where an earlier start ended.
+    """Trains until the configured epochs are done, from where an earlier start ended.
 
     Args:
+        config: `seed`, `train`, `loss`, `decode` and `logging` are read.
         model: Called as `model.apply(variables, *inputs, train=True)`.
-        variables: To start from, an imported checkpoint's for example; None draws them.
         loader: Checkpointable grain iterator of `Batch`; endless.
         grid: Grid of the model's maps.
         workdir: Checkpoints and logs go here.
-        plan: What is trained, and how.
+        info: Plain values that each checkpoint carries. Those under "same" must be the
+            same on every start of a run; "config" is shown by Weights & Biases.
+        steps_per_epoch: Batches of one pass over the data.
+        variables: To start from, an imported checkpoint's for example; initialized from
+            the seed if None.
+        pretrained: Part of the variables that replaces initialized ones, the weights of
+            an image backbone for example.
         mesh: Devices to use; all by default.
-        evaluate: Called every `evaluate_every_epochs` epochs and at the end. What it
-            returns is logged and kept with the checkpoint, of which the best stays.
+        evaluate: Called every `evaluate_every_epochs` epochs and at the end. Its result
+            is logged and saved with the checkpoint, of which the best is kept.
+        profile: Folder for a trace of the steps `config.logging.profile_steps`.
 
     Raises:
         DataError: More than `max_skipped_steps` steps in a row without a finite loss
-            and gradient; names the frames of the last such batch.
-        UserError: Batches that do not fit the devices, another `plan.info["same"]` than
+            and gradient, or no checkpoint restores.
+        UserError: A batch size that does not divide over the devices, other data than
             the run began with, a full disk.
     """
-    # State, restored or drawn --------------------------------------------------------
-    mesh = sharding.make_mesh() if mesh is None else mesh
-    optimizer, options, num_steps = plan.optimizer(), plan.options, plan.num_steps
-    init = initial(model, variables, loader, optimizer, plan)
-    folder, keep = pathlib.Path(workdir), options.checkpoints_to_keep
+    options, folder = TrainOptions(**config.train), pathlib.Path(workdir)
+    mesh = distributed.make_mesh() if mesh is None else mesh
+    distributed.check_batch_size(options.batch_size, mesh)
+    num_steps = steps_per_epoch * options.num_epochs
+    optimizer = options.make_optimizer(steps_per_epoch)
+
+    # Initial state -------------------------------------------------------------------
+    def create(batch: Batch, variables: Any, pretrained: Any) -> TrainState:
+        if variables is None:
+            keys = jax.random.split(jax.random.key(config.seed))
+            rngs = {"params": keys[0], "dropout": keys[1]}
+            variables = model.init(rngs, *model_inputs(batch), train=False)
+        if pretrained is not None:
+            variables = with_pretrained(variables, pretrained)
+        is_frozen = getattr(model, "is_frozen", None)
+        use_ema = options.ema_decay is not None
+        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
+
+    # NumPy arrays: the same on every process, and so on every device.
+    given = jax.tree.map(np.asarray, (_first_batch(loader), variables, pretrained))
+    abstract = jax.eval_shape(create, *given)
+    placement = distributed.state_sharding(abstract, mesh, options.parameter_sharding)
+
+    # Restore or initialize -----------------------------------------------------------
+    keep = options.checkpoints_to_keep
     with Checkpoints(folder / "checkpoints", max_to_keep=keep) as checkpoints:
-        state, start = restore(checkpoints, loader, init, mesh, plan)
-        step_fn = compile_step(model, grid, optimizer, state, mesh, plan)
+        saved = abstract_state(abstract, placement).replace(frozen={})
+        state, saved_info, step = checkpoints.restore(saved, loader) or (None, {}, 0)
+        if state is None:
+            state = jax.jit(create, out_shardings=placement)(*given)
+        else:
+            _check_same(saved_info.get("same", {}), info.get("same", {}), folder)
+            _log.info("continuing from step %d of %d", step, num_steps)
+            # Frozen parameters are not saved: they come from where they came from.
+            frozen = jax.jit(
+                lambda *x: create(*x).frozen, out_shardings=placement.frozen
+            )
+            state = state.replace(frozen=frozen(*given) if abstract.frozen else {})
+        step_fn = make_train_step(
+            model,
+            optimizer,
+            grid,
+            loss=loss_options(config),
+            ema_decay=options.ema_decay,
+        )
+        train_step = _compile(step_fn, placement, mesh, config.seed)
 
         # Loop ------------------------------------------------------------------------
-        trace = Trace(plan.trace_folder, *plan.watch.profile_steps)
+        trace = _trace(profile, *LoggingOptions(**config.logging).profile_steps)
+        batch_size, wandb = options.batch_size, _wandb_arguments(config, info)
         with (
-            Watch(folder, start, num_steps, options.batch_size, plan.wandb) as logs,
-            contextlib.closing(trace),
-            processes.stop_on_signal(mesh) as stop,
+            MetricLogger(folder, step, num_steps, batch_size, wandb) as logger,
+            distributed.stop_on_signal(mesh) as stop,
         ):
-            step, metrics, is_stopped, is_cut = start, None, stop(), False
-            told = int(state.num_skipped)
+            metrics, is_stopped, is_cut, num_skipped = None, stop(), False, 0
             while step < num_steps and not is_stopped:
-                with logs.timing("data", behind=metrics):
-                    batch = next(loader)
-                trace.before_step()
-                batch = sharding.put_batch(batch, mesh)
-                with logs.timing("compute"):
-                    state, metrics = step_fn(state, batch)
-                with logs.timing("other"):  # writing a trace takes seconds
-                    trace.after_step(metrics)
+                started = time.perf_counter()
+                batch = next(loader)
+                if all(x.is_ready() for x in jax.tree.leaves(metrics)):
+                    logger.waited(time.perf_counter() - started)
+                trace.send(metrics)
+                batch = distributed.put_batch(batch, mesh)
+                state, metrics = train_step(state, batch)
                 step += 1
-                logs.tick(step, metrics)
+                logger.advance(step, metrics)
                 if _is_due(step, options.log_every_steps, num_steps):
-                    logs.log(step, metrics, epoch=step / plan.steps_per_epoch)
-                    told = _check_skipped(state, plan, told)
-                scores, every = None, options.evaluate_every_epochs
-                if evaluate and _is_due(step, every * plan.steps_per_epoch, num_steps):
-                    scores = _evaluate(evaluate, state, step, stop, logs)
+                    logger.log(step, metrics, epoch=step / steps_per_epoch)
+                    num_skipped = _check_skipped(state, options, num_skipped)
+                scores, every = None, options.evaluate_every_epochs * steps_per_epoch
+                if evaluate and _is_due(step, every, num_steps):
+                    scores = _evaluate(evaluate, state, step, stop, logger)
                     is_cut = scores is None
                 is_stopped = stop()
 
                 # Save ----------------------------------------------------------------
                 is_due = _is_due(step, options.checkpoint_every_steps, num_steps)
                 if is_due or is_stopped or scores is not None:
-                    told = _check_skipped(state, plan, told)
+                    num_skipped = _check_skipped(state, options, num_skipped)
                     found = None if scores is None else scores.with_best()
                     kept = state.replace(frozen={})
-                    checkpoints.save(step, kept, loader, info=plan.info, metrics=found)
+                    checkpoints.save(step, kept, loader, info=info, metrics=found)
+            trace.close()
             checkpoints.wait()
     return TrainResult(state, step, finished=step >= num_steps and not is_cut)
+
+
+def loss_options(config: ConfigDict) -> dict[str, Any]:
+    """Keyword arguments of `detection_loss`.
+
+    Boxes that "nms" compares with objects are those that decoding would find.
+    """
+    decode = config.decode
+    nms = NmsAssignment(
+        score_threshold=decode.score_threshold,
+        threshold_inclusive=decode.threshold_inclusive,
+        nms_iou=decode.nms_iou,
+        per_class=decode.per_class_nms,
+    )
+    return {**config.loss.to_dict(), "nms": nms}
+
+
+def _first_batch(loader: Any) -> Batch:
+    """One empty frame of the right shapes; the iterator stays where it is."""
+    position = loader.get_state()
+    batch = next(loader)
+    loader.set_state(position)
+    return jax.tree.map(lambda x: np.zeros((1, *x.shape[1:]), x.dtype), batch)
+
+
+def _check_same(
+    found: Mapping[str, Any], given: Mapping[str, Any], folder: pathlib.Path
+) -> None:
+    """Raises `UserError` if a run would continue with other data or frozen weights."""
+    if lines := files.differences(found, {k: given.get(k) for k in found}, ""):
+        raise UserError(
+            f"the run in {folder} was trained with something else: {'; '.join(lines)}; "
+            "give the same, or another --workdir"
+        )
+
+
+def _compile(
+    step: Step, placement: Any, mesh: jax.sharding.Mesh, seed: int
+) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
+    """The step of a run, which consumes its state.
+
+    It returns before it is computed, unless too many steps are under way.
+    """
+    whole = distributed.replicated(mesh)
+    compiled = jax.jit(step, donate_argnums=0, out_shardings=(placement, whole))
+    rng = jax.jit(jax.random.key, out_shardings=whole)(np.uint32(seed + 1))
+    in_flight: collections.deque[Metrics] = collections.deque()
+
+    def limited(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        with jax.transfer_guard("disallow"):
+            state, metrics = compiled(state, batch, rng)
+        in_flight.append(metrics)
+        if len(in_flight) > _STEPS_IN_FLIGHT:
+            jax.block_until_ready(in_flight.popleft())
+        return state, metrics
+
+    return limited
+
+
+def _trace(folder: str, first: int, last: int) -> Generator[None, Any, None]:
+    """Traces steps `first` to `last`; each step begins with `send(metrics before it)`."""
+    step, metrics = 0, None
+    try:
+        while True:
+            if folder and step == first:
+                jax.profiler.start_trace(folder)
+            if folder and step == last + 1:
+                jax.block_until_ready(metrics)
+                jax.profiler.stop_trace()
+            metrics = yield
+            step += 1
+    finally:
+        if folder and first <= step <= last:
+            jax.profiler.stop_trace()
+        if folder and step < first:
+            _log.warning("no trace: this start ended before step %d", first)
+
+
+def _wandb_arguments(
+    config: ConfigDict, info: Mapping[str, Any]
+) -> dict[str, Any] | None:
+    """Project and config of a run at Weights & Biases; None without one."""
+    if not config.logging.wandb:
+        return None
+    return {"project": config.logging.wandb_project, "config": info.get("config", {})}
 
 
 def _is_due(step: int, every: int, last: int) -> bool:
@@ -135,21 +280,21 @@ def _evaluate(
     state: TrainState,
     step: int,
     stop: Callable[[], bool],
-    logs: Watch,
+    logger: MetricLogger,
 ) -> Scores | None:
-    """Scores, logged; None where a signal cut the evaluation short."""
+    """Scores, logged; None where a signal ended the evaluation early."""
     try:
-        with logs.timing("other"):
-            scores = evaluate(state, step, stop)
-            logs.log_scores(step, scores)
-    except processes.Stopped:
-        _log.warning("the evaluation after step %d is left out", step)
+        scores = evaluate(state, step, stop)
+    except distributed.Stopped:
+        _log.warning("the evaluation after step %d is skipped", step)
         return None
+    logger.log_scores(step, scores)
+    logger.restart_timer(step)
     return scores
 
 
-def _check_skipped(state: TrainState, plan: Plan, told: int) -> int:
-    """Tells of steps without a finite loss and gradient beyond those `told` of.
+def _check_skipped(state: TrainState, options: TrainOptions, reported: int) -> int:
+    """Warns of steps without a finite loss and gradient beyond those `reported`.
 
     Returns:
         How many there were so far.
@@ -157,20 +302,15 @@ def _check_skipped(state: TrainState, plan: Plan, told: int) -> int:
     Raises:
         DataError: Too many were in a row.
     """
-    in_row, limit = int(state.most_skipped_in_row), plan.options.max_skipped_steps
-    if (skipped := int(state.num_skipped)) > told or in_row > limit:
-        frames = np.asarray(state.skipped_frames).tolist()
-        if plan.frame_names is not None:
-            frames = [plan.frame_names[i] for i in frames]
-        last = f"frames of the last batch: {', '.join(map(str, frames))}"
-        if in_row > limit:
-            raise DataError(
-                f"loss or gradient was not finite in {in_row} steps in a row (limit "
-                f"train.max_skipped_steps={limit}); {last}"
-            )
+    limit, counts = options.max_skipped_steps, state.opt_state
+    if (in_row := int(counts.notfinite_count)) > limit:
+        raise DataError(
+            f"loss or gradient was not finite in {in_row} steps in a row (limit "
+            f"config.train.max_skipped_steps={limit})"
+        )
+    if (skipped := int(counts.total_notfinite)) > reported:
         _log.warning(
-            "%d steps so far were skipped, as their loss or gradient was not finite; %s",
+            "%d steps so far were skipped because loss or gradient was not finite",
             skipped,
-            last,
         )
     return skipped

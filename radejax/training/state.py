@@ -3,35 +3,124 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
+
+Schedule = Literal["cosine", "cyclic_cosine"]
+
+_POSITIVE_INTEGERS = (
+    "batch_size",
+    "num_epochs",
+    "gradient_accumulation_steps",
+    "log_every_steps",
+    "checkpoint_every_steps",
+)
+_INTEGERS = ("warmup_steps", "evaluate_every_epochs", "max_skipped_steps")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainOptions:
+    """Optimizer and training loop: the fields of `config.train`, described there.
+
+    Raises:
+        UserError: A field is out of its range.
+    """
+
+    batch_size: int
+    num_epochs: int
+    learning_rate: float
+    final_learning_rate: float
+    schedule: Schedule
+    weight_decay: float
+    warmup_steps: int
+    gradient_clip_norm: float | None
+    ema_decay: float | None
+    gradient_accumulation_steps: int
+    parameter_sharding: Literal["replicated", "fsdp"]
+    log_every_steps: int
+    checkpoint_every_steps: int
+    checkpoints_to_keep: int | None
+    evaluate_every_epochs: int
+    best_metric: str
+    max_skipped_steps: int
+
+    def __post_init__(self) -> None:
+        def check(name: str, holds: bool, expected: str) -> None:
+            require(holds, f"config.train.{name}", getattr(self, name), expected)
+
+        for name in _POSITIVE_INTEGERS:
+            check(name, getattr(self, name) >= 1, "an integer of at least 1")
+        for name in _INTEGERS:
+            check(name, getattr(self, name) >= 0, "an integer of at least 0")
+        keep, clip, ema = (
+            self.checkpoints_to_keep,
+            self.gradient_clip_norm,
+            self.ema_decay,
+        )
+        check("checkpoints_to_keep", keep is None or keep >= 1, "at least 1, or None")
+        rate = self.learning_rate
+        check("learning_rate", 0 < rate < math.inf, "a number above 0")
+        check(
+            "final_learning_rate",
+            0 <= self.final_learning_rate <= rate,
+            f"a number from 0 to config.train.learning_rate, {rate}",
+        )
+        check("weight_decay", 0 <= self.weight_decay < math.inf, "at least 0")
+        is_norm = clip is None or 0 < clip < math.inf
+        check("gradient_clip_norm", is_norm, "a number above 0, or None")
+        is_decay = ema is None or 0 <= ema < 1
+        check("ema_decay", is_decay, "a number from 0 to below 1, or None")
+        schedules = ("cosine", "cyclic_cosine")
+        check("schedule", self.schedule in schedules, f"one of {schedules}")
+        shardings = ("replicated", "fsdp")
+        is_known = self.parameter_sharding in shardings
+        check("parameter_sharding", is_known, f"one of {shardings}")
+
+    def make_schedule(self, steps_per_epoch: int) -> optax.Schedule:
+        """Learning rate by step."""
+        return make_schedule(
+            learning_rate=self.learning_rate,
+            final_learning_rate=self.final_learning_rate,
+            num_steps=steps_per_epoch * self.num_epochs,
+            warmup_steps=self.warmup_steps,
+            kind=self.schedule,
+            steps_per_epoch=steps_per_epoch,
+        )
+
+    def make_optimizer(self, steps_per_epoch: int) -> optax.GradientTransformation:
+        """AdamW with its learning rate by step."""
+        return make_optimizer(
+            self.make_schedule(steps_per_epoch),
+            weight_decay=self.weight_decay,
+            gradient_clip_norm=self.gradient_clip_norm,
+            gradient_accumulation_steps=self.gradient_accumulation_steps,
+        )
 
 
 class TrainState(struct.PyTreeNode):
     """Everything a training step reads and writes.
 
     Attributes:
-        step: Number of steps taken, skipped ones included; int32.
+        step: Number of steps taken, including skipped ones; int32.
         params: Parameters that are trained, float32.
         model_state: Other variable collections, such as running batch statistics.
-        opt_state: The optimizer's.
+        opt_state: State of the optimizer. It counts skipped steps, see
+            `optax.ApplyIfFiniteState`.
         ema_params: Moving average of `params`, or None.
-        num_skipped: Steps skipped in all because loss or gradient was not finite.
-        num_skipped_in_row: The same, since the last step that was taken.
-        most_skipped_in_row: The most that this has been.
-        skipped_frames: int32 frames of the last skipped batch; -1 at first.
-        frozen: Parameters that are not trained: in no gradient, optimizer or average,
-            and in no checkpoint, as they are known from where they came.
+        frozen: Parameters that are not trained. They have no gradient, optimizer state
+            or average, and are not saved in checkpoints.
     """
 
     step: Int[jax.Array, ""]
@@ -39,10 +128,6 @@ class TrainState(struct.PyTreeNode):
     model_state: Any
     opt_state: Any
     ema_params: Any
-    num_skipped: Int[jax.Array, ""]
-    num_skipped_in_row: Int[jax.Array, ""]
-    most_skipped_in_row: Int[jax.Array, ""]
-    skipped_frames: Int[jax.Array, " B"]
     frozen: Any = dataclasses.field(default_factory=dict)
 
     @property
@@ -50,9 +135,6 @@ class TrainState(struct.PyTreeNode):
         """Variables to run the model with: averaged parameters where there are any."""
         params = self.params if self.ema_params is None else self.ema_params
         return {"params": merge_parameters(params, self.frozen), **self.model_state}
-
-
-Schedule = Literal["cosine", "cyclic_cosine"]
 
 
 def make_schedule(
@@ -82,28 +164,17 @@ def make_schedule(
         Learning rate by step, float32.
 
     Raises:
-        UserError: The warm-up is longer than the training, the learning rate is not
-            positive, the floor is above it, or the kind is unknown.
+        UserError: The warm-up is not shorter than the training.
     """
-    if learning_rate <= 0:
-        raise UserError(f"train.learning_rate={learning_rate} must be positive")
-    if not 0 <= final_learning_rate <= learning_rate:
-        raise UserError(
-            f"train.final_learning_rate={final_learning_rate} must be from 0 to "
-            f"train.learning_rate={learning_rate}: the rate falls from that one"
-        )
-    if not 0 <= warmup_steps < num_steps:
-        raise UserError(
-            f"train.warmup_steps={warmup_steps} must be less than the {num_steps} steps "
-            "of the training"
-        )
+    require(
+        0 <= warmup_steps < num_steps,
+        "config.train.warmup_steps",
+        warmup_steps,
+        f"less than the {num_steps} steps of the training",
+    )
     if kind == "cosine":
         return optax.warmup_cosine_decay_schedule(
             0.0, learning_rate, warmup_steps, num_steps, final_learning_rate
-        )
-    if kind != "cyclic_cosine":
-        raise UserError(
-            f"train.schedule must be 'cosine' or 'cyclic_cosine', got {kind!r}"
         )
     warmup = optax.linear_schedule(0.0, learning_rate, warmup_steps)
     cyclic = _cyclic_cosine(learning_rate, final_learning_rate, steps_per_epoch)
@@ -130,25 +201,44 @@ def make_optimizer(
     *,
     weight_decay: float,
     gradient_clip_norm: float | None = None,
+    gradient_accumulation_steps: int = 1,
 ) -> optax.GradientTransformation:
     """AdamW with torch's defaults, decaying every parameter as the papers' runs do.
+
+    A step whose gradient is not finite changes nothing and is counted in the state, see
+    `optax.apply_if_finite`.
 
     Args:
         schedule: Learning rate by step.
         weight_decay: Decoupled weight decay.
         gradient_clip_norm: Global norm to clip to, or None.
+        gradient_accumulation_steps: The mean gradient of this many steps updates the
+            parameters, see `optax.MultiSteps`.
     """
-    adamw = optax.adamw(schedule, weight_decay=weight_decay)
-    if gradient_clip_norm is None:
-        return optax.chain(adamw)
-    return optax.chain(optax.clip_by_global_norm(gradient_clip_norm), adamw)
+    count = gradient_accumulation_steps
+    if count == 1:
+        adamw = optax.adamw(schedule, weight_decay=weight_decay)
+    else:  # which counts updates
+        adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)
+    optimizer: optax.GradientTransformation = optax.chain(adamw)
+    if gradient_clip_norm is not None:
+        optimizer = optax.chain(optax.clip_by_global_norm(gradient_clip_norm), adamw)
+    if count > 1:
+        optimizer = optax.MultiSteps(optimizer, count).gradient_transformation()
+    return skip_not_finite(optimizer)
+
+
+def skip_not_finite(
+    optimizer: optax.GradientTransformation,
+) -> optax.GradientTransformation:
+    """An optimizer that ignores gradients that are not finite, any number in a row."""
+    return optax.apply_if_finite(optimizer, np.iinfo(np.int32).max)
 
 
 def create_state(
     variables: Mapping[str, Any],
     optimizer: optax.GradientTransformation,
     *,
-    batch_size: int,
     use_ema: bool,
     is_frozen: Callable[[str], bool] | None = None,
 ) -> TrainState:
@@ -157,9 +247,8 @@ def create_state(
     Args:
         variables: Of the model: "params" and any other collections.
         optimizer: From `make_optimizer`.
-        batch_size: Global; the shape of `skipped_frames`.
         use_ema: Keep a moving average of the parameters.
-        is_frozen: Told a parameter's path, True where it is not to be trained.
+        is_frozen: Called with the path of a parameter; True if it is not trained.
     """
     params, frozen = split_parameters(variables["params"], is_frozen)
     return TrainState(
@@ -168,10 +257,6 @@ def create_state(
         model_state={k: v for k, v in variables.items() if k != "params"},
         opt_state=optimizer.init(params),
         ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
-        num_skipped=jnp.zeros((), jnp.int32),
-        num_skipped_in_row=jnp.zeros((), jnp.int32),
-        most_skipped_in_row=jnp.zeros((), jnp.int32),
-        skipped_frames=jnp.full((batch_size,), -1, jnp.int32),
         frozen=frozen,
     )
 

@@ -13,7 +13,7 @@ from radejax.core.errors import UserError
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.training import sharding
+from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
@@ -34,8 +34,8 @@ def _config(num_epochs=2):
 
 @pytest.mark.slow
 def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeypatch):
-    mesh = sharding.make_mesh(1)
-    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    mesh = distributed.make_mesh(1)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     result = train_online(_config(), whole, num_sequences=2)
     assert result.step == 4  # 4 frames an epoch

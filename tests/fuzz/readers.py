@@ -1,5 +1,6 @@
 """Every reader of the package, with a small valid folder written by our own writers."""
 
+import json
 import pathlib
 import shutil
 from collections.abc import Callable, Iterable
@@ -30,7 +31,7 @@ from radejax.runs.data import DataPaths
 from radejax.simulation import dataset
 from radejax.simulation.config import SimulationConfig
 from radejax.training.checkpoints import Checkpoints
-from radejax.training.watch import _Jsonl
+from radejax.training.metric_logger import _remove_after
 from radejax.visualize.curves import read_metrics
 from radejax.weights import dinov3_hf, radenet_torch
 from radejax.weights.convert import write_state_dict
@@ -234,9 +235,8 @@ def _workdir(folder: Folder) -> None:
         pass
     paths = DataPaths(("nowhere",), None, "nowhere/records")
     files.write_json(folder / "run.json", workdir.run_info(folder, paths))
-    log = _Jsonl(folder / "metrics.jsonl", 0)
-    for step in range(5):
-        log.write(step, {"loss": 1.5 * step}, {})
+    rows = [json.dumps({"step": step, "loss": 1.5 * step}) for step in range(5)]
+    (folder / "metrics.jsonl").write_text("\n".join(rows) + "\n")
     names = [*seeds._KEYS, "ap", "num_gt"]
     lines = [
         names,
@@ -251,7 +251,7 @@ def _read_workdir(folder: Folder) -> None:
         pass
     workdir.run_info(folder, DataPaths(("nowhere",), None, "nowhere/records"))
     read_metrics(folder / "metrics.jsonl")
-    _Jsonl(folder / "metrics.jsonl", 3)
+    _remove_after(3, folder / "metrics.jsonl")
     seeds.read_aps(folder / "metrics.csv")
 
 

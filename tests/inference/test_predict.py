@@ -20,7 +20,7 @@ from radejax.runs.evaluate import make_detector
 from radejax.runs.sources import DataPaths
 from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.training import processes, sharding
+from radejax.training import distributed
 
 from ..small_models import drawn
 
@@ -66,7 +66,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 
 def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
-    mesh = sharding.make_mesh(num_devices)
+    mesh = distributed.make_mesh(num_devices)
     detector = make_detector(setup.config, setup.data, setup.variables, mesh)
     return predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
 
@@ -120,7 +120,7 @@ def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
         return True
 
     state = SimpleNamespace(eval_variables=setup.variables)
-    with pytest.raises(processes.Stopped):
+    with pytest.raises(distributed.Stopped):
         Validation(setup.config, setup.data)(state, 7, should_stop)
     assert asked == [True]
 
@@ -163,7 +163,7 @@ def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> N
     (picture,) = scores.pictures.values()
     assert picture.dtype == np.uint8
     assert picture.shape[2] == 3
-    alone = Validation(setup.config, setup.data, sharding.make_mesh(1))(state, 7)
+    alone = Validation(setup.config, setup.data, distributed.make_mesh(1))(state, 7)
     assert alone.values == pytest.approx(scores.values)
 
 

@@ -17,7 +17,7 @@ from radejax.runs import experiment, validation
 from radejax.runs.sources import Sources
 from radejax.runs.workdir import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.training import loop, sharding
+from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -42,11 +42,10 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level("INFO", logger="radejax")
-    said_before, plans = [], []
+    said_before = []
 
     def train(*args: Any, **__: Any) -> SimpleNamespace:
         said_before.append(caplog.text)
-        plans.append(args[-1])
         return SimpleNamespace(finished=True, step=1)
 
     simulation = default_config()
@@ -58,8 +57,8 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     config.train.batch_size = 2
     config.decode.update(score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False)
     monkeypatch.setattr(loop, "train", train)
-    mesh = sharding.make_mesh(1)
-    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    mesh = distributed.make_mesh(1)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     experiment.run(
         config, name="x", workdir=tmp_path / "run", sources=Sources(data=(str(root),))
     )
@@ -72,7 +71,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     expected = NmsAssignment(
         score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False, per_class=False
     )
-    assert plans[0].loss["nms"] == expected
+    assert loop.loss_options(config)["nms"] == expected
 
 
 def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
@@ -106,8 +105,8 @@ def test_labels_are_read_once(
         return parse(*args, where=where, **options)
 
     monkeypatch.setattr(dataset, "parse_label_file", count)
-    mesh = sharding.make_mesh(1)
-    monkeypatch.setattr(sharding, "make_mesh", lambda *_: mesh)
+    mesh = distributed.make_mesh(1)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
     config.simulation.update(
         train_sequences=3, frames_per_sequence=2, output="projection"

@@ -18,8 +18,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import starting_weights
 from radejax.losses.detection import detection_loss
 from radejax.runs import check_config
-from radejax.training import loop, sharding
-from radejax.training.start import Plan
+from radejax.training import distributed, loop
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step
 from radejax.weights import radenet_torch
@@ -222,20 +221,15 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     torch.save({k: torch.tensor(v) for k, v in state.items()}, workdir / "best.pth")
     variables = starting_weights(config.model, workdir / "best.pth").variables
     result = loop.train(
+        config,
         tiny.model,
-        variables,
         tiny.loader(),
         tiny.map_grid,
         workdir,
-        Plan(
-            options=config.train,
-            loss=config.loss,
-            watch=config.logging,
-            seed=config.seed,
-            info={},
-            steps_per_epoch=2,
-        ),
-        mesh=sharding.make_mesh(1),
+        info={},
+        steps_per_epoch=2,
+        variables=variables,
+        mesh=distributed.make_mesh(1),
     )
     assert result.step == 2
     chex.assert_trees_all_close(result.state.params, official["params"], atol=1e-7)
@@ -257,7 +251,6 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
     start = create_state(
         drawn(model, *inputs),
         optimizer,
-        batch_size=2,
         use_ema=False,
         is_frozen=getattr(model, "is_frozen", None),
     )
@@ -272,7 +265,7 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
     state = start
     for _ in range(2):
         state, metrics = step(state, batch, jax.random.key(1))
-    assert (int(state.step), int(state.num_skipped)) == (2, 0)
+    assert (int(state.step), int(metrics["skipped"])) == (2, 0)
     chex.assert_tree_all_finite((state.params, metrics))
     changed = jax.tree.map(
         lambda a, b: bool((a != b).any()), state.params, start.params

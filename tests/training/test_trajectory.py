@@ -22,10 +22,10 @@ from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M
-from radejax.runs.experiment import loss_options
-from radejax.training import sharding
-from radejax.training.start import Plan, compile_step
-from radejax.training.state import TrainState, create_state
+from radejax.training import distributed
+from radejax.training.loop import loss_options
+from radejax.training.state import TrainOptions, TrainState, create_state
+from radejax.training.step import make_train_step
 from radejax.weights import dinorade_torch, dinov3_hf, radenet_torch
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -63,31 +63,26 @@ def train(
     """State after batches of two in order, and what each step measured."""
     config.train.batch_size = 2
     config.train.num_epochs = -(-num_steps // STEPS_PER_EPOCH)
-    plan = Plan(
-        options=config.train,
-        loss=loss_options(config),
-        watch=config.logging,
-        seed=0,
-        info={},
-        steps_per_epoch=STEPS_PER_EPOCH,
-    )
+    options = TrainOptions(**config.train)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
-    mesh, optimizer = sharding.make_mesh(1), plan.optimizer()
+    mesh, optimizer = distributed.make_mesh(1), options.make_optimizer(STEPS_PER_EPOCH)
     state = create_state(
         variables,
         optimizer,
-        batch_size=2,
         use_ema=False,
         is_frozen=getattr(model, "is_frozen", None),
     )
-    state = jax.device_put(state, sharding.state_sharding(state, mesh, "replicated"))
-    step = compile_step(model, grid, optimizer, state, mesh, plan)
+    placement = distributed.state_sharding(state, mesh, "replicated")
+    state = jax.device_put(state, placement)
+    step = make_train_step(model, optimizer, grid, loss=loss_options(config))
+    step = jax.jit(step, donate_argnums=0, out_shardings=(placement, None))
+    schedule, rng = options.make_schedule(STEPS_PER_EPOCH), jax.random.key(1)
     measured = []
     for i in range(num_steps):
         first = 2 * (i % STEPS_PER_EPOCH)
         part = jax.tree.map(lambda x, a=first: x[a : a + 2], batch)
-        state, metrics = step(state, sharding.put_batch(part, mesh))
-        rate = plan.schedule(np.int32(i))
+        state, metrics = step(state, distributed.put_batch(part, mesh), rng)
+        rate = schedule(np.int32(i))
         measured.append({"lr": rate} | {name: metrics[name] for name in LOSSES})
     return state, {
         name: np.array([float(m[name]) for m in measured]) for name in measured[0]

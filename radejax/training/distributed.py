@@ -1,0 +1,222 @@
+"""Devices and processes that train together: mesh, placement, who writes, when to stop.
+
+Training is data parallel: every device holds all parameters and a slice of the batch.
+With `fsdp` the large parameters and their optimizer state are split over the same devices
+too; XLA gathers them where a layer needs them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, Literal, TypeVar, cast
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree, Shaped
+
+from radejax.core.errors import UserError, require
+
+_log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+ParameterSharding = Literal["replicated", "fsdp"]
+DATA_AXIS = "data"
+
+_WAIT_S = 7 * 24 * 3600  # preprocessing all of K-Radar takes hours
+_numbers = itertools.count()
+
+
+# Devices -----------------------------------------------------------------------------
+
+
+def make_mesh(num_devices: int | None = None) -> Mesh:
+    """One-dimensional mesh over all devices of all processes, or the first few."""
+    devices = jax.devices()
+    count = len(devices) if num_devices is None else num_devices
+    require(1 <= count <= len(devices), "num_devices", count, f"1 to {len(devices)}")
+    return jax.make_mesh(
+        (count,), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count]
+    )
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Sharding of what every device holds whole."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def batch_sharding(mesh: Mesh) -> NamedSharding:
+    """Sharding of arrays whose leading axis is the batch."""
+    return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
+
+
+def check_batch_size(
+    batch_size: int, mesh: Mesh, name: str = "config.train.batch_size"
+) -> None:
+    """Raises `UserError` for a global batch that does not divide over the mesh."""
+    devices = mesh.devices.size
+    if batch_size % devices:
+        lower = batch_size // devices * devices
+        choices = f"{lower} or {lower + devices}" if lower else f"{devices}"
+        raise UserError(
+            f"{name}={batch_size} does not divide over {devices} devices; use a "
+            f"multiple, for example {choices}"
+        )
+
+
+def put_batch(
+    batch: PyTree[Shaped[np.ndarray, "b ..."]], mesh: Mesh
+) -> PyTree[Shaped[jax.Array, "B ..."]]:
+    """Puts this process's frames, `b = B / processes`, onto the mesh as a global batch."""
+    sharding = batch_sharding(mesh)
+    return jax.tree.map(
+        lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch
+    )
+
+
+def state_sharding(
+    state: Any, mesh: Mesh, parameters: ParameterSharding, min_size: int = 2**16
+) -> Any:
+    """Pytree of `NamedSharding`: where each array of a train state is placed.
+
+    Args:
+        state: Pytree of arrays or `jax.ShapeDtypeStruct`.
+        mesh: From `make_mesh`.
+        parameters: "replicated", or "fsdp": every array of at least `min_size`
+            elements is split along its largest axis that divides over the mesh.
+        min_size: Smaller arrays stay whole; splitting them costs more than it saves.
+    """
+    size = mesh.devices.size
+
+    def place(x: Any) -> NamedSharding:
+        axes = [a for a in range(len(x.shape)) if x.shape[a] % size == 0]
+        is_small = np.prod(x.shape, dtype=int) < min_size
+        if parameters == "replicated" or is_small or not axes:
+            return replicated(mesh)
+        spec: list[str | None] = [None] * len(x.shape)
+        spec[max(axes, key=lambda a: x.shape[a])] = DATA_AXIS
+        return NamedSharding(mesh, PartitionSpec(*spec))
+
+    return jax.tree.map(place, state)
+
+
+# Processes ---------------------------------------------------------------------------
+
+
+def is_main() -> bool:
+    """True on the one process that writes logs, figures and configurations."""
+    return jax.process_index() == 0
+
+
+def main_first(prepare: Callable[[], T]) -> T:
+    """Calls a function on the main process, and after that on the others.
+
+    For work that finds its own results again, such as preparing data.
+
+    Raises:
+        UserError: On the others, if the main process failed; it raises its own error.
+    """
+    result = main_only(prepare)
+    if not is_main():
+        result = prepare()
+    wait_for_all("main_first")
+    return cast(T, result)  # it is None on the other processes only
+
+
+def main_only(work: Callable[[], T]) -> T | None:
+    """Calls a function on the main process while the others wait; returns None on those.
+
+    For reports and figures, which may take long: processes that continued would wait in
+    a collective, or at the end of JAX, and give up after minutes.
+
+    Raises:
+        UserError: On the others, if the main process failed; it raises its own error.
+    """
+    if jax.process_count() == 1:
+        return work()
+    result = error = None
+    if is_main():
+        try:
+            result = work()
+        except Exception as failed:
+            error = failed
+    wait_for_all("main_only")
+    is_fine = bool(multihost_utils.broadcast_one_to_all(np.int32(error is None)))
+    if error is not None:
+        raise error
+    if not is_fine:
+        raise UserError("process 0 stopped with an error, see its output")
+    return result
+
+
+def wait_for_all(name: str) -> None:
+    """Returns when every process has called it, which may take hours."""
+    if jax.process_count() == 1:
+        return
+    ocp.multihost.sync_global_processes(
+        f"radejax {name} {next(_numbers)}",
+        timeout=_WAIT_S,
+        # All processes are named, so that they wait at the coordinator and not in a
+        # collective, which would give up after minutes.
+        processes=set(range(jax.process_count())),
+    )
+
+
+def all_agree(is_fine: bool) -> bool:
+    """True if it is true on every process."""
+    if jax.process_count() == 1:
+        return is_fine
+    return bool(multihost_utils.process_allgather(np.int32(is_fine)).all())
+
+
+class Stopped(Exception):
+    """A long computation, such as an evaluation, ended early because of a signal."""
+
+
+@contextlib.contextmanager
+def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
+    """Yields a function that tells all processes in the same step that all should stop.
+
+    It returns True once SIGTERM or SIGINT came to one process, and every process must
+    call it equally often. A second signal interrupts at once. A signal reaches processes
+    in different steps, and those that continue would wait for the others forever.
+    Therefore each call sends a flag around and reads the flag of the previous call.
+
+    Args:
+        mesh: Devices of all processes.
+    """
+    event, before = threading.Event(), None
+    any_of = jax.jit(lambda x: x.any(), out_shardings=replicated(mesh))
+
+    def handle(number: int, _: object) -> None:
+        name = signal.Signals(number).name
+        if event.is_set():
+            raise KeyboardInterrupt(f"second {name}")
+        _log.warning("%s: saving a checkpoint, then stopping", name)
+        event.set()
+
+    def stop() -> bool:
+        nonlocal before
+        if jax.process_count() == 1:
+            return event.is_set()
+        rows = np.full(len(mesh.local_devices), event.is_set())
+        found, before = before, any_of(put_batch(rows, mesh))
+        return found is not None and bool(found)
+
+    # Only a main thread may set handlers.
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    numbers = (signal.SIGTERM, signal.SIGINT) if is_main_thread else ()
+    previous = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            # None: set outside Python, by jax.distributed; it cannot be restored.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -1,0 +1,220 @@
+"""Logs of a run: progress bar, metrics.jsonl, TensorBoard, Weights & Biases."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+import re
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import tensorboardX
+import tqdm
+from jaxtyping import UInt8
+
+from radejax.core import files
+from radejax.core.errors import DataError, UserError, require
+from radejax.losses.detection import LOSSES
+from radejax.training import distributed
+from radejax.training.checkpoints import BEST
+
+Values = Mapping[str, float]
+Figures = Mapping[str, UInt8[np.ndarray, "_ _ 3"]]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoggingOptions:
+    """The fields of `config.logging`, described there.
+
+    Raises:
+        UserError: A field is out of its range.
+    """
+
+    num_visualizations: int
+    wandb: bool
+    wandb_project: str
+    profile_steps: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        count, steps = self.num_visualizations, self.profile_steps
+        name = "config.logging.num_visualizations"
+        require(count >= 0, name, count, "an integer of at least 0")
+        is_range = len(steps) == 2 and all(type(step) is int for step in steps)
+        require(
+            is_range and 0 <= steps[0] <= steps[1],
+            "config.logging.profile_steps",
+            steps,
+            "two integers of at least 0, the first not above the last",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Scores:
+    """Result of an evaluation during training.
+
+    Attributes:
+        values: Metrics by name.
+        best: The metric that decides which checkpoint is best; None where undefined.
+        pictures: Images `[H, W, 3]` by name, on the main process.
+    """
+
+    values: Values
+    best: float | None = None
+    pictures: Figures = dataclasses.field(default_factory=dict)
+
+    def with_best(self) -> dict[str, float] | None:
+        """Metrics of a checkpoint; None if it cannot become the best."""
+        return None if self.best is None else {**self.values, BEST: self.best}
+
+
+class MetricLogger:
+    """Writes the metrics of a run, on the main process.
+
+    Records of steps after `start_step`, left by a run that was interrupted after its
+    last checkpoint, are removed; they will be written again.
+
+    Args:
+        folder: Workdir; contains `metrics.jsonl` and `tensorboard/`.
+        start_step: Step of the restored state.
+        num_steps: Of the whole training.
+        frames_per_step: For the rate.
+        wandb: Project and config of a run at Weights & Biases; None for no such run.
+
+    Raises:
+        UserError: Weights & Biases is asked for and not installed.
+        DiskFullError: No space is left, also in the methods.
+    """
+
+    def __init__(
+        self,
+        folder: pathlib.Path,
+        start_step: int,
+        num_steps: int,
+        frames_per_step: int,
+        wandb: Mapping[str, Any] | None = None,
+    ) -> None:
+        is_main = distributed.is_main()
+        self._folder, self._frames_per_step = folder, frames_per_step
+        self._path = folder / "metrics.jsonl" if is_main else None
+        self._board, self._wandb = None, None
+        if self._path is not None:
+            if self._path.exists():
+                _remove_after(start_step, self._path)
+            if wandb is not None:
+                self._wandb = _start_wandb(folder, wandb)
+            # An unlimited queue: a limited one blocks forever on a full disk.
+            self._board = tensorboardX.SummaryWriter(
+                str(folder / "tensorboard"), purge_step=start_step + 1, max_queue=0
+            )
+        self._bar = tqdm.tqdm(
+            total=num_steps,
+            initial=start_step,
+            desc="train",
+            unit="step",
+            disable=not is_main,
+            dynamic_ncols=True,
+        )
+        self._start = self._last_step = start_step
+        self._waited, self._since = 0.0, time.perf_counter()
+
+    def waited(self, seconds: float) -> None:
+        """Counts time in which the devices were idle because a batch was missing."""
+        self._waited += seconds
+
+    def advance(self, step: int, metrics: Any) -> None:
+        """Moves the progress bar; the first step, which compiles, is not timed."""
+        self._bar.update(step - self._bar.n)
+        if step == self._start + 1:
+            jax.block_until_ready(metrics)
+            self.restart_timer(step)
+
+    def restart_timer(self, step: int) -> None:
+        """Leaves the time since the last record out of the rate."""
+        self._waited, self._since, self._last_step = 0.0, time.perf_counter(), step
+
+    def log(self, step: int, metrics: Mapping[str, Any], *, epoch: float) -> None:
+        """Writes the metrics of a step, and the rate since the last record."""
+        values = {k: float(np.asarray(v)) for k, v in metrics.items()}
+        text = [f"{k} {v:.4g}" for k, v in values.items() if k in LOSSES]
+        elapsed, steps = time.perf_counter() - self._since, step - self._last_step
+        if steps:
+            values["frames_per_s"] = steps * self._frames_per_step / elapsed
+            values["data_wait_share"] = self._waited / elapsed
+            text.append(f"{values['frames_per_s']:.1f} frames/s")
+        self.restart_timer(step)
+        self._bar.set_postfix_str(" ".join(text))
+        self._write(step, {**values, "epoch": epoch}, {})
+
+    def log_scores(self, step: int, scores: Scores) -> None:
+        """Writes the result of an evaluation."""
+        self._write(step, scores.values, scores.pictures)
+
+    def _write(self, step: int, values: Values, figures: Figures) -> None:
+        if self._path is None or self._board is None:
+            return
+        message = (
+            f"no space left to write logs in {self._folder}; checkpoints are intact, "
+            "free some and run the same command again"
+        )
+        with files.disk_full(self._folder, message):
+            with self._path.open("a") as file:
+                file.write(json.dumps({"step": step, **values}) + "\n")
+            self._board.flush()  # raises if its thread could not write
+            for name, value in values.items():
+                name = re.sub(r"[^\w./-]", "_", name)  # TensorBoard allows no others
+                self._board.add_scalar(name, value, step)
+            for name, figure in figures.items():
+                self._board.add_image(name, figure, step, dataformats="HWC")
+
+    def __enter__(self) -> MetricLogger:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+        if self._board is not None:
+            try:
+                self._board.close()
+            except OSError:  # a full disk, which `_write` reported; not again at exit
+                writer = self._board._get_file_writer().event_writer
+                writer._worker.stop()
+                writer._closed = True
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+def _remove_after(step: int, path: pathlib.Path) -> None:
+    kept, lines = [], files.read_text(path).splitlines()
+    for number, line in enumerate(lines, 1):
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line + "\n")
+        except (ValueError, LookupError, TypeError) as error:
+            if number < len(lines):  # the last is the one a killed run was writing
+                raise DataError(
+                    f"{path}, line {number} is corrupted: {error}"
+                ) from None
+    files.write_text(path, "".join(kept))
+
+
+def _start_wandb(folder: pathlib.Path, arguments: Mapping[str, Any]) -> Any:
+    """The run of a workdir at Weights & Biases, which copies what TensorBoard gets."""
+    try:
+        import wandb
+    except ImportError as error:
+        raise UserError(
+            "config.logging.wandb is set, and wandb is not installed: "
+            "pip install 'radejax[wandb]'"
+        ) from error
+    return wandb.init(
+        name=folder.name,
+        id=hashlib.sha256(str(folder.absolute()).encode()).hexdigest()[:16],
+        resume="allow",
+        dir=str(folder),
+        sync_tensorboard=True,
+        **arguments,
+    )

@@ -1,0 +1,94 @@
+"""Meshes, placements and processes; real ones are in tests/test_two_processes.py."""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec
+
+from radejax.core.errors import UserError
+from radejax.training import distributed
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes this process one of two; returns what happens between them, in order."""
+    events: list[str] = []
+
+    def become(index: int, *, main_is_fine: bool = True) -> list[str]:
+        def broadcast(value: np.ndarray) -> np.ndarray:
+            events.append("told")
+            return value if index == 0 else np.int32(main_is_fine)
+
+        monkeypatch.setattr(jax, "process_count", lambda: 2)
+        monkeypatch.setattr(jax, "process_index", lambda: index)
+        monkeypatch.setattr(
+            distributed, "wait_for_all", lambda _: events.append("wait")
+        )
+        monkeypatch.setattr(
+            distributed.multihost_utils, "broadcast_one_to_all", broadcast
+        )
+        return events
+
+    return become
+
+
+def test_the_others_wait_while_the_main_process_works(two: Any) -> None:
+    events = two(0)
+    assert distributed.main_only(lambda: events.append("work") or 5) == 5
+    assert events == ["work", "wait", "told"]
+    events.clear()
+    two(1)
+    assert distributed.main_only(lambda: events.append("work")) is None
+    assert events == ["wait", "told"]
+
+
+def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
+    def fail() -> None:
+        raise OSError("broken")
+
+    events = two(0)
+    with pytest.raises(OSError, match="broken"):
+        distributed.main_only(fail)
+    assert events == ["wait", "told"]
+    two(1, main_is_fine=False)
+    with pytest.raises(UserError, match="process 0 stopped with an error"):
+        distributed.main_only(fail)
+
+
+def test_what_the_main_process_prepared_is_found_by_the_others(two: Any) -> None:
+    events = two(1)
+    assert distributed.main_first(lambda: events.append("work") or "found") == "found"
+    assert events == ["wait", "told", "work", "wait"]
+
+
+def test_put_batch_splits_the_leading_axis() -> None:
+    mesh = distributed.make_mesh(4)
+    batch = {"x": np.arange(24.0).reshape(8, 3), "i": np.arange(8)}
+    placed = distributed.put_batch(batch, mesh)
+    chex.assert_trees_all_equal(placed, batch)
+    assert [s.data.shape for s in placed["x"].addressable_shards] == [(2, 3)] * 4
+
+
+def test_fsdp_splits_the_widest_axis_that_divides() -> None:
+    mesh = distributed.make_mesh(4)
+    state = {
+        "kernel": jax.ShapeDtypeStruct((3, 3, 128, 256), jnp.float32),
+        "bias": jax.ShapeDtypeStruct((256,), jnp.float32),
+        "odd": jax.ShapeDtypeStruct((333, 333), jnp.float32),
+    }
+    placed = distributed.state_sharding(state, mesh, "fsdp")
+    assert placed["kernel"].spec == PartitionSpec(None, None, None, "data")
+    assert placed["bias"].spec == placed["odd"].spec == PartitionSpec()
+    whole = distributed.state_sharding(state, mesh, "replicated")
+    assert {s.spec for s in whole.values()} == {PartitionSpec()}
+
+
+def test_a_batch_that_does_not_divide_names_those_that_do() -> None:
+    with pytest.raises(UserError, match=r"batch_size=6 does not divide .* 4 or 8"):
+        distributed.check_batch_size(6, distributed.make_mesh(4))
+    with pytest.raises(UserError, match="num_devices is 9, expected 1 to 8"):
+        distributed.make_mesh(9)
