@@ -52,8 +52,6 @@ def main():
     is_whole = True
     if not arguments.tables:
         memory.restart_with_huge_pages()  # as every command; torch's process does not
-        memory.keep_freed()
-        memory.collect_seldom()
         jax.config.update("jax_enable_compilation_cache", False)
         chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
         result = run(

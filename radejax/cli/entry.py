@@ -15,7 +15,6 @@ import socket
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 
-from radejax.core import memory
 from radejax.core.errors import UserError
 from radejax.core.files import is_no_space
 
@@ -162,8 +161,6 @@ def _check_port(coordinator: str) -> None:
 def set_up_jax(*, cache: bool = True) -> None:
     """Logging at level info without noise, and a compilation cache that persists.
 
-    Freed memory is kept for the next step; see `core.memory`.
-
     Args:
         cache: Keep compiled programs in the folder that the environment variable
             JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
@@ -172,7 +169,6 @@ def set_up_jax(*, cache: bool = True) -> None:
     from absl import flags
     from absl import logging as absl_logging
 
-    memory.keep_freed()
     log = logging.getLogger("radejax")
     if not log.handlers:
         handler = logging.StreamHandler()
