@@ -25,7 +25,7 @@ from radejax.core.config import load_config
 from radejax.data.frame_table import make_table
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader
-from radejax.data.projection import project, project_jax, project_plain
+from radejax.data.projection import project_jax, project_plain, project_tensor
 from radejax.data.tesseract import project_file
 from radejax.evaluation.average_precision import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
@@ -41,14 +41,14 @@ def tpm(machine):
     """Tensor max projection of a tesseract, as `loadmat` lays it out."""
     tesseract = inputs.make_tesseract(GRID.shape_drea)
     columns = {
-        "radejax": lambda: timed(lambda: project(tesseract)),
+        "radejax": lambda: timed(lambda: project_tensor(tesseract)),
         "released formula": lambda: timed(lambda: project_plain(tesseract)),
         "plain read (sum)": lambda: timed(tesseract.sum),
     }
     yield Case(
         name="TPM on the host",
         columns=columns,
-        error=difference([project(tesseract)], [project_plain(tesseract)]),
+        error=difference([project_tensor(tesseract)], [project_plain(tesseract)]),
         note="beside a plain read: the share of its bandwidth",
     )
     if machine["platform"] != "cpu":

@@ -67,9 +67,7 @@ class LabelledFrame(Protocol):
     @property
     def radar_from_lidar_z_m(self) -> float: ...
 
-    def read_projection(
-        self, grid: RadarGrid, timings: dict[str, float] | None = None
-    ) -> Float[np.ndarray, "R A DE"]:
+    def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         """Projection; seconds of reading are added to "reading"."""
 
     def read_calibration(

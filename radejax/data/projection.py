@@ -28,10 +28,10 @@ MAX_LEVEL = 100.0
 """Beyond any projection: float64's largest power is at 17, the floor at -0.54."""
 
 
-def project(
+def project_tensor(
     tesseract: Real[np.ndarray, "D R E A"], *, dtype: Any = np.float32
 ) -> Float[np.ndarray, "R A D+E"]:
-    """Tensor max projection of one tesseract, in one pass over its memory.
+    """Tensor max projection of a 4D radar tensor, in one pass over its memory.
 
     Channels are the maximum over elevation of every Doppler bin, then the maximum over
     Doppler of every elevation bin, both on a normalised logarithmic scale:
@@ -54,7 +54,7 @@ def project(
         create_projections.py.
 
     Examples:
-        >>> project(np.ones((8, 16, 5, 12), np.float32)).shape
+        >>> project_tensor(np.ones((8, 16, 5, 12), np.float32)).shape
         (16, 12, 13)
     """
     tesseract = np.asarray(tesseract)
@@ -81,7 +81,7 @@ def project_columns(
     *,
     dtype: Any = np.float32,
 ) -> Float[np.ndarray, "R A DE"]:
-    """`project` for a tesseract that arrives column by column, as files store it.
+    """`project_tensor` for a tesseract that arrives column by column, as files store it.
 
     Args:
         columns: For every azimuth a C-contiguous slab of linear power.
@@ -150,7 +150,7 @@ def project_plain(
 ) -> Float[np.ndarray, "R A D+E"]:
     """The formula as released: logarithm of every cell, transpose, two maxima.
 
-    Slow; the reference that `project` is tested and timed against.
+    Slow; the reference that `project_tensor` is tested and timed against.
     """
     level = (10 * np.log10(tesseract + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
     level = np.transpose(level, (1, 3, 2, 0))  # [R, A, E, D]
@@ -161,7 +161,7 @@ def project_plain(
 def project_jax(
     tesseract: Real[jax.Array, "*frames D R E A"],
 ) -> Float[jax.Array, "*frames R A D+E"]:
-    """`project` for accelerators, float32.
+    """`project_tensor` for accelerators, float32.
 
     Leading axes are frames. Jit-compiled; maxima first, as on the host.
     """

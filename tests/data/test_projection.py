@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from radejax.core.errors import UserError
 from radejax.data.projection import (
-    project,
     project_columns,
     project_jax,
     project_plain,
+    project_tensor,
     to_log_scale,
 )
 
@@ -47,7 +47,7 @@ def test_levels_worked_out_by_hand():
 def test_channels_are_doppler_then_elevation():
     tesseract = np.full(SHAPE, 1.0)
     tesseract[2, 4, 1, 3] = 1e6  # Doppler 2, range 4, elevation 1, azimuth 3
-    projection = project(tesseract)
+    projection = project_tensor(tesseract)
     assert projection.shape == (6, 5, 7)
     strong = np.argwhere(projection > 0.1)
     np.testing.assert_array_equal(strong, [[4, 3, 2], [4, 3, 4 + 1]])
@@ -58,10 +58,10 @@ def test_channels_are_doppler_then_elevation():
 def test_equals_the_plain_formula(layout, dtype):
     tesseract = LAYOUTS[layout](random_power(dtype=dtype))
     wanted = project_plain(random_power(dtype=dtype).astype(np.float64))
-    found = project(tesseract)
+    found = project_tensor(tesseract)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, wanted, atol=1e-6, rtol=0)
-    exact = project(tesseract, dtype=np.float64)
+    exact = project_tensor(tesseract, dtype=np.float64)
     tolerance = 1e-14 if dtype == np.float64 else 1e-6
     np.testing.assert_allclose(exact, wanted, atol=tolerance, rtol=0)
 
@@ -69,7 +69,7 @@ def test_equals_the_plain_formula(layout, dtype):
 def test_input_is_left_as_it_is():
     tesseract = random_power()
     copy = tesseract.copy()
-    project(tesseract)
+    project_tensor(tesseract)
     np.testing.assert_array_equal(tesseract, copy)
 
 
@@ -90,7 +90,7 @@ def test_odd_numbers_are_reduced_as_floats_are(cells, layout):
     for *cell, value in cells:
         tesseract[tuple(cell)] = value
     with np.errstate(invalid="ignore"):
-        found = project(LAYOUTS[layout](tesseract))
+        found = project_tensor(LAYOUTS[layout](tesseract))
         maxima = [tesseract.max(2).transpose(1, 2, 0), tesseract.max(0).swapaxes(1, 2)]
         wanted = to_log_scale(np.concatenate(maxima, -1))
     np.testing.assert_array_equal(found, wanted)
@@ -100,7 +100,7 @@ def test_odd_numbers_are_reduced_as_floats_are(cells, layout):
 def test_other_types(dtype):
     tesseract = np.arange(np.prod(SHAPE)).reshape(SHAPE).astype(dtype)
     wanted = project_plain(tesseract.astype(np.float64))
-    np.testing.assert_allclose(project(tesseract), wanted, atol=1e-6)
+    np.testing.assert_allclose(project_tensor(tesseract), wanted, atol=1e-6)
 
 
 def test_columns_one_by_one_in_the_same_buffer():
@@ -113,12 +113,12 @@ def test_columns_one_by_one_in_the_same_buffer():
             yield buffer
 
     found = project_columns(columns(), SHAPE, dtype=np.float16)
-    np.testing.assert_array_equal(found, project(tesseract, dtype=np.float16))
+    np.testing.assert_array_equal(found, project_tensor(tesseract, dtype=np.float16))
 
 
 def test_jax_on_one_frame_and_on_batches():
     frames = np.stack([random_power(seed) for seed in range(3)])
-    wanted = np.stack([project(frame) for frame in frames])
+    wanted = np.stack([project_tensor(frame) for frame in frames])
     one = project_jax(jnp.asarray(frames[0]))
     np.testing.assert_allclose(one, wanted[0], atol=1e-6, rtol=0)
     many = project_jax(jnp.asarray(frames))
@@ -137,4 +137,4 @@ def test_what_is_no_tesseract(tesseract):
     with pytest.raises(
         UserError, match=r"a tesseract is a real array \[Doppler, range"
     ):
-        project(tesseract)
+        project_tensor(tesseract)

@@ -1,18 +1,17 @@
 import io
 import struct
-import tracemalloc
 import zlib
 
-import h5py
 import numpy as np
 import pytest
 import scipy.io
 
 from radejax.core.errors import DataError
 from radejax.data.kradar.write import write_tesseract
-from radejax.data.projection import project
+from radejax.data.mat5 import Layout
+from radejax.data.projection import project_tensor
 from radejax.data.tesseract import (
-    _read_slabs,
+    _read_columns,
     check_tesseract,
     project_file,
     read_projection_npy,
@@ -29,18 +28,13 @@ def tesseract():
 
 
 def write(path, tesseract, kind):
-    if kind == "v7.3":
-        with h5py.File(path, "w", userblock_size=512) as file:
-            file["arrDREA"] = tesseract.T
-        with open(path, "r+b") as file:
-            file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    elif kind == "two variables":
+    if kind == "two variables":
         scipy.io.savemat(path, {"other": np.ones(3), "arrDREA": tesseract})
     else:
         write_tesseract(path, tesseract, compress=kind == "compressed")
 
 
-KINDS = ["plain", "compressed", "v7.3", "two variables"]
+KINDS = ["plain", "compressed", "two variables"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -51,10 +45,8 @@ def test_every_kind_of_file(tmp_path, tesseract, kind, dtype):
     found = read_tesseract(path, shape_drea=SHAPE)
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, tesseract)
-    timings = {"reading": 0.0}
-    projection = project_file(path, shape_drea=SHAPE, timings=timings)
-    np.testing.assert_array_equal(projection, project(tesseract.astype(dtype)))
-    assert timings["reading"] > 0
+    projection = project_file(path, shape_drea=SHAPE)
+    np.testing.assert_array_equal(projection, project_tensor(tesseract.astype(dtype)))
     check_tesseract(path, shape_drea=SHAPE)
     check_tesseract(path, shape_drea=SHAPE, deep=True)
 
@@ -72,7 +64,7 @@ def test_truncated_files_are_named(tmp_path, tesseract, kind, keep):
     path.write_bytes(path.read_bytes()[:keep])
     for read in (read_tesseract, project_file):
         with pytest.raises(
-            DataError, match=r"t\.mat: (the file is empty|damaged|trunc|no arrDREA)"
+            DataError, match=r"t\.mat: (not a MATLAB|corrupted|trunc|no arrDREA)"
         ):
             read(path)
 
@@ -83,7 +75,7 @@ def test_flipped_bytes_are_found_where_files_have_checksums(tmp_path, tesseract)
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"t\.mat: damaged"):
+    with pytest.raises(DataError, match=r"t\.mat: corrupted"):
         project_file(path)
 
 
@@ -125,45 +117,6 @@ def test_a_flipped_bit_is_found_or_changes_no_number(tmp_path, tesseract, kind):
     assert num_found > len(bits) - 8 * (124 + 8 + 64)
 
 
-# All of them take a minute: HDF5 opens a file in milliseconds.
-@pytest.mark.parametrize("every", [211, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("options", [{}, {"compression": "gzip"}])
-def test_a_flipped_bit_of_a_v73_file_is_found_or_changes_no_number(
-    tmp_path, tesseract, options, every
-):
-    path = tmp_path / "t.mat"
-    with h5py.File(path, "w") as file:
-        data = file.create_dataset("arrDREA", data=tesseract.T, **options)
-        start = data.id.get_chunk_info(0).byte_offset if options else 0
-    content = path.read_bytes()
-    end = start or content.find(tesseract.tobytes(order="F"))
-    # All of the headers but long runs of zeros, which nothing uses; then, where there
-    # is a checksum, the numbers.
-    used = [i for i in range(end) if any(content[max(i - 8, 0) : i + 9])]
-    bits = [8 * i + j for i in used for j in range(8)]
-    if options:
-        numbers = np.arange(8 * start, 8 * len(content))
-        bits += np.random.default_rng(1).choice(numbers, 1000, replace=False).tolist()
-    num_found = 0
-    for bit in bits[::every]:
-        damaged = bytearray(content)
-        damaged[bit // 8] ^= 1 << bit % 8
-        path.write_bytes(damaged)
-        found = read_or_damage(path, SHAPE)
-        num_found += found is None
-        if found is not None:
-            np.testing.assert_array_equal(found, tesseract, err_msg=f"bit {bit}")
-    assert num_found > len(bits[::every]) / 10
-
-
-@pytest.mark.parametrize("dtype", [">f4", "<u4"])
-def test_types_that_a_flipped_bit_makes_of_floats_are_refused(tmp_path, dtype):
-    with h5py.File(tmp_path / "t.mat", "w") as file:
-        file["arrDREA"] = np.ones(SHAPE[::-1], dtype)
-    with pytest.raises(DataError, match=f"unusual {dtype}, expected little-endian"):
-        read_tesseract(tmp_path / "t.mat")
-
-
 def test_a_flip_that_crashed_scipy_is_one_line(tmp_path, tesseract):
     path = tmp_path / "t.mat"
     write(path, tesseract, "plain")
@@ -172,7 +125,7 @@ def test_a_flip_that_crashed_scipy_is_one_line(tmp_path, tesseract):
     path.write_bytes(content)
     for read in (read_tesseract, project_file, check_tesseract):
         with pytest.raises(
-            DataError, match=r"t\.mat: damaged MATLAB file: .* stored as"
+            DataError, match=r"t\.mat: corrupted MATLAB file: .* stored as"
         ):
             read(path)
 
@@ -195,7 +148,7 @@ def test_small_integers_of_floats_and_big_endian_files_are_read(tmp_path, tesser
         content[:124] + b"\x01\x00MI" + swapped[:56] + content[184:192] + swapped[56:]
     )
     np.testing.assert_array_equal(read_tesseract(path), tesseract)
-    np.testing.assert_array_equal(project_file(path), project(tesseract))
+    np.testing.assert_array_equal(project_file(path), project_tensor(tesseract))
 
 
 def test_no_more_is_inflated_than_is_claimed(tmp_path):
@@ -205,44 +158,17 @@ def test_no_more_is_inflated_than_is_claimed(tmp_path):
     raw = bytearray(zlib.decompress(content[136:]))
     bomb = zlib.compress(bytes(raw) + bytes(1 << 26))
     path.write_bytes(content[:132] + struct.pack("<I", len(bomb)) + bomb)
-    tracemalloc.start()
-    with pytest.raises(DataError, match="inflates to other than"):
+    with pytest.raises(DataError, match="does not inflate to"):
         read_tesseract(path)
-    assert tracemalloc.get_traced_memory()[1] < len(raw) + (4 << 20)
-    tracemalloc.stop()
     with pytest.raises(DataError, match="grid demands"):
         read_tesseract(path, shape_drea=SHAPE)
 
 
-def test_hdf5_is_looked_at_before_it_is_read(tmp_path, tesseract):
+def test_v73_files_say_what_to_do(tmp_path):
     path = tmp_path / "t.mat"
-    with h5py.File(path, "w") as file:  # 1.4 kB that claim 2.4 GB
-        file.create_dataset("arrDREA", (300, 200, 100, 100), "f4", chunks=True)
-    for read in (read_tesseract, check_tesseract, project_file):
-        with pytest.raises(DataError, match="claims 2400000000 bytes and stores 0"):
-            read(path)
-    (tmp_path / "secret").write_bytes(bytes(4 * 360))
-    with h5py.File(path, "w") as file:
-        file.create_dataset(
-            "arrDREA", SHAPE[::-1], "f4", external=[(str(tmp_path / "secret"), 0, 1440)]
-        )
-    with pytest.raises(DataError, match="numbers of arrDREA are in other files"):
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(384))
+    with pytest.raises(DataError, match="not a MATLAB v5 file; save it in v7 or v6"):
         read_tesseract(path)
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["arrDREA"] = tesseract.T
-    with h5py.File(path, "w") as file:
-        file["arrDREA"] = h5py.ExternalLink("other.h5", "/arrDREA")
-    with pytest.raises(DataError, match="no array, or a link"):
-        read_tesseract(path)
-    with h5py.File(path, "w") as file:
-        layout = h5py.VirtualLayout(SHAPE[::-1], "f4")
-        layout[...] = h5py.VirtualSource("other.h5", "arrDREA", SHAPE[::-1])
-        file.create_virtual_dataset("arrDREA", layout)
-    with pytest.raises(DataError, match="numbers of arrDREA are in other files"):
-        read_tesseract(path)
-    with h5py.File(path, "w") as file:  # deflated, as MATLAB writes it
-        file.create_dataset("arrDREA", data=tesseract.T, compression="gzip")
-    np.testing.assert_array_equal(read_tesseract(path), tesseract)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e4])
@@ -252,7 +178,7 @@ def test_impossible_power_is_damage(tmp_path, tesseract, value):
     write(path, tesseract, "plain")
     with (
         np.errstate(invalid="ignore"),
-        pytest.raises(DataError, match="negative or non-finite power"),
+        pytest.raises(DataError, match="negative or infinite power"),
     ):
         project_file(path)
 
@@ -263,16 +189,18 @@ def test_wrong_content_is_named(tmp_path, tesseract):
     with pytest.raises(DataError, match=r"no arrDREA in it, only \['arrREA'\]"):
         read_tesseract(path)
     scipy.io.savemat(path, {"arrDREA": np.ones((2, 2))})
-    with pytest.raises(DataError, match=r"shape \(2, 2\) of float64, expected real"):
+    with pytest.raises(
+        DataError, match=r"shape \(2, 2\), the sensor.s grid demands four"
+    ):
         project_file(path)
     scipy.io.savemat(path, {"arrDREA": tesseract * 1j})
-    with pytest.raises(DataError, match="arrDREA is complex, expected real"):
+    with pytest.raises(DataError, match="flags 0x807, expected real"):
         read_tesseract(path)
     write(path, tesseract, "plain")
     for read in (read_tesseract, project_file, check_tesseract):
         with pytest.raises(DataError, match=r"grid demands \(1, 2, 3, 4\)"):
             read(path, shape_drea=(1, 2, 3, 4))
-        with pytest.raises(FileNotFoundError, match=r"none\.mat: no such tesseract"):
+        with pytest.raises(FileNotFoundError, match=r"none\.mat: no such radar tensor"):
             read(tmp_path / "none.mat")
         with pytest.raises(DataError, match="is a folder"):
             read(tmp_path)
@@ -281,7 +209,7 @@ def test_wrong_content_is_named(tmp_path, tesseract):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_released_projections(tmp_path, tesseract, dtype):
     path = tmp_path / "DERA_tesseract_00001.npy"
-    wanted = project(tesseract, dtype=dtype)
+    wanted = project_tensor(tesseract, dtype=dtype)
     np.save(path, wanted.transpose(2, 0, 1))
     found = read_projection_npy(path, projection_shape=(6, 5, 7))
     np.testing.assert_array_equal(found, wanted)
@@ -296,7 +224,7 @@ def test_bad_released_projections(tmp_path):
     path = tmp_path / "p.npy"
     for value in (np.nan, -np.inf, 1e38):
         np.save(path, np.where(np.arange(210).reshape(7, 6, 5) == 9, value, 0.5))
-        with pytest.raises(DataError, match="1 of 210 cells are not finite or beyond"):
+        with pytest.raises(DataError, match="1 of 210 values are not finite or beyond"):
             read_projection_npy(path)
     path.unlink()
     with pytest.raises(FileNotFoundError, match="no such projection"):
@@ -306,13 +234,13 @@ def test_bad_released_projections(tmp_path):
         read_projection_npy(path)
     np.save(path, np.ones((7, 6, 5)))
     path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(DataError, match=r"p\.npy: damaged"):
+    with pytest.raises(DataError, match=r"p\.npy: corrupted"):
         read_projection_npy(path)
     path.write_bytes(b"")
-    with pytest.raises(DataError, match=r"p\.npy: damaged"):
+    with pytest.raises(DataError, match=r"p\.npy: corrupted"):
         read_projection_npy(path)
     np.save(path, np.array([{}], object))
-    with pytest.raises(DataError, match=r"p\.npy: damaged"):
+    with pytest.raises(DataError, match=r"p\.npy: corrupted"):
         read_projection_npy(path)
 
 
@@ -324,12 +252,11 @@ class Dribble(io.BytesIO):
 
 
 @pytest.mark.wrong_types
-def test_slabs_of_a_file_that_returns_parts(tesseract):
+def test_columns_of_a_file_that_returns_parts(tesseract):
     content = np.asfortranarray(tesseract).tobytes(order="F")
-    slab = np.empty(SHAPE[2::-1], np.float32)
-    slabs = _read_slabs(Dribble(content), slab, SHAPE[3], {"reading": 0.0})
-    found = np.stack([column.copy() for column in slabs])  # [A, E, R, D]
+    layout = Layout(tesseract.dtype, SHAPE, 0, None, len(content))
+    columns = _read_columns(Dribble(content), layout)
+    found = np.stack([column.copy() for column in columns])  # [A, E, R, D]
     np.testing.assert_array_equal(found.T, tesseract)
-    short = _read_slabs(Dribble(content[:-3]), slab, SHAPE[3], {"reading": 0.0})
-    with pytest.raises(EOFError, match="the file ends in column 4 of 5"):
-        list(short)
+    with pytest.raises(EOFError, match="the file ends in column 4"):
+        list(_read_columns(Dribble(content[:-3]), layout))

@@ -6,7 +6,6 @@ import shutil
 from collections.abc import Callable, Iterable
 
 import grain
-import h5py
 import jax.numpy as jnp
 import numpy as np
 from PIL import Image
@@ -97,9 +96,6 @@ def _tesseract(folder: Folder, kind: str) -> None:
     power = (10 ** _rng().uniform(2, 15, GRID.shape_drea)).astype(np.float32)
     if kind == "npy":
         np.save(folder / "a.npy", np.log10(power[0]).transpose(1, 0, 2))
-    elif kind == "hdf5":
-        with h5py.File(folder / "a.mat", "w") as file:
-            file.create_dataset("arrDREA", data=power.T, chunks=True, compression=1)
     else:
         write.write_tesseract(folder / "a.mat", power, compress=kind == "deflated")
 
@@ -334,9 +330,7 @@ READERS: dict[str, Reader] = {
         _root, lambda f: folders.read_grid([f]), "radar_grid.json"
     ),
     "data set": Reader(_root, _read_root, "**/*.txt", "*.json", count=200),
-    **_kinds(
-        "tesseract", ("plain", "deflated", "hdf5"), _tesseract, _read_tesseract, "a.mat"
-    ),
+    **_kinds("tesseract", ("plain", "deflated"), _tesseract, _read_tesseract, "a.mat"),
     "projection npy": Reader(
         lambda f: _tesseract(f, "npy"),
         lambda f: read_projection_npy(f / "a.npy"),

@@ -12,7 +12,7 @@ import pytest
 from radejax import Detector, UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import write
-from radejax.data.projection import project
+from radejax.data.projection import project_tensor
 from radejax.evaluation.files.kitti import prediction_texts
 from radejax.weights import dinorade_torch
 
@@ -34,7 +34,7 @@ def tesseracts(detector: Detector) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def projections(tesseracts: np.ndarray) -> np.ndarray:
-    return np.stack([project(t) for t in tesseracts])
+    return np.stack([project_tensor(t) for t in tesseracts])
 
 
 def _equal(a: Any, b: Any, atol: float = 1e-4) -> None:

@@ -66,9 +66,7 @@ class Frame:
         """File of the radar: the tesseract, or without one the official projection."""
         return self.tesseract_path or self.projection_path
 
-    def read_projection(
-        self, grid: RadarGrid, timings: dict[str, float] | None = None
-    ) -> Float[np.ndarray, "R A DE"]:
+    def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         """float32 projection; see `tesseract.read_frame`.
 
         Raises:
@@ -77,7 +75,7 @@ class Frame:
         """
         if self.radar_path is None:
             raise FileNotFoundError("no tesseract in any root")
-        return read_frame(self.radar_path, grid, timings)
+        return read_frame(self.radar_path, grid)
 
     def read_calibration(
         self, radar_from_lidar_m: tuple[float, ...] | None = None

@@ -304,13 +304,13 @@ def _project_task(
 ) -> tuple[files.RecordFile, float, float]:
     """Projects one file of records; returns its manifest, reading and working time."""
     began = time.perf_counter()
-    timings = {"reading": 0.0}
+    reading_s = 0.0
     grid, encoding, compress = task.kind.grid, task.kind.encoding, task.kind.compressed
     with files.RecordFileWriter(task.folder, task.name, compress=compress) as writer:
         for frame in task.frames:
             key = frame.key
             try:
-                projection = frame.read_projection(grid, timings)
+                projection = frame.read_projection(grid)
             except (DataError, FileNotFoundError, OSError) as error:
                 if not task.skip_bad:
                     raise DataError(
@@ -323,7 +323,7 @@ def _project_task(
                 writer.write(key, encode(projection, encoding))
             count_frame(1)
         entry = writer.commit()
-    return entry, timings["reading"], time.perf_counter() - began
+    return entry, reading_s, time.perf_counter() - began
 
 
 def _finish(

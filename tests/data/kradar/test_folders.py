@@ -109,7 +109,7 @@ def test_damaged_zip_names_the_member(tmp_path):
     source = folders.labels_from(path)
     ((_, error),) = source.read([(1, LABEL)])
     assert isinstance(error, DataError)
-    assert f"labels.zip/1/{LABEL}.txt: damaged" in str(error)
+    assert f"labels.zip/1/{LABEL}.txt: corrupted" in str(error)
 
 
 def test_a_frame_twice_names_both(tmp_path):
@@ -138,16 +138,14 @@ def test_one_bad_member_leaves_the_others(tmp_path):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(f"1/{LABEL}.txt", content)
         archive.writestr("1/00005_00002.txt", bomb)
-        archive.writestr("1/00006_00003.txt", content, zipfile.ZIP_LZMA)
     data = KRadar(labels=path)
     assert [frame.name for frame in data] == [LABEL]
-    bombed, lzma = (problem.message for problem in data.summary().problems)
-    assert "claims 2097152 bytes, expected at most" in bombed
-    assert "compressed by method 14, expected stored (0) or deflated (8)" in lzma
+    (bombed,) = (problem.message for problem in data.summary().problems)
+    assert "2097152 bytes, expected at most" in bombed
     with pytest.raises(DataError, match="00005_00002"):
         KRadar(labels=path, strict=True)
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(DataError, match=r"labels\.zip: damaged, not a zip file"):
+    with pytest.raises(DataError, match=r"labels\.zip: corrupted, not a zip file"):
         KRadar(labels=path)
 
 

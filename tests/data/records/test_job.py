@@ -357,6 +357,6 @@ def test_a_killed_worker_is_one_line(root, tmp_path):
 
     killer = threading.Thread(target=kill_worker)
     killer.start()
-    with pytest.raises(UserError, match=r"a worker process was killed.*run the same"):
+    with pytest.raises(UserError, match=r"a worker process ended early.*run the same"):
         run(KRadar(root), out, num_workers=1)
     killer.join()

@@ -104,7 +104,7 @@ def test_wrong_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         predictions.read_table(tmp_path / "none.csv")
     raises("a.txt", "", "cannot read '.txt'; known: .npz", UserError)
-    raises("a.npz", "nonsense", "a.npz: damaged, not a readable .npz file")
+    raises("a.npz", "nonsense", "a.npz: corrupted, not a NumPy archive")
     raises("a.json", "{", "a.json is not valid JSON")
     raises("a.json", "[1]", "expected a list of objects")
     raises("a.json", '{"1/a": 3}', "frame '1/a': expected a list")

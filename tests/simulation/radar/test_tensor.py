@@ -375,7 +375,7 @@ class TestOutputs:
         )  # fmt: skip
 
     def test_projection_equals_the_projected_tesseract(self):
-        from radejax.data.projection import project
+        from radejax.data.projection import project_tensor
 
         noise = np.full((32, 16), 1e9, np.float32)
         power = tesseract(self.scene(), noise=noise)
@@ -383,7 +383,7 @@ class TestOutputs:
             self.scene(), noise, tensor.frame_key(1), grid=GRID, parameters=PARAMETERS
         )
         np.testing.assert_allclose(
-            fused, project(power.astype(np.float32)), rtol=0, atol=2e-6
+            fused, project_tensor(power.astype(np.float32)), rtol=0, atol=2e-6
         )
 
     def test_vmap_over_frames(self):
