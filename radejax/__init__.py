@@ -7,15 +7,24 @@ __version__ = "0.2.0"
 
 # On first use: reading labels or evaluating files should not load the models.
 _LAZY = {
-    "Batch": "radejax.core.structures",
-    "CLASSES": "radejax.core.structures",
-    "DataError": "radejax.core.errors",
-    "DetectionMaps": "radejax.core.structures",
-    "Detections": "radejax.core.structures",
-    "Detector": "radejax.inference.detector",
-    "Scene": "radejax.visualize.style",
-    "UserError": "radejax.core.errors",
-    "draw_frame": "radejax.visualize.draw",
+    "Batch": "core.structures",
+    "Boxes": "core.structures",
+    "CLASSES": "core.structures",
+    "DataError": "core.errors",
+    "DetectionMaps": "core.structures",
+    "Detections": "core.structures",
+    "Detector": "inference.detector",
+    "KRadar": "data.kradar",
+    "RadarGrid": "geometry.radar_grid",
+    "SavedModel": "inference.saved",
+    "Scene": "visualize.style",
+    "UserError": "core.errors",
+    "draw_frame": "visualize.draw",
+    "evaluate": "evaluation.average_precision",
+    "load_config": "core.config",
+    "load_model": "inference.saved",
+    "predict_dataset": "inference.predict",
+    "simulate": "simulation.dataset:simulate_dataset",
 }
 
 __all__ = list(_LAZY)
@@ -23,5 +32,6 @@ __all__ = list(_LAZY)
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
+        module, _, attribute = _LAZY[name].partition(":")
+        return getattr(importlib.import_module(f"radejax.{module}"), attribute or name)
     raise AttributeError(f"module 'radejax' has no attribute {name!r}")
