@@ -34,14 +34,23 @@ PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
 """Names of the files that hold a frame."""
 
 
-def find_frames(paths: Sequence[str | os.PathLike]) -> list[pathlib.Path]:
+def find_frames(
+    paths: Sequence[str | os.PathLike],
+    sequence_numbers: Sequence[int] | None = None,
+    weather: Sequence[str] | None = None,
+) -> list[pathlib.Path]:
     """Tesseract and projection files among files and below folders, sorted.
 
-    Of a frame that is there as both, the projection is taken.
+    If a frame exists as both, the projection is taken.
+
+    Args:
+        paths: Files and folders.
+        sequence_numbers: Only these sequences; all if None.
+        weather: Only sequences of these, by their `description.txt`; all if None.
 
     Raises:
-        FileNotFoundError: A path does not exist.
-        UserError: There is no frame; says what was looked for.
+        FileNotFoundError: A path, or the description of a sequence, does not exist.
+        UserError: There is no frame; names what was looked for.
     """
     found: set[pathlib.Path] = set()
     for path in map(pathlib.Path, paths):
@@ -54,22 +63,7 @@ def find_frames(paths: Sequence[str | os.PathLike]) -> list[pathlib.Path]:
     if not found:
         names = ", ".join(map(str, paths))
         raise UserError(f"no frames in {names}: looked for {' and '.join(PATTERNS)}")
-    frames = {_place(path): path for path in sorted(found, key=_by_preference)}
-    return sorted(frames.values())
-
-
-def chosen_frames(
-    paths: Sequence[pathlib.Path],
-    sequence_numbers: Sequence[int] | None = None,
-    weather: Sequence[str] | None = None,
-) -> list[pathlib.Path]:
-    """Files of the sequences and weathers that are asked for; all of them for None.
-
-    Raises:
-        UserError: There is none, or no such weather.
-        FileNotFoundError: A sequence without a `description.txt` has no weather.
-    """
-    folders = sorted({path.absolute().parent.parent for path in paths})
+    folders = sorted({_sequence(path) for path in found})
     if sequence_numbers:
         wanted = {str(number) for number in sequence_numbers}
         folders = [f for f in folders if f.name.lstrip("0") in wanted]
@@ -77,19 +71,19 @@ def chosen_frames(
         check_weather(weather)
         conditions = {f: read_description(f / "description.txt") for f in folders}
         folders = [f for f in folders if conditions[f].weather in weather]
-    kept = [path for path in paths if path.absolute().parent.parent in folders]
-    if not kept:
+    frames = {
+        (_sequence(path), path.stem.removeprefix("DERA_")): path
+        for path in sorted(found, key=lambda path: (path.suffix == ".npy", path))
+        if _sequence(path) in folders
+    }
+    if not frames:
         asked = [*(sequence_numbers or ()), *(weather or ())]
         raise UserError(f"no frames of {', '.join(map(str, asked))} in these folders")
-    return kept
+    return sorted(frames.values())
 
 
-def _by_preference(path: pathlib.Path) -> tuple[bool, pathlib.Path]:
-    return path.suffix == ".npy", path
-
-
-def _place(path: pathlib.Path) -> tuple[pathlib.Path, str]:
-    return path.absolute().parent.parent, path.stem.removeprefix("DERA_")
+def _sequence(path: pathlib.Path) -> pathlib.Path:
+    return path.absolute().parent.parent
 
 
 def front_images(
@@ -113,7 +107,7 @@ def front_images(
     """
     sequences = [
         folder
-        for folder in {path.absolute().parent.parent for path in paths}
+        for folder in {_sequence(path) for path in paths}
         if folder.name.isdecimal() and (labels or any(folder.glob("info_label*")))
     ]
     if not sequences:
@@ -151,62 +145,66 @@ def detect_files(
     image_backbone: str | os.PathLike | None = None,
     **settings: Any,
 ) -> dict[str, int]:
-    """Detects in every frame and writes one file each, atomically.
+    """Detect in every frame and write one file per frame, atomically.
 
     Args:
-        source: Model, as `load` takes it: a run, an exported folder, ...
+        source: Model, as `load_model` takes it: a run, an exported folder, ...
         paths: Files and folders of frames.
         out: Folder for `<sequence>_<radar>.json`: a list of {frame, cls, score, x, y, z,
-            l, w, h, yaw}, metres and radians in the ego frame, frame "sequence/radar".
-        step: Of a run: a number or "best"; the newest if None.
+            l, w, h, yaw}, meters and radians in the radar frame, frame
+            "sequence/radar".
+        step: Step of the checkpoint, or "best"; the latest if None.
         batch_size: Frames at once.
         file_format: "json", or "kitti" for `preds/000000.txt` as K-Radar's tools write
             them, and `frames.json` with the frames of these numbers.
-        sequence_numbers: Only these; all if None.
-        weather: Only sequences of these, by their `description.txt`; all if None.
-        labels: Label revision that says which image belongs to a frame, for
-            radar-camera models; the one that a run was trained with if None. Of the
-            version that the model's config states, v2.1 without one.
+        sequence_numbers: See `find_frames`, as `weather`.
+        weather: See `find_frames`.
+        labels: Label revision used to find the image of each frame, for radar-camera
+            models; the one that a run was trained with if None.
         image_backbone: See `Detector.from_workdir`.
         **settings: `score_threshold`, `nms_iou`, `roi` of the detector.
 
     Returns:
-        Counts "frames", "boxes" and "clipped", boxes of them with a size that was clipped,
-        and for a radar-camera model "radar_only": frames without a label file, image
-        or calibration.
+        Counts "frames", "boxes" and "clipped", boxes of them with a size that was
+        clipped, and for a radar-camera model "radar_only": frames without a label file,
+        image or calibration.
 
     Raises:
         FileNotFoundError: A path does not exist.
         UserError: There is no frame, two would be written to one file, or an image or
             a weight is not as expected.
     """
-    frames = chosen_frames(find_frames(paths), sequence_numbers, weather)
-    _check_names(frames)
+    frames = find_frames(paths, sequence_numbers, weather)
+    seen: dict[str, pathlib.Path] = {}
+    for path in frames:
+        if (other := seen.setdefault(output_name(path), path)) is not path:
+            raise UserError(
+                f"{other} and {path} would both be written as "
+                f"{output_name(path)}.json: detect each root into a folder of its own"
+            )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
-    out = pathlib.Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
-
+    saved, out = detector.saved, pathlib.Path(out)
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or (detector.saved.run.get("data") or {}).get("labels")
-        version = detector.saved.config.data.label_version
-        known = front_images(frames, detector, labels, version)
-
+        labels = labels or (saved.run.get("data") or {}).get("labels")
+        known = front_images(frames, detector, labels, saved.config.data.label_version)
+    out.mkdir(parents=True, exist_ok=True)
     if file_format == "kitti":
-        numbers, names = range(len(frames)), map(frame_key, frames)
-        table = {"frame": list(numbers), "name": list(names)}
+        names = list(map(frame_key, frames))
+        table = {"frame": list(range(len(frames))), "name": names}
         files.write_json(out / "frames.json", table)
-    count = {"frames": len(frames), "boxes": 0, "clipped": 0}
+    chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
+    count = {"frames": 0, "boxes": 0, "clipped": 0}
     found = detector.stream(_batches(chunks, detector.grid, known), **settings)
     with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:
-        written = 0
         for chunk, detections in zip(chunks, found, strict=True):
+            for name, text in _as_files(
+                chunk, count["frames"], detections, file_format
+            ):
+                files.write_text(out / name, text)
             count["boxes"] += int(np.asarray(detections.is_valid).sum())
             count["clipped"] += int(detections.num_clipped.sum())
-            for name, text in _as_files(chunk, written, detections, file_format):
-                files.write_text(out / name, text)
-            written += len(chunk)
+            count["frames"] += len(chunk)
             bar.update(len(chunk))
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
@@ -241,22 +239,10 @@ def _as_files(
         yield f"{output_name(path)}.json", json.dumps(named, indent=2) + "\n"
 
 
-def _check_names(frames: Sequence[pathlib.Path]) -> None:
-    """`UserError` if two frames would be written to one file."""
-    seen: dict[str, pathlib.Path] = {}
-    for path in frames:
-        other = seen.setdefault(output_name(path), path)
-        if other is not path:
-            raise UserError(
-                f"{other} and {path} would both be written as "
-                f"{output_name(path)}.json: detect each root into a folder of its own"
-            )
-
-
 def frame_key(path: pathlib.Path) -> str:
     """Key without the part that only labels tell: "5/00033"."""
     radar = path.stem.removeprefix("DERA_").removeprefix("tesseract_")
-    sequence = path.absolute().parent.parent.name
+    sequence = _sequence(path).name
     return f"{sequence}/{radar}" if sequence else radar
 
 

@@ -14,7 +14,6 @@ from radejax.evaluation.files.load import Source
 from radejax.evaluation.files.load import load as load_tables
 from radejax.evaluation.files.predictions import write_table
 from radejax.inference.detect_files import (
-    chosen_frames,
     detect_files,
     find_frames,
     front_images,
@@ -65,12 +64,10 @@ def test_names_of_results_are_unique_among_sequences(root: pathlib.Path) -> None
 def test_a_part_of_the_frames(root: pathlib.Path) -> None:
     for sequence, weather in (("5", "fog"), ("6", "rain")):
         (root / sequence / "description.txt").write_text(f"urban,day,{weather}\n")
-    every = find_frames([root])
-    assert chosen_frames(every) == every
-    assert [output_name(p) for p in chosen_frames(every, (6, 9))] == ["6_00033"]
-    assert len(chosen_frames(every, weather=("fog",))) == 2
+    assert [output_name(p) for p in find_frames([root], (6, 9))] == ["6_00033"]
+    assert len(find_frames([root], weather=("fog",))) == 2
     with pytest.raises(UserError, match="no frames of 5, rain in these folders"):
-        chosen_frames(every, (5,), ("rain",))
+        find_frames([root], (5,), ("rain",))
 
 
 def test_nothing_found_and_nothing_there(tmp_path: pathlib.Path) -> None:
