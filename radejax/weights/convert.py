@@ -142,18 +142,21 @@ def torch_name(names: Names, path: str) -> str:
 
 def to_torch_layout(path: str, value: np.ndarray) -> np.ndarray:
     """A variable of ours in the layout of torch."""
-    if path.endswith("kernel") and value.ndim == 4:
-        is_transposed = _TRANSPOSED.search(path)
-        return value.transpose((2, 3, 0, 1) if is_transposed else (3, 2, 0, 1))
-    return value.T if path.endswith("kernel") else value
+    return value.transpose(_torch_axes(path, value.ndim))
 
 
 def to_our_layout(path: str, value: np.ndarray) -> np.ndarray:
     """Inverse of `to_torch_layout`."""
-    if path.endswith("kernel") and value.ndim == 4:
-        is_transposed = _TRANSPOSED.search(path)
-        return value.transpose((2, 3, 0, 1) if is_transposed else (2, 3, 1, 0))
-    return value.T if path.endswith("kernel") else value
+    return value.transpose(np.argsort(_torch_axes(path, value.ndim)))
+
+
+def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
+    """Our axes in the order of torch."""
+    if not path.endswith("kernel"):
+        return tuple(range(ndim))
+    if ndim == 4:
+        return (2, 3, 0, 1) if _TRANSPOSED.search(path) else (3, 2, 0, 1)
+    return tuple(reversed(range(ndim)))
 
 
 def variable_shapes(model: nn.Module) -> dict[str, tuple[int, ...]]:
@@ -200,21 +203,26 @@ def read_state_dict(
         DataError: The file is corrupted, or has no such state dict or several.
     """
     content, source = read_content(content_or_path)
-    found = _state_dicts(content, part)
+    found = state_dicts(content, part)
     if len(found) != 1:
-        what = f"{len(found)} state dicts ({', '.join(found)})" if found else "none"
         raise DataError(
-            f"{source}: expected one state dict with tensors {part}*, found {what}"
+            f"{source}: expected one state dict with tensors {part}*, found {len(found)}"
         )
-    (tensors,) = found.values()
-    start = _start(part)
-    prefix = next(m[1] for name in tensors if (m := start.match(str(name))))
-    return {str(k).removeprefix(prefix): v for k, v in tensors.items()}, source
+    return found[0], source
 
 
-def holds(content: Any, part: str) -> bool:
-    """Whether content of a file has a state dict with such a part."""
-    return bool(_state_dicts(content, part))
+def state_dicts(content: Any, part: str) -> list[dict[str, Any]]:
+    """State dicts with such a part, without prefixes: the content, or directly in it."""
+    start, found = re.compile(rf"((?:.*\.)?){re.escape(part)}"), []
+    inside = content.values() if isinstance(content, Mapping) else ()
+    for mapping in (content, *inside):
+        if not isinstance(mapping, Mapping):
+            continue
+        matches = (start.match(name) for name in map(str, mapping))
+        if match := next(filter(None, matches), None):
+            items = mapping.items()
+            found.append({str(k).removeprefix(match[1]): v for k, v in items})
+    return found
 
 
 def read_content(content_or_path: Any) -> tuple[Any, str]:
@@ -224,23 +232,6 @@ def read_content(content_or_path: Any) -> tuple[Any, str]:
     path = pathlib.Path(content_or_path)
     readers = {".npz": read_npz, ".safetensors": read_safetensors}
     return readers.get(path.suffix, torch_file.read)(path), str(path)
-
-
-def _start(part: str) -> re.Pattern[str]:
-    return re.compile(rf"((?:.*\.)?){re.escape(part)}")
-
-
-def _state_dicts(content: Any, part: str) -> dict[str, Mapping[Any, Any]]:
-    """Mappings with such names, by their key: the content itself, or directly in it."""
-    if not isinstance(content, Mapping):
-        return {}
-    inside = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
-    start = _start(part)
-    return {
-        key: mapping
-        for key, mapping in ({"the whole": content} | inside).items()
-        if any(isinstance(name, str) and start.match(name) for name in mapping)
-    }
 
 
 def write_state_dict(path: PathLike, tensors: Mapping[str, np.ndarray]) -> None:

@@ -18,8 +18,8 @@ from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.weights import dinov3_hf, radenet_torch, resnet_torch
 from radejax.weights.convert import (
     from_torch,
-    holds,
     read_state_dict,
+    state_dicts,
     to_numpy,
     variable_shapes,
 )
@@ -109,7 +109,7 @@ def read(
 
 def is_dinorade(content: Any) -> bool:
     """Whether a state dict, or a checkpoint that holds one, is DinoRADE's."""
-    return holds(content, PART)
+    return bool(state_dicts(content, PART))
 
 
 def infer_fusion(

@@ -21,7 +21,7 @@ from radejax.core.archives import read_safetensors
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
-from radejax.weights.convert import from_torch, shapes_of, to_torch
+from radejax.weights.convert import from_torch, shapes_of, to_numpy, to_torch
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -59,13 +59,11 @@ _LAYER_NAMES = {
 _TOKENS = ("embeddings.cls_token", "embeddings.register_tokens")
 
 
-def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]:
+def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     """Model and variables from a folder with `config.json` and `model.safetensors`.
 
     Args:
         folder: For instance a download of `facebook/dinov3-vits16-pretrain-lvd1689m`.
-        **model_overrides: Fields of `ViT` that do not change the weights, such as
-            `dtype`, `attention`, `remat`.
 
     Returns:
         The model, and `{"params": ...}` with float32 arrays. Applied to normalized
@@ -75,7 +73,7 @@ def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]
         FileNotFoundError: The folder or one of its files is missing.
         DataError: A file is corrupted, or tensors are missing, unexpected or of another
             shape; all are listed.
-        UserError: The folder holds another kind of model, or an override is unknown.
+        UserError: The folder holds another kind of model.
     """
     folder = pathlib.Path(folder)
     missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
@@ -85,7 +83,7 @@ def load(folder: PathLike, **model_overrides: Any) -> tuple[ViT, dict[str, Any]]
             " as downloaded from Hugging Face"
         )
     config = files.read_json(folder / CONFIG_FILE, dict[str, Any])
-    model = model_from_config(config, **model_overrides)
+    model = model_from_config(config)
     path = folder / WEIGHTS_FILE
     return model, {"params": to_params(model, read_safetensors(path), str(path))}
 
@@ -110,12 +108,12 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         file.write(content)
 
 
-def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
+def model_from_config(config: Mapping[str, Any]) -> ViT:
     """The model that a Hugging Face `config.json` describes.
 
     Raises:
         UserError: It is not a DINOv3 ViT, a field is missing, of a wrong type, out of
-            range or not supported, or an override is unknown.
+            range or not supported.
     """
     kind = config.get("model_type")
     require(kind == "dinov3_vit", "model_type", kind, "'dinov3_vit'")
@@ -124,40 +122,31 @@ def model_from_config(config: Mapping[str, Any], **model_overrides: Any) -> ViT:
     defaults = {field.name: field.default for field in dataclasses.fields(ViT)}
     fields = {}
     for theirs, ours in _FIELDS.items():
-        fields[ours] = config[theirs]
-        _check_value(theirs, config[theirs], type(defaults[ours]))
+        value, kind = config[theirs], type(defaults[ours])
+        least = 0 if ours == "num_registers" else 1
+        holds, expected = {
+            int: (type(value) is int and least <= value <= 65536, f"{least} to 65536"),
+            float: (
+                type(value) in (int, float) and 0 < value < float("inf"),
+                "a finite number above 0",
+            ),
+            bool: (type(value) is bool, "true or false"),
+            str: (value in ("gelu", "silu"), "'gelu' or 'silu'"),
+        }[kind]
+        require(holds, f"DINOv3 config: {theirs}", value, expected)
+        fields[ours] = value
     channels, heads = fields["hidden_size"], fields["num_heads"]
     require(
-        channels % heads == 0 and channels // heads % 4 == 0,
-        "DINOv3 config: hidden_size, num_attention_heads",
-        (channels, heads),
-        "heads of a multiple of 4 channels",
+        channels % (4 * heads) == 0,
+        "DINOv3 config: hidden_size",
+        channels,
+        f"a multiple of 4 * num_attention_heads = {4 * heads}",
     )
     fields["qkv_bias"] = tuple(
         bool(config.get(f"{name}_bias", default))
         for name, default in (("query", True), ("key", False), ("value", True))
     )
-    known = set(defaults) - {"parent", "name"}
-    if unknown := sorted(set(model_overrides) - known):
-        raise UserError(f"unknown ViT fields {unknown}; available: {sorted(known)}")
-    return ViT(**(fields | model_overrides))
-
-
-def _check_value(name: str, value: Any, kind: type) -> None:
-    least = 0 if name == "num_register_tokens" else 1
-    holds, expected = {
-        int: (
-            type(value) is int and least <= value <= 65536,
-            f"an integer from {least} to 65536",
-        ),
-        float: (
-            type(value) in (int, float) and 0 < value < float("inf"),
-            "a finite number above 0",
-        ),
-        bool: (type(value) is bool, "true or false"),
-        str: (value in ("gelu", "silu"), "'gelu' or 'silu'"),
-    }[kind]
-    require(holds, f"DINOv3 config: {name}", value, expected)
+    return ViT(**fields)
 
 
 def image_fields(model: ViT) -> dict[str, Any]:
@@ -183,15 +172,14 @@ def module_names(part: str = "") -> dict[str, str]:
 
 def with_prefix_tokens(tensors: Mapping[str, Any], part: str = "") -> dict[str, Any]:
     """With the register tokens behind the class token, as one tensor."""
-    cls_name, registers_name = (f"{part}.{name}".strip(".") for name in _TOKENS)
-    tensors = dict(tensors)
-    cls, registers = tensors.get(cls_name), tensors.get(registers_name)
-    if cls is not None and registers is not None:
-        tokens = [np.asarray(x, np.float32) for x in (cls, registers)]
-        if tokens[0].ndim == tokens[1].ndim == 3 and tokens[0].shape[1] == 1:
-            del tensors[registers_name]
-            tensors[cls_name] = np.concatenate(tokens, 1)
-    return tensors
+    first, second = (f"{part}.{name}".strip(".") for name in _TOKENS)
+    if not {first, second} <= set(tensors):
+        return dict(tensors)
+    tokens = [to_numpy(tensors[name]) for name in (first, second)]
+    rest = {name: value for name, value in tensors.items() if name != second}
+    if [x.ndim for x in tokens] != [3, 3] or tokens[0].shape[2] != tokens[1].shape[2]:
+        return rest  # which `from_torch` refuses
+    return rest | {first: np.concatenate(tokens, 1)}
 
 
 def to_params(

@@ -45,17 +45,10 @@ def load_image_backbone(
             embeddings are from; or the model has a frozen backbone and no weights are
             given.
     """
-    if not models.has_camera(model):
-        if path is not None:
-            raise UserError(
-                "image backbone weights are given, but config.model.name is 'radenet', "
-                "which has no camera"
-            )
-        return None
-    if embeddings is not None and path is None and model.vit is not None:
-        return None
+    has_camera = models.has_camera(model)
     if path is None:
-        if model.freeze:
+        is_embedded = embeddings is not None and has_camera and model.vit is not None
+        if has_camera and model.freeze and not is_embedded:
             raise UserError(
                 "config.model.image.freeze is True, but no weights are given: "
                 "--image_backbone FOLDER (DINOv3 from Hugging Face: config.json and "
@@ -63,6 +56,11 @@ def load_image_backbone(
                 "with --config.model.image.freeze=False"
             )
         return None
+    if not has_camera:
+        raise UserError(
+            "image backbone weights are given, but config.model.name is 'radenet', "
+            "which has no camera"
+        )
     if model.vit is None:
         part = resnet_torch.load(path, model.resnet_width)
     else:

@@ -161,7 +161,7 @@ def infer_config(
             f"{backbone}.decoder_block_{levels}.double_conv.0.single_conv.0.bias", 0
         ),
         "cbam": "official" if f"{backbone}.cbam_" in "\n".join(tensors) else "off",
-        "neck": _infer_neck(tensors, f"{prefix}neck.neck.0.", source),
+        "neck": "plain" if f"{prefix}neck.neck.0.conv.weight" in tensors else "dilated",
         "heads": "expanded" if is_expanded else "default",
         "pad_multiple": 2 ** len(widths),
     }
@@ -181,17 +181,6 @@ def infer_config(
         k: "off" if k == "cbam" and v is None else v for k, v in overrides.items()
     }
     return fields | overrides
-
-
-def _infer_neck(tensors: StateDict, block: str, source: str) -> str:
-    for kind, conv in (("dilated", "conv1.conv"), ("plain", "conv")):
-        if f"{block}{conv}.weight" in tensors:
-            return kind
-    found = sorted(n for n in tensors if n.startswith(block))
-    raise DataError(
-        f"{source}: {block}* has {', '.join(found[:5]) or 'no tensors'}, expected conv1 "
-        "(neck 'dilated') or conv ('plain')"
-    )
 
 
 def check_overrides(overrides: Mapping[str, Any], known: Mapping[str, Any]) -> None:

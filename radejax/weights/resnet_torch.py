@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
+from radejax import models
+from radejax.core.config import load_config
 from radejax.core.files import PathLike
-from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
 from radejax.weights.convert import (
     from_torch,
     read_state_dict,
-    shapes_of,
     to_torch,
+    variable_shapes,
     write_state_dict,
 )
 
@@ -66,31 +64,20 @@ def load(
         DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
     tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
-    shapes = _shapes(width)
-    if not any(name.startswith("layer4.") for name in tensors):
-        shapes = {k: s for k, s in shapes.items() if "/image_neck/" not in k}
-    return from_torch(module_names(), shapes, tensors, source, r"fc\.")
+    names = module_names()
+    config = load_config("dinorade:rcw_resnet50").model
+    config.image.resnet_width = width
+    has_last = any(name.startswith("layer4.") for name in tensors)
+    shapes = {
+        path: shape
+        for path, shape in variable_shapes(models.build(config)).items()
+        if path.partition("/")[2].rpartition("/")[0] in names
+        and (has_last or "/image_neck/" not in path)
+    }
+    return from_torch(names, shapes, tensors, source, r"fc\.")
 
 
 def save(params: Mapping[str, Any], path: PathLike) -> None:
     """Writes the parameters of a `ResNetTrunk` under torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
     write_state_dict(path, to_torch(module_names(), trunk))
-
-
-def _shapes(width: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of trunk and last stage."""
-    key, image = jax.random.key(0), jnp.zeros((1, STRIDE, STRIDE, 3))
-    features = jnp.zeros((1, 1, 1, 16 * width))
-    trunk = jax.eval_shape(ResNetTrunk(width).init, key, image)
-    neck = jax.eval_shape(
-        ResNetNeck(width=width).init, key, features, jnp.ones(1, bool)
-    )
-    parts = {"image_backbone": trunk, "image_neck": neck}
-    return {
-        f"{kind}/{part}/{path}": shape
-        for part, variables in parts.items()
-        for kind, leaves in variables.items()
-        for path, shape in shapes_of(leaves).items()
-        if not path.startswith("proj/")
-    }

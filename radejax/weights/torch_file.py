@@ -62,13 +62,8 @@ def read(path: PathLike) -> Any:
         )
     try:
         with open_zip(path, "a torch file") as archive:
-            names = archive.namelist()
-            pickles = [
-                n for n in names if n.endswith("/data.pkl") and n.count("/") == 1
-            ]
-            if len(pickles) != 1:
-                raise DataError(f"has {len(pickles)} members data.pkl, expected one")
-            return _Unpickler(archive, pickles[0].removesuffix("data.pkl")).load()
+            root = archive.namelist()[0].partition("/")[0]
+            return _Unpickler(archive, f"{root}/").load()
     except DataError as error:
         raise DataError(f"{path}: {one_line(error)}") from None
     # What a corrupted pickle raises is not limited to one family.
@@ -93,7 +88,7 @@ def _rebuild_tensor(
     if not isinstance(storage, _Storage) or max(len(shape), len(strides)) > _MAX_DIMS:
         raise DataError("a tensor without a storage or of more than 16 axes")
     if any(type(n) is not int or n < 0 for n in (offset, *shape, *strides)):
-        raise DataError("a tensor whose shape, offset or strides are no sizes")
+        raise DataError("a tensor whose shape, offset or strides are not sizes")
     values = storage.values
     if math.prod(shape) == 0:
         return np.zeros(shape, values.dtype)
@@ -173,18 +168,17 @@ class _Unpickler(pickle._Unpickler):
         if kind != "storage" or dtype not in _DTYPES.values() or type(key) is not str:
             raise DataError("a tensor without a storage of numbers")
         if key not in self._storages:
-            self._storages[key] = _Storage(self._values(key, dtype, size))
+            raw = np.dtype("uint16" if dtype == "bfloat16" else dtype)
+            data = self._member(f"data/{key}")
+            if not 0 <= size * raw.itemsize <= len(data):
+                raise DataError(
+                    f"storage {key} has {len(data)} bytes for {size} {dtype}"
+                )
+            values = np.frombuffer(data, raw.newbyteorder(self._order))[:size]
+            if dtype == "bfloat16":  # the upper half of a float32
+                values = (values.astype(np.uint32) << 16).view(np.float32)
+            self._storages[key] = _Storage(values)
         return self._storages[key]
-
-    def _values(self, key: str, dtype: str, size: int) -> np.ndarray:
-        raw = np.dtype("uint16" if dtype == "bfloat16" else dtype)
-        data = self._member(f"data/{key}")
-        if not 0 <= size * raw.itemsize <= len(data):
-            raise DataError(f"storage {key} has {len(data)} bytes for {size} {dtype}")
-        values = np.frombuffer(data, raw.newbyteorder(self._order))[:size]
-        if dtype == "bfloat16":  # the upper half of a float32
-            return (values.astype(np.uint32) << 16).view(np.float32)
-        return values.astype(raw, copy=False)
 
     def _ignore_state(self) -> None:
         """BUILD: the `_metadata` of a state dict; no object here has a state."""

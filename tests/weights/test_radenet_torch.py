@@ -146,7 +146,7 @@ def test_nested_and_prefixed_checkpoints(small_state, prefix, key):
 
 
 def test_several_state_dicts_are_not_guessed_at(small_state):
-    with pytest.raises(DataError, match=r"2 state dicts \(model, ema\)"):
+    with pytest.raises(DataError, match=r"expected one state dict .*, found 2"):
         radenet_torch.load({"model": small_state, "ema": small_state})
 
 
@@ -188,8 +188,8 @@ def test_paper_cbam_has_no_official_form(recipe):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"a": 1}, r"expected one state dict with tensors backbone\.\*, found none"),
-        ([1, 2], r"found none"),
+        ({"a": 1}, r"expected one state dict with tensors backbone\.\*, found 0"),
+        ([1, 2], r"found 0"),
         ({"backbone.fc.weight": np.zeros(3)}, r"not a state dict of RADE-Net"),
     ],
 )
@@ -203,9 +203,7 @@ def test_a_neck_of_other_names_is_not_taken_for_a_known_one(small_state):
         n.replace("neck.neck.0.conv", "neck.neck.0.strip"): v
         for n, v in small_state.items()
     }
-    with pytest.raises(
-        DataError, match=r"neck\.neck\.0\.\* has .*strip.*'dilated'.*'plain'"
-    ):
+    with pytest.raises(DataError, match=r"missing neck.neck.0.conv1"):
         radenet_torch.load(other, **OVERRIDES)
 
 

@@ -114,9 +114,9 @@ def tensor(size=6, shape=(2, 3), strides=(3, 1), offset=0, storage="FloatStorage
     ("changes", "message"),
     [
         ({"offset": 1}, "reaches outside its storage"),
-        ({"strides": (-1, 1)}, "no sizes"),
-        ({"shape": (2, -3)}, "no sizes"),
-        ({"offset": -1}, "no sizes"),
+        ({"strides": (-1, 1)}, "not sizes"),
+        ({"shape": (2, -3)}, "not sizes"),
+        ({"offset": -1}, "not sizes"),
         ({"shape": (2, 30)}, r"tensor \(2, 30\) reaches outside its storage \(6,\)"),
         ({"shape": (1000, 1000, 600), "strides": (0, 0, 0)}, "reaches outside"),
         ({"shape": (2, 3, 1)}, "corrupted"),
@@ -158,7 +158,7 @@ def test_the_format_before_torch_1_6_is_refused(shared):
 def test_zip_without_a_pickle_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "x.pth", "w") as archive:
         archive.writestr("a.txt", "text")
-    with pytest.raises(DataError, match=r"has 0 members data.pkl"):
+    with pytest.raises(DataError, match=r"no item named .*data.pkl"):
         torch_file.read(tmp_path / "x.pth")
 
 
