@@ -27,9 +27,9 @@ from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.projection import project_jax, project_plain, project_tensor
 from radejax.data.tesseract import project_file
-from radejax.evaluation.average_precision import EvaluationSet
+from radejax.evaluation import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.report.measure import Options, measure
+from radejax.evaluation.results import EvaluationOptions, compute_results
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.export import export
 from radejax.inference.exported_loader import load as load_exported
@@ -97,10 +97,11 @@ def evaluate(machine):
     """A test split's worth of predictions, every protocol, all weathers."""
     for false_per_frame in (2, 50):
         truth, found, frames = inputs.synthetic_set(false_per_frame=false_per_frame)
-        options = Options(protocols=tuple(PROTOCOLS))
+        options = EvaluationOptions(protocols=tuple(PROTOCOLS))
 
         def everything(truth=truth, found=found, frames=frames, options=options):
-            measure(EvaluationSet(truth, found, frames=frames), frames, options)
+            data = EvaluationSet(truth, found, frames=frames)
+            compute_results(data, frames, options)
 
         yield Case(
             name=f"evaluation of the test split, {len(found['frame']):,} predictions",

@@ -11,8 +11,8 @@ import pathlib
 
 import numpy as np
 
-from radejax.evaluation.average_precision import PROTOCOLS, EvaluationSet, mean_ap
-from radejax.evaluation.report.tables import Table, number
+from radejax.evaluation import PROTOCOLS, EvaluationSet, mean_ap
+from radejax.evaluation.tables import Table, number
 
 
 def load(folder: pathlib.Path) -> tuple[EvaluationSet, np.ndarray]:
@@ -52,7 +52,7 @@ def main() -> None:
     rows = {
         f"{name}, skip {skip}": {"protocol": name, "empty_frames": skip, "spaces": "3d"}
         for name in ("kradar_r40", "coco101", "all_point")
-        for skip in ("class", "frame", None)
+        for skip in ("class", "frame", "none")
     }
     show("Frame rules, AP 3d, IoU 0.3", data, rows)
     rows = {

@@ -45,10 +45,10 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import Source, load
-from radejax.evaluation.report import bootstrap
-from radejax.evaluation.report.measure import repair_sizes
+from radejax.evaluation.files import Source, load
+from radejax.evaluation.results import repair_sizes
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import Sources
@@ -96,7 +96,7 @@ class Work:
 
     def report(self, name: str, seed: int) -> pathlib.Path:
         """Evaluation of a cell on the held-out scenes."""
-        end = "_exchanged" if self.study.cells[name].exchanges else ""
+        end = "_shuffled" if self.study.cells[name].exchanges else ""
         return self.run_folder(name, seed) / f"held{end}"
 
     def is_done(self, name: str, seed: int) -> bool:
@@ -155,7 +155,7 @@ class Work:
         if backbone := self.backbone(cell):
             parts.append(f"--image_backbone {os.path.relpath(backbone)}")
         parts.append(f"&& python evaluate.py --workdir RUN --split all --data {held}")
-        return " ".join([*parts, *["--exchange_images 0"] * bool(cell.exchanges)])
+        return " ".join([*parts, *["--shuffle-images 0"] * bool(cell.exchanges)])
 
     def make(self, name: str, seed: int) -> bool:
         """Trains and evaluates a cell; False where a signal ended it early."""
@@ -178,7 +178,7 @@ class Work:
                 split="all",
                 out=self.report(name, seed),
                 image_backbone=backbone,
-                exchange_images=0 if cell.exchanges else None,
+                shuffle_images=0 if cell.exchanges else None,
                 other=Sources(data=(self.data(cell, None),)),
                 num_visualizations=0,
             )
@@ -218,14 +218,13 @@ def resampled(
     data = EvaluationSet(truth, found, classes=classes, frames=frames, roi=roi)
     sequence, result = np.asarray(frames["sequence"]), {}
     for condition, mask in conditions(work, frames).items():
-        weights = np.zeros((1 + resamples, len(mask)), np.int16)
-        weights[0, mask] = 1
-        weights[1:, mask] = bootstrap.sequence_weights(
+        weights = bootstrap.sequence_weights(
             sequence[mask], resamples=resamples, seed=0
         )
+        weights = np.concatenate([np.ones_like(weights[:1]), weights])
         cut = config.evaluation.score_threshold
         aps = bootstrap.resample(
-            data, weights, "all_point", "bev", 0.3, score_threshold=cut
+            data.of_frames(mask), weights, "all_point", "bev", 0.3, score_threshold=cut
         )
         result[condition] = aps.astype(np.float32)
     with files.atomic_write(path) as file:

@@ -8,7 +8,7 @@ from typing import Any
 from ablation_studies import Study
 
 from radejax.core.structures import CLASSES
-from radejax.evaluation.report.tables import Table, number
+from radejax.evaluation.tables import Table, number
 
 
 def interval_text(row: Mapping[str, Any]) -> str:

@@ -20,11 +20,11 @@ from radejax.cli import entry
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import Source, load
+from radejax.evaluation.files import Source, load
 from radejax.evaluation.matching import Pairs, match_free
 from radejax.evaluation.overlap import ranges
 from radejax.evaluation.protocols import pooled_curve
-from radejax.evaluation.report.tables import Table, number
+from radejax.evaluation.tables import Table, number
 from radejax.geometry.rotated_iou import bev_iou
 
 DISTANCES_M = (0.0, 20.0, 40.0, 73.0)  # to the region's far corners

@@ -29,8 +29,8 @@ from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
 from radejax.data.records.projections import RecordSource, record_positions
-from radejax.evaluation.files.load import tables_from_frames
-from radejax.evaluation.report.report import Report, write_report
+from radejax.evaluation.files import tables_from_frames
+from radejax.evaluation.report import Report, write_report
 from radejax.simulation.radar.tensor import RadarParameters
 
 # The gain only shifts the cross-sections, and the steps between classes with them.
@@ -81,13 +81,14 @@ def run_baseline(
         table,
         out,
         run="CFAR",
+        left_out=frames.summary().counts,
         classes=CLASSES,
         protocols=protocols,
         iou_thresholds=(0.3, 0.5),
         roi=NARROW_ROI,
         score_threshold=score_threshold,
+        min_score=score_threshold,
         bootstrap=bootstrap,
-        left_out_before=frames.summary().counts,
     )
 
 

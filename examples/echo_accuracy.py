@@ -23,8 +23,8 @@ import numpy as np
 from radejax.cli import entry
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
-from radejax.evaluation.columns import in_roi
-from radejax.evaluation.report.tables import Table, number
+from radejax.evaluation.boxes import in_roi
+from radejax.evaluation.tables import Table, number
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
 from radejax.simulation.simulator import SequenceSimulator, make_source

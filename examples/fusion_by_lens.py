@@ -23,11 +23,10 @@ from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar.folders import SIMULATION_MARKER as MARKER
+from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import Source, load
-from radejax.evaluation.files.predictions import frame_keys
-from radejax.evaluation.report import bootstrap
-from radejax.evaluation.report.measure import repair_sizes
+from radejax.evaluation.files import Source, frame_keys, load
+from radejax.evaluation.results import repair_sizes
 from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_of_run
 from radejax.runs.figures import frame_shares, mean_share

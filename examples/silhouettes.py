@@ -16,10 +16,10 @@ import click
 
 from radejax.cli import entry
 from radejax.core.config import load_config
+from radejax.evaluation import bootstrap, tables
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import Source, load
-from radejax.evaluation.report import bootstrap, tables
-from radejax.evaluation.report.measure import repair_sizes
+from radejax.evaluation.files import Source, load
+from radejax.evaluation.results import repair_sizes
 from radejax.runs import experiment
 
 CONFIG = (

@@ -49,8 +49,11 @@ RUN_IN = {
     "radejax view": "tests/test_documented_commands.py::test_view_writes_a_recording",
     "radejax demo": ".ci/run: radejax demo",
     "radejax detect": ".ci/run: radejax detect --workdir",
-    "radejax evaluate": "tests/cli/test_main.py"
-    "::test_evaluate_scores_predictions_in_files",
+    "radejax evaluate": "tests/test_quickstart.py"
+    "::test_evaluate_reproduces_the_table_and_detect_writes_boxes",
+    "radejax score": "tests/cli/test_main.py"
+    "::test_score_evaluates_predictions_in_files",
+    "radejax compare": "tests/evaluation/test_compare.py::test_command_line",
     "radejax export": "tests/cli/test_main.py::test_export_takes_an_exported_folder",
     "radejax embed": "tests/test_fusion_run.py::test_embed_command",
     "examples/cfar_baseline.py": "tests/examples/test_cfar_baseline.py"

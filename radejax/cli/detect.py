@@ -52,7 +52,7 @@ def detect(
     .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
     files, or such a file itself. No labels are needed; a radar-camera model finds a
     frame's image by its label file, and goes by the radar alone without. What is
-    written is scored by `radejax evaluate --predictions OUT --data ROOT`.
+    written is scored by `radejax score OUT --data ROOT`.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """

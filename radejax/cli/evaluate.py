@@ -1,10 +1,10 @@
-"""`radejax evaluate` and `evaluate.py`: scores of a run or of files, and comparisons."""
+"""`radejax evaluate`, `score` and `compare`: APs of a run, of files, and of several."""
 
 from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import click
@@ -13,245 +13,268 @@ from radejax.cli import entry
 from radejax.cli.options import STEP, Command, echo_result, numbers, split_words
 from radejax.core.errors import UserError
 
-
-def _flag(name: str, text: str, **settings: Any) -> click.Option:
-    return click.Option([f"--{name}"], help=text, **settings)
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-def _list(name: str, text: str) -> click.Option:
-    """Of `--data A,B --data C`: A, B and C."""
-    return _flag(name, text, multiple=True, callback=split_words, metavar="A,B,...")
+def _option(*names: str, **settings: Any) -> Decorator:
+    return click.option(*names, default=None, **settings)
 
 
-_COMMON = (
-    click.Argument(["others"], nargs=-1, metavar="[B C ...]"),
-    _flag("workdir", "Folder of a run of train.py."),
-    _flag("predictions", "File or folder."),
-    _flag("compare", "Runs: folders of reports, or predictions.", metavar="A"),
-    _flag("out", "Folder of the report; beside the predictions or in the workdir."),
-    _flag(
-        "split",
-        "train, test, all or a split file; of a run also validation.",
-        default="test",
-    ),
-    _flag("debug", "Show tracebacks of user errors.", is_flag=True),
-)
-_DATA = (
-    _list("data", "Roots of K-Radar; with --workdir other ones than the run's."),
-    _flag("labels", "Folder or zip of a label revision."),
-    _flag("label-version", "v1.0, v1.1, v2.0, v2.1 (default), or a run's own."),
-    click.Option(
-        ["--sequences"],
+def _list(name: str, text: str) -> Decorator:
+    """A list option: `--data A,B --data C` gives A, B and C."""
+    return click.option(
+        name, multiple=True, callback=split_words, metavar="A,B,...", help=text
+    )
+
+
+def _all(*decorators: Decorator) -> Decorator:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return decorate
+
+
+_data = _all(
+    _list("--data", "Roots of K-Radar; for a run, other ones than its own."),
+    _option("--labels", help="Folder or zip of a label revision."),
+    _option("--label-version", help="v1.0, v1.1, v2.0 or v2.1. Default: v2.1."),
+    click.option(
+        "--sequences",
         multiple=True,
         callback=numbers,
         metavar="1,58",
-        help="Only frames of these.",
+        help="Only frames of these sequences.",
     ),
-    _list("weather", "Only frames of these: fog,rain."),
-)
-_DATA_OF_RUNS = (
-    _flag("records", "For a run: projected frames; made beside the data if missing."),
-    _flag("camera-calibration", "For a run: folder of them; the data's own if none."),
-    _flag("embeddings", "For a run: folder of `radejax embed` of other images."),
-)
-_RUNS = (
-    _flag("min-score", "Of a run: predictions are kept from here on.", type=float),
-    _flag("batch-size", "Of a run: frames at once.", type=int),
-    _flag("num-visualizations", "Of a run: frames drawn.", type=int),
-    click.Option(
-        ["--checkpoint", "--step", "checkpoint"],
-        type=STEP,
-        help="Of a run; the newest by default.",
-    ),
-    _flag(
-        "image-backbone", "Of a run: its weights, where they are not found any more."
-    ),
-    _flag(
-        "exchange-images",
-        "A seed; every frame of a run sees the image of another, as a control.",
-        type=int,
+    _list("--weather", "Only frames of these weathers, such as fog,rain."),
+    click.option(
+        "--split",
+        default="test",
+        show_default=True,
+        help="train, test, all or a split file; for a run also validation.",
     ),
 )
-_FILES = (
-    _flag("ground-truth", "File of ground truth, or the folder of a report or a run."),
-    _flag("frames", "JSON of frame columns, for it; the one beside it."),
-    _flag("z-offset", "Metres to add to the z of predictions.", default=0.0),
-    _flag("yaw-degrees", "Yaws of predictions are degrees.", is_flag=True),
-)
-_SCORING = (
-    _list("classes", "K-Radar's five, or the run's, by default."),
-    _list("protocols", "Beside exact; all, or the run's, by default."),
-    click.Option(
-        ["--iou", "--iou-thresholds", "iou_thresholds"],
+_settings = _all(
+    _list("--classes", "Classes. Default: K-Radar's five, or the run's."),
+    _list("--protocols", "In addition to all_point. Default: all, or the run's."),
+    click.option(
+        "--iou",
+        "--iou-thresholds",
+        "iou_thresholds",
         multiple=True,
         callback=split_words,
         metavar="A,B,...",
-        help="IoU thresholds; 0.3,0.5,0.7, or the run's, by default.",
+        help="IoU thresholds. Default: 0.3,0.5,0.7, or the run's.",
     ),
-    _flag(
-        "roi", "narrow, wide, none or x0,x1,y0,y1,z0,z1; narrow, or the run's, if none."
+    _option(
+        "--roi",
+        help="narrow, wide, none or x0,x1,y0,y1,z0,z1. Default: narrow, or the run's.",
     ),
-    _flag("score-threshold", "Predictions need more; 0, or the run's.", type=float),
-    _flag(
-        "empty-frames",
-        "Frames left out: without the class, without any object, none; each protocol's "
-        "own by default.",
+    _option(
+        "--score-threshold",
+        type=float,
+        help="Score threshold of all protocols except all_point. Default: 0, or the "
+        "run's.",
+    ),
+    _option(
+        "--empty-frames",
         type=click.Choice(["protocol", "class", "frame", "none"]),
+        help="Frames to ignore: without the class, without any object, or none. "
+        "Default: as each protocol does.",
     ),
-    _flag(
-        "bootstrap",
-        "Resamples of sequences for intervals: 200 by default, 2000 in --compare, the "
-        "run's; 0: none.",
-        type=int,
-    ),
-    _flag("name", "Name of the run in tables."),
-    _flag(
-        "invalid-sizes",
-        "Predicted sizes that are not positive: an error by default.",
+    _option(
+        "--invalid-sizes",
         type=click.Choice(["error", "false_positive"]),
+        help="Treatment of predicted sizes that are not positive. Default: error, or "
+        "false_positive for a run.",
+    ),
+    _option(
+        "--bootstrap",
+        type=int,
+        help="Resamples of sequences for 95 % intervals. Default: 200 (score), 2000 "
+        "(compare), the run's (evaluate); 0: none.",
     ),
 )
-_OF_OTHER_DATA = {option.name for option in _DATA + _DATA_OF_RUNS}
-_ALL = [*_COMMON, *_DATA, *_DATA_OF_RUNS, *_RUNS, *_FILES, *_SCORING]
+_of_files = _all(
+    _option(
+        "--ground-truth", help="Ground-truth file, or folder of a report or of a run."
+    ),
+    _option(
+        "--frames",
+        help="Frame table (JSON) for --ground-truth. Default: frames.json next to it.",
+    ),
+    click.option(
+        "--z-offset", default=0.0, help="Meters to add to the z of predictions."
+    ),
+    click.option("--yaw-degrees", is_flag=True, help="Yaws are in degrees."),
+)
+_debug = click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
+_name = _option("--name", help="Name of the run in tables.")
+_OTHER_DATA = [
+    "data",
+    "labels",
+    "label_version",
+    "sequences",
+    "weather",
+    "records",
+    "camera_calibration",
+    "embeddings",
+]
 
 
-@click.command(cls=Command, params=_ALL)
-@click.pass_context
-def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
-    """Score a run, or predictions made elsewhere, or compare two and more.
+@click.command(cls=Command)
+@click.argument("run", required=False)
+@_option("--workdir", help="The same as RUN.")
+@_option("--out", help="Folder of the report. Default: evaluation/ in the workdir.")
+@_option(
+    "--checkpoint",
+    "--step",
+    "checkpoint",
+    type=STEP,
+    help='Checkpoint step or "best". Default: latest.',
+)
+@_data
+@_option("--records", help="Preprocessed frames of --data; made there if missing.")
+@_option("--camera-calibration", help="Folder of camera calibrations of --data.")
+@_option("--embeddings", help="Folder of `radejax embed` of the images of --data.")
+@_option("--image-backbone", help="Weights of the image backbone, if they were moved.")
+@_option(
+    "--shuffle-images",
+    type=int,
+    metavar="SEED",
+    help="Sanity check: pair every frame with another frame's image.",
+)
+@_settings
+@_option("--min-score", type=float, help="Discard predictions below before storing.")
+@_option("--batch-size", type=int, help="Frames per batch.")
+@_option("--num-visualizations", type=int, help="Number of frames to draw.")
+@_name
+@_debug
+def evaluate(run: str | None, workdir: str | None, as_json: bool, **flags: Any) -> None:
+    """Evaluate a checkpoint of a run of `radejax train` on a split.
 
-    Predictions: .npz, .json, .csv, or a folder of text files as K-Radar's tools write
-    them. Ground truth: --data (K-Radar), --labels (a label revision alone),
-    --ground-truth (a file), or what lies in the folder of predictions.
-
-    Example: radejax evaluate --workdir runs/quickstart
-
-    Example: radejax evaluate --predictions found.json --data /data/kradar --out results
-
-    Example: radejax evaluate --compare results_a results_b
+    Example: radejax evaluate runs/quickstart
     """
-    modes = ("workdir", "predictions", "compare")
-    if sum(flags[mode] is not None for mode in modes) != 1:
-        raise UserError("give one of --workdir, --predictions and --compare A B")
-    if flags["others"] and flags["compare"] is None:
-        entry.check_leftovers(flags["others"])
-    is_run = flags["workdir"] is not None
-    typed = click.core.ParameterSource.COMMANDLINE
-    given = {name for name in flags if ctx.get_parameter_source(name) is typed}
-    others = _FILES if is_run else _RUNS + _DATA_OF_RUNS
-    if lost := [option.name for option in others if option.name in given]:
-        names = ", --".join(lost).replace("_", "-")
-        raise UserError(f"--{names}: only {'without' if is_run else 'with'} --workdir")
-    values: dict[str, Any] | list[dict[str, Any]]
-    if is_run:
-        if "data" in given and not flags["data"]:
-            raise UserError("--data names no folder")
-        values, text = _evaluate_run(flags, has_other=bool(given & _OF_OTHER_DATA))
-    elif flags["compare"] is not None:
-        values, text = _compare(flags)
-    else:
-        values, text = _evaluate_files(flags)
-    echo_result(as_json, values, text)
-
-
-def _evaluate_run(flags: dict[str, Any], has_other: bool) -> tuple[dict[str, Any], str]:
-    """Runs the detector of a run over a split; the config of the run has the options."""
     from radejax.runs.evaluate import evaluate_run
     from radejax.runs.sources import Sources
 
+    workdir = workdir or run
+    if workdir is None:
+        raise UserError("give the workdir of a run: radejax evaluate RUN")
+    context = click.get_current_context()
+    typed = click.core.ParameterSource.COMMANDLINE
+    is_other = [context.get_parameter_source(name) is typed for name in _OTHER_DATA]
+    if context.get_parameter_source("data") is typed and not flags["data"]:
+        raise UserError("--data names no folder")
+    other = {name: flags[name] for name in _OTHER_DATA}
+    for name in ("sequences", "weather"):
+        other[name] = other[name] or ()
     entry.set_up_jax()
-    other: dict[str, Any] = {
-        name: flags[name] or () for name in ("sequences", "weather")
-    }
-    other |= {name: flags[name] for name in _OF_OTHER_DATA - other.keys()}
     report = evaluate_run(
-        flags["workdir"],
+        workdir,
         step=flags["checkpoint"],
         split=flags["split"],
         out=flags["out"],
         image_backbone=flags["image_backbone"],
-        exchange_images=flags["exchange_images"],
-        other=Sources(**other) if has_other else None,
-        **_scoring(flags),
-        **_given(flags, "min_score", "batch_size", "num_visualizations"),
+        shuffle_images=flags["shuffle_images"],
+        other=Sources(**other) if any(is_other) else None,
+        run=flags["name"],
+        **_scoring(flags, "min_score", "batch_size", "num_visualizations"),
     )
     assert report is not None  # as this is the only process
-    # The table has been logged already, to standard error.
-    return report.metrics, f"Written to {report.files[0].parent}"
+    # The tables have been logged to standard error.
+    text = f"Written to {report.files[0].parent}"
+    echo_result(as_json, report.metrics, text)
 
 
-def _evaluate_files(flags: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """Evaluates predictions in files."""
-    from radejax.evaluation.report.compare import evaluate_files
+@click.command(cls=Command)
+@click.argument("predictions")
+@_option("--out", help="Folder of the report. Default: next to the predictions.")
+@_data
+@_of_files
+@_settings
+@_name
+@_debug
+def score(predictions: str, as_json: bool, **flags: Any) -> None:
+    """Evaluate predictions in files.
 
-    path = pathlib.Path(flags["predictions"])
+    PREDICTIONS is a .npz or .json file, a folder of `radejax detect`, or a folder of text
+    files as K-Radar's tools write them. Ground truth: --data (K-Radar), --labels (a label
+    revision without radar data), --ground-truth (a file), or the folder's own.
+
+    Example: radejax score found.json --data /data/kradar --out results
+    """
+    from radejax.evaluation.report import evaluate_files
+
+    path = pathlib.Path(predictions)
     out = flags["out"] or path.with_name(f"{path.stem}_evaluation")
-    report = evaluate_files(path, out, _source(flags), _options(flags, path.stem))
-    return report.metrics, f"{report.text}\nWritten to {out}"
+    options = _options(flags, bootstrap=200)
+    name = flags["name"] or path.stem
+    report = evaluate_files(path, out, _source(flags), options, run=name)
+    echo_result(as_json, report.metrics, f"{report.text}\nWritten to {out}")
 
 
-def _compare(flags: dict[str, Any]) -> tuple[list[dict[str, Any]], str]:
-    """Compares runs with the first of them."""
-    from radejax.evaluation.report.compare import compare_files
-    from radejax.evaluation.report.report import plain
+@click.command(cls=Command)
+@click.argument("runs", nargs=-1, required=True, metavar="A B [C ...]")
+@_option("--out", help="Folder for comparison.txt and comparison.json.")
+@_data
+@_of_files
+@_settings
+@_debug
+def compare(runs: tuple[str, ...], as_json: bool, **flags: Any) -> None:
+    """Compare runs with the first of them.
 
-    if flags["bootstrap"] == 0:
-        raise UserError("--bootstrap=0: a comparison needs resamples")
+    Each is the folder of a report, or predictions as `radejax score` takes them.
+
+    Example: radejax compare runs/a/evaluation runs/b/evaluation
+    """
+    from radejax.evaluation.report import compare_files, plain
+
+    options = _options(flags, bootstrap=2000)
+    if options.bootstrap == 0:
+        raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
     text, rows = compare_files(
-        [flags["compare"], *flags["others"]],
-        flags["out"],
-        _source(flags),
-        _options(flags, "comparison"),
-        resamples=2000 if flags["bootstrap"] is None else flags["bootstrap"],
+        runs, flags["out"], _source(flags), options, resamples=options.bootstrap
     )
-    return plain([dataclasses.asdict(row) for row in rows]), text.rstrip("\n")
+    values = plain([dataclasses.asdict(row) for row in rows])
+    echo_result(as_json, values, text.rstrip("\n"))
 
 
 def _source(flags: dict[str, Any]) -> Any:
-    from radejax.evaluation.report.compare import Source
+    from radejax.evaluation.files import Source
 
+    same = ("data", "labels", "ground_truth", "frames", "weather", "yaw_degrees")
     return Source(
-        data=flags["data"],
-        labels=flags["labels"],
         label_version=flags["label_version"] or "v2.1",
         split=None if flags["split"] == "all" else flags["split"],
-        ground_truth=flags["ground_truth"],
-        frames=flags["frames"],
         sequences=flags["sequences"] or (),
-        weather=flags["weather"],
         z_offset_m=flags["z_offset"],
-        yaw_degrees=flags["yaw_degrees"],
+        **{name: flags[name] for name in same},
     )
 
 
-def _options(flags: dict[str, Any], name: str) -> Any:
-    from radejax.evaluation.report.measure import Options
+def _options(flags: dict[str, Any], bootstrap: int) -> Any:
+    from radejax.evaluation.results import EvaluationOptions
 
-    values: dict[str, Any] = {"run": name, "bootstrap": 200}
-    values |= {"label_version": flags["label_version"] or "v2.1", **_scoring(flags)}
-    if values.get("empty_frames") == "none":
-        values["empty_frames"] = None
-    return Options(**values)
+    values = {"bootstrap": bootstrap, "label_version": flags["label_version"] or "v2.1"}
+    return EvaluationOptions(**{**values, **_scoring(flags)})
 
 
-def _scoring(flags: dict[str, Any]) -> dict[str, Any]:
-    """What was said of the scores, by the names of `Options` and `config.evaluation`."""
-    from radejax.evaluation.columns import roi_bounds
-
-    values = _given(flags, *(option.name for option in _SCORING))
-    if "name" in values:
-        values["run"] = values.pop("name")
+def _scoring(flags: dict[str, Any], *others: str) -> dict[str, Any]:
+    """The flags of `_settings` that were given, by the names of `EvaluationOptions`."""
+    names = (
+        *("classes", "protocols", "iou_thresholds", "roi", "score_threshold"),
+        *("empty_frames", "invalid_sizes", "bootstrap", *others),
+    )
+    values = {name: flags[name] for name in names if flags[name] not in (None, ())}
     if "iou_thresholds" in values:
         values["iou_thresholds"] = _floats("iou", values["iou_thresholds"])
-    if (roi := values.get("roi")) is not None:
-        if "," in roi:
-            roi = _floats("roi", roi.split(","))
-        values["roi"] = None if roi == "none" else roi_bounds(roi)
+    if values.get("roi") == "none":
+        values["roi"] = None
+    elif "," in values.get("roi", ""):
+        values["roi"] = _floats("roi", values["roi"].split(","))
     return values
-
-
-def _given(flags: dict[str, Any], *names: str) -> dict[str, Any]:
-    return {name: flags[name] for name in names if flags[name] not in (None, ())}
 
 
 def _floats(name: str, words: Sequence[str]) -> tuple[float, ...]:

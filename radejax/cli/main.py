@@ -9,7 +9,7 @@ from radejax.cli.data import data, project
 from radejax.cli.demo import demo
 from radejax.cli.detect import detect
 from radejax.cli.embed import embed
-from radejax.cli.evaluate import evaluate
+from radejax.cli.evaluate import compare, evaluate, score
 from radejax.cli.export import export
 from radejax.cli.overlay import overlay
 from radejax.cli.simulate import simulate
@@ -28,6 +28,8 @@ from radejax.cli.view import view
         view,
         train,
         evaluate,
+        score,
+        compare,
         detect,
         embed,
         export,

@@ -164,18 +164,23 @@ class Detections(struct.PyTreeNode):
         return pandas.DataFrame({**columns, **boxes})
 
 
+MAX_BOX_VALUE = 1e6
+"""Meters and radians: squares of larger numbers lose all precision."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Boxes:
     """Boxes of many frames outside `jit`: predictions, ground truth, what is drawn.
 
     Attributes:
         frame: int64 index of each box's frame.
-        box: float64 x, y, z, l, w, h, yaw in metres and radians, radar frame.
-        cls: Class names.
+        box: float64 x, y, z, l, w, h, yaw in meters and radians, radar frame.
+        cls: Class names, or indices of classes.
         score: float64 in [0, 1]; None for ground truth.
 
     Raises:
-        DataError: Columns differ in length, or a box is not finite or has no 7 numbers.
+        DataError: Columns differ in length, or a value is not finite or out of range;
+            names the frame and the row.
     """
 
     frame: Int[np.ndarray, " N"]
@@ -191,9 +196,22 @@ class Boxes:
                 f"columns of boxes differ: {count} frames, boxes {self.box.shape}, "
                 f"{len(self.cls)} classes, {score_rows} scores; expected one row per box"
             )
-        if not np.isfinite(self.box).all():
-            row = int(np.argmin(np.isfinite(self.box).all(-1)))
-            raise DataError(f"box {row} is {self.box[row]}, expected finite numbers")
+        is_good = np.abs(self.box) <= MAX_BOX_VALUE  # False for NaN too
+        if not is_good.all():
+            row, field = np.argwhere(~is_good)[0]
+            raise DataError(
+                f"frame {self.frame[row]}, row {row}: {BOX_FIELDS[field]} of the box is "
+                f"{self.box[row, field]}, expected a number up to {MAX_BOX_VALUE:g}"
+            )
+        if self.score is None:
+            return
+        is_good = (self.score >= 0) & (self.score <= 1)
+        if not is_good.all():
+            row = int(np.argmin(is_good))
+            raise DataError(
+                f"frame {self.frame[row]}, row {row}: score {self.score[row]} is outside "
+                "[0, 1]"
+            )
 
     @classmethod
     def one_frame(cls, box: Any, names: Any, score: Any = None) -> Boxes:

@@ -1,0 +1,86 @@
+"""Average precision of 3D detections, in every protocol that K-Radar papers use.
+
+`evaluate` computes the APs of one protocol from column arrays. To ask several questions
+about the same predictions (protocols, weathers, resamples), build an `EvaluationSet`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from radejax.core.structures import CLASSES
+from radejax.evaluation.boxes import AnyColumns, Roi
+from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result, mean_ap
+from radejax.evaluation.protocols import PROTOCOLS
+
+__all__ = ["PROTOCOLS", "SPACES", "EvaluationSet", "Result", "evaluate", "mean_ap"]
+
+
+def evaluate(
+    ground_truth: AnyColumns,
+    predictions: AnyColumns,
+    *,
+    classes: Sequence[str] = CLASSES,
+    iou_thresholds: Sequence[float] | float = (0.3,),
+    protocol: str = "kradar_r40",
+    frames: AnyColumns | None = None,
+    empty_frames: str = "protocol",
+    score_threshold: float = 0.0,
+    roi: Roi = None,
+    spaces: Sequence[str] = SPACES,
+    label_version: str | None = None,
+) -> list[Result]:
+    """Average precision per class, space and IoU threshold in one protocol.
+
+    Args:
+        ground_truth: Columns frame `[N]` int, box `[N, 7]` x, y, z, l, w, h, yaw (meters,
+            radians, radar frame, full extents, z at mid-height) and cls `[N]` names. The
+            order of boxes within a frame matters to K-Radar's protocols.
+        predictions: The same columns and score `[M]` in [0, 1].
+        classes: Classes to evaluate. `empty_frames` considers only these.
+        iou_thresholds: A match needs an IoU above the threshold.
+        protocol: One of `protocols.PROTOCOLS`.
+        frames: Columns of the frame table, at least frame `[F]`; None takes the frames
+            that occur. Boxes of other frames are an error.
+        empty_frames: Frames to ignore: "class" those without an object of the class,
+            "frame" those without an object of any class, "none" no frames, "protocol"
+            as the protocol does.
+        score_threshold: Predictions need a score above this. 0 keeps all (in K-Radar's
+            protocols all above 0).
+        roi: Keep only boxes with their center in this region.
+        spaces: "bev" and "3d", or one of them.
+        label_version: Label revision, part of the results' names.
+
+    Returns:
+        One `Result` per space, IoU threshold and class, in that nesting.
+
+    Raises:
+        UserError: Unknown protocol, space, region or empty-frame rule; missing columns.
+        DataError: A bad row; names the table, frame and row.
+
+    References:
+        K-Radar evaluation: Paek et al., arXiv:2206.08171, and its issues 28, 36, 81.
+
+    Examples:
+        >>> import numpy as np
+        >>> box = np.array([[20.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> truth = {"frame": [0], "box": box, "cls": ["Sedan"]}
+        >>> found = {**truth, "score": [0.9]}
+        >>> [r.ap for r in evaluate(truth, found, classes=["Sedan"], protocol="all_point")]
+        [100.0, 100.0]
+    """
+    data = EvaluationSet(
+        ground_truth,
+        predictions,
+        classes=classes,
+        frames=frames,
+        roi=roi,
+        label_version=label_version,
+    )
+    return data.results(
+        protocol,
+        iou_thresholds=iou_thresholds,
+        empty_frames=empty_frames,
+        score_threshold=score_threshold,
+        spaces=spaces,
+    )

@@ -1,42 +1,124 @@
-"""Ground truth and predictions, paired once and asked many times."""
+"""Ground truth and predictions, paired once and evaluated many times."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import CLASSES
-from radejax.evaluation import columns, matching, overlap, protocols
-from radejax.evaluation.columns import AnyColumns
-from radejax.evaluation.protocols import PROTOCOL_DEFAULT, Curve, Protocol
-from radejax.evaluation.result import SPACES, Result
+from radejax.core.structures import CLASSES, Boxes
+from radejax.evaluation import boxes, matching, overlap, protocols
+from radejax.evaluation.boxes import AnyColumns, Roi
+from radejax.evaluation.protocols import Curve, Protocol
 
-MOST_PAIRS = 1_000_000
+SPACES = ("bev", "3d")
+
+MAX_PAIRS = 1_000_000
 """Of predictions and ground truths of a class in a frame; 100 and 20 are many."""
 
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
-# Scores, falling; frames; how many true positives (or matches) each adds.
-Falling = tuple[
+# Scores, descending; their frames; the true positives or matches that each adds.
+Ranked = tuple[
     Float[np.ndarray, " K"],
     Int[np.ndarray, " K"],
     Int[np.ndarray, " K"] | Bool[np.ndarray, " K"],
 ]
 
 
-class Terms(NamedTuple):
-    """What one AP of a class is asked in: protocol, "bev" or "3d", IoU, score cut."""
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One average precision and everything that it depends on.
 
-    protocol: Protocol
+    Attributes:
+        cls: Class name; in reports also "mean", over the classes that occur.
+        space: "bev" or "3d".
+        iou: IoU threshold; a match needs more.
+        ap: Average precision, 0 to 100. Without any object of the class it is NaN, except
+            in K-Radar's protocols, which define it as 0; see `is_defined`.
+        num_gt: Objects of the class in the frames that take part.
+        num_det: Predictions of the class in those frames above the score threshold.
+        protocol: Name of the protocol.
+        num_frames: Frames that take part.
+        score_threshold: Predictions need a score above this.
+        empty_frames: Frames that were ignored: "class", "frame" or "none".
+        roi: Name of the region of interest.
+        label_version: Label revision of the ground truth, if known.
+        precision: Precision along the curve (K-Radar: after making it monotone).
+        recall: Recall along the curve.
+        score: Score threshold along the curve, descending.
+        is_simulated: Whether the frames are simulated.
+        kind: "all", or the column of the frame table that `condition` is a value of.
+        condition: "all", or for example a weather.
+        low: Lower end of the 95 % bootstrap interval, or None.
+        high: Upper end.
+    """
+
+    cls: str
     space: str
     iou: float
-    score_threshold: float = 0.0
+    ap: float
+    num_gt: int
+    num_det: int
+    protocol: str
+    num_frames: int
+    score_threshold: float
+    empty_frames: str
+    roi: str
+    label_version: str | None
+    precision: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    recall: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    score: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    is_simulated: bool = False
+    kind: str = "all"
+    condition: str = "all"
+    low: float | None = None
+    high: float | None = None
+
+    @property
+    def is_defined(self) -> bool:
+        """Whether the class occurs at all; reports show `-` where it does not."""
+        return self.num_gt > 0
+
+    @property
+    def ap_or_none(self) -> float | None:
+        """AP, or None where the class does not occur, whatever the protocol defines."""
+        return self.ap if self.is_defined else None
+
+    @property
+    def key(self) -> tuple[str, str, str, str, float]:
+        """Protocol, condition, class, space and IoU threshold."""
+        return self.protocol, self.condition, self.cls, self.space, self.iou
+
+    @property
+    def metric(self) -> str:
+        """Name with everything the number depends on but the class and the frames.
+
+        Such as ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow, then
+        /simulated where the frames are.
+        """
+        return (
+            f"ap_{self.space}_iou{100 * self.iou:.4g}/{self.protocol}"
+            f"/score>{self.score_threshold:g}/skip={self.empty_frames}"
+            f"/labels={self.label_version or 'unknown'}/roi={self.roi}"
+            + ("/simulated" if self.is_simulated else "")
+        )
+
+
+def mean_ap(results: Sequence[Result]) -> float:
+    """Mean AP over the classes that occur; NaN if none does.
+
+    Examples:
+        >>> mean_ap([])
+        nan
+    """
+    present = [result.ap for result in results if result.is_defined]
+    return float(np.mean(present)) if present else float("nan")
 
 
 class EvaluationSet:
@@ -45,86 +127,114 @@ class EvaluationSet:
     Attributes:
         classes: Class names.
         frame: `[F]` frame ids, in the order of the frame table.
-        gt: Objects of the classes inside the region.
-        pred: Predictions of the classes inside the region.
-        left_out: Counts of what does not take part and why.
+        gt: Objects of the classes inside the region, by frame, class and then the given
+            order, with positions in `frame` and in `classes` as their frame and cls.
+        pred: Predictions of the classes inside the region, likewise.
+        score: Scores of `pred`.
+        all_predictions: The predictions as given.
+        left_out: Counts of boxes that do not take part, by reason.
         roi: Name of the region.
         label_version: Label revision or None.
-        is_simulated: The frame table says that frames are simulated.
+        is_simulated: Whether the frame table says that frames are simulated.
     """
 
     def __init__(
         self,
-        ground_truth: AnyColumns,
-        predictions: AnyColumns,
+        ground_truth: AnyColumns | Boxes,
+        predictions: AnyColumns | Boxes,
         *,
         classes: Sequence[str] = CLASSES,
         frames: AnyColumns | None = None,
-        roi: str | Sequence[float] | None = None,
+        roi: Roi = None,
         label_version: str | None = None,
     ) -> None:
         """See `evaluate` for the arguments."""
         self.classes = _check_classes(classes)
-        self.roi = columns.roi_name(roi)
+        self.roi = boxes.roi_name(roi)
         self.label_version = label_version
-        self.is_simulated = columns.are_simulated(frames)
-        truth = columns.read_columns(ground_truth, name="ground truth", scored=False)
-        found = columns.read_columns(predictions, name="predictions", scored=True)
+        self.is_simulated = boxes.are_simulated(frames)
+        truth = boxes.read_boxes(ground_truth, "ground truth", scored=False)
+        found = boxes.read_boxes(predictions, "predictions", scored=True)
         if frames is None:
-            self.frame = np.unique(np.concatenate([truth[0], found[0]]))
+            self.frame = np.unique(np.concatenate([truth.frame, found.frame]))
         else:
-            self.frame = columns.frame_ids(frames)
+            self.frame = boxes.frame_ids(frames)
+        self.all_predictions = found
         self.left_out: dict[str, int] = {}
-        self.gt = self._select(truth, "ground truth", roi)
-        self.pred = self._select(found, "predictions", roi)
+        self.gt, _ = self._select(truth, "ground truth", roi)
+        self.pred, self._pred_row = self._select(found, "predictions", roi)
+        assert self.pred.score is not None  # read_boxes requires it
+        self.score = self.pred.score
         num_classes = len(self.classes)
         self.gt_group = self.gt.frame * num_classes + self.gt.cls
         self.pred_group = self.pred.frame * num_classes + self.pred.cls
+        self.gt_count = self._count(self.gt_group)
         self._check_number()
         self.pair_pred, self.pair_gt = overlap.candidate_pairs(
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
-        self.gt_count = np.bincount(
-            self.gt_group, minlength=self.frame.size * num_classes
-        ).reshape(self.frame.size, num_classes)
         self._overlaps: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._matches: dict[tuple, Matches] = {}
-        self._parts: dict[tuple, list[Falling]] = {}
+        self._ranked: dict[tuple, list[Ranked]] = {}
 
     def _select(
-        self, table: tuple, name: str, roi: str | Sequence[float] | None
-    ) -> columns.Objects:
-        """Boxes of the evaluated classes in the region, sorted; counts the others."""
-        frame, box, cls_name, score = table
-        dense = columns.dense_frames(frame, self.frame, name=name)
-        cls = columns.class_indices(cls_name, frame, self.classes, name=name)
-        wanted = cls >= 0
-        inside = columns.in_roi(box, roi)
-        self.left_out[f"{name}: class not evaluated"] = int((~wanted).sum())
+        self, table: Boxes, name: str, roi: Roi
+    ) -> tuple[Boxes, Int[np.ndarray, " N"]]:
+        """Sorted boxes of the classes in the region, and their rows; counts the others."""
+        position = boxes.frame_positions(table.frame, self.frame, name)
+        cls = boxes.class_indices(table, self.classes, name)
+        is_class, is_inside = cls >= 0, boxes.in_roi(table.box, roi)
+        self.left_out[f"{name}: class not evaluated"] = int((~is_class).sum())
         self.left_out[f"{name}: center outside the region of interest"] = int(
-            (wanted & ~inside).sum()
+            (is_class & ~is_inside).sum()
         )
-        row = np.flatnonzero(wanted & inside)
-        row = row[np.lexsort((row, cls[row], dense[row]))]
-        return columns.Objects(dense[row], box[row], cls[row], score[row], row)
+        row = np.flatnonzero(is_class & is_inside)
+        row = row[np.lexsort((row, cls[row], position[row]))]
+        score = None if table.score is None else table.score[row]
+        return Boxes(position[row], table.box[row], cls[row], score), row
+
+    def _count(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
+        """Number of boxes of every class in every frame."""
+        shape = self.frame.size, len(self.classes)
+        return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
     def _check_number(self) -> None:
-        """`DataError` for more boxes of a class in a frame than can be compared."""
-        groups = self.frame.size * len(self.classes)
-        counts = [
-            np.bincount(group, minlength=groups)
-            for group in (self.gt_group, self.pred_group)
-        ]
-        pairs = counts[0] * counts[1]
-        if pairs.max(initial=0) > MOST_PAIRS:
-            group = int(pairs.argmax())
-            frame, cls = divmod(group, len(self.classes))
+        """Raise `DataError` for more boxes of a class in a frame than can be compared."""
+        pred_count = self._count(self.pred_group)
+        pairs = self.gt_count * pred_count
+        if pairs.max(initial=0) > MAX_PAIRS:
+            frame, cls = np.unravel_index(pairs.argmax(), pairs.shape)
             raise DataError(
-                f"frame {self.frame[frame]}: {counts[1][group]} predictions and "
-                f"{counts[0][group]} ground truths of {self.classes[cls]} are "
-                f"{pairs[group]:,} pairs, expected at most {MOST_PAIRS:,}: keep those "
+                f"frame {self.frame[frame]}: {pred_count[frame, cls]} predictions and "
+                f"{self.gt_count[frame, cls]} ground truths of {self.classes[cls]} are "
+                f"{pairs[frame, cls]:,} pairs, expected at most {MAX_PAIRS:,}: keep those "
                 "with the highest scores"
             )
+
+    def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
+        """The set of some frames, for many evaluations of a condition."""
+        names = np.array(self.classes)
+        tables = [
+            Boxes(self.frame[t.frame], t.box, names[t.cls], t.score).take(rows)
+            for t, rows in (
+                (self.gt, np.flatnonzero(is_chosen[self.gt.frame])),
+                # By row, which breaks ties between equal scores.
+                (self.pred, self._rows_in_order(is_chosen)),
+            )
+        ]
+        part = EvaluationSet(
+            *tables, classes=self.classes, frames={"frame": self.frame[is_chosen]}
+        )
+        part.roi, part.label_version = self.roi, self.label_version
+        part.is_simulated = self.is_simulated
+        return part
+
+    def _rows_in_order(
+        self, is_chosen: Bool[np.ndarray, " F"]
+    ) -> Int[np.ndarray, " _"]:
+        """Predictions of some frames in the given order."""
+        order = np.argsort(self._pred_row, kind="stable")
+        return order[is_chosen[self.pred.frame[order]]]
 
     # Shared work ---------------------------------------------------------------------
 
@@ -144,8 +254,8 @@ class EvaluationSet:
             return overlap.pair_iou(found[self.pair_pred], truth[self.pair_gt])
         truth = np.round(truth, 2)
         if geometry.startswith("swapped_lw"):
-            exchange = [0, 1, 2, 4, 3, 5, 6]
-            truth, found = truth[:, exchange], found[:, exchange]
+            swap = [0, 1, 2, 4, 3, 5, 6]
+            truth, found = truth[:, swap], found[:, swap]
         bev, iou_3d = overlap.pair_iou(
             found[self.pair_pred],
             truth[self.pair_gt],
@@ -164,31 +274,30 @@ class EvaluationSet:
         if key not in self._matches:
             values = self.overlaps(geometry)[SPACES.index(space)]
             pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
-            score = self.pred.score
             match: Matches
             if protocol.matching == "kradar":
-                match = matching.match_kradar(pairs, score, self.gt_group, iou)
+                match = matching.match_kradar(pairs, self.score, self.gt_group, iou)
             elif protocol.matching == "best":
-                match = matching.match_best(pairs, score, iou)
+                match = matching.match_best(pairs, self.score, iou)
             else:
                 match = matching.match_free(
-                    pairs, score, self.pred_group, len(self.gt), iou
+                    pairs, self.score, self.pred_group, len(self.gt), iou
                 )
             self._matches[key] = match
         return self._matches[key]
 
     @functools.cached_property
     def by_score(self) -> list[Int[np.ndarray, " _"]]:
-        """Predictions of every class by falling score, ties by the caller's row."""
-        order = np.lexsort((self.pred.row, -self.pred.score))
+        """Predictions of every class by descending score, ties by the given order."""
+        order = np.lexsort((self._pred_row, -self.score))
         return [order[self.pred.cls[order] == c] for c in range(len(self.classes))]
 
     # Results -------------------------------------------------------------------------
 
     def frame_weights(
-        self, empty_frames: str | None, weights: Shaped[np.ndarray, " F"] | None = None
+        self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None = None
     ) -> Int[np.ndarray, "F C"]:
-        """Weights of the frames for every class, after the frame rule."""
+        """Weights of the frames for every class, 0 for frames that are ignored."""
         if weights is None:
             weights = np.ones(self.frame.size, np.int64)
         weights = np.asarray(weights).astype(np.int64)[:, None]
@@ -196,10 +305,6 @@ class EvaluationSet:
             return weights * (self.gt_count > 0)
         if empty_frames == "frame":
             weights = weights * (self.gt_count.sum(axis=1, keepdims=True) > 0)
-        elif empty_frames is not None:
-            raise UserError(
-                f'empty_frames must be "class", "frame" or None, got {empty_frames!r}'
-            )
         return np.broadcast_to(weights, self.gt_count.shape)
 
     def results(
@@ -207,7 +312,7 @@ class EvaluationSet:
         protocol: str = "kradar_r40",
         *,
         iou_thresholds: Sequence[float] | float = (0.3,),
-        empty_frames: str | None = PROTOCOL_DEFAULT,
+        empty_frames: str = "protocol",
         score_threshold: float = 0.0,
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
@@ -225,28 +330,27 @@ class EvaluationSet:
             curves: Keep the precision, recall and score arrays.
         """
         chosen = protocols.get_protocol(protocol)
-        skip = chosen.frame_rule(empty_frames)
+        empty_frames = chosen.resolve_empty_frames(empty_frames)
         spaces = (spaces,) if isinstance(spaces, str) else tuple(spaces)
         if not set(spaces) <= set(SPACES):
             raise UserError(f"spaces must be among {SPACES}, got {spaces}")
-        frame_weights = self.frame_weights(skip, weights)
+        frame_weights = self.frame_weights(empty_frames, weights)
         points = () if curves else ("precision", "recall", "score")
         dropped = dict.fromkeys(points, np.zeros(0))
-        results = []
+        score_threshold, results = float(score_threshold), []
         for space, iou, (index, name) in itertools.product(
             spaces, _check_ious(iou_thresholds), enumerate(self.classes)
         ):
             weight = frame_weights[:, index]
-            terms = Terms(chosen, space, iou, float(score_threshold))
-            curve = self.curve(terms, index, weight)
+            curve = self.curve(chosen, space, iou, score_threshold, index, weight)
             result = Result(
                 cls=name,
                 space=space,
                 iou=iou,
                 protocol=chosen.name,
                 num_frames=int((weight > 0).sum()),
-                score_threshold=terms.score_threshold,
-                empty_frames=skip,
+                score_threshold=score_threshold,
+                empty_frames=empty_frames,
                 roi=self.roi,
                 label_version=self.label_version,
                 is_simulated=self.is_simulated,
@@ -257,70 +361,57 @@ class EvaluationSet:
 
     def curve(
         self,
-        terms: Terms,
+        protocol: Protocol,
+        space: str,
+        iou: float,
+        score_threshold: float,
         cls: int,
         weight: Int[np.ndarray, " F"],
-        among: Bool[np.ndarray, " F"] | None = None,
     ) -> Curve:
-        """Curve and AP of one class over weighted frames.
-
-        `among` is a mask of frames outside which all weights are zero: many questions about
-        few frames (resamples of a condition) are answered faster with it.
-        """
-        (score, frame, is_tp), *steps = self._falling(terms, cls, among)
-        num_gt, curve = int(weight @ self.gt_count[:, cls]), terms.protocol.curve
-        det_weight = weight[frame]
-        if terms.protocol.matching == "kradar":
+        """Curve and AP of one class over weighted frames."""
+        key = (protocol.geometry, protocol.matching, space, iou, score_threshold, cls)
+        if key not in self._ranked:
+            self._ranked[key] = self._rank(protocol, space, iou, score_threshold, cls)
+        (score, frame, is_tp), *steps = self._ranked[key]
+        num_gt, det_weight = int(weight @ self.gt_count[:, cls]), weight[frame]
+        if protocol.matching == "kradar":
             matched, events = ((s, count * weight[f]) for s, f, count in steps)
-            made = (score, det_weight)
-            return protocols.kradar_curve(matched, events, made, num_gt, curve)
+            detections = (score, det_weight)
+            return protocols.kradar_curve(
+                matched, events, detections, num_gt, protocol.curve
+            )
         return protocols.pooled_curve(
-            score=score, is_tp=is_tp, weight=det_weight, num_gt=num_gt, curve=curve
+            score=score,
+            is_tp=is_tp,
+            weight=det_weight,
+            num_gt=num_gt,
+            curve=protocol.curve,
         )
 
-    def _falling(
-        self, terms: Terms, cls: int, among: Bool[np.ndarray, " F"] | None
-    ) -> list[Falling]:
-        """What a curve of one class needs by falling score, for any weights.
+    def _rank(
+        self, protocol: Protocol, space: str, iou: float, threshold: float, cls: int
+    ) -> list[Ranked]:
+        """What a curve of one class needs, by descending score, for any weights.
 
-        Predictions with what they found; in K-Radar's protocols then the matches of the
-        first pass and the steps of the second.
+        Predictions and whether they match; in K-Radar's protocols then the matches of
+        the first pass and the steps of the second.
         """
-        protocol, *others = terms
-        where = None if among is None else among.tobytes()
-        key = (protocol.geometry, protocol.matching, *others, cls, where)
-        if key in self._parts:
-            return self._parts[key]
-        if among is not None:
-            whole = self._falling(terms, cls, None)
-            parts = [tuple(v[among[part[1]]] for v in part) for part in whole]
+        match, mine = self.match(protocol, space, iou), self.by_score[cls]
+        if not isinstance(match, matching.KradarMatches):
+            counts = [(mine, match[mine] >= 0)]
+            threshold = threshold or -1.0  # a threshold of 0 keeps scores of 0 too
         else:
-            match, mine = self.match(*terms[:3]), self.by_score[cls]
-            if isinstance(match, matching.KradarMatches):
-                first, event = match.first_pred, match.event_pred
-                counts = [(pred, np.ones_like(pred)) for pred in (mine, first)]
-                counts.append((event, match.event_delta))
-                cut = terms.score_threshold
-            else:  # a cut of 0 keeps all, scores of 0 too
-                counts = [(mine, match[mine] >= 0)]
-                cut = terms.score_threshold or -1.0
-            parts = [self._sorted(pred, count, cls, cut) for pred, count in counts]
-        self._parts[key] = parts
-        return parts
-
-    def _sorted(
-        self,
-        pred: Int[np.ndarray, " P"],
-        count: Shaped[np.ndarray, " P"],
-        cls: int,
-        cut: float,
-    ) -> Falling:
-        """Counts at predictions of a class above the score cut, by falling score."""
-        keep = (self.pred.cls[pred] == cls) & (self.pred.score[pred] > cut)
-        pred, count = pred[keep], count[keep]
-        order = np.argsort(-self.pred.score[pred], kind="stable")
-        pred = pred[order]
-        return self.pred.score[pred], self.pred.frame[pred], count[order]
+            first = match.first_pred
+            counts = [(pred, np.ones_like(pred)) for pred in (mine, first)]
+            counts.append((match.event_pred, match.event_delta))
+        ranked = []
+        for pred, count in counts:
+            keep = (self.pred.cls[pred] == cls) & (self.score[pred] > threshold)
+            pred, count = pred[keep], count[keep]
+            order = np.argsort(-self.score[pred], kind="stable")
+            pred = pred[order]
+            ranked.append((self.score[pred], self.pred.frame[pred], count[order]))
+        return ranked
 
 
 def _check_classes(classes: Sequence[str]) -> tuple[str, ...]:

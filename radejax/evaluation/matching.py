@@ -14,7 +14,6 @@ from typing import NamedTuple
 import chex
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real, Shaped
-from scipy import sparse
 
 from radejax.evaluation.overlap import ranges
 
@@ -144,56 +143,27 @@ def match_kradar(
     preference = score[pairs.pred]
     chosen = greedy(pairs.gt, pairs.pred, preference, gt_group[pairs.gt], score.size)
     first = pairs.take(chosen)
-    return KradarMatches(first.gt, first.pred, *_second_pass(pairs, score))
-
-
-def _second_pass(
-    pairs: Pairs, score: Real[np.ndarray, " M"]
-) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
-    """True positives as steps over the score threshold."""
-    if pairs.pred.size == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    component, num_gt = _components(pairs.pred, pairs.gt)
-    is_lone = num_gt[component] == 1
-    # A ground truth that shares no prediction is found once its best score is reached.
-    lone = pairs.take(is_lone)
-    order = np.lexsort((-score[lone.pred], lone.gt))
-    lone_pred = lone.pred[order][_is_new(lone.gt[order])]
-    step_pred, step_delta = _steps(pairs.take(~is_lone), score, component[~is_lone])
-    return (
-        np.concatenate([lone_pred, step_pred]),
-        np.concatenate([np.ones(lone_pred.size, np.int64), step_delta]),
-    )
-
-
-def _components(
-    pred: Int[np.ndarray, " P"], gt: Int[np.ndarray, " P"]
-) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " labels"]]:
-    """Connected parts of the pair graph: labels, and ground truths in each."""
-    gts, gt_node = np.unique(gt, return_inverse=True)
-    preds, pred_node = np.unique(pred, return_inverse=True)
-    size = gts.size + preds.size
-    graph = sparse.coo_array(
-        (np.ones(pred.size, bool), (gt_node, gts.size + pred_node)), shape=(size, size)
-    )
-    num, label = sparse.csgraph.connected_components(graph, directed=False)
-    return label[gt_node], np.bincount(label[: gts.size], minlength=num)
+    steps = _steps(pairs, score, gt_group[pairs.gt])
+    return KradarMatches(first.gt, first.pred, *steps)
 
 
 def _steps(
-    pairs: Pairs, score: Real[np.ndarray, " M"], component: Int[np.ndarray, " P"]
+    pairs: Pairs, score: Real[np.ndarray, " M"], group: Real[np.ndarray, " P"]
 ) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
-    """Second pass where ground truths compete: once per distinct score in a component."""
-    if component.size == 0:
+    """True positives of the second pass as steps over the score threshold.
+
+    The matching is computed once per level, which is a distinct score of a group.
+    """
+    if group.size == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    order = np.argsort(component, kind="stable")
-    (pred, gt, iou), component = pairs.take(order), component[order]
-    # Levels: distinct (component, score), scores falling.
-    rows = np.lexsort((pred, -score[pred], component))
-    rows = rows[_is_new(component[rows], score[pred[rows]])]
-    level_pred, level_component = pred[rows], component[rows]
-    first = np.searchsorted(component, level_component, side="left")
-    count = np.searchsorted(component, level_component, side="right") - first
+    order = np.argsort(group, kind="stable")
+    (pred, gt, iou), group = pairs.take(order), group[order]
+    # Levels: distinct (group, score), by descending score.
+    rows = np.lexsort((pred, -score[pred], group))
+    rows = rows[_is_new(group[rows], score[pred[rows]])]
+    level_pred, level_group = pred[rows], group[rows]
+    first = np.searchsorted(group, level_group, side="left")
+    count = np.searchsorted(group, level_group, side="right") - first
     true_positives = np.zeros(level_pred.size, np.int64)
     chunk = np.cumsum(count) // VIRTUAL_PAIRS_PER_CHUNK
     bounds = np.flatnonzero(np.diff(chunk, prepend=-1, append=chunk[-1] + 1))
@@ -201,11 +171,11 @@ def _steps(
         level, pair = ranges(first[low:high], count[low:high])
         enters = score[pred[pair]] >= score[level_pred[low:high]][level]
         level, pair = level[enters], pair[enters]
-        # Every level is a world of its own: number its predictions anew.
+        # Levels are independent: renumber the predictions of each.
         target = np.unique(level * score.size + pred[pair], return_inverse=True)[1]
         won = greedy(gt[pair], target, iou[pair], level, int(target.max()) + 1)
         true_positives[low:high] = np.bincount(level[won], minlength=high - low)
-    before = np.where(_is_new(level_component), 0, np.roll(true_positives, 1))
+    before = np.where(_is_new(level_group), 0, np.roll(true_positives, 1))
     return level_pred, true_positives - before
 
 
@@ -242,7 +212,7 @@ def match_free(
     num_gt: int,
     threshold: float,
 ) -> Int[np.ndarray, " M"]:
-    """The plain rule: by falling score, each prediction takes the best free object.
+    """By descending score, each prediction takes the best free object.
 
     Args:
         pairs: Predictions and ground truths that may overlap.

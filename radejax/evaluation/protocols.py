@@ -1,6 +1,6 @@
-"""The protocols in use: what each does to boxes, frames, matches and the curve.
+"""The protocols: what each does to boxes, frames, matches and the curve.
 
-Everything here is exact for weighted frames: a weight of 0 leaves a frame out, 2 counts
+Everything here is exact for weighted frames: a weight of 0 ignores a frame, 2 counts
 it twice. Conditions (weathers) and bootstrap resamples are then the same computation.
 """
 
@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 
-PROTOCOL_DEFAULT = "protocol"
-"""In place of a frame rule: the protocol's own."""
+EMPTY_FRAMES = ("protocol", "class", "frame", "none")
+"""Which frames to ignore, see `evaluate`."""
 
 EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall
 
@@ -25,35 +25,48 @@ CurveKind = Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "all_po
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """How a number is made.
+    """How an average precision is computed.
 
     Attributes:
         name: Name in results and reports.
         geometry: Boxes compared: "plain" as given; "rounded" with ground truth rounded to
-            2 decimals; "swapped_lw" rounded and with l and w exchanged (K-Radar's export);
+            2 decimals; "swapped_lw" rounded and with l and w swapped (K-Radar's export);
             "swapped_lw_z_top" also with z taken as the top of the box.
         matching: "kradar" two passes in ground-truth order; "best" each prediction may
             only take its own best object; "free" by score, the best free object.
         curve: How precisions become one number.
-        empty_frames: Frames left out by default: "class" those without an object of the
-            class, "frame" those without an object of any class, None none.
+        empty_frames: Frames to ignore by default: "class" those without an object of the
+            class, "frame" those without an object of any class, "none" no frames.
         summary: One line for reports.
+        is_fixed: Reports apply neither their score threshold nor their empty-frame rule:
+            every prediction and every frame counts.
     """
 
     name: str
     geometry: Geometry
     matching: Literal["kradar", "best", "free"]
     curve: CurveKind
-    empty_frames: Literal["class", "frame"] | None
+    empty_frames: Literal["class", "frame", "none"]
     summary: str
+    is_fixed: bool = False
 
-    def frame_rule(self, empty_frames: str | None) -> str | None:
-        """A frame rule, or the protocol's own for `PROTOCOL_DEFAULT`."""
-        return self.empty_frames if empty_frames == PROTOCOL_DEFAULT else empty_frames
+    def resolve_empty_frames(self, empty_frames: str) -> str:
+        """An empty-frame rule, or the protocol's own for "protocol"."""
+        require(
+            empty_frames in EMPTY_FRAMES,
+            "empty_frames",
+            empty_frames,
+            f"one of {', '.join(EMPTY_FRAMES)}",
+        )
+        return self.empty_frames if empty_frames == "protocol" else empty_frames
 
+
+AUTHORS_PROTOCOL = "coco101"
+"""Protocol of RADE-Net's and DinoRADE's own rows: RADE-Net's evaluator, 101 recall
+levels, frames without the class ignored (the printed 0.99 is its lower bound 1/101)."""
 
 RECOMMENDED = "all_point"
-"""The protocol of our own choice; docs/evaluation.md says why."""
+"""The protocol that docs/evaluation.md recommends, with the reasons."""
 
 
 def _kradar(name: str, geometry: Geometry, curve: CurveKind, summary: str) -> Protocol:
@@ -70,7 +83,7 @@ _ALL = (
         "kradar_r40",
         "swapped_lw",
         "r40",
-        "revised evaluation as the field runs it (l and w exchanged)",
+        "revised evaluation as published (length and width swapped)",
     ),
     _kradar(
         "kradar_r40_corrected",
@@ -93,8 +106,9 @@ _ALL = (
         "plain",
         "free",
         "all_point",
-        None,
+        "none",
         "exact area under the interpolated curve, every frame counts (recommended)",
+        is_fixed=True,
     ),
 )
 PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
@@ -149,12 +163,12 @@ def score_thresholds(
     the one after the (k-1)-th.
 
     Args:
-        sampled: Scores of the matched predictions, falling.
+        sampled: Scores of the matched predictions, descending.
         weight: How often each counts.
         num_gt: Number of ground truths n.
 
     Returns:
-        Thresholds, falling, K <= 41. Empty without matches.
+        Thresholds, descending, K <= 41. Empty without matches.
 
     References:
         K-Radar, utils/kitti_eval/eval_revised.py: get_thresholds.
@@ -191,11 +205,11 @@ def kradar_curve(
     """AP in K-Radar's protocol from the steps of `matching.match_kradar`.
 
     Args:
-        matched: Scores matched in the first pass, falling, and the weights of their
+        matched: Scores matched in the first pass, descending, and the weights of their
             frames.
-        events: Scores at which true positives appear, falling, and how many, times the
+        events: Scores at which true positives appear, descending, and how many, times the
             weight of the frame.
-        detections: Scores of all predictions, falling, and the weights of their frames.
+        detections: Scores of all predictions, descending, and the weights of their frames.
         num_gt: Number of ground truths.
         samples: "r40" all 41 precision samples, "r11" every fourth.
 
@@ -240,10 +254,10 @@ def pooled_curve(
     num_gt: int,
     curve: str,
 ) -> Curve:
-    """AP from all predictions sorted by falling score.
+    """AP from all predictions sorted by descending score.
 
     Args:
-        score: Of the predictions, falling.
+        score: Of the predictions, descending.
         is_tp: True for true positives.
         weight: Weights of their frames.
         num_gt: Number of ground truths.

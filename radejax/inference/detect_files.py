@@ -24,7 +24,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.kradar.sequences import read_description
 from radejax.data.kradar.splits import check_weather
 from radejax.data.tesseract import read_frame
-from radejax.evaluation.files import kitti
+from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector

@@ -1,4 +1,4 @@
-"""Evaluation while a run trains: metrics and pictures of what it holds out."""
+"""Evaluation during training: metrics and figures of held-out frames."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
-from radejax.evaluation.columns import Columns, roi_bounds
-from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files.load import tables_from_frames
-from radejax.evaluation.report.measure import measure, repair_sizes
+from radejax.evaluation.boxes import Columns
+from radejax.evaluation.evaluation_set import Result
+from radejax.evaluation.files import tables_from_frames
+from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.predict import predict_dataset
 from radejax.runs.check_config import check_best_metric
 from radejax.runs.data import Data
-from radejax.runs.evaluate import make_detector, report_options
+from radejax.runs.evaluate import make_detector
 from radejax.runs.figures import FrameDrawer
 from radejax.training import distributed
 from radejax.training.metric_logger import Scores
@@ -34,10 +34,10 @@ class Validation:
     """Called by the training loop with a state and its step.
 
     On the sequences of `data.validation`, or on the test split where there are none.
-    Every process takes part in the predictions and comes to the same numbers.
+    Every process takes part in the predictions and computes the same numbers.
 
     Args:
-        config: Of the run; `evaluation`, `decode`, `watch` and `train.best_metric` are
+        config: Of the run; `evaluation`, `decode`, `logging` and `train.best_metric` are
             read.
         data: Of the run.
         mesh: All devices if None.
@@ -53,16 +53,16 @@ class Validation:
         mesh: jax.sharding.Mesh | None = None,
     ) -> None:
         self._config, self._records = config, data.records
-        self._options = report_options(config, "training")
+        self._options = EvaluationOptions.from_config(config, bootstrap=0)
         check_best_metric(config.train.best_metric, self._options.iou_thresholds)
         self._frames = data.split(data.choosing_split)
         if not len(self._frames):
             raise UserError(
-                f"no frames of the {data.choosing_split} split to evaluate on during training; set "
-                "train.evaluate_every_epochs=0"
+                f"no frames of the {data.choosing_split} split to evaluate on during "
+                "training; set train.evaluate_every_epochs=0"
             )
         self._images = data.images(self._frames)
-        self._detector = make_detector(config, data, {}, mesh)
+        self._detector = make_detector(config, data, {}, mesh, self._options)
 
     @functools.cached_property
     def _tables(self) -> tuple[Columns, Columns]:
@@ -80,30 +80,21 @@ class Validation:
         Raises:
             distributed.Stopped: `should_stop`, asked at every batch, said so.
         """
-        found = self._predict(state.eval_variables, should_stop)
-        predictions, _ = repair_sizes(found, self._options.invalid_sizes)
+        predictions = self._predict(state.eval_variables, should_stop)
         ground_truth, table = self._tables
-        data = EvaluationSet(
-            ground_truth,
-            predictions,
-            classes=self._options.classes,
-            frames=table,
-            roi=self._options.roi,
-            label_version=self._options.label_version,
+        _, results = evaluate_tables(
+            ground_truth, predictions, table, self._options, kinds=()
         )
         values, best = {}, None
-        for row in measure(data, table, self._options, kinds=()):
-            result = row.result
-            if not result.is_defined:
-                continue
+        for result in filter(lambda result: result.is_defined, results):
             if result.cls == "mean":
                 values[f"validation/m{result.metric}"] = result.ap
             else:
                 values[f"validation/{result.metric}/{result.cls}"] = result.ap
             if self._is_best_metric(result) and not math.isnan(result.ap):
                 best = result.ap
-        pictures = distributed.main_only(lambda: self._draw(predictions)) or {}
-        return Scores(values, best, pictures)
+        figures = distributed.main_only(lambda: self._draw(predictions)) or {}
+        return Scores(values, best, figures)
 
     def _predict(
         self, variables: Mapping[str, Any], should_stop: Callable[[], bool] | None
@@ -112,18 +103,17 @@ class Validation:
             self._detector.replace(variables=variables),
             self._records,
             self._frames,
-            self._config.evaluation.batch_size,
+            self._options.batch_size,
             images=self._images,
             progress=False,
             should_stop=should_stop,
         )
 
-    def _is_best_metric(self, result: Any) -> bool:
-        name = result.metric.split("/")[0]
+    def _is_best_metric(self, result: Result) -> bool:
         return (
             result.cls == "mean"
             and result.protocol == self._options.protocols[0]
-            and f"m{name}" == self._config.train.best_metric
+            and f"m{result.metric.split('/')[0]}" == self._config.train.best_metric
         )
 
     def _draw(self, predictions: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -135,13 +125,13 @@ class Validation:
             self._records,
             self._frames,
             Boxes(**predictions),
-            roi=roi_bounds(self._options.roi),
+            roi=self._options.roi_bounds,
             score_threshold=self._config.decode.score_threshold,
         )
-        pictures = {}
+        figures = {}
         with tempfile.TemporaryDirectory() as folder:
             for path in drawer.draw_spread(pathlib.Path(folder), count):
                 with Image.open(path) as image:
                     pixels = np.asarray(image.convert("RGB"))
-                pictures[f"validation/{path.stem}"] = pixels
-        return pictures
+                figures[f"validation/{path.stem}"] = pixels
+        return figures

@@ -8,12 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from radejax.core import files
-from radejax.core.errors import UserError
 from radejax.visualize.style import SERIES_COLORS, new_figure
 
 _LINE_STYLES = ("-", "--", "-.", ":")
@@ -116,85 +115,6 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
         count[width:] - count[:-width],
     )
     return np.divide(total, count, out=np.full(values.shape, np.nan), where=count > 0)
-
-
-def calibration_bins(
-    scores: Any, is_match: Any, num_bins: int = 10
-) -> tuple[
-    Float[np.ndarray, " {num_bins}"],
-    Float[np.ndarray, " {num_bins}"],
-    Int[np.ndarray, " {num_bins}"],
-]:
-    """Mean score, share of matches and number of detections in equal score bins.
-
-    Args:
-        scores: `[N]` in [0, 1].
-        is_match: `[N]` bool, True where the detection matches an object.
-        num_bins: Of equal width over [0, 1].
-
-    Returns:
-        Of each bin; mean score and share are NaN in empty ones.
-    """
-    scores, is_match = np.asarray(scores, float), np.asarray(is_match, bool)
-    if scores.shape != is_match.shape or scores.ndim != 1:
-        raise UserError(
-            f"scores {scores.shape} and matches {is_match.shape} must be vectors of "
-            "one length"
-        )
-    if scores.size and not (0 <= scores.min() <= scores.max() <= 1):
-        raise UserError(f"scores must lie in [0, 1], got up to {scores.max()}")
-    idx = np.minimum((scores * num_bins).astype(int), num_bins - 1)
-    count = np.bincount(idx, minlength=num_bins)
-    sums = np.bincount(idx, scores, num_bins), np.bincount(idx, is_match, num_bins)
-    mean, share = (
-        np.divide(s, count, out=np.full(num_bins, np.nan), where=count > 0)
-        for s in sums
-    )
-    return mean, share, count
-
-
-def draw_calibration(
-    scores: Any,
-    is_match: Any,
-    *,
-    num_bins: int = 10,
-    ax: Axes | None = None,
-    title: str | None = None,
-) -> Axes:
-    """Draws what share of detections with a score really are objects.
-
-    On the diagonal a score is a probability; below it the detector is too sure. The
-    text gives the expected calibration error, the mean distance to the diagonal weighted
-    by the number of detections.
-
-    Args:
-        scores: `[N]` in [0, 1].
-        is_match: `[N]` bool, True where the detection matches an object.
-        num_bins: Of equal width over [0, 1].
-        ax: Where to draw; a new figure by default.
-        title: Title of the axes.
-    """
-    mean, share, count = calibration_bins(scores, is_match, num_bins)
-    ax = new_figure(5.0, 4.4, layout="constrained").add_subplot() if ax is None else ax
-    ax.plot([0, 1], [0, 1], color="0.4", lw=1, ls="--", label="calibrated")
-    ax.plot(mean, share, "o-", color=SERIES_COLORS[0], label="detections")
-    histogram = ax.twinx()
-    edges = np.linspace(0, 1, num_bins + 1)
-    histogram.bar(
-        edges[:-1], count, 1 / num_bins, align="edge", color=SERIES_COLORS[5], alpha=0.3
-    )
-    histogram.set(ylabel="detections in the bin", ylim=(0, 3 * max(count.max(), 1)))
-    error = np.nansum(np.abs(mean - share) * count) / max(count.sum(), 1)
-    ax.set(
-        xlim=(0, 1),
-        ylim=(0, 1.02),
-        xlabel="score",
-        ylabel="share that matches an object",
-    )
-    text = f"expected calibration error {error:.3f}, {count.sum()} detections"
-    ax.set_title("\n".join(filter(None, (title, text))), fontsize=9)
-    ax.legend(fontsize=8, loc="upper left")
-    return ax
 
 
 def _line(i: int) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from radejax.core import memory
 from radejax.core.errors import UserError
 from radejax.data.kradar import write
 from radejax.data.kradar.labels import Label
-from radejax.evaluation.files import kitti
+from radejax.evaluation import kitti
 from radejax.inference.saved import save_model
 
 from .. import small_models
@@ -112,10 +112,10 @@ def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
     assert isinstance(_run("--debug", *arguments).exception, FileNotFoundError)
 
 
-def test_evaluate_wants_one_source() -> None:
+def test_evaluate_needs_a_run() -> None:
     result = _run("evaluate")
     assert result.exit_code == 2
-    assert "error: give one of" in result.output
+    assert "error: give the workdir" in result.output
 
 
 def test_evaluate_takes_flags_as_its_script_does(
@@ -139,8 +139,10 @@ def test_evaluate_takes_flags_as_its_script_does(
     _run("evaluate", "--workdir=run", "--split=train")
     assert seen[1] == ("run", None, None)
     flags = "--roi=0,50,-5,5,-2,6 --min_score=0.01 --iou=0.5 --classes Sedan --name n"
-    _run("evaluate", "--workdir=run", *flags.split(), "--protocols=all_point,auc")
-    given = {k: v for k, v in scoring[2].items() if k not in scoring[1]}
+    _run(
+        "evaluate", "run", "--split=train", *flags.split(), "--protocols=all_point,auc"
+    )
+    given = {k: v for k, v in scoring[2].items() if v != scoring[1].get(k)}
     assert given == {
         "roi": (0.0, 50.0, -5.0, 5.0, -2.0, 6.0),
         "min_score": 0.01,
@@ -152,13 +154,14 @@ def test_evaluate_takes_flags_as_its_script_does(
     wrong = _run("evaluate", "--workdir", "run", "--data=", "--debug")
     assert "names no folder" in str(wrong.exception)
     assert isinstance(wrong.exception, UserError)
+    assert _run("evaluate", "run").exit_code == 0
+    assert seen[-1][0] == "run"
     for flags, message in (
-        (("--workdir", "run", "--frames=x"), "--frames: only without --workdir"),
-        (("--predictions", "x", "--step=3"), "--checkpoint: only with --workdir"),
-        (("--predictions", "x", "y", "z"), "unexpected arguments: y z"),
-        (("--compare", "a", "b", "--bootstrap=0"), "a comparison needs resamples"),
+        (("evaluate", "run", "--frames=x"), "No such option"),
+        (("score", "x", "--step=3"), "No such option"),
+        (("score", "x", "y", "z"), "unexpected extra arguments (y z)"),
     ):
-        wrong = _run("evaluate", *flags)
+        wrong = _run(*flags)
         assert (wrong.exit_code, message in wrong.output) == (2, True), wrong.output
 
 
@@ -178,14 +181,13 @@ def test_export_takes_an_exported_folder(tmp_path: pathlib.Path) -> None:
         assert "error: platform is 'foo', expected some of cpu, cuda" in wrong.output
 
 
-def test_evaluate_scores_predictions_in_files(tmp_path: pathlib.Path) -> None:
+def test_score_evaluates_predictions_in_files(tmp_path: pathlib.Path) -> None:
     box = np.array([[20.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], [30, 3, 0, 4, 2, 1.5, 0.1]])
     truth = {"frame": np.arange(2), "box": box, "cls": np.array(["Sedan"] * 2)}
     found = {**truth, "score": np.array([0.9, 0.8])}
     kitti.write_kitti(tmp_path / "kitti", truth, found, {"frame": np.arange(2)})
     arguments = (
-        "evaluate",
-        "--predictions",
+        "score",
         tmp_path / "kitti",
         "--out",
         tmp_path / "out",

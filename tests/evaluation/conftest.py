@@ -7,8 +7,8 @@ import pytest
 
 from radejax.core import files
 from radejax.core.config import load_module
-from radejax.evaluation.files import predictions
-from radejax.evaluation.files.load import Source
+from radejax.evaluation import files as predictions
+from radejax.evaluation.files import Source
 
 HERE = pathlib.Path(__file__).parent
 
@@ -54,11 +54,11 @@ def stored(random_scene, tmp_path):
     """Folder with predictions, ground truth and frames as files, and their `Source`."""
     truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
     predictions.write_table(tmp_path / "found.json", found, frames)
-    predictions.write_table(tmp_path / "truth.csv", truth, frames)
+    predictions.write_table(tmp_path / "truth.npz", truth, frames)
     files.write_json(
         tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
     )
     source = Source(
-        ground_truth=str(tmp_path / "truth.csv"), frames=str(tmp_path / "frames.json")
+        ground_truth=str(tmp_path / "truth.npz"), frames=str(tmp_path / "frames.json")
     )
     return tmp_path, source

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.structures import CLASSES
-from radejax.evaluation.report.report import write_report
+from radejax.evaluation.report import write_report
 from radejax.runs import check_config
 from radejax.runs.override import override
 
@@ -108,7 +108,7 @@ def test_what_is_missing_is_run_and_judged(
     assert verdicts["0.75 is best for all classes"] == "shown"
     assert verdicts["control: labels teach"] == "shown"
     assert "shown" in (tmp_path / "table_sigma.md").read_text()
-    assert r"\begin{table}" in (tmp_path / "table_sigma.tex").read_text()
+    assert r"\begin{tabular}" in (tmp_path / "table_sigma.tex").read_text()
     # One table's cells are another's: nothing is run again.
     before = len(runs.trained)
     command = ["--table", "3", "--seeds", "0", "--resamples", "40"]

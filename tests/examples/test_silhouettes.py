@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from radejax.core.config import load_module
 from radejax.core.structures import CLASSES
-from radejax.evaluation.report.report import write_report
+from radejax.evaluation.report import write_report
 from radejax.runs import experiment
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

@@ -19,10 +19,11 @@ from radejax.data.records import embeddings, job
 from radejax.data.records.files import RecordFileWriter, file_name, read_manifest_of
 from radejax.data.records.projections import RecordSource
 from radejax.data.tesseract import project_file, read_projection_npy
-from radejax.evaluation.columns import KNOWN_CLASSES
+from radejax.evaluation import files as predictions
+from radejax.evaluation import kitti
+from radejax.evaluation.boxes import KNOWN_CLASSES
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files import kitti, predictions
-from radejax.evaluation.files.load import Source, load
+from radejax.evaluation.files import Source, load
 from radejax.geometry.camera import CameraCalibration
 from radejax.inference.saved import load_model, save_model
 from radejax.runs import evaluate, seeds, workdir
@@ -348,7 +349,7 @@ READERS: dict[str, Reader] = {
     "report": Reader(_report, _read_report, "*.json", "*.npz", count=200),
     **_kinds(
         "predictions",
-        (".npz", ".json", ".csv"),
+        (".npz", ".json"),
         _predictions,
         _read_predictions,
         "p*",

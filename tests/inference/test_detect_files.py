@@ -10,9 +10,8 @@ import pytest
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
-from radejax.evaluation.files.load import Source
-from radejax.evaluation.files.load import load as load_tables
-from radejax.evaluation.files.predictions import write_table
+from radejax.evaluation.files import Source, write_table
+from radejax.evaluation.files import load as load_tables
 from radejax.inference.detect_files import (
     detect_files,
     find_frames,

@@ -13,7 +13,7 @@ from radejax import Detector, UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import write
 from radejax.data.projection import project_tensor
-from radejax.evaluation.files.kitti import prediction_texts
+from radejax.evaluation.kitti import prediction_texts
 from radejax.weights import dinorade_torch
 
 from .. import small_models as small

@@ -15,9 +15,10 @@ from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
 from radejax.data.kradar.frame import Frame
 from radejax.detection.decode import decode
+from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
-from radejax.runs.evaluate import _changed, report_options, with_images_exchanged
+from radejax.runs.evaluate import with_shuffled_images
 
 
 def _frames(paths: list[str | None]) -> list[Frame]:
@@ -32,25 +33,25 @@ def _frames(paths: list[str | None]) -> list[Frame]:
 
 def test_every_frame_sees_another_ones_image() -> None:
     paths = ["a", "b", None, "c", "d", "e"]
-    exchanged = with_images_exchanged(_frames(paths), seed=3)
-    found = [frame.camera_path for frame in exchanged]
-    assert [frame.name for frame in exchanged] == list("012345")
+    shuffled = with_shuffled_images(_frames(paths), seed=3)
+    found = [frame.camera_path for frame in shuffled]
+    assert [frame.name for frame in shuffled] == list("012345")
     assert sorted(filter(None, found)) == ["a", "b", "c", "d", "e"]
     assert found[2] is None
     assert all(a != b for a, b in zip(found, paths, strict=True) if b is not None)
-    assert found == [frame.camera_calibration_path for frame in exchanged]
+    assert found == [frame.camera_calibration_path for frame in shuffled]
 
     def again(seed: int) -> list[str | None]:
-        frames = with_images_exchanged(_frames(paths), seed)
+        frames = with_shuffled_images(_frames(paths), seed)
         return [frame.camera_path for frame in frames]
 
     assert found == again(3)
     assert any(found != again(seed) for seed in range(4, 8))
 
 
-def test_images_of_fewer_than_two_frames_cannot_be_exchanged() -> None:
-    with pytest.raises(UserError, match="1 frames have an image: none to exchange"):
-        with_images_exchanged(_frames(["a", None]), seed=0)
+def test_images_of_fewer_than_two_frames_cannot_be_shuffled() -> None:
+    with pytest.raises(UserError, match="two frames with an image, found 1"):
+        with_shuffled_images(_frames(["a", None]), seed=0)
 
 
 def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
@@ -81,36 +82,49 @@ def _config(**evaluation: object) -> ConfigDict:
     return config
 
 
-def test_reports_of_runs_cut_all_but_exact() -> None:
-    options = report_options(_config(empty_frames="class"), "run")
-    assert options.cut("kradar_r40") == 0.3
-    assert options.cut("all_point") == options.min_score == 0.05
-    assert options.frame_rule("coco101") == "class"
-    assert options.frame_rule("all_point") == "protocol"
-    # A cut below what the run would keep is kept.
-    assert report_options(_config(score_threshold=0.0), "run").cut("all_point") == 0.0
+def test_settings_of_a_run_hold_for_all_protocols_except_all_point() -> None:
+    options = EvaluationOptions.from_config(_config(empty_frames="class"))
+    expected = {"score_threshold": 0.3, "empty_frames": "class"}
+    assert options.settings_of("kradar_r40") == expected
+    expected = {"score_threshold": 0.05, "empty_frames": "protocol"}
+    assert options.settings_of("all_point") == expected
+    # A threshold below what the run would store is kept.
+    options = EvaluationOptions.from_config(_config(score_threshold=0.0))
+    assert options.min_score == 0.0
 
 
-def test_every_option_is_given_when_evaluating() -> None:
-    old = _config()
-    del old.evaluation.min_score  # a run of before
-    config, options = _changed(old, {})
-    assert (config.evaluation.min_score, options) == (0.05, {})
-    changes = {"protocols": ("auc",), "min_score": 0.2, "roi": None, "run": "mine"}
-    config, options = _changed(old, changes | {"classes": ("Sedan",)})
-    assert options == {"run": "mine", "classes": ("Sedan",)}
-    made = report_options(config, "run")
-    assert (made.protocols, made.min_score, made.roi) == (("auc",), 0.2, None)
-    assert old.evaluation.protocols == base_config().evaluation.protocols
-    _, options = _changed(old, {"score_threshold": 0.5})
-    assert options == {"uncut": ()}
-    for changes, message in (
-        ({"protocols": ("nope",)}, r"config.evaluation.protocols is \('nope',\)"),
-        ({"batch_size": 0}, "config.evaluation.batch_size is 0, expected an integer"),
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"protocols": ("nope",)}, r"evaluation.protocols is \('nope',\), expected"),
+        ({"protocols": ()}, "evaluation.protocols"),
+        ({"protocols": ("auc", "auc")}, "evaluation.protocols"),
+        (
+            {"iou_thresholds": (1.0,)},
+            r"iou_thresholds is \(1.0,\), expected numbers in",
+        ),
+        ({"score_threshold": float("nan")}, "score_threshold is nan, expected"),
+        ({"min_score": -0.1}, "min_score is -0.1, expected"),
+        ({"batch_size": 0}, "batch_size is 0, expected an integer of at least 1"),
+        ({"bootstrap": -1}, "bootstrap is -1"),
+        ({"num_visualizations": -1}, "num_visualizations is -1"),
+        ({"empty_frames": "all"}, "empty_frames is 'all', expected one of protocol"),
+        ({"roi": (0.0, 1.0)}, "roi must be"),
         ({"classes": ("Tram",)}, "classes has 'Tram', expected some of the run's: Sed"),
-    ):
-        with pytest.raises(UserError, match=message):
-            _changed(old, changes)
+    ],
+)
+def test_options_are_checked(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        EvaluationOptions.from_config(_config(), **changes)
+
+
+def test_changes_replace_what_the_config_says() -> None:
+    changes = {"protocols": ("auc",), "min_score": 0.2, "roi": None}
+    config = _config()
+    options = EvaluationOptions.from_config(config, **changes, classes=("Sedan",))
+    assert (options.protocols, options.min_score) == (("auc",), 0.2)
+    assert (options.roi, options.classes) == (None, ("Sedan",))
+    assert config.evaluation.protocols == base_config().evaluation.protocols
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,9 +159,10 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     data = SimpleNamespace(choosing_split=choosing)
     loaded = _Loaded(_config())
     monkeypatch.setattr(evaluate, "load", lambda *_, **__: loaded)
-    monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (None, data))
+    monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
     monkeypatch.setattr(evaluate, "evaluate", lambda *_, **named: written.update(named))
     evaluate.evaluate_run(tmp_path, step=step, split=split)
     assert written["out"] == tmp_path / folder
-    assert written["remark"] == (f" ({remark})" if remark else "")
+    name = f"{tmp_path.name} ({remark})" if remark else tmp_path.name
+    assert written["run"] == name
     assert ("may not be reported" in caplog.text) == bool(remark)

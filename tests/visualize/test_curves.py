@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError
 from radejax.visualize import curves
 
 
@@ -53,26 +53,6 @@ def test_moving_mean_by_hand():
     np.testing.assert_allclose(mean, [1.0, 2.0, 3.0, 5.0, 6.0])
     np.testing.assert_array_equal(curves.moving_mean(values[:1], 3), [1.0])
     assert values[0] == 1.0
-
-
-def test_calibration_by_hand():
-    scores = [0.05, 0.15, 0.95, 1.0]
-    mean, share, count = curves.calibration_bins(scores, [False, True, True, False])
-    np.testing.assert_array_equal(count, [1, 1, 0, 0, 0, 0, 0, 0, 0, 2])
-    np.testing.assert_allclose(mean[[0, 1, 9]], [0.05, 0.15, 0.975])
-    np.testing.assert_array_equal(share[[0, 1, 9]], [0.0, 1.0, 0.5])
-    assert np.isnan(share[5])
-    ax = curves.draw_calibration(scores, [False, True, True, False])
-    # (0.05 + 0.85 + 2 * 0.475) / 4
-    assert "error 0.463, 4 detections" in ax.get_title()
-
-
-def test_calibration_without_detections_and_with_bad_ones():
-    assert "0 detections" in curves.draw_calibration([], []).get_title()
-    with pytest.raises(UserError, match=r"\[0, 1\]"):
-        curves.calibration_bins([1.5], [True])
-    with pytest.raises(UserError, match="one length"):
-        curves.calibration_bins([0.5], [True, False])
 
 
 def test_the_legend_covers_no_curve_and_colours_differ() -> None:

@@ -1,6 +1,6 @@
 """KITTI text folders as K-Radar's tools write and read them.
 
-    <folder>/<score cut>/<condition>/{preds,gts,desc}/000012.txt and val.txt
+    <folder>/<score threshold>/<condition>/{preds,gts,desc}/000012.txt and val.txt
 
 with condition "all" or a tag of the frame (weather, environment, time). The number of a
 file is the frame's position in the data set. A line is
@@ -9,8 +9,8 @@ file is the frame's position in the data set. A line is
     sed -1 -1 0 50 50 150 150 h w l y z x yaw score     (prediction)
 
 and a frame without predictions has one line "dummy". Frames without ground truth are not
-written. K-Radar's evaluator then compares every box with l and w exchanged (its issue
-81): that is the reader's doing, the numbers in the files are the plain ones.
+written. K-Radar's evaluator then compares every box with length and width swapped (its issue
+81): its reader does that, the numbers in the files are the plain ones.
 
 References:
     K-Radar, pipelines/pipeline_detection_v1_0.py and utils/util_pipeline.py.
@@ -28,8 +28,7 @@ from jaxtyping import Int
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
-from radejax.evaluation.columns import Columns, dense_frames, frame_ids, read_name
-from radejax.evaluation.files.predictions import find_frames
+from radejax.evaluation.boxes import Columns, find_frames, frame_ids, frame_positions
 
 CLASS_KEYS = {
     "Sedan": "sed",
@@ -62,8 +61,8 @@ def write_kitti(
     """Writes folders that K-Radar's official evaluation script reads.
 
     Args:
-        folder: Where; a folder named after the score cut is made in it.
-        ground_truth: Columns as in `average_precision.evaluate`, or with frames by key as
+        folder: Where; a folder named after the score threshold is made in it.
+        ground_truth: Columns as in `evaluation.evaluate`, or with frames by key as
             in a report's files, already reduced to the classes, region and field of view
             that shall count.
         predictions: The same with scores.
@@ -72,7 +71,7 @@ def write_kitti(
         conditions: Columns of the frame table whose values get folders beside "all".
 
     Returns:
-        Number of frames written; those without ground truth are left out, as K-Radar's
+        Number of frames written; those without ground truth are skipped, as K-Radar's
         tools do.
 
     Raises:
@@ -115,13 +114,13 @@ def _with_ids(table: Columns, frames: Columns, name: str) -> Columns:
     """The table with frames by id, all of which the frame table has."""
     ids = frame_ids(frames)
     found = find_frames(table["frame"], frames, where=name)
-    return {**table, "frame": ids[dense_frames(found, ids, name=name)]}
+    return {**table, "frame": ids[frame_positions(found, ids, name)]}
 
 
 def prediction_texts(
     detections: Detections, classes: Sequence[str] | None = None
 ) -> list[str]:
-    """One text a frame as K-Radar's tools write predictions, without a final newline.
+    """One text per frame as K-Radar's tools write predictions, without a final newline.
 
     Args:
         detections: Of a batch; a frame without any gets the line "dummy".
@@ -166,8 +165,8 @@ def read_kitti(
 
     Args:
         folder: A folder with `preds` (or `pred`) and perhaps `gts` (or `gt`) and `desc`,
-            or the folder of a score cut around it, or the one around that if it holds a
-            single score cut.
+            or the folder of a score threshold around it, or the one around that if it holds a
+            single score threshold.
         condition: Which condition's folder to read.
 
     Returns:
@@ -176,7 +175,7 @@ def read_kitti(
 
     Raises:
         FileNotFoundError: No such folder.
-        UserError: Nothing to read in it, or several score cuts.
+        UserError: Nothing to read in it, or several score thresholds.
         DataError: A malformed line; names the file and the line.
     """
     root = _find_root(pathlib.Path(folder), condition)
@@ -193,15 +192,15 @@ def _find_root(folder: pathlib.Path, condition: str) -> pathlib.Path:
     for root in (folder, folder / condition):
         if _part(root, "preds", "pred"):
             return root
-    cuts = [
+    folders = [
         p for p in sorted(folder.iterdir()) if _part(p / condition, "preds", "pred")
     ]
-    if len(cuts) == 1:
-        return cuts[0] / condition
-    if cuts:
-        names = ", ".join(p.name for p in cuts)
+    if len(folders) == 1:
+        return folders[0] / condition
+    if folders:
+        names = ", ".join(p.name for p in folders)
         raise UserError(
-            f"{folder} holds several score cuts ({names}): name one of them"
+            f"{folder} holds several score thresholds ({names}): name one of them"
         )
     raise UserError(
         f"{folder} has no folder 'preds' of predictions, neither itself nor in"
@@ -244,7 +243,7 @@ def _read_line(line: str, scored: bool, where: str) -> tuple | None:
     expected = 16 if scored else 15
     if len(fields) != expected:
         raise DataError(f"{where}: {len(fields)} fields, expected {expected}")
-    name = CLASS_NAMES.get(fields[0]) or read_name(fields[0], where)
+    name = CLASS_NAMES.get(fields[0], fields[0][:80])
     try:
         height, width, length, y, z, x, yaw = (float(f) for f in fields[8:15])
         score = float(fields[15]) if scored else 0.0
@@ -261,7 +260,6 @@ def _frame_table(numbers: list[int], desc: pathlib.Path | None) -> Columns:
     for number in numbers:
         path = desc / f"{number:06d}.txt"
         words = files.read_text(path).split() if path.is_file() else []
-        words = [read_name(word, str(path)) for word in words]
-        tags.append(words if len(words) == 3 else ["unknown"] * 3)
+        tags.append([w[:80] for w in words] if len(words) == 3 else ["unknown"] * 3)
     columns = np.array(tags, dtype=str).reshape(-1, 3).T
     return ids | dict(zip(DESCRIPTION, columns, strict=True))

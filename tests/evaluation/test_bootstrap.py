@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
+from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.report import bootstrap
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -61,7 +61,7 @@ def test_weights_of_a_condition_give_the_condition(scene):
 
 def test_interval_covers_the_number_and_grows_with_the_level(scene):
     data = make(*scene)
-    found = bootstrap.add_intervals(
+    found = bootstrap.intervals(
         data, scene[2], [("all_point", "3d", 0.3)], resamples=200, seed=1
     )
     result = data.results("all_point", iou_thresholds=0.3, spaces="3d")[0]
@@ -76,7 +76,7 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
     truth, found, frames = scene
     sequence = frames["sequence"]
     masks = {"one": sequence == 0, "two": sequence < 2}
-    intervals = bootstrap.add_intervals(
+    intervals = bootstrap.intervals(
         make(truth, found, frames),
         frames,
         [("all_point", "bev", 0.3)],
@@ -86,7 +86,7 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
     )
     assert {key[1] for key in intervals} == {"all", "two"}
     with pytest.raises(UserError, match="need a column 'sequence'"):
-        bootstrap.add_intervals(
+        bootstrap.intervals(
             make(truth, found, frames),
             {"frame": frames["frame"]},
             [],
@@ -102,10 +102,10 @@ def test_a_run_does_not_differ_from_itself(scene):
     for row in rows:
         assert (row.difference, row.low, row.high) == (0, 0, 0)
         assert row.p_value == 1
-        assert not row.is_real
+        assert not row.is_significant
 
 
-def test_a_large_difference_is_real_and_antisymmetric(scene):
+def test_a_large_difference_is_significant_and_antisymmetric(scene):
     truth, found, frames = scene
     good, bad = make(truth, found, frames), make(truth, thin(found, 0.3), frames)
     terms = {
@@ -122,7 +122,7 @@ def test_a_large_difference_is_real_and_antisymmetric(scene):
     sedan = next(row for row in forward if row.cls == "Sedan")
     assert sedan.difference > 10
     assert sedan.low > 0
-    assert sedan.is_real
+    assert sedan.is_significant
 
 
 def test_the_comparison_is_paired(scene):
@@ -145,14 +145,17 @@ def test_the_comparison_is_paired(scene):
 def test_holm():
     p = [0.01, 0.04, 0.03, 0.005]
     rows = [
-        bootstrap.Comparison(
-            "a", "3d", 0.3, "all_point", 0, 0, 0, 0, 0, value, value, False
-        )
+        bootstrap.Comparison("a", "3d", 0.3, "all_point", 0, 0, 0, 0, 0, value, value)
         for value in p
     ]
     adjusted = [row.p_adjusted for row in bootstrap._holm(rows)]
     assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert [row.is_real for row in bootstrap._holm(rows)] == [True, False, False, True]
+    assert [row.is_significant for row in bootstrap._holm(rows)] == [
+        True,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_runs_on_different_data_cannot_be_compared(scene):

@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES
-from radejax.evaluation.average_precision import (
-    PROTOCOLS,
-    EvaluationSet,
-    evaluate,
-    mean_ap,
-)
+from radejax.evaluation import PROTOCOLS, EvaluationSet, evaluate, mean_ap
 
 TWO = ("Sedan", "Bus or Truck")
 METHODS = {
@@ -129,7 +124,7 @@ def test_frame_rules_differ_as_described():
         (1, car(60), "Sedan", 0.8),
         (2, car(60), "Sedan", 0.7),
     )
-    for skip, false in (("class", 1), ("frame", 2), (None, 3)):
+    for skip, false in (("class", 1), ("frame", 2), ("none", 3)):
         result = evaluate(
             truth,
             found,
@@ -148,7 +143,7 @@ def test_frame_rules_differ_as_described():
     assert result.num_det == 2
 
 
-def test_kradar_compares_boxes_with_length_and_width_exchanged():
+def test_kradar_compares_boxes_with_length_and_width_swapped():
     # Side by side 1.5 m apart: 2 m wide cars hardly overlap, 4 m wide ones do.
     truth, found = (
         truth_of((0, car(), "Sedan")),
@@ -381,7 +376,7 @@ def test_radenet_fixture(kradar_fixture, shared):
     data = EvaluationSet(truth, found, frames=frames, roi="narrow")
     checked = 0
     for setting, conditions in expected.items():
-        skip = "class" if "skip_0_gt_frames=True" in setting else None
+        skip = "class" if "skip_0_gt_frames=True" in setting else "none"
         iou = float(setting.split("iou=")[1])
         for condition, spaces in conditions.items():
             mask = None if condition == "all" else frames["weather"] == condition
@@ -441,7 +436,7 @@ def test_map_fixture(shared):
                 protocol=protocol,
                 roi=run["roi"],
                 spaces={"2D": "bev", "3D": "3d"}[run["dim"]],
-                empty_frames="class" if run["skip_frames_without_gt"] else None,
+                empty_frames="class" if run["skip_frames_without_gt"] else "none",
             )
             aps = run["results"][method]["aps"]
             assert {r.cls for r in results if r.is_defined} == set(aps)
@@ -579,7 +574,7 @@ def test_unknown_things_are_named():
         evaluate(truth, found, protocol="r40")
     with pytest.raises(UserError, match="spaces must be among"):
         evaluate(truth, found, spaces="2d")
-    with pytest.raises(UserError, match="empty_frames must be"):
+    with pytest.raises(UserError, match="empty_frames is 'all', expected one of"):
         evaluate(truth, found, empty_frames="all")
     with pytest.raises(UserError, match="unknown roi 'wider'; known: narrow, wide"):
         evaluate(truth, found, roi="wider")
@@ -614,7 +609,7 @@ def test_bad_rows_are_named():
     raises("predictions: frame 9, row 1: z of the box is nan", box=put((1, 2), np.nan))
     raises("frame 7, row 0: yaw of the box is inf", box=put((0, 6), np.inf))
     raises(
-        "w of the box is 0 m, .*--invalid_sizes false_positive", box=put((1, 4), 0.0)
+        "w of the box is 0 m, .*--invalid-sizes false_positive", box=put((1, 4), 0.0)
     )
     raises("frame 9, row 1: score 1.2 is outside", score=put(1, 1.2))
     raises("frame 7, row 0: score nan is outside", score=put(0, np.nan))
@@ -636,7 +631,7 @@ def test_far_too_many_boxes_of_a_frame_are_refused_at_once():
 
 def test_ground_truth_and_frames_are_checked_too():
     truth, found = truth_of((0, car(), "Sedan")), found_of()
-    with pytest.raises(DataError, match="frame 3 occurs twice, in rows"):
+    with pytest.raises(DataError, match="frame 3 occurs twice"):
         evaluate(truth, found, frames={"frame": np.array([0, 3, 3])})
     with pytest.raises(DataError, match="ground truth: frame 0, row 0: no such frame"):
         evaluate(truth, found, frames={"frame": np.array([1])})

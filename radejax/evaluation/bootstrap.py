@@ -1,4 +1,4 @@
-"""How sure a number is: resampling whole sequences.
+"""Confidence intervals and comparisons by resampling whole sequences.
 
 Frames of one sequence show the same few cars, so they are not independent; sequences
 are. A resample draws as many sequences as there are, with replacement, and every frame
@@ -10,16 +10,15 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
-from radejax.evaluation.columns import Columns
-from radejax.evaluation.evaluation_set import EvaluationSet, Terms
-from radejax.evaluation.protocols import PROTOCOL_DEFAULT
-from radejax.evaluation.result import SPACES
+from radejax.evaluation.boxes import Columns
+from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 
 LEVEL = 0.95
 
@@ -54,7 +53,7 @@ def resample(
     space: str,
     iou: float,
     *,
-    empty_frames: str | None = PROTOCOL_DEFAULT,
+    empty_frames: str = "protocol",
     score_threshold: float = 0.0,
 ) -> Float[np.ndarray, "B _"]:
     """`[B, C + 1]` AP of every class, then their mean, in every resample.
@@ -62,15 +61,14 @@ def resample(
     NaN where a resample has no object of a class; the mean is over classes that occur.
     """
     chosen = protocols.get_protocol(protocol)
-    skip = chosen.frame_rule(empty_frames)
-    terms = Terms(chosen, space, iou, float(score_threshold))
-    num_classes = len(data.classes)
-    among = np.any(weights, axis=0)
-    ap = np.full((len(weights), num_classes + 1), np.nan)
+    empty_frames = chosen.resolve_empty_frames(empty_frames)
+    ap = np.full((len(weights), len(data.classes) + 1), np.nan)
     for row, weight in enumerate(weights):
-        by_class = data.frame_weights(skip, weight)
-        for cls in range(num_classes):
-            curve = data.curve(terms, cls, by_class[:, cls], among)
+        by_class = data.frame_weights(empty_frames, weight)
+        for cls in range(len(data.classes)):
+            curve = data.curve(
+                chosen, space, iou, float(score_threshold), cls, by_class[:, cls]
+            )
             if curve.num_gt:
                 ap[row, cls] = curve.ap
         present = ap[row, ~np.isnan(ap[row])]
@@ -81,12 +79,52 @@ def resample(
 def interval(
     samples: Float[np.ndarray, " B"], level: float = LEVEL
 ) -> tuple[float, float]:
-    """Percentile interval of samples; NaN if fewer than half of them exist."""
+    """Percentile interval of the samples that are defined; NaN if none is."""
     samples = samples[~np.isnan(samples)]
     if samples.size < 1:
         return float("nan"), float("nan")
     low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
+
+
+def intervals(
+    data: EvaluationSet,
+    frames: Columns,
+    metrics: Sequence[tuple[str, str, float]],
+    *,
+    resamples: int,
+    seed: int,
+    masks: Mapping[str, Bool[np.ndarray, " F"]] | None = None,
+    **settings: Any,
+) -> dict[tuple[str, str, str, str, float], tuple[float, float]]:
+    """95 % intervals by (protocol, condition, class, space, IoU).
+
+    Args:
+        data: The evaluation set.
+        frames: Frame table with a column sequence.
+        metrics: (protocol, space, IoU) to resample.
+        resamples: Number of resamples.
+        seed: Seed of the resampling.
+        masks: Frames by condition, resampled within the condition's sequences.
+            Conditions of a single sequence get no interval.
+        **settings: `empty_frames` and `score_threshold`, as in `evaluate`.
+    """
+    if "sequence" not in frames:
+        raise UserError("intervals need a column 'sequence' in the frame table")
+    sequence = np.asarray(frames["sequence"])
+    found = {}
+    everything = np.ones(sequence.size, bool)
+    for condition, mask in {"all": everything, **(masks or {})}.items():
+        if np.unique(sequence[mask]).size < 2:
+            continue
+        part = data if mask.all() else data.of_frames(mask)
+        weights = sequence_weights(sequence[mask], resamples=resamples, seed=seed)
+        for protocol, space, iou in metrics:
+            ap = resample(part, weights, protocol, space, iou, **settings)
+            for index, name in enumerate((*data.classes, "mean")):
+                key = (protocol, condition, name, space, iou)
+                found[key] = interval(ap[:, index])
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +143,7 @@ class Comparison:
         high: Upper end.
         p_value: Two-sided, from the share of resamples in which the sign turns.
         p_adjusted: The same after Holm's correction over all rows compared together.
-        is_real: Whether `p_adjusted` is below 0.05.
+        is_significant: Whether `p_adjusted` is below 0.05.
     """
 
     cls: str
@@ -119,7 +157,7 @@ class Comparison:
     high: float
     p_value: float
     p_adjusted: float
-    is_real: bool
+    is_significant: bool = False
 
 
 def compare(
@@ -143,54 +181,50 @@ def compare(
         protocol_names: Protocols to compare in.
         iou_thresholds: IoU thresholds.
         spaces: "bev", "3d".
-        score_threshold: Score cut of both.
+        score_threshold: Score threshold of both.
         resamples: Number of resamples.
-        seed: Of the resampling.
+        seed: Seed of the resampling.
 
     Raises:
         UserError: The runs differ in classes, frames or ground truth.
     """
     check_same_truth(data_a, data_b)
     weights = sequence_weights(sequence, resamples=resamples, seed=seed)
-    everything = np.ones((1, len(sequence)), np.int16)
-    raw = []
-    for terms in itertools.product(protocol_names, spaces, map(float, iou_thresholds)):
-        whole, samples = (
-            [
-                resample(data, chosen, *terms, score_threshold=score_threshold)
-                for data in (data_a, data_b)
-            ]
-            for chosen in (everything, weights)
+    # The first row weights every frame once: the APs themselves.
+    weights = np.concatenate([np.ones_like(weights[:1]), weights])
+    rows = []
+    for metric in itertools.product(protocol_names, spaces, map(float, iou_thresholds)):
+        samples_a, samples_b = (
+            resample(data, weights, *metric, score_threshold=score_threshold)
+            for data in (data_a, data_b)
         )
-        raw += _compare_classes(data_a.classes, terms, whole, samples)
-    return _holm(raw)
+        for index, name in enumerate((*data_a.classes, "mean")):
+            if not np.isnan(samples_a[0, index]):
+                pair = samples_a[:, index], samples_b[:, index]
+                rows.append(_compare_class(name, metric, *pair))
+    return _holm(rows)
 
 
-def _compare_classes(
-    classes: Sequence[str], terms: tuple, whole: list, samples: list
-) -> list[Comparison]:
-    """One comparison per class that occurs, and for the mean."""
-    protocol, space, iou = terms
-    result = []
-    for index, name in enumerate((*classes, "mean")):
-        ap_a, ap_b = (float(ap[0, index]) for ap in whole)
-        if np.isnan(ap_a):
-            continue
-        gaps = samples[1][:, index] - samples[0][:, index]
-        gaps = gaps[~np.isnan(gaps)]
-        low, high = interval(gaps)
-        # One is added so that no finite number of resamples claims certainty.
-        below, above = (
-            (side.sum() + 1) / (gaps.size + 1) for side in (gaps <= 0, gaps >= 0)
-        )
-        p_value = float(min(1.0, 2 * min(below, above)))
-        result.append(
-            Comparison(
-                name, space, iou, protocol, ap_a, ap_b, ap_b - ap_a, low, high,
-                p_value, p_value, False,
-            )
-        )  # fmt: skip
-    return result
+def _compare_class(
+    cls: str,
+    metric: tuple[str, str, float],
+    samples_a: Float[np.ndarray, " B"],
+    samples_b: Float[np.ndarray, " B"],
+) -> Comparison:
+    """Comparison of one class from its APs; the first of each is over all frames."""
+    protocol, space, iou = metric
+    ap_a, ap_b = float(samples_a[0]), float(samples_b[0])
+    gaps = samples_b[1:] - samples_a[1:]
+    gaps = gaps[~np.isnan(gaps)]
+    low, high = interval(gaps)
+    # One is added so that no finite number of resamples gives a p-value of 0.
+    below, above = (
+        (side.sum() + 1) / (gaps.size + 1) for side in (gaps <= 0, gaps >= 0)
+    )
+    p_value = float(min(1.0, 2 * min(below, above)))
+    return Comparison(
+        cls, space, iou, protocol, ap_a, ap_b, ap_b - ap_a, low, high, p_value, p_value
+    )
 
 
 def _holm(rows: list[Comparison]) -> list[Comparison]:
@@ -202,7 +236,7 @@ def _holm(rows: list[Comparison]) -> list[Comparison]:
         row = rows[position]
         adjusted = max(adjusted, min(1.0, (len(rows) - rank) * row.p_value))
         result[position] = dataclasses.replace(
-            row, p_adjusted=adjusted, is_real=adjusted < 1 - LEVEL
+            row, p_adjusted=adjusted, is_significant=adjusted < 1 - LEVEL
         )
     return result
 
@@ -225,49 +259,3 @@ def check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
         if not np.array_equal(one, other):
             row = int(np.flatnonzero((one != other).reshape(len(one), -1).any(1))[0])
             raise DataError(f"the runs have different {name}, first in row {row}")
-
-
-def add_intervals(
-    data: EvaluationSet,
-    frames: Columns,
-    terms: Sequence[tuple[str, str, float]],
-    *,
-    resamples: int,
-    seed: int,
-    masks: Mapping[str, Bool[np.ndarray, " F"]] | None = None,
-    empty_frames: str | None = PROTOCOL_DEFAULT,
-    score_threshold: float = 0.0,
-) -> dict[tuple[str, str, str, str, float], tuple[float, float]]:
-    """95 % intervals by (protocol, condition, class, space, IoU).
-
-    Args:
-        data: The evaluation set.
-        frames: Frame table with a column sequence.
-        terms: (protocol, space, IoU) to resample.
-        resamples: Number of resamples.
-        seed: Of the resampling.
-        masks: Of frames by condition, resampled within the condition's sequences.
-            Conditions of a single sequence get no interval.
-        empty_frames: Frame rule.
-        score_threshold: Score cut.
-    """
-    if "sequence" not in frames:
-        raise UserError("intervals need a column 'sequence' in the frame table")
-    sequence = np.asarray(frames["sequence"])
-    everything = {"all": np.ones(sequence.size, bool), **(masks or {})}
-    found = {}
-    for condition, mask in everything.items():
-        if np.unique(sequence[mask]).size < 2:
-            continue
-        weights = np.zeros((resamples, sequence.size), np.int16)
-        weights[:, mask] = sequence_weights(
-            sequence[mask], resamples=resamples, seed=seed
-        )
-        for protocol, space, iou in terms:
-            ap = resample(
-                data, weights, protocol, space, iou,
-                empty_frames=empty_frames, score_threshold=score_threshold,
-            )  # fmt: skip
-            for index, name in enumerate((*data.classes, "mean")):
-                found[protocol, condition, name, space, iou] = interval(ap[:, index])
-    return found

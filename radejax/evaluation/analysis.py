@@ -1,7 +1,8 @@
-"""Where a detector is good and where it fails: slices, errors, calibration, confusion.
+"""Where a detector is good and where it fails: subsets, box errors, worst frames.
 
-All of it uses the recommended protocol's matches (every prediction, by falling score,
-takes the best free object of its class) at one IoU threshold and one space.
+All of it uses the matches of `all_point` (every prediction, by descending score, takes
+the best free object of its class) at one IoU threshold and one space. The sanity checks
+at the end report what is wrong with predictions as a whole.
 """
 
 from __future__ import annotations
@@ -14,23 +15,22 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from radejax.evaluation import matching, overlap, protocols
+from radejax.evaluation import protocols
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.result import SPACES
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
 
 @dataclasses.dataclass(frozen=True)
-class Slice:
-    """Numbers of one class in one slice of the data.
+class Subset:
+    """Numbers of one class in a subset of the data.
 
     Attributes:
         ap: Exact AP, 0 to 100, NaN without objects.
         precision: Share of predictions above the operating score that are right.
         recall: Share of objects they find.
-        num_gt: Objects in the slice.
-        num_det: Predictions above the operating score in the slice.
+        num_gt: Objects in the subset.
+        num_det: Predictions above the operating score in the subset.
     """
 
     ap: float
@@ -56,7 +56,7 @@ def by_distance(
     *,
     edges_m: tuple[float, ...] = DISTANCES_M,
     operating_score: float = 0.3,
-) -> dict[tuple[str, str], Slice]:
+) -> dict[tuple[str, str], Subset]:
     """Numbers by (distance band, class); bands are of ground distance sqrt(x^2 + y^2).
 
     A prediction that found an object belongs to the object's band, any other to its own:
@@ -71,7 +71,7 @@ def by_distance(
     for low, high in itertools.pairwise(edges_m):
         band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
         bands[band] = [(d >= low) & (d < high) for d in (far_gt, far)]
-    return _by_slice(data, bands, match, operating_score)
+    return _by_subset(data, bands, match, operating_score)
 
 
 def by_condition(
@@ -81,27 +81,27 @@ def by_condition(
     iou: float,
     *,
     operating_score: float = 0.3,
-) -> dict[tuple[str, str], Slice]:
+) -> dict[tuple[str, str], Subset]:
     """Numbers by (condition, class); a condition is a mask of frames."""
     masks = {
         name: (mask[data.gt.frame], mask[data.pred.frame])
         for name, mask in conditions.items()
     }
     match = matched_objects(data, space, iou)
-    return _by_slice(data, masks, match, operating_score)
+    return _by_subset(data, masks, match, operating_score)
 
 
-def _by_slice(
+def _by_subset(
     data: EvaluationSet,
     masks: Mapping[str, Sequence[Bool[np.ndarray, " _"]]],
     match: Int[np.ndarray, " M"],
     operating_score: float,
-) -> dict[tuple[str, str], Slice]:
-    """Numbers by (slice, class).
+) -> dict[tuple[str, str], Subset]:
+    """Numbers by (subset, class).
 
     Args:
         data: The evaluation set.
-        masks: `[N]` objects and `[M]` predictions in each slice.
+        masks: `[N]` objects and `[M]` predictions in each subset.
         match: From `matched_objects`.
         operating_score: Precision and recall are of predictions above this score.
     """
@@ -111,7 +111,7 @@ def _by_slice(
     ):
         order = data.by_score[cls]
         order = order[in_pred[order]]
-        score, is_tp = data.pred.score[order], match[order] >= 0
+        score, is_tp = data.score[order], match[order] >= 0
         num_gt = int((in_gt & (data.gt.cls == cls)).sum())
         curve = protocols.pooled_curve(
             score=score,
@@ -124,41 +124,7 @@ def _by_slice(
         num_det, found = int(above.sum()), int(is_tp[above].sum())
         precision = found / num_det if num_det else math.nan
         recall = found / num_gt if num_gt else math.nan
-        result[name, cls_name] = Slice(curve.ap, precision, recall, num_gt, num_det)
-    return result
-
-
-def calibration(
-    data: EvaluationSet, space: str, iou: float, *, num_bins: int = 10
-) -> dict[str, dict[str, list]]:
-    """How often predictions of a score are right, per class and for "all".
-
-    Returns:
-        Per class: "low" and "high" edges of the score bins, "count", mean "score" and
-        "precision" per bin (NaN where empty), and "error", the mean of
-        |precision - score| weighted by count (expected calibration error).
-    """
-    # Here, for it loads matplotlib, and the numbers of a training run need none of that.
-    from radejax.visualize.curves import calibration_bins
-
-    is_match = matched_objects(data, space, iou) >= 0
-    edges = np.linspace(0, 1, num_bins + 1)
-    result = {}
-    for cls, name in [(None, "all"), *enumerate(data.classes)]:
-        rows = np.ones(len(data.pred), bool) if cls is None else data.pred.cls == cls
-        score, precision, count = calibration_bins(
-            data.pred.score[rows], is_match[rows], num_bins
-        )
-        total = int(count.sum())
-        error = float(np.nansum(np.abs(precision - score) * count))
-        result[name] = {
-            "low": edges[:-1].tolist(),
-            "high": edges[1:].tolist(),
-            "count": count.tolist(),
-            "score": score.tolist(),
-            "precision": precision.tolist(),
-            "error": error / total if total else math.nan,
-        }
+        result[name, cls_name] = Subset(curve.ap, precision, recall, num_gt, num_det)
     return result
 
 
@@ -175,7 +141,7 @@ def box_errors(
         matches.
     """
     match = matched_objects(data, space, iou)
-    rows = np.flatnonzero((match >= 0) & (data.pred.score > operating_score))
+    rows = np.flatnonzero((match >= 0) & (data.score > operating_score))
     found, truth = data.pred.box[rows], data.gt.box[match[rows]]
     turn = np.abs(np.angle(np.exp(1j * (found[:, 6] - truth[:, 6]))))
     gap = np.abs(found - truth)
@@ -206,33 +172,6 @@ def _or_nan(
     return float(statistic(values)) if values.size else math.nan
 
 
-def confusion(
-    data: EvaluationSet, space: str, iou: float, *, operating_score: float = 0.3
-) -> Int[np.ndarray, "true predicted"]:
-    """Counts: C + 1 true classes by as many predicted, last row and column "none".
-
-    Predictions above the operating score are matched to objects of any class, by falling
-    score to the best free object. Row C counts predictions on nothing, column C objects
-    that were not found.
-    """
-    num_classes = len(data.classes)
-    pred = data.pred.take(data.pred.score > operating_score)
-    first, second = overlap.candidate_pairs(
-        pred.frame, data.gt.frame, pred.box, data.gt.box
-    )
-    ious = overlap.pair_iou(pred.box[first], data.gt.box[second])
-    pairs = matching.Pairs(first, second, ious[SPACES.index(space)])
-    match = matching.match_free(pairs, pred.score, pred.frame, len(data.gt), iou)
-    table = np.zeros((num_classes + 1, num_classes + 1), np.int64)
-    hit = match >= 0
-    np.add.at(table, (data.gt.cls[match[hit]], pred.cls[hit]), 1)
-    np.add.at(table[num_classes], pred.cls[~hit], 1)
-    missed = np.ones(len(data.gt), bool)
-    missed[match[hit]] = False
-    np.add.at(table[:, num_classes], data.gt.cls[missed], 1)
-    return table
-
-
 def worst_frames(
     data: EvaluationSet,
     space: str,
@@ -249,7 +188,7 @@ def worst_frames(
         order of the frame table. Frames without a mistake are never listed.
     """
     match = matched_objects(data, space, iou)
-    above = data.pred.score > operating_score
+    above = data.score > operating_score
     num = data.frame.size
     found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)
     false = np.bincount(data.pred.frame[above & (match < 0)], minlength=num)
@@ -266,4 +205,57 @@ def worst_frames(
         {name: int(column[i]) for name, column in columns.items()}
         for i in order
         if missed[i] + false[i] > 0
+    ]
+
+
+# Sanity checks ------------------------------------------------------------------------
+
+MAX_BEHIND = 0.01
+"""A larger fraction of predictions behind the sensor is reported."""
+
+MAX_OFFSET_M = 0.25
+"""A larger median offset is reported where it is nearly the same for all objects."""
+
+MIN_OBJECTS = 10
+"""Objects with a prediction near them that a median offset needs."""
+
+
+def sanity_checks(data: EvaluationSet) -> list[str]:
+    """Warnings about another unit, frame or height of the predicted boxes."""
+    box, lines = data.all_predictions.box, []
+    is_large = np.abs(box[:, 6]) > 2 * np.pi
+    if is_large.any():
+        lines.append(
+            f"{is_large.sum()} of {len(box)} predictions have |yaw| > 2 pi, up to "
+            f"{np.abs(box[:, 6]).max():.4g}: yaw is in radians; --yaw-degrees reads degrees"
+        )
+    behind = int((box[:, 0] < 0).sum())
+    if behind > MAX_BEHIND * len(box):
+        lines.append(
+            f"{behind} of {len(box)} predictions lie behind the sensor (x < 0): boxes are "
+            "in the radar frame, x forward, y left, z up"
+        )
+    return lines + _constant_offset(data)
+
+
+def _constant_offset(data: EvaluationSet) -> list[str]:
+    """The median offset of the best prediction near each object, if it is constant."""
+    by_score = np.argsort(data.score[data.pair_pred], kind="stable")
+    best = np.full(len(data.gt), -1)
+    best[data.pair_gt[by_score]] = data.pair_pred[by_score]
+    has = best >= 0
+    if has.sum() < MIN_OBJECTS:
+        return []
+    gap = data.pred.box[best[has], :3] - data.gt.box[has, :3]
+    median = np.median(gap, axis=0)
+    spread = np.median(np.abs(gap - median), axis=0)
+    is_constant = (np.abs(median) > MAX_OFFSET_M) & (np.abs(median) > 1.5 * spread)
+    if not is_constant.any():
+        return []
+    x, y, z = (f"{value:+.2f}" for value in median)
+    hint = f"; --z-offset {-median[2]:.2f} moves them" if is_constant[2] else ""
+    return [
+        f"predictions lie ({x}, {y}, {z}) m from their objects (x, y, z; median of "
+        f"{has.sum()}); boxes are in the radar frame, which is K-Radar's "
+        f"LiDAR frame + (-2.54, 0.3, 0), with z at mid-height{hint}"
     ]

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation.average_precision import evaluate
-from radejax.evaluation.files import kitti, predictions
+from radejax.evaluation import evaluate, files, kitti
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -100,7 +99,7 @@ def test_errors(tmp_path, scene):
         kitti.read_kitti(tmp_path)
     for cut in (0.0, 0.3):
         kitti.write_kitti(tmp_path, truth, found, frames, score_threshold=cut)
-    with pytest.raises(UserError, match=r"several score cuts \(0.0, 0.3\)"):
+    with pytest.raises(UserError, match=r"several score thresholds \(0.0, 0.3\)"):
         kitti.read_kitti(tmp_path)
     strange = {**truth, "cls": np.full(len(truth["cls"]), "Tram")}
     with pytest.raises(UserError, match="no key for class 'Tram'"):
@@ -113,8 +112,7 @@ def test_errors(tmp_path, scene):
     with pytest.raises(DataError, match="line 2: could not convert"):
         kitti.read_kitti(tmp_path / "0.0")
     path.write_text(f"{'s' * 20000} -1 -1 0 50 50 150 150 1 1 1 0 0 0 0 0.5\n")
-    with pytest.raises(DataError, match=r"line 1: 'sss.* is no name: 20000 characters"):
-        kitti.read_kitti(tmp_path / "0.0")
+    assert kitti.read_kitti(tmp_path / "0.0")[1]["cls"].dtype.itemsize <= 4 * 80
     path.rename(path.with_name("first.txt"))
     with pytest.raises(DataError, match="named by its number"):
         kitti.read_kitti(tmp_path / "0.0")
@@ -123,7 +121,7 @@ def test_errors(tmp_path, scene):
 def test_a_reports_own_files_are_written(tmp_path, scene):
     truth, found, frames = scene
     for name, table in (("truth", truth), ("found", found)):
-        predictions.write_table(tmp_path / f"{name}.npz", table, frames)
+        files.write_table(tmp_path / f"{name}.npz", table, frames)
     by_key = [dict(np.load(tmp_path / f"{name}.npz")) for name in ("truth", "found")]
     assert by_key[0]["frame"].dtype.kind == "U"
     count = kitti.write_kitti(tmp_path / "by_key", *by_key, frames)

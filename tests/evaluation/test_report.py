@@ -2,7 +2,6 @@ import csv
 import errno
 import json
 import math
-import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -11,12 +10,10 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, DiskFullError, UserError
-from radejax.evaluation.average_precision import evaluate
+from radejax.evaluation import evaluate, plots, published, report, results, tables
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.report import measure, paper_tables, plots, report, tables
-from radejax.evaluation.report.measure import Options
-from radejax.evaluation.report.published import published_rows
+from radejax.evaluation.results import EvaluationOptions
 from radejax.visualize.style import SERIES_COLORS
 
 TERMS = {"roi": None, "plots": False}
@@ -84,24 +81,24 @@ def test_json_holds_the_numbers_of_evaluate(written, scene):
                 assert row["ap_official"] == official
             assert row["num_gt"] == result.num_gt
     assert metrics["options"]["roi"] is None
-    assert metrics["slices"]["time"]
-    assert metrics["slices"]["environment"]
+    assert metrics["subsets"]["time"]
+    assert metrics["subsets"]["environment"]
 
 
 def test_means_are_over_classes_that_occur(written):
     made, _, _ = written
-    table = tables.index(made.rows)
+    table = tables.index(made.results)
     for protocol in PROTOCOLS:
         for condition in ("all", "fog"):
             present = [
-                row.shown
+                row.ap_or_none
                 for key, row in table.items()
                 if key[:2] == (protocol, condition)
                 and key[3:] == ("3d", 0.3)
                 and key[2] != "mean"
-                and row.shown is not None
+                and row.ap_or_none is not None
             ]
-            mean = table[protocol, condition, "mean", "3d", 0.3].shown
+            mean = table[protocol, condition, "mean", "3d", 0.3].ap_or_none
             assert mean == pytest.approx(np.mean(present))
 
 
@@ -109,9 +106,9 @@ def test_csv_is_the_same_table(written):
     made, out, _ = written
     with open(out / "metrics.csv", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(made.rows)
-    for row, measured in zip(rows, made.rows, strict=True):
-        shown = measured.shown
+    assert len(rows) == len(made.results)
+    for row, measured in zip(rows, made.results, strict=True):
+        shown = measured.ap_or_none
         assert row["ap"] == ("" if shown is None else repr(shown))
 
 
@@ -126,7 +123,7 @@ def test_a_class_that_does_not_occur_shows_a_dash(written):
         assert all(cell in ("-", "- / -", "mine") for cell in cells)
     assert (
         "0.99"
-        not in made.text.split("Left out")[0].split("Motorcycle")[1].split("\n")[0]
+        not in made.text.split("Not part of")[0].split("Motorcycle")[1].split("\n")[0]
     )
 
 
@@ -137,27 +134,17 @@ def test_tables_stand_beside_the_published_rows(written):
         assert cell in text
     latex = (out / "tables.tex").read_text()
     count = latex.count(r"\begin{tabular}")
-    assert count > 5
-    for part in (r"\end{tabular}", r"\toprule", r"\begin{table", r"\caption{"):
-        assert latex.count(part) == count
-    assert latex.count(r"\begin{adjustbox}{max width=\linewidth}") == count
-    for table in latex.split(r"\begin{table")[1:]:  # wide ones stand across the page
-        columns = table.split(r"\begin{tabular}{")[1].split("}")[0]
-        star = "*" * (len(columns) > 7)
-        assert table.startswith(star + "}[t]")
-        assert rf"\end{{table{star}}}" in table
-    assert r"\begin{table*}" in latex
-    captions = [line for line in latex.splitlines() if line.startswith(r"\caption{")]
-    assert any(r"kradar\_r40, score$>$0, skip=frame" in line for line in captions)
-    assert not any(re.search(r"[^\\$][_&%><]", line[9:]) for line in captions)
+    assert count == text.count("**") / 2 > 5
+    assert latex.count(r"\toprule") == latex.count(r"\end{tabular}") == count
+    titles = [line for line in latex.splitlines() if line.startswith("% AP")]
+    assert any("kradar_r40, score>0, skip=frame" in title for title in titles)
 
 
 def test_differences_are_ours_minus_theirs(written):
     made, _, _ = written
-    table = tables.index(made.rows)
-    options = Options(run="mine", **TERMS)
-    theirs = published_rows("RADE-Net", "I", method="RADE-Net", space="3d")[0].terms
-    built = paper_tables.table_1(table, options, theirs)
+    table = tables.index(made.results)
+    options = EvaluationOptions(roi="narrow", label_version="v1.1", plots=False)
+    built = published.table_1(table, options, "mine", "test")
     row = next(
         row
         for row in built.rows
@@ -165,10 +152,10 @@ def test_differences_are_ours_minus_theirs(written):
         and row[1] == "RADE-Net, Table I"
         and row[3] == "3D"
     )
-    ours = table["coco101", "all", "Sedan", "3d", 0.3].shown
+    ours = table["coco101", "all", "Sedan", "3d", 0.3].ap_or_none
     assert float(row[4]) == pytest.approx(ours - 64.1, abs=0.0051)
     assert row[6] == "-"  # no overcast frames here
-    three = paper_tables.table_3({"one": table, "two": table})
+    three = published.table_3({"one": table, "two": table})
     assert [row[0] for row in three.rows[-2:]] == ["one", "two"]
     assert len(three.rows) == 7 + 4 + 2
 
@@ -176,24 +163,24 @@ def test_differences_are_ours_minus_theirs(written):
 def test_what_was_left_out_is_counted(scene):
     truth, found, frames = scene
     data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
-    options = Options(score_threshold=0.3, left_out_before={"labels: of mine": 3})
-    counts = measure.left_out(data, options)
-    assert counts["labels: of mine"] == 3
+    options = EvaluationOptions(score_threshold=0.3)
+    counts = results.exclusion_counts(data, options)
     kept = len(data.gt) + counts["ground truth: center outside the region of interest"]
     assert kept == len(truth["frame"])
-    assert counts["predictions: score not above 0.3"] == (data.pred.score <= 0.3).sum()
-    empty = ~np.isin(np.arange(30), data.gt.frame)
     assert (
-        counts["frames: without ground truth (left out by skip=frame)"] == empty.sum()
+        counts["predictions: score not above 0.3 (counted by all_point)"]
+        == (data.pred.score <= 0.3).sum()
     )
+    empty = ~np.isin(np.arange(30), data.gt.frame)
+    assert counts["frames: without ground truth (ignored by skip=frame)"] == empty.sum()
     above = data.pred.score > 0.3
     assert (
-        counts["predictions: in frames without ground truth (left out by skip=frame)"]
+        counts["predictions: in frames without ground truth (ignored by skip=frame)"]
         == (empty[data.pred.frame] & above).sum()
     )
-    results = data.results("coco101", score_threshold=0.3, spaces="3d")
-    left = counts["predictions: in frames without their class (left out by skip=class)"]
-    assert sum(r.num_det for r in results) == above.sum() - left
+    found = data.results("coco101", score_threshold=0.3, spaces="3d")
+    left = counts["predictions: in frames without their class (ignored by skip=class)"]
+    assert sum(r.num_det for r in found) == above.sum() - left
 
 
 def test_sizes_of_an_untrained_network(scene, tmp_path):
@@ -217,10 +204,10 @@ def test_sizes_of_an_untrained_network(scene, tmp_path):
     assert made.metrics["left_out"][what] == 1
     assert made.metrics["left_out"]["predictions: size clipped to 0.01 m, kept"] == 2
     whole = evaluate(truth, found, protocol="all_point", frames=frames)
-    row = made.rows[0].result
+    row = made.results[0]
     assert row.num_det == whole[0].num_det
     with pytest.raises(UserError, match='"error" or "false_positive"'):
-        measure.repair_sizes(found, "drop")
+        EvaluationOptions(invalid_sizes="drop")
 
 
 def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
@@ -252,19 +239,23 @@ def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
 
 def test_conditions_are_in_the_papers_order():
     frames = {"frame": [0] * 4, "weather": ["sleet", "martian", "normal", "fog"]}
-    masks = measure.condition_masks(frames, "weather")
+    masks = results.condition_masks(frames, "weather")
     assert list(masks) == ["normal", "fog", "sleet", "martian"]
     assert masks["fog"].tolist() == [False, False, False, True]
-    assert measure.condition_masks(frames, "time") == {}
+    assert results.condition_masks(frames, "time") == {}
 
 
 def test_frames_with_ids_only(scene, tmp_path):
     truth, found, frames = scene
     only = {"frame": frames["frame"]}
     made = report.write_report(
-        truth, found, only, tmp_path, Options(protocols=("all_point",), **TERMS)
+        truth,
+        found,
+        only,
+        tmp_path,
+        EvaluationOptions(protocols=("all_point",), **TERMS),
     )
-    assert {row.condition for row in made.rows} == {"all"}
+    assert {row.condition for row in made.results} == {"all"}
     assert "Total" in made.text
 
 
@@ -274,7 +265,7 @@ def test_nothing_at_all(tmp_path, scene):
     made = report.write_report(
         {k: v[:0] for k, v in truth.items()}, none, frames, tmp_path, **TERMS
     )
-    assert all(row.shown is None for row in made.rows)
+    assert all(row.ap_or_none is None for row in made.results)
 
 
 def test_curves_are_drawn(scene, tmp_path):
@@ -284,7 +275,6 @@ def test_curves_are_drawn(scene, tmp_path):
     )
     pictures = sorted(p.name for p in made.files if p.suffix == ".png")
     assert pictures == [
-        "calibration.png",
         "precision_recall_3d_iou30.png",
         "precision_recall_bev_iou30.png",
     ]
@@ -294,9 +284,9 @@ def test_curves_are_drawn(scene, tmp_path):
 
 
 def test_matplotlib_waits_until_something_is_drawn():
-    code = "import sys, radejax.evaluation.report.compare as _; print(*sys.modules)"
+    code = "import sys, radejax.evaluation.report as _; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    assert b"radejax.evaluation.report.report" in done.stdout
+    assert b"radejax.evaluation.report" in done.stdout
     assert b"matplotlib" not in done.stdout
 
 

@@ -1,8 +1,11 @@
+import re
+
 import numpy as np
 import pytest
 
+from radejax.evaluation import analysis, report
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.report import breakdown
+from radejax.evaluation.files import Source, load, write_table
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -48,7 +51,7 @@ def data():
 
 
 def test_by_distance_by_hand(data):
-    numbers = breakdown.by_distance(data, "bev", 0.3)
+    numbers = analysis.by_distance(data, "bev", 0.3)
     near = numbers["0-20 m", "Sedan"]
     # Hits at 0.9 and 0.2, the false one of frame 3 between them.
     assert (near.num_gt, near.num_det) == (2, 2)
@@ -65,7 +68,7 @@ def test_by_distance_by_hand(data):
 
 def test_by_condition_by_hand(data):
     masks = {"day": np.array([True, True, False, False]), "night": np.arange(4) > 1}
-    numbers = breakdown.by_condition(data, masks, "bev", 0.3)
+    numbers = analysis.by_condition(data, masks, "bev", 0.3)
     assert numbers["day", "Sedan"].num_gt == 2
     assert numbers["day", "Sedan"].precision == pytest.approx(1 / 3)
     assert numbers["night", "Sedan"].ap == pytest.approx(50.0)
@@ -75,64 +78,115 @@ def test_by_condition_by_hand(data):
 def test_distance_bands_sum_to_everything(random_scene):
     truth, found, frames = random_scene(5)
     data = EvaluationSet(truth, found, classes=CLASSES, frames=frames)
-    numbers = breakdown.by_distance(data, "3d", 0.3, edges_m=(0, 8, 12, 1000))
+    numbers = analysis.by_distance(data, "3d", 0.3, edges_m=(0, 8, 12, 1000))
     assert sum(n.num_gt for n in numbers.values()) == len(data.gt)
     assert sum(n.num_det for n in numbers.values()) == (data.pred.score > 0.3).sum()
-    whole = breakdown.by_distance(data, "3d", 0.3, edges_m=(0, 1000))
+    whole = analysis.by_distance(data, "3d", 0.3, edges_m=(0, 1000))
     for cls, result in zip(
         CLASSES, data.results("all_point", iou_thresholds=0.3, spaces="3d"), strict=True
     ):
         assert whole["0-1000 m", cls].ap == pytest.approx(result.ap)
 
 
-def test_calibration_by_hand(data):
-    bins = breakdown.calibration(data, "bev", 0.3, num_bins=2)["all"]
-    assert bins["count"] == [1, 4]
-    assert bins["score"] == pytest.approx([0.2, (0.9 + 0.8 + 0.7 + 0.6) / 4])
-    assert bins["precision"] == pytest.approx([1.0, 0.25])
-    assert bins["error"] == pytest.approx((0.8 * 1 + 0.5 * 4) / 5)
-    none = breakdown.calibration(data, "bev", 0.3)["Bus or Truck"]
-    assert np.isnan(none["error"])
-    assert np.isnan(none["precision"]).all()
-
-
 def test_box_errors_by_hand(data):
-    errors = breakdown.box_errors(data, "bev", 0.3)["Sedan"]
+    errors = analysis.box_errors(data, "bev", 0.3)["Sedan"]
     assert errors["count"] == 2
     assert errors["center_m_mean"] == pytest.approx(0.15)
     assert errors["heading_deg_mean"] == pytest.approx(90)
     assert errors["axis_deg_mean"] == pytest.approx(0, abs=1e-9)
     assert errors["reversed"] == 0.5
     assert errors["length_m_median"] == 0
-    above = breakdown.box_errors(data, "bev", 0.3, operating_score=0.3)["Sedan"]
+    above = analysis.box_errors(data, "bev", 0.3, operating_score=0.3)["Sedan"]
     assert above["count"] == 1
-    assert np.isnan(breakdown.box_errors(data, "bev", 0.3)["Bus or Truck"]["z_m_mean"])
-
-
-def test_confusion_by_hand(data):
-    table = breakdown.confusion(data, "bev", 0.3)
-    # true Sedan: one found, two not (one only below the score); the bus was called Sedan.
-    assert table.tolist() == [[1, 0, 2], [1, 0, 0], [2, 0, 0]]
-    everything = breakdown.confusion(data, "bev", 0.3, operating_score=0.0)
-    assert everything.sum(axis=1).tolist()[:2] == [3, 1]
-    assert everything.sum(axis=0).tolist()[:2] == [5, 0]
+    assert np.isnan(analysis.box_errors(data, "bev", 0.3)["Bus or Truck"]["z_m_mean"])
 
 
 def test_worst_frames_by_hand(data):
-    worst = breakdown.worst_frames(data, "bev", 0.3)
+    worst = analysis.worst_frames(data, "bev", 0.3)
     assert [(w["frame"], w["missed"], w["false"], w["found"]) for w in worst] == [
         (100, 1, 1, 1),
         (101, 1, 1, 0),
         (102, 1, 0, 0),
         (103, 0, 1, 0),
     ]
-    assert len(breakdown.worst_frames(data, "bev", 0.3, count=2)) == 2
+    assert len(analysis.worst_frames(data, "bev", 0.3, count=2)) == 2
 
 
 def test_nothing_at_all():
     data = make([], [])
-    assert breakdown.worst_frames(data, "bev", 0.3) == []
-    assert breakdown.confusion(data, "bev", 0.3).sum() == 0
-    assert breakdown.box_errors(data, "bev", 0.3)["Sedan"]["count"] == 0
-    assert all(n.num_gt == 0 for n in breakdown.by_distance(data, "3d", 0.5).values())
-    assert breakdown.calibration(data, "3d", 0.5)["all"]["count"] == [0] * 10
+    assert analysis.worst_frames(data, "bev", 0.3) == []
+    assert analysis.box_errors(data, "bev", 0.3)["Sedan"]["count"] == 0
+    assert all(n.num_gt == 0 for n in analysis.by_distance(data, "3d", 0.5).values())
+
+
+# Sanity checks ------------------------------------------------------------------------
+
+
+def _scene(num=60):
+    rng = np.random.default_rng(1)
+    box = np.column_stack(
+        [rng.uniform(10, 60, num), rng.uniform(-6, 6, num), rng.normal(0, 0.3, num)]
+        + [np.full(num, size) for size in (4.4, 1.9, 1.6)]
+        + [rng.uniform(-3, 3, num)]
+    )
+    truth = {"frame": np.arange(num), "box": box, "cls": np.full(num, "Sedan")}
+    noise = rng.normal(0, [0.3, 0.15, 0.1, 0.2, 0.1, 0.1, 0.05], (num, 7))
+    return truth, {**truth, "box": box + noise, "score": rng.uniform(0.3, 1, num)}
+
+
+def _warnings(found, truth):
+    return analysis.sanity_checks(EvaluationSet(truth, found))
+
+
+def _moved(found, column, change):
+    box = found["box"].copy()
+    box[:, column] = change(box[:, column])
+    return {**found, "box": box}
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "expected"),
+    [
+        (6, np.rad2deg, r"60 predictions have \|yaw\| > 2 pi, up to 1\d\d"),
+        (
+            2,
+            lambda z: z + 0.7,
+            r"\(.0.\d\d, .0.\d\d, \+0.7\d\) m .*; --z-offset -0.7\d moves",
+        ),
+        (0, lambda x: x + 2.54, r"\(\+2.\d\d, .* LiDAR frame \+ \(-2.54, 0.3, 0\)"),
+        (0, np.negative, r"60 of 60 predictions lie behind the sensor \(x < 0\)"),
+    ],
+)
+def test_another_unit_or_frame_is_said(column, change, expected):
+    truth, found = _scene()
+    assert _warnings(found, truth) == []
+    lines = _warnings(_moved(found, column, change), truth)
+    assert re.search(expected, lines[0]), lines
+
+
+def test_a_correction_takes_the_warning_away(tmp_path):
+    truth, found = _scene()
+    wrong = _moved(_moved(found, 6, np.rad2deg), 2, lambda z: z + 0.7)
+    frames = {"frame": truth["frame"]}
+    made = report.write_report(truth, wrong, frames, tmp_path, plots=False)
+    assert len(made.metrics["warnings"]) == made.text.count("WARNING: ") == 2
+    write_table(tmp_path / "found.npz", wrong)
+    write_table(tmp_path / "truth.npz", truth)
+    source = Source(
+        ground_truth=str(tmp_path / "truth.npz"), z_offset_m=-0.7, yaw_degrees=True
+    )
+    right = load(tmp_path / "found.npz", source, CLASSES)[1]
+    np.testing.assert_allclose(right["box"], found["box"])
+    made = report.write_report(truth, right, frames, tmp_path, plots=False)
+    assert made.metrics["warnings"] == []
+
+
+def test_few_or_scattered_predictions_are_no_offset():
+    truth, found = _scene()
+    few = {
+        name: column[:9] for name, column in _moved(found, 2, lambda z: z + 1).items()
+    }
+    assert _warnings(few, truth) == []
+    rng = np.random.default_rng(2)
+    wide = _moved(found, 2, lambda z: z + rng.normal(0.3, 1, z.size))
+    assert _warnings(wide, truth) == []

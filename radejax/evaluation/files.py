@@ -1,0 +1,351 @@
+"""Ground truth, predictions and frames from files, and the files that are written.
+
+Formats: .npz (reports), .json with a list of records (what `radejax detect` writes, one
+file or a folder of them), and folders in K-Radar's KITTI layout (`evaluation.kitti`). A
+table has the columns frame, cls, box and, for predictions, score. A frame is named by its
+id in the frame table (an integer) or by its key "sequence/name", such as
+"1/00033_00001" (K-Radar's label file, with or without .txt).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from radejax.core import files
+from radejax.core.archives import read_npz
+from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike
+from radejax.core.structures import BOX_FIELDS
+from radejax.data.kradar import KRadar
+from radejax.evaluation.boxes import (
+    AnyColumns,
+    Columns,
+    find_frames,
+    frame_keys,
+    of_known_frames,
+    take_frames,
+)
+from radejax.evaluation.kitti import read_kitti
+
+# Tables -------------------------------------------------------------------------------
+
+
+def read_table(
+    path: PathLike, frames: Columns | None = None, *, scored: bool = True
+) -> Columns:
+    """Read predictions (or, not `scored`, ground truth) from .npz or .json.
+
+    Args:
+        path: The file; or the folder of `radejax detect`, a .json per frame, of which
+            frames that the table does not have are ignored.
+        frames: Frame table to look frames up in; None leaves integer ids as they are.
+        scored: Whether a score is expected.
+
+    Returns:
+        Columns frame, box, cls and score, as `evaluation.evaluate` takes them.
+
+    Raises:
+        FileNotFoundError: Names the file.
+        UserError: An unknown kind of file.
+        DataError: A missing column, a value that is not a number, an unknown frame; names
+            the file and the row.
+    """
+    path = pathlib.Path(path)
+    wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
+    columns: Columns
+    if path.is_dir():
+        records = [r for p in sorted(path.glob("*.json")) for r in _records(p, wanted)]
+        columns = _columns_of_records(records, wanted)
+        if frames is not None:
+            columns = of_known_frames(columns, frames)
+    elif not path.is_file():
+        raise FileNotFoundError(2, "no such file", str(path))
+    elif path.suffix == ".json":
+        columns = _columns_of_records(_records(path, wanted), wanted)
+    elif path.suffix == ".npz":
+        columns = read_npz(path)
+        if missing := [name for name in wanted if name not in columns]:
+            raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
+    else:
+        raise UserError(
+            f"{path}: cannot read '{path.suffix}'; known: .npz, .json and folders in "
+            "KITTI's layout"
+        )
+    table = {name: columns[name] for name in wanted}
+    table["frame"] = find_frames(columns["frame"], frames, where=str(path))
+    return table
+
+
+def _records(path: pathlib.Path, wanted: Sequence[str]) -> list[dict[str, Any]]:
+    """Records of a file, each with the wanted fields, checked."""
+    content = files.read_json(path)
+    if not isinstance(content, list):
+        raise DataError(f"{path}: expected a list of records with {', '.join(wanted)}")
+    records = []
+    for row, record in enumerate(content):
+        if not isinstance(record, dict):
+            raise DataError(f"{path}: row {row}: expected a record, got {record!r:.80}")
+        spelled = [record.get(name) for name in BOX_FIELDS]
+        entry = {"box": spelled, **record}
+        if lacking := [name for name in wanted if name not in entry]:
+            raise DataError(f"{path}: row {row}: lacks {lacking[0]!r}")
+        box = entry["box"] if isinstance(entry["box"], list) else []
+        numbers = [*box, entry["score"]] if "score" in wanted else box
+        is_number = all(type(value) in (int, float) for value in numbers)
+        if len(box) != len(BOX_FIELDS) or not is_number:
+            raise DataError(
+                f"{path}: row {row}, frame {entry['frame']!r:.80}: box is {box!r:.200} "
+                f"and score {entry.get('score')!r:.80}, expected 7 numbers "
+                f"{', '.join(BOX_FIELDS)} and a score"
+            )
+        for name in ("frame", "cls"):
+            # An array of names is as wide as its longest name.
+            if len(str(entry[name])) > 200:
+                raise DataError(f"{path}: row {row}: {name} has over 200 characters")
+        records.append(entry)
+    return records
+
+
+def _columns_of_records(
+    records: Sequence[dict[str, Any]], wanted: Sequence[str]
+) -> dict[str, np.ndarray]:
+    columns = {
+        "frame": np.array([str(record["frame"]) for record in records]),
+        "cls": np.array([str(record["cls"]) for record in records], str),
+        "box": np.array([r["box"] for r in records], np.float64).reshape(-1, 7),
+    }
+    if "score" in wanted:
+        columns["score"] = np.array([r["score"] for r in records], np.float64)
+    return columns
+
+
+def write_table(
+    path: PathLike, table: AnyColumns, frames: Columns | None = None
+) -> None:
+    """Write columns as .npz, or as .json records; `read_table` gives the same back.
+
+    Args:
+        path: The file; its suffix chooses the format. It is written whole or not at all.
+        table: Columns frame, box, cls and, for predictions, score.
+        frames: Frame table; with it frames are written by key, which survives another
+            selection or order of frames, and without it by id.
+    """
+    path = pathlib.Path(path)
+    frame = np.asarray(table["frame"], np.int64)
+    if frames is not None:
+        ids = np.asarray(frames["frame"]).tolist()
+        keys = dict(zip(ids, frame_keys(frames), strict=True))
+        frame = np.array([keys[i] for i in frame.tolist()], dtype=str)
+    columns = {
+        "frame": frame,
+        "cls": np.asarray(table["cls"], dtype=str),
+        "box": np.asarray(table["box"], np.float64).reshape(-1, 7),
+    }
+    if "score" in table:
+        columns["score"] = np.asarray(table["score"], np.float64)
+    if path.suffix == ".npz":
+        with files.atomic_write(path) as file:
+            # NumPy's signature has `allow_pickle`, which no column is named.
+            np.savez_compressed(file, **columns)  # type: ignore[arg-type]
+    elif path.suffix == ".json":
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        records = [dict(zip(columns, row, strict=True)) for row in rows]
+        files.write_text(path, json.dumps(records))
+    else:
+        raise UserError(f"{path}: cannot write '{path.suffix}'; known: .npz, .json")
+
+
+def tables_from_frames(
+    frames: Iterable[Any], split: str | None = None
+) -> tuple[Columns, Columns]:
+    """Ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
+
+    Args:
+        frames: Objects with sequence, name, weather, environment, time, is_simulated,
+            boxes `[N, 7]` (radar frame) and classes `[N]` (names).
+        split: Of the dataset, for the frame table: "train", "test", "all" or a split
+            file; None where it is not known.
+
+    Returns:
+        Ground-truth columns and frame columns; the frame id is the position.
+    """
+    frames = list(frames)
+    counts = [len(frame.boxes) for frame in frames]
+    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
+    cls = [str(name) for frame in frames for name in frame.classes]
+    ground_truth = {
+        "frame": np.repeat(np.arange(len(frames)), counts),
+        "box": np.concatenate(box) if box else np.zeros((0, 7)),
+        "cls": np.array(cls, dtype=str),
+    }
+    table = {"frame": np.arange(len(frames))}
+    for column in ("sequence", "name", "weather", "environment", "time"):
+        table[column] = np.array([getattr(frame, column) for frame in frames])
+    table["simulated"] = np.array([frame.is_simulated for frame in frames], bool)
+    if split is not None:
+        table["split"] = np.full(len(frames), str(split))
+    return ground_truth, table
+
+
+# Predictions with their ground truth --------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """Where ground truth and frames come from.
+
+    Attributes:
+        data: Root folders of K-Radar, or none.
+        labels: Folder or zip of a label revision.
+        label_version: v1.0, v1.1, v2.0 or v2.1.
+        split: "train", "test", a split file, or None for every frame.
+        ground_truth: File of ground truth instead, or the folder of a report or a run.
+        frames: JSON file of the frame table (columns) for `ground_truth`; by default the
+            `frames.json` in the same folder.
+        sequences: Only frames of these; all if empty.
+        weather: Likewise.
+        z_offset_m: Added to the z of predictions.
+        yaw_degrees: Whether yaws of predictions are degrees.
+    """
+
+    data: tuple[str, ...] = ()
+    labels: str | None = None
+    label_version: str = "v2.1"
+    split: str | None = "test"
+    ground_truth: str | None = None
+    frames: str | None = None
+    sequences: tuple[int, ...] = ()
+    weather: tuple[str, ...] = ()
+    z_offset_m: float = 0.0
+    yaw_degrees: bool = False
+
+
+def load(
+    path: PathLike, source: Source, classes: Sequence[str]
+) -> tuple[Columns, Columns, Columns, dict[str, int]]:
+    """Ground truth, predictions, frame table and counts of what loading skipped.
+
+    Args:
+        path: Predictions: a .npz or .json file, the folder of `radejax detect`, one in
+            KITTI's layout, or that of an earlier report.
+        source: Ground truth; a KITTI folder and a report bring their own.
+        classes: Classes to load from labels.
+
+    Raises:
+        UserError: No ground truth anywhere, or no frame of the chosen part.
+        FileNotFoundError: Names what is missing.
+        DataError: Malformed content.
+    """
+    path = pathlib.Path(path)
+    left_out: dict[str, int] = {}
+    if (path / "predictions.npz").is_file():
+        frames = _read_frames(path / "frames.json")
+        truth = read_table(path / "ground_truth.npz", frames, scored=False)
+        found = read_table(path / "predictions.npz", frames)
+    else:
+        truth, given, left_out = _load_ground_truth(path, source, classes)
+        found = _load_predictions(path, given)
+        frames = given or {"frame": np.union1d(truth["frame"], found["frame"])}
+    box = np.array(found["box"], np.float64).reshape(-1, 7)
+    box[:, 2] += source.z_offset_m
+    if source.yaw_degrees:
+        box[:, 6] = np.deg2rad(box[:, 6])
+    found = {**found, "box": box}
+    for column, wanted in (("sequence", source.sequences), ("weather", source.weather)):
+        if not wanted:
+            continue
+        if column not in frames:
+            raise UserError(
+                f"the frame table has no column {column}: give --data or --labels"
+            )
+        values = np.asarray(frames[column]).astype(str)
+        is_chosen = np.isin(values, [str(value) for value in wanted])
+        if not is_chosen.any():
+            raise UserError(
+                f"no frames of {column} {', '.join(map(str, wanted))}; there are "
+                f"{', '.join(np.unique(values))}"
+            )
+        frames = {name: np.asarray(v)[is_chosen] for name, v in frames.items()}
+        truth, found = (take_frames(table, frames["frame"]) for table in (truth, found))
+    return truth, found, frames, left_out
+
+
+def _is_kitti(path: pathlib.Path) -> bool:
+    """Whether a folder is in KITTI's layout and not one of `radejax detect`'s .json."""
+    return path.is_dir() and ((path / "preds").is_dir() or not any(path.glob("*.json")))
+
+
+def _load_ground_truth(
+    path: pathlib.Path, source: Source, classes: Sequence[str]
+) -> tuple[Columns, Columns | None, dict[str, int]]:
+    """Ground truth, the frame table if there is one, and counts of skipped labels."""
+    if source.ground_truth:
+        truth = pathlib.Path(source.ground_truth)
+        of_report = (truth / "ground_truth.npz", truth / "evaluation/ground_truth.npz")
+        truth = next((place for place in of_report if place.is_file()), truth)
+        table = pathlib.Path(source.frames or truth.with_name("frames.json"))
+        has_frames = source.frames is not None or table.is_file()
+        frames = _read_frames(table) if has_frames else None
+        return read_table(truth, frames, scored=False), frames, {}
+    if source.data or source.labels:
+        data = KRadar(
+            list(source.data) or None,
+            source.labels,
+            version=source.label_version,
+            split=source.split,
+            classes=classes,
+        )
+        counts = {f"labels: {what}": int(n) for what, n in data.counts.items()}
+        return *tables_from_frames(data, source.split or "all"), counts
+    if _is_kitti(path):
+        objects, _, frames = read_kitti(path)
+        return objects, frames, {}
+    raise UserError(
+        f"{path} has predictions only: give the ground truth with --data, --labels or "
+        "--ground-truth"
+    )
+
+
+def _load_predictions(path: pathlib.Path, frames: Columns | None) -> Columns:
+    """Predictions of a file or folder, with frames by id."""
+    if not _is_kitti(path):
+        return read_table(path, frames)
+    found = read_kitti(path)[1]
+    if frames is None or not (path / "frames.json").is_file():
+        return found
+    # Of `radejax detect`, whose frame table names the numbered files.
+    names = _read_frames(path / "frames.json")["name"]
+    named = of_known_frames({**found, "frame": names[found["frame"]]}, frames)
+    return {**named, "frame": find_frames(named["frame"], frames, where=str(path))}
+
+
+def stored_from(path: PathLike) -> float:
+    """Score from which on predictions were stored, as the report of a run says; or 0."""
+    path = pathlib.Path(path)
+    if not (path / "source.json").is_file() or not (path / "metrics.json").is_file():
+        return 0.0
+    return float(files.read_json(path / "metrics.json")["options"]["min_score"])
+
+
+def _read_frames(path: PathLike) -> Columns:
+    """A frame table as `report.write_report` writes it."""
+    columns = files.read_json(path)
+    lists = columns.values() if isinstance(columns, dict) else [0]
+    if not all(isinstance(values, list) for values in lists) or "frame" not in columns:
+        raise DataError(f"{path}: expected columns (lists), with 'frame' among them")
+    for name, values in columns.items():
+        if len(values) != len(columns["frame"]):
+            raise DataError(
+                f"{path}: column {name!r} has {len(values)} entries for "
+                f"{len(columns['frame'])} frames"
+            )
+        kinds = {type(value) for value in values}
+        if len(kinds) > 1 or not kinds <= {int, str, bool, float}:
+            raise DataError(f"{path}: column {name!r} mixes types, or has other values")
+    return {name: np.asarray(values) for name, values in columns.items()}

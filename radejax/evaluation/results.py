@@ -1,0 +1,352 @@
+"""All numbers of an evaluation: protocols, conditions, classes, spaces, IoU thresholds."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from ml_collections import ConfigDict
+
+from radejax.core.errors import UserError, require
+from radejax.core.structures import CLASSES, MIN_SIZE_M
+from radejax.data.kradar.sequences import WEATHERS
+from radejax.evaluation import bootstrap, protocols
+from radejax.evaluation.boxes import AnyColumns, Columns, Roi, roi_bounds
+from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result, mean_ap
+
+ENVIRONMENTS = (
+    "urban highway countryside alleyway parkinglots shoulder mountain university"
+)
+ORDER = {
+    "weather": WEATHERS,
+    "environment": tuple(ENVIRONMENTS.split()),
+    "time": ("day", "night"),
+}
+"""K-Radar's conditions in the order of its papers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationOptions:
+    """Settings of an evaluation: the fields of `config.evaluation` and what reports add.
+
+    Attributes:
+        classes: Classes evaluated.
+        iou_thresholds: IoU thresholds.
+        protocols: Names of protocols.
+        score_threshold: Score threshold of all protocols except fixed ones (all_point).
+        empty_frames: Frames to ignore, except in fixed protocols; see `evaluate`.
+        min_score: Predictions below are not stored, hence part of no number.
+        roi: Region of interest of ground truth and predictions.
+        label_version: Label revision of the ground truth.
+        bootstrap: Number of resamples of sequences for intervals; 0 for none.
+        seed: Seed of the resampling.
+        invalid_sizes: "error", or "false_positive": predicted boxes with a size that is
+            not positive match nothing but count as predictions.
+        operating_score: Precision, recall and worst frames are of predictions above it.
+        worst_frames: Number of worst frames to list.
+        plots: Whether to draw curves.
+        batch_size: Frames per batch of predictions.
+        num_visualizations: Number of frames to draw.
+    """
+
+    classes: tuple[str, ...] = CLASSES
+    iou_thresholds: tuple[float, ...] = (0.3, 0.5, 0.7)
+    protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
+    score_threshold: float = 0.0
+    empty_frames: str = "protocol"
+    min_score: float = 0.0
+    roi: Roi = "narrow"
+    label_version: str | None = None
+    bootstrap: int = 0
+    seed: int = 0
+    invalid_sizes: str = "error"
+    operating_score: float = 0.3
+    worst_frames: int = 10
+    plots: bool = True
+    batch_size: int = 8
+    num_visualizations: int = 8
+
+    def __post_init__(self) -> None:
+        def check(name: str, holds: Any, expected: str) -> None:
+            field = f"config.evaluation.{name}"
+            require(bool(holds), field, getattr(self, name), expected)
+
+        known = protocols.PROTOCOLS
+        names = self.protocols if isinstance(self.protocols, tuple) else ()
+        is_known = names and all(name in known for name in names)
+        is_distinct = is_known and len(set(names)) == len(names)
+        check("protocols", is_distinct, f"different ones of {', '.join(known)}")
+        ious = self.iou_thresholds if isinstance(self.iou_thresholds, tuple) else ()
+        is_good = ious and all(0 <= iou < 1 for iou in ious)
+        check("iou_thresholds", is_good, "numbers in [0, 1)")
+        for name in ("score_threshold", "min_score", "operating_score"):
+            check(name, 0 <= getattr(self, name) <= 1, "a number in [0, 1]")
+        for name, least in (("bootstrap", 0), ("batch_size", 1)):
+            is_good = getattr(self, name) >= least
+            check(name, is_good, f"an integer of at least {least}")
+        check("num_visualizations", self.num_visualizations >= 0, "an integer from 0")
+        rules = protocols.EMPTY_FRAMES
+        check("empty_frames", self.empty_frames in rules, f"one of {', '.join(rules)}")
+        is_good = self.invalid_sizes in ("error", "false_positive")
+        check("invalid_sizes", is_good, '"error" or "false_positive"')
+        roi_bounds(self.roi)
+
+    @classmethod
+    def from_config(cls, config: ConfigDict, **changes: Any) -> EvaluationOptions:
+        """How the config of a run says that it is evaluated.
+
+        Args:
+            config: Of the run; `evaluation`, `classes` and `data.label_version` are read.
+            **changes: Fields to replace.
+
+        Raises:
+            UserError: A value out of its range, or classes that the run does not have.
+        """
+        classes = tuple(config.classes)
+        if unknown := sorted(set(changes.get("classes", ())) - set(classes)):
+            raise UserError(
+                f"classes has {unknown[0]!r}, expected some of the run's: "
+                f"{', '.join(classes)}"
+            )
+        values = {
+            "classes": classes,
+            "label_version": config.data.label_version,
+            "invalid_sizes": "false_positive",
+            **config.evaluation.to_dict(),
+            **changes,
+        }
+        values["min_score"] = min(values["min_score"], values["score_threshold"])
+        return cls(**values)
+
+    @property
+    def roi_bounds(self) -> tuple[float, ...] | None:
+        """Bounds of the region of interest, or None."""
+        return roi_bounds(self.roi)
+
+    @property
+    def paper_protocol(self) -> str:
+        """Protocol of rows next to published ones: the authors', or the first."""
+        authors = protocols.AUTHORS_PROTOCOL
+        return authors if authors in self.protocols else self.protocols[0]
+
+    @property
+    def main_protocols(self) -> tuple[str, ...]:
+        """Protocols shown in full on the console: the usual ones, or else the first."""
+        usual = (protocols.RECOMMENDED, "kradar_r40", "coco101")
+        chosen = tuple(name for name in usual if name in self.protocols)
+        return chosen or self.protocols[:1]
+
+    def settings_of(self, protocol: str) -> dict[str, Any]:
+        """Score threshold and empty-frame rule of a protocol, for `results`."""
+        if protocols.get_protocol(protocol).is_fixed:
+            return {"score_threshold": self.min_score, "empty_frames": "protocol"}
+        threshold = max(self.score_threshold, self.min_score)
+        return {"score_threshold": threshold, "empty_frames": self.empty_frames}
+
+
+def evaluate_tables(
+    ground_truth: Columns,
+    predictions: Columns,
+    frames: Columns,
+    options: EvaluationOptions,
+    *,
+    kinds: Sequence[str] = ("weather",),
+) -> tuple[EvaluationSet, list[Result]]:
+    """Evaluate predictions over all frames and over every condition.
+
+    Args:
+        ground_truth: Columns as in `evaluation.evaluate`.
+        predictions: The same with scores.
+        frames: Frame table.
+        options: What to compute.
+        kinds: Columns of the frame table whose values are conditions.
+
+    Returns:
+        The evaluation set and the results of all protocols, with 95 % intervals where
+        `options.bootstrap` asks for them. The last class of every group is "mean".
+
+    Raises:
+        UserError: Wrong options or missing columns.
+        DataError: A bad row; names the table, frame and row.
+    """
+    predictions, num_invalid = repair_sizes(predictions, options.invalid_sizes)
+    sizes = np.asarray(predictions["box"], np.float64).reshape(-1, 7)[:, 3:6]
+    is_clipped = ((sizes > 1e-6) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1)
+    data = EvaluationSet(
+        ground_truth,
+        predictions,
+        classes=options.classes,
+        frames=frames,
+        roi=options.roi,
+        label_version=options.label_version,
+    )
+    data.left_out |= {
+        "predictions: size not positive, kept as false positives": num_invalid,
+        f"predictions: size clipped to {MIN_SIZE_M} m, kept": int(is_clipped.sum()),
+    }
+    results = compute_results(data, frames, options, kinds)
+    if why_no_intervals(frames, options) is None:
+        results = _with_intervals(data, frames, results, options)
+    return data, results
+
+
+def compute_results(
+    data: EvaluationSet,
+    frames: Columns,
+    options: EvaluationOptions,
+    kinds: Sequence[str] = ("weather",),
+) -> list[Result]:
+    """Results of every protocol and condition, see `evaluate_tables`."""
+    conditions: list[tuple[str, str, np.ndarray | None]] = [("all", "all", None)]
+    for kind in kinds:
+        masks = condition_masks(frames, kind)
+        conditions += [(kind, name, mask) for name, mask in masks.items()]
+    rows = []
+    for protocol, (kind, condition, mask) in itertools.product(
+        options.protocols, conditions
+    ):
+        results = data.results(
+            protocol,
+            iou_thresholds=options.iou_thresholds,
+            weights=mask,
+            curves=False,
+            **options.settings_of(protocol),
+        )
+        for start in range(0, len(results), len(data.classes)):
+            group = results[start : start + len(data.classes)]
+            rows += [
+                dataclasses.replace(result, kind=kind, condition=condition)
+                for result in (*group, _mean(group))
+            ]
+    return rows
+
+
+def _mean(group: Sequence[Result]) -> Result:
+    """The row "mean" of the classes of one space and IoU threshold, without a curve."""
+    return dataclasses.replace(
+        group[0],
+        cls="mean",
+        ap=mean_ap(group),
+        num_gt=sum(result.num_gt for result in group),
+        num_det=sum(result.num_det for result in group),
+        num_frames=max(result.num_frames for result in group),
+    )
+
+
+def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray, " F"]]:
+    """Masks of frames by value of a column of the frame table, K-Radar's values first."""
+    if kind not in frames:
+        return {}
+    column = np.asarray(frames[kind]).astype(str)
+    present = set(np.unique(column).tolist())
+    known = [name for name in ORDER.get(kind, ()) if name in present]
+    return {
+        name: column == name for name in [*known, *sorted(present.difference(known))]
+    }
+
+
+def why_no_intervals(frames: Columns, options: EvaluationOptions) -> str | None:
+    """The reason for not computing intervals, or None."""
+    if not options.bootstrap:
+        return "none requested"
+    if "sequence" not in frames:
+        return "none: the frame table has no column sequence"
+    if np.unique(np.asarray(frames["sequence"])).size < 2:
+        return "none: all frames are of one sequence"
+    return None
+
+
+def _with_intervals(
+    data: EvaluationSet,
+    frames: Columns,
+    results: list[Result],
+    options: EvaluationOptions,
+) -> list[Result]:
+    """The results with 95 % intervals: all over all frames, the main ones per weather."""
+    main = (protocols.RECOMMENDED, "kradar_r40", options.paper_protocol)
+    weathers = condition_masks(frames, "weather")
+    found: dict[tuple, tuple[float, float]] = {}
+    for name in options.protocols:
+        found |= bootstrap.intervals(
+            data,
+            frames,
+            list(itertools.product([name], SPACES, options.iou_thresholds)),
+            resamples=options.bootstrap,
+            seed=options.seed,
+            masks=weathers if name in main else {},
+            **options.settings_of(name),
+        )
+    rows = []
+    for row in results:
+        low, high = found.get(row.key, (None, None)) if row.is_defined else (None, None)
+        rows.append(dataclasses.replace(row, low=low, high=high))
+    return rows
+
+
+def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:
+    """Counts of what is not part of the numbers, by reason."""
+    fixed = [p for p in options.protocols if protocols.PROTOCOLS[p].is_fixed]
+    threshold = max(options.score_threshold, options.min_score)
+    is_low = data.score <= threshold
+    but = f" (counted by {', '.join(fixed)})" if threshold > options.min_score else ""
+    empty = data.gt_count.sum(axis=1) == 0
+    is_other = data.gt_count[data.pred.frame, data.pred.cls] == 0
+    in_empty = empty[data.pred.frame] & ~is_low
+    return {
+        **data.left_out,
+        f"predictions: score not above {threshold:g}{but}": int(is_low.sum()),
+        "frames: without ground truth (ignored by skip=frame)": int(empty.sum()),
+        "predictions: in frames without ground truth (ignored by skip=frame)": int(
+            in_empty.sum()
+        ),
+        "predictions: in frames without their class (ignored by skip=class)": int(
+            (is_other & ~is_low).sum()
+        ),
+    }
+
+
+def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
+    """Make invalid sizes, which an untrained network may predict, harmless.
+
+    Args:
+        predictions: Columns as in `evaluation.evaluate`.
+        rule: "error" leaves them as they are; "false_positive" shrinks boxes with a size
+            that is not positive to a micrometer: they match nothing but still count.
+
+    Returns:
+        The predictions and how many boxes were changed.
+    """
+    box = np.array(predictions["box"], np.float64).reshape(-1, 7)
+    is_invalid = (box[:, 3:6] <= 0).any(axis=1)
+    if rule == "error" or not is_invalid.any():
+        return predictions, 0
+    box[is_invalid, 3:6] = 1e-6
+    return {**predictions, "box": box}, int(is_invalid.sum())
+
+
+def to_row(result: Result) -> Mapping[str, Any]:
+    """A row of metrics.json and metrics.csv."""
+    return {
+        "name": f"{result.cls}/{result.condition}/{result.metric}",
+        "protocol": result.protocol,
+        "kind": result.kind,
+        "condition": result.condition,
+        "cls": result.cls,
+        "space": result.space,
+        "iou": result.iou,
+        "ap": result.ap_or_none,
+        "ap_low": result.low,
+        "ap_high": result.high,
+        "ap_official": None if np.isnan(result.ap) else result.ap,
+        "num_gt": result.num_gt,
+        "num_det": result.num_det,
+        "num_frames": result.num_frames,
+        "score_threshold": result.score_threshold,
+        "empty_frames": result.empty_frames,
+        "roi": result.roi,
+        "label_version": result.label_version,
+    }

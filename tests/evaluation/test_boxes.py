@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.core.structures import Boxes
+from radejax.evaluation import boxes
+
+
+def test_roi_names_and_bounds():
+    assert boxes.roi_bounds("narrow") == (0, 72, -6.4, 6.4, -2, 6)
+    assert boxes.roi_bounds(None) is None
+    assert boxes.roi_name((0, 72, -16, 16, -2, 7.6)) == "wide"
+    assert boxes.roi_name((0, 10, -1, 1, -2, 2)) == "0,10,-1,1,-2,2"
+    assert boxes.roi_name(None) == "none"
+    with pytest.raises(UserError, match="increasing bounds"):
+        boxes.roi_bounds((0, 0, 1, 2, 3, 4))
+
+
+def test_in_roi_looks_at_centers_only_and_includes_bounds():
+    box = np.zeros((4, 7))
+    box[:, 0] = [0, 72, 72.0001, -1e-9]
+    box[:, 3:6] = 100
+    assert boxes.in_roi(box, "narrow").tolist() == [True, True, False, False]
+    assert boxes.in_roi(box, None).all()
+
+
+def test_frame_ids():
+    np.testing.assert_array_equal(boxes.frame_ids({"frame": [3, 1]}), [3, 1])
+    np.testing.assert_array_equal(boxes.frame_ids({"frame": np.array([3.0])}), [3])
+    with pytest.raises(UserError, match="need a column 'frame', found \\['name'\\]"):
+        boxes.frame_ids({"name": ["a"]})
+    with pytest.raises(DataError, match="frame 5 occurs twice"):
+        boxes.frame_ids({"frame": [5, 1, 5]})
+    with pytest.raises(UserError, match="column 'weather' has"):
+        boxes.frame_ids({"frame": [1, 2], "weather": ["fog"]})
+
+
+def test_frame_positions_of_any_order():
+    position = boxes.frame_positions(np.array([5, 3, 5]), np.array([3, 9, 5]), "x")
+    assert position.tolist() == [2, 0, 2]
+    with pytest.raises(DataError, match="x: frame 4, row 1: no such frame among the 2"):
+        boxes.frame_positions(np.array([3, 4]), np.array([3, 5]), "x")
+    with pytest.raises(DataError, match="among the 0 frames"):
+        boxes.frame_positions(np.array([3]), np.zeros(0, int), "x")
+    assert boxes.frame_positions(np.zeros(0, int), np.zeros(0, int), "x").size == 0
+
+
+def _named(*cls, frame=0):
+    return Boxes(np.full(len(cls), frame), np.ones((len(cls), 7)), np.array(cls))
+
+
+def test_class_indices():
+    several = _named("Bicycle", "Sedan", "Bicycle Group")
+    index = boxes.class_indices(several, ("Sedan", "Bicycle"), "x")
+    assert index.tolist() == [1, 0, -1]
+    assert boxes.class_indices(_named("Tram"), ("Tram",), "x").tolist() == [0]
+    with pytest.raises(DataError, match="frame 4, row 0: unknown class 'sedan'"):
+        boxes.class_indices(_named("sedan", frame=4), ("Sedan",), "x")
+
+
+def test_read_boxes_takes_lists_and_empty_tables():
+    found = boxes.read_boxes(
+        {"frame": [1], "box": [[0, 0, 0, 1, 1, 1, 0]], "cls": ["Sedan"], "score": [1]},
+        "predictions",
+        scored=True,
+    )
+    assert (found.frame.dtype, found.box.shape) == (np.int64, (1, 7))
+    assert (found.cls[0], found.score[0]) == ("Sedan", 1)
+    empty = {"frame": [], "box": [], "cls": []}
+    assert boxes.read_boxes(empty, "x", scored=False).box.shape == (0, 7)

@@ -1,0 +1,207 @@
+import dataclasses
+import json
+import types
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.evaluation import boxes, files
+from radejax.evaluation.files import Source
+
+
+def test_ground_truth_has_to_come_from_somewhere(stored):
+    folder, source = stored
+    with pytest.raises(UserError, match="give the ground truth with"):
+        files.load(folder / "found.json", Source(), ("Sedan",))
+    with pytest.raises(FileNotFoundError, match=r"none\.json"):
+        files.load(folder / "none.json", source, ("Sedan",))
+    (folder / "frames.json").write_text("[]")
+    with pytest.raises(DataError, match=r"frames\.json: expected columns"):
+        files.load(folder / "found.json", source, ("Sedan",))
+    (folder / "frames.json").write_text('{"frame": [1, 2], "name": ["a"]}')
+    with pytest.raises(DataError, match="column 'name' has 1 entries for 2 frames"):
+        files.load(folder / "found.json", source, ("Sedan",))
+
+
+def test_ground_truth_by_id_without_a_frame_table(random_scene, tmp_path):
+    truth, found, _ = random_scene(8)
+    files.write_table(tmp_path / "found.npz", found)
+    files.write_table(tmp_path / "truth.npz", truth)
+    source = Source(ground_truth=str(tmp_path / "truth.npz"))
+    _, _, frames, _ = files.load(tmp_path / "found.npz", source, ("Sedan",))
+    both = np.union1d(truth["frame"], found["frame"])
+    np.testing.assert_array_equal(frames["frame"], both)
+
+
+def test_ground_truth_of_a_report(stored):
+    folder, source = stored
+    expected = files.load(folder / "found.json", source, ("Sedan",))
+    beside = dataclasses.replace(source, frames=None)
+    truth = files.read_table(folder / "truth.npz", expected[2], scored=False)
+    report = folder / "run" / "evaluation"
+    report.mkdir(parents=True)
+    files.write_table(report / "ground_truth.npz", truth, expected[2])
+    (report / "frames.json").write_bytes((folder / "frames.json").read_bytes())
+    for place in (folder / "truth.npz", report, report.parent):
+        other = dataclasses.replace(beside, ground_truth=str(place))
+        found = files.load(folder / "found.json", other, ("Sedan",))
+        for a, b in zip(found[:3], expected[:3], strict=True):
+            assert a.keys() == b.keys()
+            for name in a:
+                np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_a_part_of_the_frames(stored, random_scene):
+    folder, source = stored
+    _, _, whole, _ = files.load(folder / "found.json", source, ("Sedan",))
+    part = dataclasses.replace(source, weather=("fog", "rain"))
+    truth, found, frames, _ = files.load(folder / "found.json", part, ("Sedan",))
+    chosen = whole["frame"][np.isin(whole["weather"], ("fog", "rain"))]
+    assert 0 < chosen.size < whole["frame"].size
+    np.testing.assert_array_equal(frames["frame"], chosen)
+    for table in (truth, found):
+        assert set(table["frame"]) <= set(chosen.tolist())
+        assert len(table["box"]) == len(table["frame"]) > 0
+    none = dataclasses.replace(source, sequences=(77,))
+    with pytest.raises(UserError, match="no frames of sequence 77; there are "):
+        files.load(folder / "found.json", none, ("Sedan",))
+
+
+def test_labels_of_kradar(shared, tmp_path):
+    folder = shared / "data" / "kradar"
+    source = Source(labels=str(folder / "labels_v2_1.zip"), split="test")
+    first = (folder / "split" / "test.txt").read_text().splitlines()[0]
+    record = {"frame": first.replace(",", "/"), "cls": "Sedan", "score": 0.5}
+    record["box"] = [20, 0, 0, 4, 2, 1.5, 0]
+    (tmp_path / "p.json").write_text(json.dumps([record]))
+    truth, found, frames, left_out = files.load(tmp_path / "p.json", source, ("Sedan",))
+    assert frames["frame"].size == 17536
+    assert found["frame"].tolist() == [0]
+    assert truth["frame"].size > 10000
+    assert any(name.startswith("labels: ") for name in left_out)
+
+
+def test_tables_from_frames():
+    frame = types.SimpleNamespace(
+        sequence=3,
+        name="00001_00001",
+        weather="fog",
+        environment="urban",
+        time="day",
+        boxes=np.ones((2, 7)),
+        classes=["Sedan", "Bicycle"],
+        is_simulated=False,
+    )
+    empty = types.SimpleNamespace(
+        **{**vars(frame), "boxes": np.zeros((0, 7)), "classes": [], "weather": "rain"}
+    )
+    truth, table = files.tables_from_frames([empty, frame])
+    assert truth["frame"].tolist() == [1, 1]
+    assert truth["cls"].tolist() == ["Sedan", "Bicycle"]
+    assert table["weather"].tolist() == ["rain", "fog"]
+    none, _ = files.tables_from_frames([])
+    assert none["box"].shape == (0, 7)
+
+
+# Tables -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def scene(random_scene):
+    return random_scene(2)
+
+
+def assert_same(one, other):
+    for column, values in other.items():
+        np.testing.assert_array_equal(one[column], values)
+
+
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+@pytest.mark.parametrize("by_key", [True, False])
+def test_round_trip_is_exact(tmp_path, scene, suffix, by_key):
+    truth, found, frames = scene
+    for name, table, scored in (("p", found, True), ("t", truth, False)):
+        path = tmp_path / f"{name}.{suffix}"
+        files.write_table(path, table, frames if by_key else None)
+        read = files.read_table(path, frames, scored=scored)
+        assert_same(read, table)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"p.{suffix}", f"t.{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", ["npz", "json"])
+def test_empty_tables(tmp_path, scene, suffix):
+    nothing = {k: v[:0] for k, v in scene[1].items()}
+    path = tmp_path / f"p.{suffix}"
+    files.write_table(path, nothing, scene[2])
+    read = files.read_table(path, scene[2])
+    assert read["box"].shape == (0, 7)
+    assert read["frame"].dtype == np.int64
+
+
+def test_keys_survive_another_selection_of_frames(tmp_path, scene):
+    _, found, frames = scene
+    files.write_table(tmp_path / "p.json", found, frames)
+    shifted = {**frames, "frame": frames["frame"] + 1000}
+    read = files.read_table(tmp_path / "p.json", shifted)
+    np.testing.assert_array_equal(read["frame"], found["frame"] + 1000)
+
+
+def test_frame_keys():
+    ids = {"frame": np.array([4, 5])}
+    assert boxes.frame_keys(ids) == ["4", "5"]
+    named = {**ids, "name": np.array(["00033_00001.txt", "00034_00002"])}
+    assert boxes.frame_keys(named) == ["00033_00001", "00034_00002"]
+    named["sequence"] = np.array([1, 12])
+    assert boxes.frame_keys(named) == ["1/00033_00001", "12/00034_00002"]
+    named["name"] = np.array(["1/00033_00001", "12/00034_00002"])
+    assert boxes.frame_keys(named) == ["1/00033_00001", "12/00034_00002"]
+
+
+def test_json_records(tmp_path):
+    frames = {"frame": np.array([10, 11]), "name": np.array(["1/a", "1/b"])}
+    box = [1, 2, 3, 4, 5, 6, 0.5]
+    record = {"cls": "Sedan", "box": box, "score": 0.5}
+    spelled = {"cls": "Sedan", "score": 0.5, **dict(zip("xyzlwh", box, strict=False))}
+    for form in (
+        {"frame": "1/b", **record},
+        {"frame": "1/b.txt", **record},
+        {"frame": 11, **spelled, "yaw": 0.5},
+    ):
+        path = tmp_path / "p.json"
+        path.write_text(json.dumps([form]))
+        read = files.read_table(path, frames)
+        assert_same(
+            read,
+            {"frame": [11], "cls": ["Sedan"], "box": [box], "score": [0.5]},
+        )
+
+
+def test_wrong_files_are_named(tmp_path):
+    frames = {"frame": np.array([0]), "name": np.array(["1/a"])}
+
+    def raises(name, content, match, error=DataError):
+        path = tmp_path / name
+        path.write_bytes(content.encode())
+        with pytest.raises(error, match=match):
+            files.read_table(path, frames)
+
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        files.read_table(tmp_path / "none.json")
+    raises("a.txt", "", "cannot read '.txt'; known: .npz", UserError)
+    raises("a.npz", "nonsense", "a.npz")
+    raises("a.json", "{", "a.json is not valid JSON")
+    raises("a.json", "{}", "expected a list of records")
+    raises("a.json", "[1]", "row 0: expected a record, got 1")
+    raises("a.json", '[{"frame": 0, "cls": "Sedan", "score": 1}]', "frame 0: box is")
+    one = '{"frame": 0, "cls": "Sedan", "box": [1,2,3,4,5,6,7]'
+    raises("a.json", f'[{one}, "score": 1}}, {one}}}]', "row 1: lacks 'score'")
+    raises("a.json", f'[{one}, "score": "high"}}]', "score 'high', expected 7 numbers")
+    long = json.dumps({"frame": 0, "cls": "S" * 999, "box": [1] * 7, "score": 1})
+    raises("a.json", f"[{long}]", "row 0: cls has over 200 characters")
+    named = json.dumps({"frame": "1/b", "cls": "S", "box": [1] * 7, "score": 1})
+    raises("a.json", f"[{named}]", "row 0: no frame '1/b' among the 1 frames")
+    with pytest.raises(DataError, match="frames are named"):
+        files.read_table(tmp_path / "a.json")
+    with pytest.raises(UserError, match=r"cannot write '\.txt'"):
+        files.write_table(tmp_path / "b.txt", {"frame": [], "box": [], "cls": []})
