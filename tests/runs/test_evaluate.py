@@ -133,6 +133,7 @@ class _Loaded:
     model: None = None
     variables: None = None
     step: int = 3
+    run: str = "run"
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     written: dict[str, Any] = {}
     data = SimpleNamespace(choosing_split=choosing)
     loaded = _Loaded(_config())
-    monkeypatch.setattr(evaluate, "load", lambda *_, **__: loaded)
+    monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
     monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
     monkeypatch.setattr(evaluate, "evaluate", lambda *_, **named: written.update(named))
     evaluate.evaluate_run(tmp_path, step=step, split=split)
