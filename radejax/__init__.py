@@ -20,7 +20,7 @@ _LAZY = {
     "Scene": "visualize.style",
     "UserError": "core.errors",
     "draw_frame": "visualize.draw",
-    "evaluate": "evaluation.average_precision",
+    "evaluate": "evaluation",
     "load_config": "core.config",
     "load_model": "inference.saved",
     "predict_dataset": "inference.predict",
