@@ -43,6 +43,7 @@ def process_pool(
     Raises:
         UserError: A process was killed or could not start.
     """
+    others = multiprocessing.active_children()
     pool = concurrent.futures.ProcessPoolExecutor(
         num_workers, CONTEXT, _start, (start, *arguments)
     )
@@ -52,7 +53,10 @@ def process_pool(
             try:
                 yield pool.submit
             except BaseException:
-                pool.shutdown(cancel_futures=True)
+                # An interrupt must not wait for what the workers are doing.
+                for process in multiprocessing.active_children():
+                    if process not in others:
+                        process.terminate()
                 raise
     except BrokenProcessPool:
         raise UserError(
