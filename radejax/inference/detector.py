@@ -19,6 +19,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
 from radejax.core.structures import Array, Batch, Detections
 from radejax.data.cameras import CameraOptions
+from radejax.detection.decode import DecodeOptions
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.program import detect
 from radejax.inference.saved import SavedModel, Step, load_model, load_torch
@@ -84,14 +85,11 @@ class Detector:
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = CameraOptions.of_config(config.data)
         self.classes = tuple(config.classes)
-        decode = dict(config.decode)
+        decode = dataclasses.asdict(DecodeOptions(**config.decode))
         self.score_threshold: float = decode.pop("score_threshold")
         self.nms_iou: float = decode.pop("nms_iou")
         self.roi = decode.pop("roi")
         self.decode_options: dict[str, Any] = decode
-        for name in ("score_threshold", "nms_iou"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"config.decode.{name}", value, "from 0 to 1")
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = (
             NamedSharding(self.sharding.mesh, PartitionSpec())

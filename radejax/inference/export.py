@@ -51,18 +51,20 @@ tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
 
 # {name}: 3D object detection in 4D radar tensors
 
-Format: {format}. Classes: {classes}. Input: projections [B, {shape}]. `config.json` holds
-the config, the axes of the sensor and what is left out ({left_out}); `model.safetensors` the
-weights. Use: `radejax.Detector.from_checkpoint(folder)`, or {use}; inputs and outputs are
-described in docs/deploy.md of radejax.{backbone}
-
+- Classes: {classes}
+- Input: projections [B, {shape}]; inputs and outputs are described in docs/deploy.md of
+  radejax
+- Use: `radejax.Detector.from_checkpoint(folder)`{use}
+- `config.json`: config and axes of the sensor; `model.safetensors`: weights, {dtype}
+- Left out: {left_out}
+{backbone}
 {origin}
 """
 _USE = {
-    "stablehlo": "`from load import load; detect = load()`, which needs `pip install jax "
-    "flatbuffers`",
-    "onnx": "ONNX Runtime with `detector.onnx`, or `network.onnx` before decoding",
-    "huggingface": "download the folder from the Hub first",
+    "stablehlo": ", or `from load import load; detect = load()`, which needs `pip install "
+    "jax flatbuffers`",
+    "onnx": ", or ONNX Runtime with `detector.onnx`, or `network.onnx` before decoding",
+    "huggingface": "",
 }
 
 
@@ -118,7 +120,9 @@ def export(
     if kind == "stablehlo":
         loader = pathlib.Path(exported_loader.__file__)
         files.write_text(folder / "load.py", loader.read_text())
-    files.write_text(folder / "README.md", _readme(detector, kind, content["left_out"]))
+    dtype = "float16" if half else "float32"
+    text = _readme(detector, kind, content["left_out"], dtype)
+    files.write_text(folder / "README.md", text)
     return {
         "kind": kind,
         "folder": str(folder),
@@ -127,18 +131,19 @@ def export(
     }
 
 
-def _readme(detector: Detector, kind: str, left_out: Sequence[str]) -> str:
+def _readme(detector: Detector, kind: str, left_out: Sequence[str], dtype: str) -> str:
+    """The model card, which is short: docs/deploy.md has the rest."""
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _README.format(
         name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
-        format=kind,
+        dtype=dtype,
         classes=", ".join(detector.classes),
         shape=", ".join(map(str, detector.grid.projection_shape)),
         left_out=", ".join(left_out) or "nothing",
         use=_USE[kind],
-        backbone="\nThe license of the frozen DINOv3 weights restricts redistribution: "
-        "download them from their owner and pass `image_backbone=FOLDER`."
+        backbone="The license of the frozen DINOv3 weights restricts redistribution: "
+        "download them from their owner and pass `image_backbone=FOLDER`.\n"
         * bool(left_out),
         origin="Trained on simulated data only: no use on frames of a real radar."
         if is_simulated

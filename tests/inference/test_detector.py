@@ -264,8 +264,14 @@ def test_arguments_by_name_and_wrong_ones() -> None:
             r"batch_sizes is \(0,\), expected integers of at least",
         ),
         ({"batch_sizes": ()}, r"batch_sizes is \(\), expected"),
-        ({"score_threshold": float("nan")}, "score_threshold is nan, expected from 0"),
-        ({"nms_iou": 1.5}, r"config\.decode\.nms_iou is 1\.5, expected from 0 to 1"),
+        (
+            {"score_threshold": float("nan")},
+            "score_threshold is nan, expected a number from 0",
+        ),
+        (
+            {"nms_iou": 1.5},
+            r"config\.decode\.nms_iou is 1\.5, expected a number from 0 to 1",
+        ),
     ):
         with pytest.raises(UserError, match=message):
             small.detector(**wrong)
