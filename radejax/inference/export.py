@@ -142,7 +142,7 @@ def _readme(detector: Detector, kind: str, left_out: Sequence[str], dtype: str) 
         shape=", ".join(map(str, detector.grid.projection_shape)),
         left_out=", ".join(left_out) or "nothing",
         use=_USE[kind],
-        backbone="The license of the frozen DINOv3 weights restricts redistribution: "
+        backbone="\nThe license of the frozen DINOv3 weights restricts redistribution: "
         "download them from their owner and pass `image_backbone=FOLDER`.\n"
         * bool(left_out),
         origin="Trained on simulated data only: no use on frames of a real radar."
