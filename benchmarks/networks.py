@@ -76,8 +76,8 @@ def network(path, dtype, **fields):
 
 def torch_state(model, variables):
     """Tensors of a `DinoRade` by the names of `torch_dinorade.DinoRade`."""
-    radar, params = model.radar, dict(variables["params"])
-    names = radenet_torch.module_names(len(radar.widths), radar.heads)
+    params = dict(variables["params"])
+    names = radenet_torch.module_names(len(model.widths), model.heads)
     for part in ("radar_neck", "camera_neck"):
         names |= radenet_torch.neck_names(f"image_fusion/{part}", f"{part}.neck")
     for path in flax.traverse_util.flatten_dict(params):

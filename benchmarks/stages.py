@@ -15,6 +15,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 from ml_collections import ConfigDict
+from module_calls import ModuleCall, module_calls
 from tabulate import tabulate
 
 from radejax import models
@@ -26,7 +27,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import placeholder
 from radejax.inference.saved import SavedModel
-from radejax.models.parts import Call, calls_of
 from radejax.simulation.config import SimulationConfig
 
 STAGES = ("transfer", "projection", "network", "decode + NMS")
@@ -153,11 +153,11 @@ def _parts(
     model: nn.Module, variables: Mapping[str, Any], inputs: tuple[Any, ...]
 ) -> dict[str, Callable[[], Any]]:
     """Calls of the network's parts on what they get in a call of the network."""
-    calls: dict[str, Call] = {}
+    calls: dict[str, ModuleCall] = {}
 
     @jax.jit
     def arguments(variables: Any, *inputs: Any) -> dict[str, tuple[Any, ...]]:
-        calls.update(calls_of(lambda: model.apply(variables, *inputs, train=False)))
+        calls.update(module_calls(lambda: model.apply(variables, *inputs, train=False)))
         return {name: call.args for name, call in calls.items()}
 
     def part(name: str, given: tuple[Any, ...]) -> Callable[[], Any]:

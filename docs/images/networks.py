@@ -4,7 +4,7 @@
 
 writes docs/images/radenet.png and docs/images/dinorade.png. Shapes, channels and numbers of
 parameters are read from the models of configs/radenet.py and configs/dinorade.py as they
-are traced (`models.parts.calls_of`); only the places on the sheet are written here.
+are traced (`flax.linen.intercept_methods`); only the places on the sheet are written here.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import flax.linen as nn
 import jax
 import numpy as np
 from sheet import Block, Point, Sheet
@@ -24,7 +25,6 @@ from radejax import models
 from radejax.core.config import load_config
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.inputs import placeholder
-from radejax.models.parts import calls_of
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 DATA, RADAR, ATTENTION, CAMERA, HEADS = (
@@ -68,12 +68,18 @@ class Network:
         kinds: dict[str, str] = {}
 
         def run(*inputs: Any) -> Any:
-            variables = []
-            calls = calls_of(
-                lambda: variables.append(model.init(jax.random.key(0), *inputs)), 2
-            )
-            kinds.update({k: type(c.module).__name__ for k, c in calls.items()})
-            return variables[0], {k: (c.args, c.output) for k, c in calls.items()}
+            calls: dict[str, tuple[Any, Any]] = {}
+
+            def record(call: Any, args: Any, kwargs: Any, context: Any) -> Any:
+                output = call(*args, **kwargs)
+                path = context.module.path
+                if context.method_name == "__call__" and 1 <= len(path) <= 2:
+                    calls["/".join(path)] = (args, output)
+                    kinds["/".join(path)] = type(context.module).__name__
+                return output
+
+            with nn.intercept_methods(record):
+                return model.init(jax.random.key(0), *inputs), calls
 
         variables, calls = jax.eval_shape(run, *inputs)
         sizes = {

@@ -3,42 +3,112 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import flax.linen as nn
 
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
-from radejax.models import dinorade_config, radenet
+from radejax.models.checks import check_choice
 from radejax.models.dinorade import DinoRade
+from radejax.models.fusion import Fusion
+from radejax.models.lifting import LiftingAxes
+from radejax.models.radenet import DTYPES, RadeNet
+from radejax.models.vit import ViT
 
-_MAKERS = {"radenet": radenet.from_config, "dinorade": dinorade_config.from_config}
+_VIT_FIELDS = (
+    "hidden_size",
+    "num_layers",
+    "num_heads",
+    "mlp_dim",
+    "patch_size",
+    "num_registers",
+    "gated_mlp",
+    "layer_scale",
+    "attention",
+)
+_IMAGE_FIELDS = ("kind", "size", "freeze", "standardize", "resnet_width", *_VIT_FIELDS)
+_GRID_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
 
 
 def build(config: Mapping[str, Any]) -> nn.Module:
     """The model that `config.model` describes.
 
     Args:
-        config: A mapping with `name`, "radenet" or "dinorade", and exactly the
-            fields of that model.
+        config: A mapping with `name`, "radenet" or "dinorade", and exactly the fields of
+            that model. Those of RADE-Net are attributes of `RadeNet`, `cbam` may be
+            "off"; DinoRADE has the sections `image`, `fusion` and `query_grid` as well.
 
     Returns:
         A Flax module, without parameters.
 
     Raises:
-        UserError: The name is unknown, a field is missing, unknown or impossible.
+        UserError: The name is unknown, a field is missing, unknown or out of range.
     """
-    if config.get("name") not in tuple(_MAKERS):  # also what cannot be looked up
-        name = repr(config["name"]) if "name" in config else "missing"
-        raise UserError(
-            f"config.model.name is {name}; available models: {sorted(_MAKERS)}"
-        )
-    return _MAKERS[config["name"]](config)
+    fields = _plain(config)
+    name = fields.pop("name", None)
+    check_choice("name", name, ("radenet", "dinorade"))
+    sections = ("image", "fusion", "query_grid") if name == "dinorade" else ()
+    _check_keys(fields, {*_own_fields(RadeNet), *sections}, "")
+    if fields["cbam"] == "off":
+        fields["cbam"] = None
+    try:
+        return DinoRade(**_with_camera(fields)) if sections else RadeNet(**fields)
+    except TypeError as error:
+        raise UserError(f"config.model has a value of a wrong type: {error}") from None
+
+
+def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
+    """Attributes of `DinoRade` from the fields of its config."""
+    image, fusion, grid = (fields.pop(k) for k in ("image", "fusion", "query_grid"))
+    fusion_fields = _own_fields(Fusion) - {"num_groups", "dtype", "remat"}
+    _check_keys(image, _IMAGE_FIELDS, "image.")
+    _check_keys(fusion, fusion_fields, "fusion.")
+    _check_keys(grid, _GRID_FIELDS, "query_grid.")
+    check_choice("image.kind", image["kind"], ("vit", "resnet50"))
+    vit = None
+    if image["kind"] == "vit":
+        activation = "silu" if image["gated_mlp"] else "gelu"
+        vit = ViT(**{name: image[name] for name in _VIT_FIELDS}, activation=activation)
+    return fields | {
+        "vit": vit,
+        "fusion": Fusion(**fusion),
+        "query_grid": LiftingAxes(**grid, num_elevation=fusion["num_elevation"]),
+        "image_size": image["size"],
+        "freeze": image["freeze"],
+        "resnet_width": image["resnet_width"],
+        "standardize_image": image["standardize"],
+    }
+
+
+def _plain(config: Any) -> Any:
+    """Dictionaries and tuples, whatever mappings and sequences a config is made of."""
+    if isinstance(config, list | tuple):
+        return tuple(map(_plain, config))
+    if isinstance(config, Mapping) or hasattr(config, "items"):
+        return {name: _plain(value) for name, value in config.items()}
+    return config
+
+
+def _own_fields(module: type[nn.Module]) -> set[str]:
+    return {f.name for f in dataclasses.fields(module)} - {"parent", "name"}
+
+
+def _check_keys(fields: Any, expected: Collection[str], section: str) -> None:
+    """Raise `UserError` naming fields that are unknown or missing."""
+    if not isinstance(fields, Mapping):
+        raise UserError(f"config.model.{section[:-1]} is {fields!r}, expected fields")
+    for text, names in (
+        ("is not a field of this model", set(fields) - set(expected)),
+        ("is missing", set(expected) - set(fields)),
+    ):
+        if names:
+            raise UserError(f"config.model.{section}{min(names)} {text}")
 
 
 def has_camera(model: nn.Module) -> bool:
-    """Whether a model looks at images."""
+    """Whether a model takes images."""
     return isinstance(model, DinoRade)
 
 
@@ -48,27 +118,21 @@ def with_dtype(model: nn.Module, dtype: str) -> nn.Module:
     Raises:
         UserError: Neither "float32" nor "bfloat16".
     """
-    if dtype not in radenet.DTYPES:
-        raise UserError(f"dtype is {dtype!r}, expected one of {radenet.DTYPES}")
-    if has_camera(model):
-        return model.clone(radar=model.radar.clone(dtype=dtype, parent=None))
+    if dtype not in DTYPES:
+        raise UserError(f"dtype is {dtype!r}, expected one of {DTYPES}")
     return model.clone(dtype=dtype)
 
 
-def map_grid(
-    grid: RadarGrid, model: nn.Module, azimuth_mapping: AzimuthMapping
-) -> RadarGrid:
+def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: AzimuthMapping) -> RadarGrid:
     """Grid of the maps that a model makes from projections on `grid`.
 
     Args:
         grid: Of the sensor.
-        model: Pads to `pad_multiple` and, if `crop_output`, crops again; a
-            radar-camera model does so in its `radar` part.
+        model: Pads to `pad_multiple` and, if `crop_output`, crops again.
         azimuth_mapping: See `RadarGrid.padded`.
     """
-    radar = model.radar if has_camera(model) else model
-    padded = grid.padded(radar.pad_multiple, azimuth_mapping)
-    if not radar.crop_output:
+    padded = grid.padded(model.pad_multiple, azimuth_mapping)
+    if not model.crop_output:
         return padded
     return dataclasses.replace(
         padded,

@@ -15,18 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Real
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.core.structures import DetectionMaps
 from radejax.geometry.camera import Camera
-from radejax.models import radenet
 from radejax.models.camera_neck import CameraNeck
+from radejax.models.checks import check_size
 from radejax.models.fusion import Fusion
 from radejax.models.image import normalize
 from radejax.models.lifting import (
+    MARGIN_PX,
     LiftingAxes,
     ReferencePoints,
     reference_points,
 )
+from radejax.models.radenet import RadeNet
 from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
 from radejax.models.vit import ViT
 
@@ -37,14 +39,12 @@ checkpoints must leave out."""
 _SCOPE = f"{IMAGE_BACKBONE}/"
 
 
-class DinoRade(nn.Module):
-    """Radar-camera detector.
+class DinoRade(RadeNet, kw_only=True):
+    """Radar-camera detector: a RADE-Net whose features are fused with an image.
 
     Attributes:
-        radar: The radar branch, neck and heads: a RADE-Net whose parts this module
-            has under the same names.
-        vit: Fields of the image transformer, or None for a ResNet-50.
-        fusion: Fields of `Fusion`.
+        vit: The image transformer, or None for a ResNet-50.
+        fusion: Fusion of the two maps; takes groups, dtype and remat of this module.
         query_grid: Centers of the radar queries.
         image_size: Height and width of the images.
         freeze: No gradients through the image backbone.
@@ -52,38 +52,61 @@ class DinoRade(nn.Module):
         standardize_image: ImageNet's mean and deviation; False scales to [0, 1].
     """
 
-    radar: radenet.RadeNet
     vit: ViT | None
-    fusion: Mapping[str, Any]
+    fusion: Fusion
     query_grid: LiftingAxes
     image_size: tuple[int, int] = (720, 1280)
     freeze: bool = True
     resnet_width: int = 64
     standardize_image: bool = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_size("image.resnet_width", self.resnet_width)
+        require(
+            self.freeze or self.vit is not None,
+            "config.model.image.freeze",
+            self.freeze,
+            "True for a ResNet, whose first stages have fixed batch statistics",
+        )
+        stride = STRIDE if self.vit is None else self.vit.patch_size
+        require(
+            len(self.image_size) == 2
+            and all(n >= stride and n % stride == 0 for n in self.image_size),
+            "config.model.image.size",
+            self.image_size,
+            f"height and width, multiples of {stride}",
+        )
+        require(
+            self.fusion.out_of_view == "drop" or self.image_size[1] > 2 * MARGIN_PX,
+            "config.model.image.size",
+            self.image_size,
+            f"a width above {2 * MARGIN_PX} for config.model.fusion.out_of_view = "
+            f"'official', which leaves out {MARGIN_PX} pixels left and right",
+        )
+        require(
+            self.decoder_width % self.fusion.num_heads == 0,
+            "config.model.fusion.num_heads",
+            self.fusion.num_heads,
+            f"a divisor of decoder_width = {self.decoder_width}",
+        )
+
     def setup(self) -> None:
-        radar, dtype = self.radar, jnp.dtype(self.radar.dtype)
-        blocks = radar.remat != "none"
-        backbone, neck, heads = radenet.radar_parts(radar)
-        self.backbone, self.neck, self.heads = backbone(), neck(), heads()
+        shared = self._shared()
+        dtype, width = shared["dtype"], self.decoder_width
         if self.vit is None:
             trunk = ResNetTrunk(self.resnet_width, dtype=dtype)
             self.image_backbone: ResNetTrunk | ViT = trunk
             self.image_neck: ResNetNeck | CameraNeck = ResNetNeck(
-                radar.decoder_width, self.resnet_width, dtype=dtype
+                width, self.resnet_width, dtype=dtype
             )
         else:
-            self.image_backbone = self.vit.clone(
-                dtype=dtype, remat=blocks and not self.freeze, parent=None
-            )
-            self.image_neck = CameraNeck(radar.decoder_width, dtype)
-        self.image_fusion = Fusion(
-            **self.fusion,
-            num_groups=radar.num_groups,
-            dtype=dtype,
-            remat=blocks,
-        )
+            remat = shared["remat"] and not self.freeze
+            self.image_backbone = self.vit.clone(dtype=dtype, remat=remat, parent=None)
+            self.image_neck = CameraNeck(width, dtype)
+        self.image_fusion = self.fusion.clone(**shared, parent=None)
 
+    @nn.compact
     def __call__(
         self,
         projection: Float[jax.Array, "B R A DE"],
@@ -111,8 +134,7 @@ class DinoRade(nn.Module):
             UserError: The image has another size than `image_size`, or image and
                 camera do not fit together.
         """
-        radar = self.radar
-        padded = radenet.padded_input(projection, radar)
+        padded = self._padded(projection)
         camera_map = reference = None
         if image is not None and camera is not None:
             reference = self._reference(camera, padded.shape)
@@ -122,11 +144,10 @@ class DinoRade(nn.Module):
                 f"{'camera' if image is None else 'image'} is given without "
                 f"{'image' if image is None else 'camera'}: give both or none"
             )
-        x = self.backbone(padded)
-        elevation = padded[..., radar.doppler_bins :]
+        x = self._features(padded)
+        elevation = padded[..., self.doppler_bins :]
         x = self.image_fusion(x, elevation, camera_map, reference, train=train)
-        maps = self.heads(self.neck(x))
-        return radenet.cropped_output(maps, projection, radar)
+        return self._maps(x, projection)
 
     def embed(self, image: Real[jax.Array, "B H W 3"]) -> Float[jax.Array, "B h w C"]:
         """What the image backbone makes of images: `__call__` takes it in their place.
@@ -169,7 +190,7 @@ class DinoRade(nn.Module):
         b, r, a = shape[:3]
         if isinstance(camera, Camera):
             arrays = jax.tree.map(jnp.asarray, camera)
-            out_of_view = self.fusion["out_of_view"]
+            out_of_view = self.fusion.out_of_view
             camera = reference_points(arrays, self.query_grid, r, a, out_of_view)
         expected = (r, a, self.query_grid.num_elevation)
         found = camera.is_valid.shape

@@ -7,15 +7,16 @@ References:
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Real
 
-from radejax.core.errors import UserError
+from radejax.core.errors import require
 from radejax.core.structures import Array
+from radejax.models.checks import check_choice, check_size
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.layers import Dense
 from radejax.models.lifting import (
@@ -64,6 +65,24 @@ class Fusion(nn.Module):
     chunk_size: int = 0
     dtype: Any = jnp.float32
     remat: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("num_heads", "num_points", "num_elevation"):
+            check_size(f"fusion.{name}", getattr(self, name))
+        check_size("fusion.chunk_size", self.chunk_size, least=0)
+        for name, kind in (
+            ("weighting", WeightingKind),
+            ("gate", GateKind),
+            ("out_of_view", OutOfViewRule),
+        ):
+            check_choice(f"fusion.{name}", getattr(self, name), get_args(kind))
+        require(
+            0 <= self.dropout < 1,
+            "config.model.fusion.dropout",
+            self.dropout,
+            "a number from 0 to below 1",
+        )
 
     @nn.compact
     def __call__(
@@ -139,11 +158,8 @@ class Fusion(nn.Module):
         if self.gate == "bin":
             x = nn.relu(Dense(c // 2, dtype=self.dtype, name="gate_hidden")(x))
             return nn.sigmoid(Dense(1, dtype=self.dtype, name="gate_out")(x))
-        if self.gate == "channel":
-            x = nn.relu(Dense(c, dtype=self.dtype, name="gate_hidden")(x))
-            gate = nn.sigmoid(Dense(c, dtype=self.dtype, name="gate_out")(x))
-            return 1 - gate
-        raise UserError(f"gate must be 'channel' or 'bin', got {self.gate!r}")
+        x = nn.relu(Dense(c, dtype=self.dtype, name="gate_hidden")(x))
+        return 1 - nn.sigmoid(Dense(c, dtype=self.dtype, name="gate_out")(x))
 
     def _has_camera(
         self, reference: ReferencePoints, mean: Float[jax.Array, "B R A E"]

@@ -21,7 +21,6 @@ import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float
 
-from radejax.core.errors import UserError
 from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
@@ -196,16 +195,11 @@ def query_weights(
 
     "drop": equal over the valid ones, all zero where none is. "official": equal over
     all, valid or not.
-
-    Raises:
-        UserError: The rule is neither.
     """
     if out_of_view == "official":
         return jnp.full(is_valid.shape, 1.0 / is_valid.shape[-1], jnp.float32)
-    if out_of_view == "drop":
-        weights = is_valid.astype(jnp.float32)
-        return weights / jnp.maximum(weights.sum(-1, keepdims=True), 1.0)
-    raise UserError(f"out_of_view must be 'drop' or 'official', got {out_of_view!r}")
+    weights = is_valid.astype(jnp.float32)
+    return weights / jnp.maximum(weights.sum(-1, keepdims=True), 1.0)
 
 
 class WeightingNetwork(nn.Module):
@@ -231,15 +225,11 @@ class WeightingNetwork(nn.Module):
             return jnp.ones((*elevation.shape[:3], self.num_elevation))
         if self.kind == "mlp":
             x = nn.relu(Dense(64, dtype=self.dtype, name="hidden")(elevation))
-        elif self.kind == "cnn":
+        else:
             x = elevation
             for i, features in enumerate((32, 64, 32), 1):
                 x = Conv(features, dtype=self.dtype, name=f"conv_{i}")(x)
                 x = nn.relu(GroupNorm(8, dtype=self.dtype, name=f"norm_{i}")(x))
-        else:
-            raise UserError(
-                f"weighting must be 'mlp', 'cnn' or 'off', got {self.kind!r}"
-            )
         logits = Dense(self.num_elevation, dtype=self.dtype, name="out")(x)
         return nn.softmax(logits.astype(jnp.float32), -1)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import flax.linen as nn
 import jax
@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from radejax.core.errors import UserError
+from radejax.core.errors import require
+from radejax.models.checks import check_choice, check_size
 from radejax.models.image import check_image
 
 AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
@@ -75,6 +76,20 @@ class ViT(nn.Module):
     attention: AttentionKind = "auto"
     dtype: Any = jnp.float32
     remat: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
+        for name in names:
+            check_size(f"image.{name}", getattr(self, name))
+        check_size("image.num_registers", self.num_registers, least=0)
+        check_choice("image.attention", self.attention, get_args(AttentionKind))
+        require(
+            self.hidden_size % (4 * self.num_heads) == 0,
+            "config.model.image.hidden_size",
+            self.hidden_size,
+            f"a multiple of 4 channels for each of {self.num_heads} heads",
+        )
 
     @property
     def num_prefix(self) -> int:
@@ -213,14 +228,7 @@ def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) 
 
     Returns:
         Two arrays `[rows * columns, head_dim]`, float32.
-
-    Raises:
-        UserError: `head_dim` is not a multiple of 4.
     """
-    if head_dim % 4:
-        raise UserError(
-            f"attention heads need a multiple of 4 channels, got {head_dim}"
-        )
     frequency = theta ** -(np.arange(head_dim // 4) * 4.0 / head_dim)
 
     def axis_angles(count: int) -> np.ndarray:
@@ -272,9 +280,6 @@ def attend(
     the whole score matrix in memory. "cudnn" is its flash form, for half precision
     on an NVIDIA GPU. "auto" is "cudnn" where that runs, "blocked" on CPUs, else
     "xla". All are exact.
-
-    Raises:
-        UserError: `kind` is none of these.
     """
     plain = jax.nn.dot_product_attention
     if kind == "auto":
@@ -288,9 +293,7 @@ def attend(
         )
     if kind == "blocked":
         return _attend_blocked(query, key, value)
-    if kind in ("xla", "cudnn"):
-        return plain(query, key, value, implementation=kind)
-    raise UserError(f"attention must be auto, blocked, xla or cudnn, got {kind!r}")
+    return plain(query, key, value, implementation=kind)
 
 
 def _attend_blocked(

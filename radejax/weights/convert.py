@@ -22,7 +22,6 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import flax.linen as nn
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
@@ -159,16 +158,15 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
     return tuple(reversed(range(ndim)))
 
 
-def variable_shapes(model: nn.Module) -> dict[str, tuple[int, ...]]:
+def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
     """Shape of every variable of a detector by its path, without creating any."""
-    radar = model.radar if models.has_camera(model) else model
-    bins, channels = radar.pad_multiple, radar.doppler_bins + radar.elevation_bins
+    bins, channels = model.pad_multiple, model.doppler_bins + model.elevation_bins
 
     def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, *shape), dtype)
 
     inputs: list[Any] = [array(bins, bins, channels)]
-    if radar is not model:
+    if models.has_camera(model):
         queries = (bins, bins, model.query_grid.num_elevation)
         points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
         inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]

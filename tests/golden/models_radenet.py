@@ -31,8 +31,11 @@ SMALL = {
     "pad_multiple": 8,
     "crop_output": False,
     "dtype": "float32",
-    "remat": False,
+    "remat": "none",
     "heatmap_prior": 0.5,
+    "backbone": "unet",
+    "input_center": 0.0,
+    "input_scale": 1.0,
 }
 """A model config with every part, small enough for a test."""
 

@@ -1,5 +1,6 @@
 """Tests of radejax.models.dinorade."""
 
+import dataclasses
 import functools
 import pathlib
 
@@ -38,8 +39,11 @@ def small_config(**changes):
         "pad_multiple": 4,
         "crop_output": True,
         "dtype": "float32",
-        "remat": False,
+        "remat": "none",
         "heatmap_prior": 0.5,
+        "backbone": "unet",
+        "input_center": 0.0,
+        "input_scale": 1.0,
         "image": {
             "kind": "vit",
             "size": SIZE,
@@ -140,8 +144,10 @@ def test_shapes_and_parts():
 
 def test_radar_parts_have_the_names_of_radenet():
     model, variables = model_and_variables()
-    assert isinstance(model.radar, RadeNet)
-    shapes = jax.eval_shape(model.radar.init, jax.random.key(0), batch()[0])["params"]
+    assert isinstance(model, RadeNet)
+    fields = {f.name: getattr(model, f.name) for f in dataclasses.fields(RadeNet)}
+    radar = RadeNet(**fields | {"parent": None})
+    shapes = jax.eval_shape(radar.init, jax.random.key(0), batch()[0])["params"]
     ours = {k: variables["params"][k] for k in ("backbone", "neck", "heads")}
     chex.assert_trees_all_equal_shapes(ours, shapes)
 
@@ -333,20 +339,20 @@ def test_images_of_another_size_are_refused():
     [
         ({"image.kind": "vgg"}, r"config.model.image.kind is 'vgg', expected one of"),
         ({"fusion.gate": "pixel"}, r"fusion.gate is 'pixel'"),
-        ({"fusion.depth": 3}, r"config.model.fusion has unknown \['depth'\]"),
-        ({"query_grid": {}}, r"config.model.query_grid has missing"),
-        ({"image.size": (30, 48)}, r"image.size is \(30, 48\); .* multiples of 16"),
-        ({"image.hidden_size": 20}, r"20 channels in 2 heads; .* multiple of 4"),
-        ({"fusion.num_heads": 3}, r"fusion.num_heads = 3 does not divide"),
+        ({"fusion.depth": 3}, r"config.model.fusion.depth is not a field"),
+        ({"query_grid": {}}, r"config.model.query_grid.azimuth_deg is missing"),
+        ({"image.size": (30, 48)}, r"image.size is \(30, 48\), .* multiples of 16"),
+        ({"image.hidden_size": 20}, r"hidden_size is 20, .* multiple of 4 .* 2 heads"),
+        ({"fusion.num_heads": 3}, r"fusion.num_heads is 3, expected a divisor"),
         (
             {"fusion.out_of_view": "official"},
-            r"leaves out 280 pixels left and right, but .*size is \(32, 48\)",
+            r"size is \(32, 48\), .* leaves out 280 pixels",
         ),
         (
             {"image.kind": "resnet50", "image.freeze": False},
-            r"freeze is False, but the ResNet's first stages",
+            r"freeze is False, expected True for a ResNet",
         ),
-        ({"image": 3}, r"config.model.image must be a mapping, got 3"),
+        ({"image": 3}, r"config.model.image is 3, expected"),
     ],
 )
 def test_impossible_configs_are_refused(changes, message):

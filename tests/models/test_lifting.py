@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.errors import UserError
 from radejax.geometry.camera import Camera, CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
@@ -165,8 +164,6 @@ def test_weights_of_the_mean():
         lifting.query_weights(is_valid, "drop"), [[0.5, 0, 0.5, 0], [0] * 4]
     )
     np.testing.assert_allclose(lifting.query_weights(is_valid, "official"), 0.25)
-    with pytest.raises(UserError, match="'drop' or 'official', got 'zero'"):
-        lifting.query_weights(is_valid, "zero")
 
 
 @pytest.mark.parametrize("kind", ["mlp", "cnn"])
@@ -203,5 +200,3 @@ def test_without_weights_queries_are_copies():
     network = WeightingNetwork(6, "off")
     weights = network.apply({}, jnp.zeros((1, 2, 3, 9)))
     np.testing.assert_array_equal(weights, np.ones((1, 2, 3, 6)))
-    with pytest.raises(UserError, match="'mlp', 'cnn' or 'off', got 'linear'"):
-        WeightingNetwork(6, "linear").init(jax.random.key(0), jnp.zeros((1, 2, 3, 9)))

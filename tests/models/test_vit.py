@@ -65,8 +65,8 @@ def test_blocked_attention_has_the_gradients_of_the_plain_one():
 
 @pytest.mark.wrong_types
 def test_unknown_attention_is_refused():
-    with pytest.raises(UserError, match="auto, blocked, xla or cudnn"):
-        vit.attend(*random_qkv(4), "flash")
+    with pytest.raises(UserError, match=r"image.attention is 'flash', expected one of"):
+        vit.ViT(attention="flash")
 
 
 def test_rotary_angles_by_hand():
@@ -162,5 +162,5 @@ def test_images_of_a_wrong_shape_are_refused(shape, message):
 
 
 def test_heads_need_a_multiple_of_four_channels():
-    with pytest.raises(UserError, match="multiple of 4 channels, got 6"):
-        vit.rotary_angles(2, 2, 6)
+    with pytest.raises(UserError, match=r"hidden_size is 12, .* 4 channels .* 2 heads"):
+        vit.ViT(hidden_size=12, num_heads=2)

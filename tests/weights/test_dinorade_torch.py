@@ -175,7 +175,7 @@ def test_loading_fills_the_model_exactly(shared):
     tensors = end_to_end_tensors(shared)
     nested = {"epoch": 3, "model": {f"module.{k}": v for k, v in tensors.items()}}
     model, variables = dinorade_torch.load(nested, crop_output=True, num_heads=8)
-    assert model.radar.crop_output
+    assert model.crop_output
     assert (model.fusion["num_heads"], model.fusion["num_points"]) == (8, 2)
     reference = jax.eval_shape(lambda: released_geometry(shared))
     expected = jax.eval_shape(

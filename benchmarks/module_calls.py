@@ -10,7 +10,7 @@ import flax.linen as nn
 
 
 @dataclasses.dataclass(frozen=True)
-class Call:
+class ModuleCall:
     """One call of a part.
 
     Attributes:
@@ -26,7 +26,7 @@ class Call:
     output: Any
 
 
-def calls_of(run: Callable[[], Any], depth: int = 1) -> dict[str, Call]:
+def module_calls(run: Callable[[], Any], depth: int = 1) -> dict[str, ModuleCall]:
     """The calls of a model's parts while it runs, by their names in the parameters.
 
     Args:
@@ -38,18 +38,18 @@ def calls_of(run: Callable[[], Any], depth: int = 1) -> dict[str, Call]:
         2 "backbone/stem"; the last call of a part that is called several times.
 
     Examples:
-        >>> calls = calls_of(lambda: model.apply(variables, projection))  # doctest: +SKIP
+        >>> calls = module_calls(lambda: model.apply(variables, projection))  # doctest: +SKIP
         >>> calls["neck"].output.shape  # doctest: +SKIP
         (1, 256, 112, 128)
     """
-    found: dict[str, Call] = {}
+    found: dict[str, ModuleCall] = {}
 
     def record(call: Callable[..., Any], args: Any, kwargs: Any, context: Any) -> Any:
         output = call(*args, **kwargs)
         path = context.module.path
         if context.method_name == "__call__" and 1 <= len(path) <= depth:
             module = context.module.clone(parent=None)
-            found["/".join(path)] = Call(module, args, kwargs, output)
+            found["/".join(path)] = ModuleCall(module, args, kwargs, output)
         return output
 
     with nn.intercept_methods(record):
