@@ -313,7 +313,7 @@ def _fusion(
         8.35, middle, 2.0, 1.15, title="Deformable attention", color=ATTENTION,
         lines=(
             f"{_size(net.calls['image_fusion'][0][3].is_valid.shape)} queries",
-            f"{fusion['num_heads']} heads, {fusion['num_points']} points each",
+            f"{fusion.num_heads} heads, {fusion.num_points} points each",
             "mean over elevation",
         ),
     )  # fmt: skip

@@ -176,7 +176,7 @@ def test_loading_fills_the_model_exactly(shared):
     nested = {"epoch": 3, "model": {f"module.{k}": v for k, v in tensors.items()}}
     model, variables = dinorade_torch.load(nested, crop_output=True, num_heads=8)
     assert model.crop_output
-    assert (model.fusion["num_heads"], model.fusion["num_points"]) == (8, 2)
+    assert (model.fusion.num_heads, model.fusion.num_points) == (8, 2)
     reference = jax.eval_shape(lambda: released_geometry(shared))
     expected = jax.eval_shape(
         model.init,
