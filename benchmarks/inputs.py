@@ -17,7 +17,7 @@ import shapely
 
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.data.encoding import encode
-from radejax.data.kradar.sequences import WEATHERS
+from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.records.arrays import ArrayRecords
 from radejax.data.records.files import RecordFileWriter, file_name
 from radejax.data.records.projections import Manifest, RecordSource, write_manifest

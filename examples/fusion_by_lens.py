@@ -22,7 +22,7 @@ from tabulate import tabulate
 from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.kradar.folders import SIMULATION_MARKER as MARKER
+from radejax.data.kradar.dataset import SIMULATION_MARKER as MARKER
 from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, frame_keys, load

@@ -21,7 +21,7 @@ ROOMS = (
     "data.encoding",
     "data.frame_table",
     "data.images",
-    "data.kradar.frame",
+    "data.kradar.dataset",
     "data.kradar.write",
     "data.pipeline",
     "data.projection",

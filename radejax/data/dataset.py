@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from radejax.core.errors import UserError
-from radejax.data.kradar.dataset import KRadar
-from radejax.data.kradar.findings import Summary
+from radejax.data.kradar.dataset import KRadar, Summary
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 

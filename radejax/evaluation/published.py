@@ -22,7 +22,7 @@ import importlib.resources
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
-from radejax.data.kradar.sequences import WEATHERS
+from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation.boxes import roi_name
 from radejax.evaluation.protocols import AUTHORS_PROTOCOL, RECOMMENDED
 from radejax.evaluation.results import EvaluationOptions

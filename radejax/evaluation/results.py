@@ -13,7 +13,7 @@ from ml_collections import ConfigDict
 
 from radejax.core.errors import UserError, require
 from radejax.core.structures import CLASSES, MIN_SIZE_M
-from radejax.data.kradar.sequences import WEATHERS
+from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import bootstrap, protocols
 from radejax.evaluation.boxes import AnyColumns, Columns, Roi, roi_bounds
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result, mean_ap

@@ -13,7 +13,7 @@ from typing import Any
 
 from tabulate import tabulate
 
-from radejax.data.kradar.sequences import WEATHERS
+from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation.bootstrap import Comparison
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.results import EvaluationOptions

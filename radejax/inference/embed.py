@@ -19,7 +19,7 @@ from tqdm import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.images import read_left_image
-from radejax.data.kradar.frame import Frame
+from radejax.data.kradar import Frame
 from radejax.data.records import embeddings
 from radejax.data.records import files as record_files
 from radejax.data.records.arrays import MANIFEST

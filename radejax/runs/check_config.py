@@ -12,8 +12,8 @@ from typing import Any
 from ml_collections import ConfigDict
 
 from radejax.core.errors import UserError
+from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, VISIBILITY_FLAGS
-from radejax.data.kradar.sequences import WEATHERS
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.losses.detection import LOSSES
 from radejax.simulation.config import SimulationConfig

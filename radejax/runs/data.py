@@ -29,7 +29,7 @@ from radejax.data.cameras import (
 )
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.frame_table import make_table
-from radejax.data.kradar.splits import held_out
+from radejax.data.kradar.dataset import held_out
 from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
 from radejax.data.records import job
 from radejax.data.records.arrays import ArrayRecords

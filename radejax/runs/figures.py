@@ -18,7 +18,7 @@ from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import decode, model_inputs
 from radejax.data.frame_table import make_table
 from radejax.data.images import front_view
-from radejax.data.kradar.sequences import WEATHERS
+from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.pipeline import LoaderOptions, make_loader
 from radejax.data.records.projections import RecordSource, record_positions
 from radejax.geometry.radar_grid import RadarGrid

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 from radejax.core.errors import UserError
-from radejax.data.kradar import Frame, KRadar, sequences
+from radejax.data.kradar import Frame, KRadar
+from radejax.data.kradar.dataset import split_by_rule
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationConfig
@@ -284,7 +285,7 @@ class LabelSource:
         """Frames of a sequence, in order."""
         config, frames = self._config, self._frames[number]
         names = [f.name for f in frames]
-        train = set(sequences.split_by_rule(names, "train"))
+        train = set(split_by_rule(names, "train"))
         chosen = range(0, len(frames), config.frame_stride)
         if config.frames_per_sequence:
             chosen = chosen[: config.frames_per_sequence]

@@ -14,7 +14,8 @@ from radejax.core import files
 from radejax.core.config import load_module
 from radejax.core.structures import CLASSES
 from radejax.data.images import read_left_image
-from radejax.data.kradar import KRadar, folders, labels, sequences, write
+from radejax.data.kradar import KRadar, conditions, labels, write
+from radejax.data.kradar import dataset as kradar
 from radejax.data.records import embeddings, job
 from radejax.data.records.files import RecordFileWriter, file_name, read_manifest_of
 from radejax.data.records.projections import RecordSource
@@ -68,7 +69,8 @@ def _labels(folder: Folder, version: str) -> None:
 
 def _read_labels(folder: Folder, version: str) -> None:
     for path in folder.glob("*.txt"):
-        found = labels.read_labels(path, version, problems=[])
+        content, problems = path.read_bytes(), []
+        found = labels.parse_label_file(content, version, problems=problems).labels
         assert np.isfinite([label.box for label in found]).all()
         assert all(min(label.box[3:6]) > 0 for label in found)
         labels.read_labels(path, version)
@@ -80,11 +82,8 @@ def _label_zip(folder: Folder) -> None:
 
 
 def _read_label_zip(folder: Folder) -> None:
-    source = folders.labels_from(folder / "labels.zip")
-    for key, content in source.read(list(source.files)):
-        if isinstance(content, Exception):
-            raise content
-        labels.parse_label_file(content, where=source.where(key))
+    data = KRadar(labels=folder / "labels.zip")
+    data.summary().to_text()
 
 
 def _read_root(folder: Folder) -> None:
@@ -310,16 +309,16 @@ READERS: dict[str, Reader] = {
     **_kinds("labels", labels.VERSIONS, _labels, _read_labels, "*.txt"),
     "label zip": Reader(_label_zip, _read_label_zip, "*.zip", count=150),
     "split": Reader(
-        _root, lambda f: sequences.read_split(f / "split/train.txt"), "split/train.txt"
+        _root, lambda f: kradar.read_split(f / "split/train.txt"), "split/train.txt"
     ),
     "calibration": Reader(
         _root,
-        lambda f: sequences.read_calibration(f / "1/info_calib/calib_radar_lidar.txt"),
+        lambda f: kradar.read_calibration(f / "1/info_calib/calib_radar_lidar.txt"),
         "1/info_calib/*.txt",
     ),
     "description": Reader(
         _root,
-        lambda f: sequences.read_description(f / "1/description.txt"),
+        lambda f: conditions.read_description(f / "1/description.txt"),
         "1/description.txt",
     ),
     "camera yml": Reader(
@@ -328,7 +327,7 @@ READERS: dict[str, Reader] = {
         "1/*.yml",
     ),
     "radar_grid.json": Reader(
-        _root, lambda f: folders.read_grid([f]), "radar_grid.json"
+        _root, lambda f: kradar.read_grid([f]), "radar_grid.json"
     ),
     "data set": Reader(_root, _read_root, "**/*.txt", "*.json", count=200),
     **_kinds("tesseract", ("plain", "deflated"), _tesseract, _read_tesseract, "a.mat"),

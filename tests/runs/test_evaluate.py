@@ -13,7 +13,7 @@ from ml_collections import ConfigDict
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
-from radejax.data.kradar.frame import Frame
+from radejax.data.kradar import Frame
 from radejax.detection.decode import decode
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid

@@ -1,82 +1,239 @@
 """K-Radar as it is on disk: labelled frames with boxes in the radar frame.
 
 The folders are described in `docs/data.md`. Reading starts from the label files:
-`KRadar` needs no tesseract to open, so that labels alone can be counted and swapped.
+`KRadar` needs no radar tensor to open, so that labels can be counted and replaced without
+them. A sequence is a folder named by its number. One sequence may have folders under
+several roots (tensors on one disk, images on another); each file is taken from the first
+root that has it.
 """
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import copy
+import dataclasses
+import functools
 import itertools
+import logging
 import os
 import pathlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from typing import Any
+import re
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
+from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, read_json, read_text
 from radejax.core.structures import CLASSES
-from radejax.data.kradar import folders
-from radejax.data.kradar.findings import Findings, Summary
-from radejax.data.kradar.frame import Frame
+from radejax.data.kradar.conditions import (
+    KRADAR_CONDITIONS,
+    UNKNOWN_CONDITIONS,
+    WEATHERS,
+    Conditions,
+    check_weather,
+    read_description,
+)
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
+    MAX_LABEL_BYTES,
     VISIBILITY_FLAGS,
+    Label,
     LabelFile,
-    Problem,
+    LabelHeader,
     normalize_version,
     parse_label_file,
+    read_label_bytes,
 )
-from radejax.data.kradar.sequences import (
-    SequenceInfo,
-    camera_folders,
-    read_sequence_info,
+from radejax.data.tesseract import read_frame
+from radejax.geometry.camera import (
+    KRADAR_RADAR_FROM_LIDAR_Z_M,
+    RADAR_FROM_LIDAR_M,
+    CameraCalibration,
 )
-from radejax.data.kradar.splits import Key, check_weather, select_frames
+from radejax.geometry.radar_grid import RadarGrid
 
-_Parsed = tuple[LabelFile | None, list[Problem]]  # None: nothing in it can be trusted
+_log = logging.getLogger(__name__)
+
+SIMULATION_MARKER = "simulation.json"
+"""File that marks a data set as simulated and has the settings of the simulator."""
+
+Key = tuple[int, str]
+"""Sequence number and frame name, such as `(1, "00033_00001")`."""
+
+_LABEL_FOLDERS = {
+    "v1.0": ("info_label_v1_0", "info_label"),
+    "v1.1": ("info_label_v1_1", "info_label"),
+    "v2.0": ("info_label_v2_0", "info_label_v2", "info_label"),
+    "v2.1": ("info_label_v2_1", "info_label"),
+}
+# Regular expressions, as str.isdecimal is also true of the digits of other scripts.
+_SEQUENCE = re.compile(r"[0-9]{1,6}")
+_LABELLED_SEQUENCE = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
+_LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
+_SPLIT_LINE = re.compile(r"\s*([0-9]{1,6})\s*,\s*([0-9]{1,9}_[0-9]{1,9})(?:\.txt)?\s*")
+_CAMERA_FOLDERS = ("calib", "cam_calib", "resources/cam_calib")
+_MAX_OFFSET_M = 100.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One labelled frame.
+
+    Attributes:
+        sequence: Number of the sequence.
+        name: Radar and LiDAR frame numbers, such as `"00033_00001"`.
+        header: Frame numbers of all sensors and the time stamp.
+        environment, time, weather: Conditions of the sequence.
+        labels: Every object of the file, in the LiDAR frame, unfiltered.
+        boxes: float64 x, y, z, l, w, h, yaw in the radar frame, of the objects that the
+            filters of the data set keep.
+        classes: Class names of `boxes`.
+        visibility: Visibility flags of `boxes`.
+        radar_from_lidar_m: Offset that was added to LiDAR positions: x, y, z
+            (`p_radar = p_lidar + t`).
+        tesseract_path: The 4D radar tensor, None where it is missing.
+        projection_path: A released `.npy` projection, None where there is none.
+        camera_path: Front image (stereo pair), None where it is missing.
+        camera_calibration_path: Calibration of the left front camera, or None.
+        is_simulated: The data set is simulated.
+        radar_from_lidar_z_m: The z of the offset between the sensors as they are
+            mounted, whatever z was added to the boxes.
+    """
+
+    sequence: int
+    name: str
+    header: LabelHeader
+    environment: str
+    time: str
+    weather: str
+    labels: tuple[Label, ...]
+    boxes: Float[np.ndarray, "N 7"]
+    classes: Shaped[np.ndarray, " N"]
+    visibility: Shaped[np.ndarray, " N"]
+    radar_from_lidar_m: tuple[float, float, float]
+    tesseract_path: pathlib.Path | None
+    projection_path: pathlib.Path | None
+    camera_path: pathlib.Path | None
+    camera_calibration_path: pathlib.Path | None
+    is_simulated: bool = False
+    radar_from_lidar_z_m: float = KRADAR_RADAR_FROM_LIDAR_Z_M
+
+    @property
+    def key(self) -> str:
+        """Name that is unique in a data set: `"1/00033_00001"`."""
+        return f"{self.sequence}/{self.name}"
+
+    @property
+    def radar_path(self) -> pathlib.Path | None:
+        """File of the radar: the tensor, or without one the released projection."""
+        return self.tesseract_path or self.projection_path
+
+    def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
+        """Read the float32 projection; see `tesseract.read_frame`.
+
+        Raises:
+            FileNotFoundError: There is no file of the radar.
+            DataError: It is corrupted, or of another shape than the grid.
+        """
+        if self.radar_path is None:
+            raise FileNotFoundError("no radar tensor in any root")
+        return read_frame(self.radar_path, grid)
+
+    def read_calibration(
+        self, radar_from_lidar_m: tuple[float, ...] | None = None
+    ) -> CameraCalibration:
+        """Read the camera's calibration, with the frame's own offset or another."""
+        assert self.camera_calibration_path is not None  # callers check it
+        return CameraCalibration.from_kradar(
+            self.camera_calibration_path,
+            radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
+        )
+
+
+@dataclasses.dataclass
+class Summary:
+    """What reading a data set found.
+
+    Attributes:
+        counts: What was read and what was skipped, by reason.
+        problems: Everything missing or malformed: kind, and message with file and line.
+        notes: Assumptions that were made where a file is missing.
+    """
+
+    counts: collections.Counter[str] = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    problems: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def problem_counts(self) -> dict[str, int]:
+        """Number of problems of every kind."""
+        return dict(collections.Counter(kind for kind, _ in self.problems))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "counts": dict(self.counts),
+            "problem_counts": self.problem_counts(),
+            "problems": [message for _, message in self.problems],
+            "notes": list(self.notes),
+        }
+
+    def to_text(self, max_problems: int = 3) -> str:
+        """Lines for a terminal: all counts, the first problems of every kind."""
+        lines = [f"{n:>9,}  {what}" for what, n in self.counts.items() if n]
+        lines += [f"note: {note}" for note in self.notes]
+        for kind, number in self.problem_counts().items():
+            messages = [text for found, text in self.problems if found == kind]
+            lines.append(f"problem: {kind}: {number:,}")
+            lines += [f"    {message}" for message in messages[:max_problems]]
+            if number > max_problems:
+                lines.append(f"    ... and {number - max_problems:,} more")
+        return "\n".join(lines)
 
 
 class KRadar(Sequence[Frame]):
     """The labelled frames of a K-Radar copy, in the order of sequence and frame.
 
+    What is missing or malformed is skipped, counted and listed in `summary()`.
+
     Args:
         root: Folder of the sequences, or several when they are spread over disks.
-            None when only labels are at hand.
+            None when only labels are available.
         labels: Folder or zip of a label revision; None: the sequences' own folders.
         version: Version of these labels: v1.0, v1.1, v2.0 or v2.1.
         split: "train" or "test", the path of a split file, or None for every frame.
             Official split files are looked for as `split/<name>.txt` in the roots and
-            beside `labels`; without them K-Radar's rule (alternating quarters of every
-            sequence) is applied, and `summary()` says so.
-        strict: Raise on the first missing or malformed thing. Otherwise it is left
-            out, counted and named in `summary()`.
-        radar_from_lidar: Metres (x, y) to add to LiDAR positions on every sequence;
-            None: from each sequence's calibration file, else (-2.54, 0.3).
-        z_offset_m: Metres to add to LiDAR z: 0 in the papers, 0.7 in K-Radar's code.
-        visibility: Availability flags to keep, None for all.
-        include_unstarred_v11_labels: Lines of v1.x labels without a `*` count too, as released.
+            next to `labels`; without them K-Radar's rule (alternating quarters of every
+            sequence) is applied, which `summary()` notes.
+        visibility: Visibility flags to keep, None for all.
+        include_unstarred_v11_labels: Lines of v1.x labels without a `*` count too, as in
+            the reference implementation.
         classes: Classes to keep.
         field_of_view: Keep only boxes whose center is in the field of view.
         sequence_numbers: Only these sequences; None for all. Sequences that have labels
-            and no folder in the roots are left out and counted, if any has one.
+            and no folder in the roots are skipped and counted, if any has one.
         weather: Only sequences of these weathers; None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
-        common_camera: `common/cam_front0.yml` for all sequences, as released.
+        common_camera: Use `common/cam_front0.yml` for all sequences, as the reference
+            implementation does.
 
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
-        split_folders: In and beside which split files are looked for.
-        is_simulated: One of these folders says that its data are simulated.
+        folders: Folders of every sequence in the roots, by number.
+        split_folders: Folders in and next to which split files are looked for.
+        is_simulated: The simulator wrote one of these folders.
 
     Raises:
         FileNotFoundError: A folder or file that was named does not exist.
-        UserError: Nothing to read, an unknown version or split, or labels of another
-            version than was said.
-        DataError: Something is missing or malformed, and `strict`.
+        UserError: There is nothing to read, no such version or split, or the labels
+            have another version.
+        DataError: The labels are corrupted or ambiguous as a whole.
 
     Examples:
         >>> data = KRadar("/data/kradar", split="train")  # doctest: +SKIP
@@ -90,9 +247,6 @@ class KRadar(Sequence[Frame]):
         *,
         version: str = "v2.1",
         split: PathLike | None = None,
-        strict: bool = False,
-        radar_from_lidar: tuple[float, float] | None = None,
-        z_offset_m: float = 0.0,
         visibility: Sequence[str] | None = ("R",),
         include_unstarred_v11_labels: bool = False,
         classes: Sequence[str] = CLASSES,
@@ -103,48 +257,53 @@ class KRadar(Sequence[Frame]):
         common_camera: bool = False,
     ) -> None:
         self.version = normalize_version(version)
-        self.strict = strict
         self.classes = tuple(classes)
         self.roots = as_paths(root)
-        _check_arguments(self.roots, labels, visibility, self.classes)
+        if not self.roots and labels is None:
+            raise UserError("give a K-Radar root, or labels, or both")
+        if isinstance(visibility, str):
+            raise UserError(f"visibility is {visibility!r}, expected a tuple of flags")
+        if not self.classes or not set(self.classes) <= set(LABEL_CLASSES):
+            expected = ", ".join(LABEL_CLASSES)
+            raise UserError(f"classes are {self.classes}, expected some of {expected}")
         self._weather = None if weather is None else check_weather(weather)
-        self.folders = folders.find_sequences(self.roots)
-        self.grid = folders.read_grid(self.roots)
-        self._source = self._open_labels(labels)
+        self.folders = find_sequences(self.roots)
+        self.grid = read_grid(self.roots)
+        self._label_files = self._find_labels(labels)
         self.split_folders = list(self.roots)
         if labels is not None:
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
-        self.is_simulated = folders.are_simulated(self.split_folders)
-        self._radar_from_lidar_z_m = folders.read_radar_from_lidar_z(self.split_folders)
-        self._sequence_numbers = sequence_numbers and tuple(sequence_numbers)
-        self._offset = (radar_from_lidar, float(z_offset_m))
-        self._camera_folders = camera_folders(self.roots, as_paths(camera_calibration))
+        self.is_simulated = are_simulated(self.split_folders)
+        self._radar_from_lidar_z_m = read_radar_from_lidar_z(self.split_folders)
+        self._sequence_numbers = (
+            None if sequence_numbers is None else set(sequence_numbers)
+        )
+        self._camera_folders = as_paths(camera_calibration)
+        self._camera_folders += [
+            r / name for r in self.roots for name in _CAMERA_FOLDERS
+        ]
         self._common_camera = common_camera
         self._visibility, self._field_of_view = visibility, field_of_view
-        self._count_disabled = include_unstarred_v11_labels
-        self._parsed: dict[Key, _Parsed] = {}
+        self._include_unstarred = include_unstarred_v11_labels
+        self._parsed: dict[Key, tuple[LabelFile | None, list[str]]] = {}
         self._read(split)
 
     def of_split(self, split: PathLike | None) -> KRadar:
-        """The frames of a split, as opening the data set with it gives them.
+        """Return the frames of a split, as opening the data set with it gives them.
 
-        Label files that either of the two has read are not read again.
-
-        Args:
-            split: As of the class.
+        Label files that were read before are not read again.
 
         Raises:
             UserError: There is no such split.
-            DataError: Something is missing or malformed, and `strict`.
         """
         other = copy.copy(self)
         other._read(split)
         return other
 
     def without(self, left_out: Collection[str], reason: str) -> KRadar:
-        """The frames but those of some keys, which are counted for a reason."""
+        """Return all frames but those of some keys, which are counted for a reason."""
         other = copy.copy(self)
-        other._findings = copy.deepcopy(self._findings)
+        other._summary = copy.deepcopy(self._summary)
         other._frames = [frame for frame in self if frame.key not in left_out]
         other.counts[f"frames left out: {reason}"] += len(self) - len(other)
         return other
@@ -156,143 +315,218 @@ class KRadar(Sequence[Frame]):
         return self._frames[index]
 
     def summary(self) -> Summary:
-        """What was read, left out, missing and malformed."""
-        return self._findings.summary()
-
-    @property
-    def label_source(self) -> str:
-        """Where the labels are from, as messages name it."""
-        return self._source.description
+        """What was read, skipped, missing and malformed."""
+        return self._summary
 
     @property
     def counts(self) -> collections.Counter[str]:
-        """What was read and left out, by reason: `summary().counts`."""
-        return self._findings.counts
+        """What was read and skipped, by reason: `summary().counts`."""
+        return self._summary.counts
 
     def class_counts(self) -> dict[str, int]:
         """Objects of every class that the filters keep."""
         counts = collections.Counter(cls for f in self._frames for cls in f.classes)
         return {cls: counts[cls] for cls in self.classes}
 
-    def _open_labels(self, labels: PathLike | None) -> folders.LabelSource:
-        """The label source; `UserError` when there is nothing in it."""
-        if not self.folders:
-            meant = folders.nearby_roots(self.roots)
-            if meant or labels is None:
-                hint = f"; try {', '.join(map(str, meant))}" if meant else ""
-                raise UserError(
-                    "no sequence folders (1, 2, ...) in "
-                    f"{', '.join(map(str, self.roots))}{hint}"
-                )
+    def _find_labels(self, labels: PathLike | None) -> LabelFiles:
+        """The label files; `UserError` when there is nothing to read."""
+        roots = ", ".join(map(str, self.roots))
+        if not self.folders and self.roots:
+            raise UserError(f"no sequence folders (1, 2, ...) in {roots}")
         if labels is not None:
-            return folders.labels_from(pathlib.Path(labels))
-        source = folders.own_labels(self.folders, self.version)
-        if not source.files:
+            return find_labels(pathlib.Path(labels))
+        found = find_own_labels(self.folders, self.version)
+        if not found.paths:
             raise UserError(
-                f"no {self.version} labels in the sequence folders of "
-                f"{', '.join(map(str, self.roots))} (info_label/*.txt); name the folder "
-                "or zip of a label revision as labels"
+                f"no {self.version} labels in the sequence folders of {roots} "
+                "(info_label/*.txt); name the folder or zip of a label revision as labels"
             )
-        return source
+        return found
 
     def _read(self, split: PathLike | None) -> None:
-        """Finds what belongs to a split and reads it."""
-        self._findings = Findings(strict=self.strict)
-        keys = select_frames(
-            self._source,
-            self._findings,
-            split=split,
-            near=self.split_folders,
-            sequence_numbers=self._sequence_numbers,
-            folders_here=self.folders,
-        )
-        if self._weather is None:
-            files = self._read_label_files(keys)
-            self._info = self._read_info(files)
-        else:  # not the labels of other weathers
-            self._info = self._read_info(keys)
-            files = self._read_label_files(self._of_weather(keys, self._weather))
-        self._frames = self._make_frames(files)
-
-    def _read_info(self, keys: Iterable[Key]) -> dict[int, SequenceInfo]:
-        """What is known of every sequence of the keys."""
-        return {
-            number: read_sequence_info(
-                number,
-                self.folders.get(number),
-                self._findings,
-                radar_from_lidar=self._offset[0],
-                z_offset_m=self._offset[1],
-                camera_folders=self._camera_folders,
-                common_camera=self._common_camera,
-            )
+        """Read the label files of a split and make its frames."""
+        self._summary = Summary()
+        keys = self._select(split)
+        self._info = {
+            number: self._read_sequence_info(number)
             for number in sorted({number for number, _ in keys})
         }
+        if self._weather is not None:
+            kept = [
+                key for key in keys if self._info[key[0]][0].weather in self._weather
+            ]
+            self.counts["frames left out by weather"] = len(keys) - len(kept)
+            keys = kept
+        self._frames = self._make_frames(self._read_label_files(keys))
 
-    def _of_weather(self, keys: list[Key], weather: tuple[str, ...]) -> list[Key]:
-        """The keys of the weathers that were asked for; the others are counted."""
-        kept = [k for k in keys if self._info[k[0]].conditions.weather in weather]
-        self.counts["frames left out by weather"] = len(keys) - len(kept)
-        return kept
+    def _select(self, split: PathLike | None) -> list[Key]:
+        """Keys of the label files to read, sorted; the others are counted."""
+        all_keys, numbers = self._label_files.paths, self._sequence_numbers
+        present = {number for number, _ in all_keys}
+        absent = present - set(self.folders) if self.folders else set()
+        if numbers is None:
+            wanted = present - absent
+            self.counts["sequences with labels that are not in the roots"] = len(absent)
+            self.counts["frames of sequences that are not in the roots"] = sum(
+                number in absent for number, _ in all_keys
+            )
+        else:
+            wanted = numbers
+        if wanted & absent:
+            raise UserError(
+                f"no folders of sequences {sorted(wanted & absent)} in the roots; there "
+                f"are {sorted(self.folders)}"
+            )
+        if wanted - present:
+            raise UserError(
+                f"no labels of sequences {sorted(wanted - present)} in "
+                f"{self._label_files.description}; there are {sorted(present)}"
+            )
+        keys = [key for key in all_keys if key[0] in wanted]
+        if split is None:
+            return keys
+        self._report_overlap()
+        entries = read_split_entries(split, self.split_folders, keys, self._summary)
+        for number, name in sorted(entries - set(keys)):
+            if number in wanted:
+                self._report(
+                    "label file missing",
+                    f"{number}/{name}: in split {split} but not among the labels of "
+                    f"{self._label_files.description}",
+                )
+            elif numbers is None:
+                self.counts["split entries of sequences that are not here"] += 1
+        return [key for key in keys if key in entries]
+
+    def _report(self, kind: str, message: str) -> None:
+        self._summary.problems.append((kind, message))
+
+    def _report_overlap(self) -> None:
+        """Report, and warn of, frames that the files of both splits name."""
+        paths = [
+            find_split_file(name, self.split_folders) for name in ("train", "test")
+        ]
+        if None in paths:
+            return
+        train, test = (set(read_split(path)) for path in paths if path)
+        if both := sorted(train & test):
+            message = (
+                f"{both[0][0]}/{both[0][1]}: the first of {len(both)} frames that are in "
+                f"both {paths[0]} and {paths[1]}; a model is evaluated on frames that it "
+                "was trained on"
+            )
+            self._report("split", message)
+            _log.warning(message)
+
+    def _read_sequence_info(
+        self, number: int
+    ) -> tuple[Conditions, tuple[float, float, float], pathlib.Path | None]:
+        """Conditions, LiDAR offset and camera calibration of a sequence."""
+        folder = self.folders.get(number)
+        camera, is_own = find_camera_calibration(
+            self._camera_folders, number, common_only=self._common_camera
+        )
+        if camera is None:
+            self.counts["sequences without camera calibration"] += 1
+        elif not is_own:
+            self.counts["sequences with the common camera calibration"] += 1
+        offset = self._read_offset(number, folder)
+        return self._read_conditions(number, folder), (*offset, 0.0), camera
+
+    def _read_offset(
+        self, number: int, folder: SequenceFolder | None
+    ) -> tuple[float, float]:
+        """Metres to add to LiDAR x and y of a sequence."""
+        path = folder.find("info_calib", "calib_radar_lidar.txt") if folder else None
+        default = RADAR_FROM_LIDAR_M[:2]
+        if path is not None:
+            try:
+                return read_calibration(path)[1:]
+            except DataError as error:
+                self._report("calibration", f"{error}; using K-Radar's {default}")
+        elif folder is not None:
+            self._report(
+                "calibration missing",
+                f"sequence {number}: no info_calib/calib_radar_lidar.txt, using K-Radar's "
+                f"{default}",
+            )
+        self.counts["sequences with the default calibration"] += 1
+        return default
+
+    def _read_conditions(
+        self, number: int, folder: SequenceFolder | None
+    ) -> Conditions:
+        """Conditions of a sequence: its own description, else the built-in table."""
+        path = folder.find(".", "description.txt") if folder else None
+        if path is not None:
+            try:
+                conditions = read_description(path)
+            except DataError as error:
+                self._report("description", str(error))
+            else:
+                if conditions.weather not in (*WEATHERS, "unknown"):
+                    self._summary.notes.append(
+                        f"{path}: weather {conditions.weather!r} is none of K-Radar's: "
+                        f"{', '.join(WEATHERS)}"
+                    )
+                return conditions
+        self.counts["sequences with built-in conditions"] += 1
+        return KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
 
     def _read_label_files(self, keys: list[Key]) -> dict[Key, LabelFile]:
-        """Parsed label files; damaged ones are reported."""
+        """Parsed label files; corrupted ones are reported."""
         files: dict[Key, LabelFile] = {}
         for key, (file, problems) in self._parse(keys):
-            if problems and not any(file.labels for file in files.values()):
-                self._raise_on_other_version(problems[0])
-            for problem in problems:
-                self._findings.report(problem.kind, problem.where, problem.message)
-            if file is not None:
-                self._count_labels(key, file)
-                files[key] = file
+            has_labels = any(file.labels for file in files.values())
+            if problems and not has_labels and "has the layout of" in problems[0]:
+                raise UserError(
+                    f"{problems[0]}; give the version of the labels in "
+                    f"{self._label_files.description}: --label-version VERSION, in "
+                    "training --config.data.label_version=VERSION, such as v1.0"
+                )
+            kind = "label file" if file is None else "label line"
+            self._summary.problems += [(kind, message) for message in problems]
+            if file is None:
+                continue
+            files[key] = file
+            odd = [x for x in file.labels if x.visibility not in VISIBILITY_FLAGS]
+            expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
+            self.counts["objects in the label files"] += len(file.labels)
+            self.counts["disabled objects (no leading *)"] += file.num_unstarred
+            self.counts["objects with an odd availability flag"] += len(odd)
+            self.counts["files named unlike their header"] += key[1] != expected
         return files
 
-    def _parse(self, keys: list[Key]) -> Iterator[tuple[Key, _Parsed]]:
-        """Every file with its problems, parsed unless that was done before."""
-        contents = self._source.read([key for key in keys if key not in self._parsed])
-        for key in keys:
-            if key not in self._parsed:
-                _, content = next(contents)
-                problems: list[Problem] = []
-                where = self._source.where(key)
-                try:
-                    if isinstance(content, DataError):
-                        raise content
-                    file = parse_label_file(
-                        content,
-                        self.version,
-                        where=where,
-                        problems=problems,
-                        include_unstarred_v11_labels=self._count_disabled,
-                    )
-                except DataError as error:
-                    file, problems = None, [Problem("label file", where, str(error))]
-                self._parsed[key] = file, problems
-            yield key, self._parsed[key]
+    def _parse(
+        self, keys: list[Key]
+    ) -> Iterator[tuple[Key, tuple[LabelFile | None, list[str]]]]:
+        """Every file with its problems, parsed unless that was done before.
 
-    def _raise_on_other_version(self, problem: Problem) -> None:
-        """A wrong version is the user's to mend, not thousands of malformed lines."""
-        if "has the layout of" in problem.message:
-            raise UserError(
-                f"{problem}; say the version of the labels in {self.label_source}: "
-                "--label-version VERSION, in training "
-                "--config.data.label_version=VERSION, such as v1.0"
-            )
-
-    def _count_labels(self, key: Key, file: LabelFile) -> None:
-        self.counts["objects in the label files"] += len(file.labels)
-        self.counts["disabled objects (no leading *)"] += file.num_disabled
-        odd = [x for x in file.labels if x.visibility not in VISIBILITY_FLAGS]
-        self.counts["objects with an odd availability flag"] += len(odd)
-        expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
-        self.counts["files named unlike their header"] += key[1] != expected
+        None stands for a file of which nothing can be used.
+        """
+        with self._label_files.reader() as read:
+            for key in keys:
+                if key not in self._parsed:
+                    problems: list[str] = []
+                    file = None
+                    try:
+                        file = parse_label_file(
+                            read(self._label_files.paths[key]),
+                            self.version,
+                            where=self._label_files.where(key),
+                            problems=problems,
+                            include_unstarred=self._include_unstarred,
+                        )
+                    except DataError as error:
+                        problems = [str(error)]
+                    self._parsed[key] = file, problems
+                yield key, self._parsed[key]
 
     def _make_frames(self, files: dict[Key, LabelFile]) -> list[Frame]:
         """Frames with filtered boxes; all boxes of the data set are filtered at once."""
         labels = [label for file in files.values() for label in file.labels]
         sizes = np.array([len(file.labels) for file in files.values()], int)
-        offsets = [self._info[number].radar_from_lidar_m for number, _ in files]
+        offsets = [self._info[number][1] for number, _ in files]
         boxes = np.array([label.box for label in labels], np.float64).reshape(-1, 7)
         boxes[:, :3] += np.repeat(np.reshape(offsets, (-1, 3)), sizes, axis=0)
         names = np.array([label.cls for label in labels], dtype=np.str_)
@@ -303,7 +537,7 @@ class KRadar(Sequence[Frame]):
         self.counts["frames without objects"] = int((np.diff(ends) == 0).sum())
         rows_of_files = [kept[a:b] for a, b in itertools.pairwise(ends)]
         return [
-            self._frame(key, file, *(column[rows] for column in (boxes, names, flags)))
+            self._frame(key, file, boxes[rows], names[rows], flags[rows])
             for (key, file), rows in zip(files.items(), rows_of_files, strict=True)
         ]
 
@@ -313,9 +547,8 @@ class KRadar(Sequence[Frame]):
         """`[M]` True for the objects to keep; the others are counted by reason."""
         rules = {"class": np.isin(names, np.array(self.classes, np.str_))}
         if self._visibility is not None:
-            rules["visibility"] = np.isin(
-                flags, np.array(list(self._visibility), np.str_)
-            )
+            wanted = np.array(list(self._visibility), np.str_)
+            rules["visibility"] = np.isin(flags, wanted)
         if self._field_of_view:
             rules["field of view"] = self.grid.in_field_of_view(
                 boxes[:, 0], boxes[:, 1]
@@ -336,7 +569,8 @@ class KRadar(Sequence[Frame]):
         visibility: np.ndarray,
     ) -> Frame:
         """One frame with the paths of its files; missing ones are reported."""
-        header, folder, info = file.header, self.folders.get(key[0]), self._info[key[0]]
+        header, folder = file.header, self.folders.get(key[0])
+        conditions, offset, camera_calibration = self._info[key[0]]
         tesseract = projection = camera = None
         if folder is not None:
             stem = f"tesseract_{header.radar:05d}"
@@ -346,48 +580,54 @@ class KRadar(Sequence[Frame]):
                 name = f"cam-front_{header.camera_front:05d}.png"
                 camera = folder.find("cam-front", name)
             if tesseract is None and projection is None:
-                self._findings.report(
+                self._report(
                     "tesseract missing",
-                    f"{key[0]}/{key[1]}",
-                    f"no radar_tesseract/{stem}.mat in "
+                    f"{key[0]}/{key[1]}: no radar_tesseract/{stem}.mat in "
                     + ", ".join(map(str, folder.folders)),
-                    error=FileNotFoundError,
                 )
             self.counts["frames without front image"] += camera is None
         return Frame(
             *key,
             header,
-            *info.conditions,
+            *conditions,
             tuple(file.labels),
             boxes,
             classes,
             visibility,
-            info.radar_from_lidar_m,
+            offset,
             tesseract,
             projection,
             camera,
-            info.camera_calibration_path,
+            camera_calibration,
             self.is_simulated,
             self._radar_from_lidar_z_m,
         )
 
 
-def _check_arguments(
-    roots: list[pathlib.Path],
-    labels: PathLike | None,
-    visibility: Sequence[str] | None,
-    classes: tuple[str, ...],
-) -> None:
-    if not roots and labels is None:
-        raise UserError("give a K-Radar root, or labels, or both")
-    if isinstance(visibility, str):
-        raise UserError(f"visibility is a sequence of flags, such as ({visibility!r},)")
-    unknown = [cls for cls in classes if cls not in LABEL_CLASSES]
-    if unknown or not classes:
-        raise UserError(
-            f"classes {unknown or 'are empty'}, expected some of "
-            + ", ".join(LABEL_CLASSES)
-        )
+# Folders -----------------------------------------------------------------------------
+
+
+class SequenceFolder:
+    """All folders of one sequence, seen as one; a subfolder is listed once."""
+
+    def __init__(self, folders: Sequence[pathlib.Path]) -> None:
+        self.folders = tuple(folders)
+        self._listings: dict[str, dict[str, pathlib.Path]] = {}
+
+    def listing(self, subfolder: str) -> dict[str, pathlib.Path]:
+        """Files of a subfolder by name; the first root takes precedence."""
+        if subfolder not in self._listings:
+            files: dict[str, pathlib.Path] = {}
+            for folder in self.folders:
+                with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                    for name in sorted(os.listdir(folder / subfolder)):
+                        files.setdefault(name, folder / subfolder / name)
+            self._listings[subfolder] = files
+        return self._listings[subfolder]
+
+    def find(self, subfolder: str, name: str) -> pathlib.Path | None:
+        """Path of a file, None where no root has it."""
+        return self.listing(subfolder).get(name)
 
 
 def as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
@@ -397,3 +637,352 @@ def as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
     return [pathlib.Path(path) for path in paths]
+
+
+def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
+    """Every sequence under the roots, by number.
+
+    Raises:
+        FileNotFoundError: A root does not exist.
+        DataError: A root has a sequence twice, as `1` and `01`.
+    """
+    found: dict[int, list[pathlib.Path]] = {}
+    for root in roots:
+        if not root.is_dir():
+            raise FileNotFoundError(f"{root}: no such folder, expected a K-Radar root")
+        for folder in sorted(root.iterdir()):
+            if _SEQUENCE.fullmatch(folder.name) and folder.is_dir():
+                same = found.setdefault(int(folder.name), [])
+                if same and same[-1].parent == root:
+                    raise DataError(
+                        f"sequence {int(folder.name)} is there twice, as {same[-1]} and "
+                        f"{folder}: delete or move one"
+                    )
+                same.append(folder)
+    return {number: SequenceFolder(found[number]) for number in sorted(found)}
+
+
+def find_camera_calibration(
+    folders: Sequence[pathlib.Path], sequence: int, *, common_only: bool = False
+) -> tuple[pathlib.Path | None, bool]:
+    """Find the calibration of the left front camera.
+
+    Args:
+        folders: Where it is looked for.
+        sequence: Number of the sequence.
+        common_only: Find the common one even where the sequence has its own.
+
+    Returns:
+        The file, None where there is none, and whether it is the sequence's own.
+    """
+    own = f"seq_{sequence:02d}/cam_1.yml"
+    of_sequence = (f"calib_seq_v2/{own}", own)
+    common = ("common/cam_front0.yml", "cam_front0.yml")
+    for names, is_own in ((of_sequence, True), (common, False))[common_only:]:
+        for folder in folders:
+            for name in names:
+                if (folder / name).is_file():
+                    return folder / name, is_own
+    return None, False
+
+
+def read_calibration(path: PathLike) -> tuple[int, float, float]:
+    """Read `info_calib/calib_radar_lidar.txt`: a header line and three numbers.
+
+    Returns:
+        Radar frame number minus LiDAR frame number, and metres to add to a LiDAR x
+        and y.
+
+    Raises:
+        DataError: The file is malformed; the message names file and line.
+    """
+    lines = read_text(path).splitlines()
+    line = lines[1] if len(lines) > 1 else ""
+    with contextlib.suppress(ValueError):
+        difference, dx_m, dy_m = map(float, line.split(","))
+        is_near = abs(dx_m) <= _MAX_OFFSET_M and abs(dy_m) <= _MAX_OFFSET_M
+        if (
+            is_near
+            and abs(difference) < 1e6
+            and difference % 1 == 0
+            and "_" not in line
+        ):
+            return int(difference), dx_m, dy_m
+    raise DataError(
+        f"{path}:2: {line[:80]!r}, expected three numbers: frame difference (whole), x, y "
+        f"up to {_MAX_OFFSET_M:g} m, such as 32,-2.54,0.3"
+    )
+
+
+def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
+    """Whether the simulator has written one of the folders."""
+    # os.path, as pathlib raises for names that no file can have.
+    return any(os.path.isfile(folder / SIMULATION_MARKER) for folder in folders)
+
+
+def read_radar_from_lidar_z(folders: Sequence[pathlib.Path]) -> float:
+    """Read z of `p_radar = p_lidar + t` as the sensors are mounted.
+
+    A simulated data set states it; K-Radar's calibration files do not, and its loaders
+    have 0.7 m: the radar is below the LiDAR.
+
+    Raises:
+        DataError: A simulation's file is malformed, or two of them differ.
+    """
+    found: dict[pathlib.Path, float] = {}
+    for path in (folder / SIMULATION_MARKER for folder in folders):
+        if path.is_file():
+            try:
+                shift = read_json(path).get("config", {}).get("radar_from_lidar_m")
+                found[path] = float(
+                    KRADAR_RADAR_FROM_LIDAR_Z_M if shift is None else shift[2]
+                )
+            except (AttributeError, IndexError, TypeError, KeyError, ValueError):
+                raise DataError(
+                    f"{path}: config.radar_from_lidar_m is not three numbers"
+                ) from None
+    return _the_same(found, "heights of the sensors", KRADAR_RADAR_FROM_LIDAR_Z_M)
+
+
+def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
+    """Read the sensor axes of a data set: `radar_grid.json` in a root, else K-Radar's.
+
+    Raises:
+        DataError: The file is malformed, or two roots have different axes.
+    """
+    paths = [root / "radar_grid.json" for root in roots]
+    found = {path: read_json(path, RadarGrid) for path in paths if path.is_file()}
+    return _the_same(found, "sensor axes", RadarGrid.kradar())
+
+
+T = TypeVar("T")
+
+
+def _the_same(found: Mapping[pathlib.Path, T], what: str, default: T) -> T:
+    """The one value of all files; `DataError` where they differ."""
+    if len(set(found.values())) > 1:
+        raise DataError(
+            f"different {what} in {', '.join(map(str, found))}; data sets of different "
+            "sensors cannot be read as one"
+        )
+    return next(iter(found.values()), default)
+
+
+# Label files -------------------------------------------------------------------------
+
+
+class LabelFiles(NamedTuple):
+    """Label files by key, sorted.
+
+    Attributes:
+        paths: Path of each label file, or its name in `archive`.
+        archive: Zip file that they are in, None for plain files.
+        description: Where they are from, for messages.
+    """
+
+    paths: dict[Key, pathlib.Path | str]
+    archive: pathlib.Path | None
+    description: str
+
+    def where(self, key: Key) -> str:
+        """Name of a label file, for messages."""
+        path = self.paths[key]
+        return str(path) if self.archive is None else f"{self.archive}/{path}"
+
+    @contextlib.contextmanager
+    def reader(self) -> Iterator[Callable[[Any], bytes]]:
+        """A function that reads one of the paths; an archive is opened once."""
+        if self.archive is None:
+            yield read_label_bytes
+        else:
+            with open_zip(self.archive) as archive:
+                yield functools.partial(read_member, archive, max_bytes=MAX_LABEL_BYTES)
+
+
+def find_own_labels(sequences: dict[int, SequenceFolder], version: str) -> LabelFiles:
+    """Label files in the sequences' own folders, as the data set is delivered."""
+    paths: dict[Key, pathlib.Path | str] = {}
+    for number, folder in sequences.items():
+        for subfolder in _LABEL_FOLDERS[version]:
+            listing = folder.listing(subfolder)
+            names = sorted(name for name in listing if _LABEL_NAME.fullmatch(name))
+            paths |= {(number, n.removesuffix(".txt")): listing[n] for n in names}
+            if names:
+                break
+    return LabelFiles(paths, None, "the sequences' own folders")
+
+
+def find_labels(path: pathlib.Path) -> LabelFiles:
+    """Label files of a revision, a folder or zip with `<sequence>/<radar>_<lidar>.txt`.
+
+    Raises:
+        FileNotFoundError: There is no such folder or file.
+        UserError: It is neither a folder nor a zip, or holds no label files.
+        DataError: A frame is in it twice, or the zip is corrupted.
+    """
+    names: list[tuple[pathlib.PurePath, Any]]
+    if path.is_dir():
+        names = [(file.relative_to(path), file) for file in sorted(path.rglob("*.txt"))]
+    elif not path.exists():
+        raise FileNotFoundError(f"{path}: no such labels, expected a folder or a zip")
+    elif path.suffix == ".zip" or zipfile.is_zipfile(path):
+        with open_zip(path) as file:
+            names = [(pathlib.PurePosixPath(name), name) for name in file.namelist()]
+    else:
+        raise UserError(f"{path}: labels must be a folder or a zip file")
+    found: dict[Key, pathlib.Path | str] = {}
+    for name, member in names:
+        key = _label_key(name)
+        if key is not None and key in found:
+            raise DataError(
+                f"{path}: frame {key[0]}/{key[1]} is there twice, as {found[key]} and "
+                f"{member}: one revision of every label, delete or move the other"
+            )
+        if key is not None:
+            found[key] = member
+    if not found:
+        raise UserError(
+            f"{path}: no label files in it, expected <sequence>/<radar>_<lidar>.txt "
+            "such as 1/00033_00001.txt"
+        )
+    archive = None if path.is_dir() else path
+    return LabelFiles(dict(sorted(found.items())), archive, str(path))
+
+
+def _label_key(path: pathlib.PurePath) -> Key | None:
+    """Sequence and frame name of a label file, None for any other file.
+
+    The sequence is the nearest folder above that is named like one: `1/...`,
+    `1/info_label/...` or `1_info_label_revised/...`.
+    """
+    if _LABEL_NAME.fullmatch(path.name):
+        for folder in reversed(path.parts[:-1]):
+            if match := _LABELLED_SEQUENCE.fullmatch(folder):
+                return int(match[1]), path.stem
+    return None
+
+
+# Splits ------------------------------------------------------------------------------
+
+
+def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | None:
+    """`split/<name>.txt` in or next to the given folders, None where there is none."""
+    for folder in near:
+        for candidate in ("split", "resources/split", "."):
+            path = folder / candidate / f"{split}.txt"
+            if path.is_file():
+                return path
+    return None
+
+
+def read_split(path: PathLike) -> list[Key]:
+    """Read a split file: lines `sequence,label file`.
+
+    Raises:
+        DataError: A line is malformed; the message names file and line.
+    """
+    frames = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if match := _SPLIT_LINE.fullmatch(line):
+            frames.append((int(match[1]), match[2]))
+        elif line.strip():
+            raise DataError(
+                f"{path}:{number}: {line[:80]!r}, expected 'sequence,label file', such "
+                "as 1,00033_00001.txt"
+            )
+    return frames
+
+
+def split_by_rule(names: Iterable[str], split: str) -> list[str]:
+    """K-Radar's split of one sequence: quarters 1 and 3 train, quarters 2 and 4 test.
+
+    Args:
+        names: Names of every labelled frame of the sequence.
+        split: "train" or "test".
+
+    Returns:
+        The names of the split, sorted. On complete sequences they equal the official
+        split files.
+    """
+    names = sorted(names)
+    cuts = [int(len(names) * quarter / 4) for quarter in range(5)]
+    first = 0 if split == "train" else 1
+    return [
+        name
+        for quarter in (first, first + 2)
+        for name in names[cuts[quarter] : cuts[quarter + 1]]
+    ]
+
+
+def read_split_entries(
+    split: PathLike,
+    near: Sequence[pathlib.Path],
+    keys: Collection[Key],
+    summary: Summary,
+) -> set[Key]:
+    """Frames of a split, from its file or by rule.
+
+    Args:
+        split: "train", "test" or a split file.
+        near: Folders in which split files are looked for.
+        keys: All labelled frames, which the rule divides.
+        summary: The use of the rule is noted in it.
+    """
+    if pathlib.Path(split).is_file():
+        return set(read_split(split))
+    if str(split) not in ("train", "test"):
+        raise UserError(
+            f"split {str(split)!r} is neither 'train', 'test', None nor a split file"
+        )
+    if path := find_split_file(str(split), near):
+        return set(read_split(path))
+    summary.notes.append(
+        f"no split/{split}.txt found: split by K-Radar's rule, alternating quarters"
+    )
+    names = collections.defaultdict(list)
+    for sequence, name in keys:
+        names[sequence].append(name)
+    return {
+        (sequence, name)
+        for sequence in names
+        for name in split_by_rule(names[sequence], str(split))
+    }
+
+
+def held_out(
+    sequences: Collection[int], validation: Sequence[float], seed: int
+) -> list[int]:
+    """Whole sequences of the train split that a run keeps for validation, sorted.
+
+    Args:
+        sequences: Numbers of those that have frames to train on.
+        validation: Numbers of sequences; or one fraction of them above 0 and below 1,
+            which is drawn, at least one sequence; () for none.
+        seed: Seed of the draw.
+
+    Raises:
+        UserError: A sequence does not exist, or none is left to train on.
+
+    Examples:
+        >>> held_out({1, 2, 5}, (5,), 0)
+        [5]
+        >>> len(held_out(range(1, 59), (0.1,), 0))
+        6
+    """
+    here = sorted(set(sequences))
+    if len(validation) == 1 and 0 < validation[0] < 1:
+        count = max(1, round(validation[0] * len(here)))
+        chosen = {int(n) for n in np.random.default_rng(seed).permutation(here)[:count]}
+    else:
+        chosen = {int(number) for number in validation}
+    if absent := sorted(chosen.difference(here)):
+        raise UserError(
+            f"config.data.validation holds out sequences {absent}, which have no frames in "
+            f"the train split; there are {here}"
+        )
+    if chosen and len(chosen) == len(here):
+        raise UserError(
+            f"config.data.validation is {tuple(validation)}, which holds out every "
+            f"sequence of the train split ({here}); leave at least one"
+        )
+    return sorted(chosen)

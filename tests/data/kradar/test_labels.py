@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.labels import (
     VERSIONS,
-    Problem,
     normalize_version,
     parse_label_file,
-    read_label_file,
     read_labels,
 )
 
@@ -78,10 +76,10 @@ def test_single_id_of_version_1_0():
 def test_disabled_objects_are_skipped_and_counted(version):
     line = LINES[version]
     file = parse(f"{HEADER}\n#{line[1:]}\n{line}\n", version)
-    assert (len(file.labels), file.num_disabled) == (1, 1)
+    assert (len(file.labels), file.num_unstarred) == (1, 1)
     text = f"{HEADER}\n#{line[1:]}\n{line}\n# no, object\n"
-    file = parse(text, version, include_unstarred_v11_labels=True)
-    assert (len(file.labels), file.num_disabled) == (2, 1)
+    file = parse(text, version, include_unstarred=True)
+    assert (len(file.labels), file.num_unstarred) == (2, 1)
     assert file.labels[0] == file.labels[1]
 
 
@@ -110,33 +108,24 @@ def test_oddities_are_read(text):
     ("text", "message"),
     [
         ("", r"f\.txt:1: the file is empty"),
-        ("hello", r"f\.txt:1: 'hello' is no header"),
-        (LINES["v2.1"], r"f\.txt:1: .* is no header"),
-        (HEADER.replace("_00004", ""), r"f\.txt:1: .* expected five"),
-        (HEADER[:-9] + ".1.2", r"f\.txt:1: timestamp"),
+        ("hello", r"f\.txt:1: 'hello' is not a header"),
+        (LINES["v2.1"], r"f\.txt:1: .* is not a header"),
+        (HEADER.replace("_00004", ""), r"f\.txt:1: .* is not a header"),
+        (HEADER[:-9] + ".1.2", r"f\.txt:1: .* is not a header"),
+        (HEADER.replace("00033", "9" * 5000), r"f\.txt:1: .* is not a header"),
+        (HEADER.replace("1643292946.", "9" * 400), r"f\.txt:1: .* is not a header"),
+        (HEADER.replace("00033", "٠٠٠٣٣"), r"f\.txt:1: .* is not a header"),
         (f"{HEADER}\n\n{LINES['v2.0']}", r"f\.txt:3: .* has the layout of v1\.0"),
-        (f"{HEADER}\nL, 4, Sedan, {BOX}", r"f\.txt:2: .* does not start with '\*'"),
-        (f"{HEADER}\n*, L, 4, Sedan, 1, 2, 3", r"f\.txt:2: 7 fields .* expected 11"),
+        (f"{HEADER}\nL, 4, Sedan, {BOX}", r"f\.txt:2: .* not an object line of v2\.1"),
+        (f"{HEADER}\n*, L, 4, Sedan, 1, 2, 3", r"f\.txt:2: 7 fields"),
         (f"{HEADER}\n*, L, 4, Sedam, {BOX}", r"f\.txt:2: class 'Sedam' is unknown"),
-        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}x", r"f\.txt:2: 'x' is not a number"),
-        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}nan", r"'nan' is not a number"),
-        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1_0", r"'1_0' is not a number"),
-        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1e999", r"must be finite"),
-        (
-            f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}-1.0",
-            r"half extents positive up to 50 m",
-        ),
-        (
-            f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1e39",
-            r"half extents positive up to 50",
-        ),
-        (f"{HEADER}\n*, L, 4, Sedan, 1e308{BOX[4:]}", r"positions up to 1000 m"),
+        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}nan", r"f\.txt:2: 11 fields .*nan"),
+        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1_0", r"f\.txt:2: 11 fields .*1_0"),
+        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}1e999", r"f\.txt:2: box .* positive"),
+        (f"{HEADER}\n*, L, 4, Sedan, {BOX[:-4]}-1.0", r"f\.txt:2: box .* positive"),
+        (f"{HEADER}\n*, L, 4, Sedan, 1e308{BOX[4:]}", r"f\.txt:2: box .* up to 10000"),
         (f"{HEADER}\n*, L, 4, Sedan, {'9' * 5000}{BOX[4:]}", r"50\d\d characters"),
-        (f"{HEADER}\n*, L, {'9' * 500}, Sedan, {BOX}", r"track id .* below 2\*\*31"),
-        (HEADER.replace("00033", "9" * 500), r"f\.txt:1: .* has frame numbers"),
-        (HEADER.replace("00033", "9" * 5000), r"f\.txt:1: .* too long for a header"),
-        (HEADER.replace("1643292946.", "9" * 400), r"is no Unix time"),
-        (HEADER.replace("00033", "٠٠٠٣٣"), r"f\.txt:1: .* is no header"),
+        (f"{HEADER}\n*, L, {'9' * 500}, Sedan, {BOX}", r"f\.txt:2: 11 fields"),
         (f"{HEADER}\n*, L, x, Sedan, {BOX}", r"is not an object line of v2\.1"),
     ],
 )
@@ -148,7 +137,7 @@ def test_malformed_files_name_file_and_line(text, message):
 def test_numbers_of_64_kb_take_no_time():
     text = f"{HEADER}\n*, L, 4, Sedan, {'1' * 65536}x, 2"
     text += f"\n*, L, 4, Sedan{' ' * 65536}x"
-    problems: list[Problem] = []
+    problems: list[str] = []
     began = time.process_time()
     parse(text, problems=problems)
     assert time.process_time() - began < 1
@@ -161,12 +150,12 @@ def test_undecodable_file_names_the_line():
 
 
 def test_lenient_reading_reports_and_goes_on():
-    problems: list[Problem] = []
+    problems: list[str] = []
     text = f"{HEADER}\n*, nonsense\n{LINES['v2.1']}\n*, L, 1"
     file = parse(text, problems=problems)
     assert len(file.labels) == 1
-    assert [problem.where for problem in problems] == ["f.txt:2", "f.txt:4"]
-    assert str(problems[0]).startswith("f.txt:2: 2 fields")
+    assert [problem.split(" ")[0] for problem in problems] == ["f.txt:2:", "f.txt:4:"]
+    assert problems[0].startswith("f.txt:2: 2 fields")
 
 
 def test_missing_file_folder_and_version(tmp_path):
@@ -215,7 +204,7 @@ PIECES = st.sampled_from(
     version=st.sampled_from(VERSIONS),
 )
 def test_fuzzed_files_never_crash(content, version):
-    problems: list[Problem] = []
+    problems: list[str] = []
     try:
         strict = parse_label_file(content, version)
     except DataError:
@@ -247,8 +236,7 @@ def test_real_examples_of_every_version(shared):
         "v2_1_header_only.txt": 0,
     }
     for name, count in counts.items():
-        file = read_label_file(folder / name, name[:4])
-        assert len(file.labels) == count, name
+        assert len(read_labels(folder / name, name[:4])) == count, name
     # The same boxes in two revisions, apart from the flag.
     old = [label.box for label in read_labels(folder / "v1_0.txt", "v1.0")]
     new = read_labels(folder / "v1_1_constructed.txt", "v1.1")

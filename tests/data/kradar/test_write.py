@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.kradar import sequences, write
+from radejax.data.kradar import conditions, dataset, write
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     VERSIONS,
     Label,
-    read_label_file,
+    parse_label_file,
     read_labels,
 )
 from radejax.geometry.radar_grid import RadarGrid
@@ -39,7 +39,7 @@ labels = st.builds(
 def test_labels_survive_writing_and_reading(tmp_path_factory, objects, version):
     path = tmp_path_factory.getbasetemp() / "round_trip" / "00033_00001.txt"
     write.write_labels(path, (33, 1, 2, 3, 4), 1643292946.71, objects, version)
-    file = read_label_file(path, version)
+    file = parse_label_file(path.read_bytes(), version)
     assert (file.header.radar, file.header.camera_lrr) == (33, 4)
     assert file.header.timestamp_s == pytest.approx(1643292946.71, abs=1e-6)
     assert len(file.labels) == len(objects)
@@ -56,16 +56,14 @@ def test_labels_survive_writing_and_reading(tmp_path_factory, objects, version):
 
 def test_calibration_description_and_splits_survive(tmp_path):
     write.write_calibration(tmp_path / "c.txt", 32, -2.54, np.float64(0.3))
-    assert sequences.read_calibration(tmp_path / "c.txt") == sequences.RadarCalibration(
-        32, -2.54, 0.3
-    )
+    assert dataset.read_calibration(tmp_path / "c.txt") == (32, -2.54, 0.3)
     write.write_description(tmp_path / "d.txt", "urban", "night", "heavysnow")
-    assert sequences.read_description(tmp_path / "d.txt") == sequences.Conditions(
+    assert conditions.read_description(tmp_path / "d.txt") == conditions.Conditions(
         "urban", "night", "heavysnow"
     )
     write.write_splits(tmp_path, [(1, "00033_00001")], [("2", "00034_00002.txt")])
-    assert sequences.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
-    assert sequences.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]
+    assert dataset.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
+    assert dataset.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]
 
 
 @pytest.mark.parametrize("compress", [False, True])

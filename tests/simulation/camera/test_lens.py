@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from radejax.data.kradar.sequences import KRADAR_CONDITIONS
+from radejax.data.kradar.conditions import KRADAR_CONDITIONS
 from radejax.simulation.camera import lens
 from radejax.simulation.radar.propagation import WEATHERS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from radejax.data.kradar.sequences import WEATHERS as KRADAR_WEATHERS
+from radejax.data.kradar.conditions import WEATHERS as KRADAR_WEATHERS
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar import propagation
 from radejax.simulation.radar.propagation import WEATHERS
