@@ -218,8 +218,8 @@ def state_dicts(content: Any, part: str) -> list[dict[str, Any]]:
             continue
         matches = (start.match(name) for name in map(str, mapping))
         if match := next(filter(None, matches), None):
-            items = mapping.items()
-            found.append({str(k).removeprefix(match[1]): v for k, v in items})
+            tensors = {k: v for k, v in mapping.items() if hasattr(v, "shape")}
+            found.append({str(k).removeprefix(match[1]): v for k, v in tensors.items()})
     return found
 
 

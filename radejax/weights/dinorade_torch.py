@@ -6,6 +6,7 @@ RADE-Net's), `image_neck.*`, `fusion.*` and `image_backbone.*`.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any, cast
@@ -83,7 +84,8 @@ def read(
     fusion |= infer_fusion(tensors, of_fusion)
     names = radenet_torch.module_names(len(config["widths"]), config["heads"], "rad_")
     names |= fusion_names()
-    if any(name.startswith("image_backbone.frozen_layers.") for name in tensors):
+    is_resnet = any(n.startswith("image_backbone.frozen_layers.") for n in tensors)
+    if is_resnet and dinov3 is None:
         # The released code feeds its ResNet colors in [0, 1].
         config["image"] |= {"kind": "resnet50", "standardize": False}
         names |= resnet_names()
@@ -123,7 +125,8 @@ def infer_fusion(
     }
     samples = tensors.get("fusion.deform_attn.attention_weights.bias")
     if samples is not None:
-        fields["num_points"] = samples.shape[0] // overrides.get("num_heads", 4)
+        heads = max(overrides.get("num_heads", 4), 1)
+        fields["num_points"] = math.prod(samples.shape) // heads
     return fields | dict(overrides)
 
 
@@ -215,7 +218,10 @@ def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
             merged[name.replace(".base_layer.", ".")] = value
     for name, pair in pairs.items():
         weight = f"{name}.weight"
-        if weight not in merged or set(pair) != {"A", "B"}:
-            raise DataError(f"{name}: an adapter without both halves and a weight")
-        merged[weight] = to_numpy(merged[weight]) + pair["B"] @ pair["A"]
+        try:
+            merged[weight] = to_numpy(merged[weight]) + pair["B"] @ pair["A"]
+        except (KeyError, ValueError):
+            raise DataError(
+                f"{name}: expected an adapter of two halves and the weight they fit"
+            ) from None
     return merged

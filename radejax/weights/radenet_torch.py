@@ -141,29 +141,22 @@ def infer_config(
             )
         return int(shape[axis])
 
-    backbone, levels = f"{prefix}backbone", 0
-    while (
-        f"{backbone}.encoder_block_{levels + 1}.double_conv.0.single_conv.0.bias"
-        in tensors
-    ):
-        levels += 1
-    widths = tuple(
-        size(f"{backbone}.encoder_block_{i}.double_conv.0.single_conv.0.bias", 0)
-        for i in range(1, max(levels, 1) + 1)
-    )
+    def width(block: str) -> int:
+        return size(f"{backbone}.{block}.double_conv.0.single_conv.0.bias", 0)
+
+    backbone = f"{prefix}backbone"
+    encoder = f"{backbone}.encoder_block_"
+    levels = len({n.split(".")[1] for n in tensors if n.startswith(encoder)})
     is_expanded = "head.heatmap_head.head.6.weight" in tensors
+    last = f"head.heatmap_head.head.{9 if is_expanded else 3}.bias"
     fields: dict[str, Any] = {
-        "num_classes": size(
-            f"head.heatmap_head.head.{9 if is_expanded else 3}.bias", 0
-        ),
-        "widths": widths,
-        "decoder_width": size(
-            f"{backbone}.decoder_block_{levels}.double_conv.0.single_conv.0.bias", 0
-        ),
+        "num_classes": size(last, 0),
+        "widths": tuple(width(f"encoder_block_{i + 1}") for i in range(levels)),
+        "decoder_width": width(f"decoder_block_{levels}"),
         "cbam": "official" if f"{backbone}.cbam_" in "\n".join(tensors) else "off",
         "neck": "plain" if f"{prefix}neck.neck.0.conv.weight" in tensors else "dilated",
         "heads": "expanded" if is_expanded else "default",
-        "pad_multiple": 2 ** len(widths),
+        "pad_multiple": 2**levels,
     }
     stem = f"{backbone}.transform_input"
     fields["input_stem"] = f"{stem}.doppler_conv.0.weight" in tensors
@@ -177,10 +170,9 @@ def infer_config(
             f"{source}: the model reads {channels} channels and nothing shows how many "
             "are Doppler; give doppler_bins and elevation_bins"
         )
-    overrides = {
-        k: "off" if k == "cbam" and v is None else v for k, v in overrides.items()
-    }
-    return fields | overrides
+    fields |= overrides
+    fields["cbam"] = fields["cbam"] or "off"
+    return fields
 
 
 def check_overrides(overrides: Mapping[str, Any], known: Mapping[str, Any]) -> None:

@@ -192,34 +192,14 @@ def test_loading_fills_the_model_exactly(shared):
     )
 
 
-def vit_tensors(prefix):
-    shapes = {
-        "embeddings.cls_token": (1, 1, 64),
-        "embeddings.mask_token": (1, 1, 64),
-        "embeddings.register_tokens": (1, 4, 64),
-        "embeddings.patch_embeddings.weight": (64, 3, 16, 16),
-        "embeddings.patch_embeddings.bias": (64,),
-        "norm.weight": (64,),
-        "norm.bias": (64,),
-    }
-    layer = {f"norm{i}.{kind}": (64,) for i in (1, 2) for kind in ("weight", "bias")}
-    layer |= {f"layer_scale{i}.lambda1": (64,) for i in (1, 2)}
-    layer |= {f"attention.{k}_proj.weight": (64, 64) for k in "qkvo"}
-    layer |= {f"attention.{k}_proj.bias": (64,) for k in "qvo"}
-    layer |= {"mlp.up_proj.weight": (96, 64), "mlp.up_proj.bias": (96,)}
-    layer |= {"mlp.down_proj.weight": (64, 96), "mlp.down_proj.bias": (64,)}
-    shapes |= {f"layer.0.{k}": s for k, s in layer.items()}
-    return {prefix + k: RECIPES.seeded_tensor(k, s) for k, s in shapes.items()}
-
-
-def test_image_backbone_with_adapters(shared):
+def test_image_backbone_with_adapters(shared, make):
     tensors = dict(end_to_end_tensors(shared))
     prefix = "image_backbone.base_model.model."
-    tensors |= vit_tensors(prefix)
-    tensors["image_neck.channel_proj.weight"] = np.zeros((128, 64), np.float32)
+    tensors |= {prefix + k: v for k, v in make.tiny_tensors().items()}
+    tensors["image_neck.channel_proj.weight"] = np.zeros((128, 96), np.float32)
     query = f"{prefix}layer.0.attention.q_proj"
-    down = RECIPES.seeded_tensor("lora_a", (2, 64))
-    up = RECIPES.seeded_tensor("lora_b", (64, 2))
+    down = RECIPES.seeded_tensor("lora_a", (2, 96))
+    up = RECIPES.seeded_tensor("lora_b", (96, 2))
     plain = tensors.pop(f"{query}.weight")
     tensors[f"{query}.base_layer.weight"] = plain
     tensors[f"{query}.base_layer.bias"] = tensors.pop(f"{query}.bias")
@@ -227,12 +207,8 @@ def test_image_backbone_with_adapters(shared):
     tensors[f"{query}.lora_B.default.weight"] = up
     model, variables = dinorade_torch.load(tensors)
     vit = model.vit
-    assert (vit.hidden_size, vit.num_layers, vit.num_heads, vit.mlp_dim) == (
-        64,
-        1,
-        1,
-        96,
-    )
+    sizes = vit.hidden_size, vit.num_layers, vit.num_heads, vit.mlp_dim
+    assert sizes == (96, 3, 1, 192)
     backbone = variables["params"]["image_backbone"]
     kernel = backbone["layers"]["query"]["kernel"][0]
     np.testing.assert_allclose(kernel, (plain + up @ down).T, atol=1e-6)

@@ -198,15 +198,6 @@ def test_something_else_is_refused(content, message):
         radenet_torch.load(content)
 
 
-def test_a_neck_of_other_names_is_not_taken_for_a_known_one(small_state):
-    other = {
-        n.replace("neck.neck.0.conv", "neck.neck.0.strip"): v
-        for n, v in small_state.items()
-    }
-    with pytest.raises(DataError, match=r"missing neck.neck.0.conv1"):
-        radenet_torch.load(other, **OVERRIDES)
-
-
 def test_overrides_are_checked(small_state):
     with pytest.raises(UserError, match=r"unknown model fields \['width'\]"):
         radenet_torch.load(small_state, width=3)
@@ -309,7 +300,7 @@ def test_another_block_is_an_error(small_state):
     state = dict(small_state)
     name = "backbone.encoder_block_100000000.adjust_input.weight"
     state[name] = np.zeros((1, 1, 1, 1), np.float32)
-    with pytest.raises(DataError, match=rf"unexpected {name}"):
+    with pytest.raises(DataError, match=r"without a tensor .*encoder_block_4"):
         radenet_torch.load(state, **OVERRIDES)
 
 
