@@ -20,8 +20,7 @@ import pytest
 from radejax.cli import main
 from radejax.cli.evaluate import evaluate
 from radejax.cli.train import train
-from radejax.core.config import load_config
-from radejax.runs.override import override
+from radejax.core.config import load_config, override
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [

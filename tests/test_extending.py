@@ -22,7 +22,7 @@ from radejax.losses.detection import LOSSES
 from radejax.models.backbone import BACKBONES
 from radejax.models.heads import HEADS
 from radejax.models.neck import NECKS
-from radejax.runs import check_config, experiment
+from radejax.runs import checks, experiment
 from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run
 from radejax.runs.sources import Sources
@@ -94,7 +94,7 @@ def test_the_page_has_every_kind_of_part() -> None:
 
 def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
     config = _config()
-    check_config.check(config)
+    checks.check(config)
     model = models.build(config.model)
     projection = jax.ShapeDtypeStruct((1, 16, 14, 5), "float32")
     made = jax.eval_shape(model.init, jax.random.key(0), projection)["params"]

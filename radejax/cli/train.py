@@ -15,7 +15,7 @@ class _Command(options.Command):
     """Also takes any field of the config: `--config.train.batch_size=4`.
 
     The last one counts where a field is given twice, and `--config.logging.wandb` alone is
-    true. Other options that do not exist name the field that was meant.
+    true.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -32,18 +32,7 @@ class _Command(options.Command):
                 is_value = bool(left) and not left[0].startswith("--")
                 text = left.pop(0) if is_value else "true"
             fields[name] = text
-        try:
-            return super().parse_args(ctx, words)
-        except click.NoSuchOption as error:
-            from radejax.runs.override import fields_like
-
-            meant = fields_like(error.option_name.lstrip("-").replace("-", "_"))
-            if not meant:
-                raise
-            flags = " or ".join(_PREFIX + name for name in meant)
-            raise click.UsageError(
-                f"no such option {error.option_name}; did you mean {flags}?", ctx
-            ) from None
+        return super().parse_args(ctx, words)
 
 
 @click.command(cls=_Command)
@@ -130,9 +119,8 @@ def train(
 
     Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
     """
-    from radejax.core.config import config_name, load_config
+    from radejax.core.config import config_name, load_config, override
     from radejax.runs.experiment import run
-    from radejax.runs.override import override
     from radejax.runs.seeds import run_seeds
     from radejax.runs.sources import Sources
 

@@ -6,17 +6,18 @@ same fields. Values are plain and resolved: no paths, no devices, nothing comput
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib.util
-import json
 import os
 import pathlib
 import types
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
+from ml_collections.config_flags import config_path
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
@@ -104,7 +105,8 @@ def load_config(path_and_options: str) -> ConfigDict:
     get_config = getattr(load_module(path), "get_config", None)
     if get_config is None:
         raise UserError(f"{path} has no function get_config()")
-    return get_config(options) if options else get_config()
+    config = get_config(options) if options else get_config()
+    return config.lock()
 
 
 def base_config() -> ConfigDict:
@@ -127,27 +129,54 @@ def base_config() -> ConfigDict:
     return config
 
 
-def renewed(
-    config: Mapping[str, Any], before: Mapping[str, Any] = types.MappingProxyType({})
-) -> dict[str, Any]:
-    """Plain values of a config of an earlier version, as the present one has them.
+def override(config: ConfigDict, texts: Mapping[str, str]) -> None:
+    """Sets fields of a config from texts such as those of a command line.
 
-    Fields that it lacks are as they were `before` they could be chosen, else at their
-    default; weights of losses in a row, `(2.0, 1.0, 1.0)`, get their names.
+    Args:
+        config: Changed in place.
+        texts: By dotted name, such as {"train.batch_size": "4"}: Python literals, words
+            such as "off", "true" and "none", or several for a tuple, "fog,rain".
+
+    Raises:
+        UserError: There is no such field, or the value is of another type.
     """
-    loss, names = config.get("loss", {}), ("focal", "gwd", "smooth_l1")
-    weights = loss["weights"] if isinstance(loss, Mapping) and "weights" in loss else ()
-    if isinstance(weights, list | tuple) and len(weights) == len(names):
-        by_name = dict(zip(names, weights, strict=True))
-        config = {**config, "loss": {**loss, "weights": by_name}}
-    return _filled_up(_filled_up(config, before), json.loads(base_config().to_json()))
+    for name, text in texts.items():
+        known = dict(fields_of(config))
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean config.{near[0]}?" if near else ""
+            raise UserError(f"config.{name} is not a field of this config{hint}")
+        kind, value = known[name], _literal(text)
+        if kind is tuple and not isinstance(value, tuple | list | None):
+            words = filter(None, text.strip("()[] ").split(","))
+            value = tuple(_literal(word) for word in words)
+        if kind is str and not isinstance(value, str | None):
+            value = text
+        try:
+            if isinstance(value, bool) and kind is not bool:
+                raise TypeError
+            config_path.set_value(name, config, value)
+        except TypeError:
+            expected = f"a value of type {kind.__name__}"
+            raise UserError(f"config.{name} is {text!r}, expected {expected}") from None
 
 
-def _filled_up(found: Any, defaults: Any) -> Any:
-    """A tree of values with those that it lacks."""
-    if not (isinstance(found, Mapping) and isinstance(defaults, Mapping)):
-        return found
-    return {**defaults, **{k: _filled_up(v, defaults.get(k)) for k, v in found.items()}}
+def fields_of(config: ConfigDict, path: str = "") -> Iterator[tuple[str, type]]:
+    """Dotted name and type of every field."""
+    for key in config:
+        if isinstance(config[key], ConfigDict):
+            yield from fields_of(config[key], f"{path}{key}.")
+        else:
+            yield f"{path}{key}", config.get_type(key)
+
+
+def _literal(text: str) -> Any:
+    """The Python value that a text is, or the text."""
+    words = {"true": True, "false": False, "none": None}
+    try:
+        return ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return words.get(text.strip().lower(), text.strip())
 
 
 def _model() -> ConfigDict:
@@ -190,8 +219,7 @@ def _loss() -> ConfigDict:
             "normalize": True,  # divide each part by its own value
             # Boxes are z0 + dz. The paper prints no value for its sensor height.
             "z0_m": 0.0,
-        },
-        type_safe=False,  # config files of before have weights=(2.0, 1.0, 1.0)
+        }
     )
 
 

@@ -1,8 +1,12 @@
-"""Errors that are the user's to mend, told apart from defects of the program.
+"""Errors of the user and of files, and the ranges of options.
 
-Command line programs turn every `ValueError` with an `exit_code` into one line without a
-traceback: 2 for wrong use, 1 for a file that is not what it should be and a full disk.
+Command line programs print every `ValueError` with an `exit_code` as one line without a
+traceback: 2 for wrong use, 1 for a corrupted file and a full disk.
 """
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 _LONGEST = 2000
 
@@ -54,3 +58,67 @@ def require(holds: bool, name: str, value: object, expected: str) -> None:
     """
     if not holds:
         raise UserError(f"{name} is {value!r}, expected {expected}")
+
+
+Range = tuple[Callable[[Any], bool], str]
+"""Whether a value is in a range, and the range in words."""
+
+
+def integer(least: int, most: float = math.inf) -> Range:
+    """Integers of a range; True is not 1."""
+    upper = "" if most == math.inf else f" and at most {most:.0f}"
+    return (
+        lambda value: isinstance(value, int) and _is_number(value, least, most),
+        f"an integer of at least {least}{upper}",
+    )
+
+
+def number(least: float, most: float = math.inf) -> Range:
+    """Finite numbers of a closed range."""
+    upper = "" if most == math.inf else f" and at most {most}"
+    return lambda x: _is_number(x, least, most), f"a number of at least {least}{upper}"
+
+
+def one_of(*choices: Any) -> Range:
+    """One of several values."""
+    return lambda value: value in choices, f"one of {', '.join(map(repr, choices))}"
+
+
+def several(entries: Range, expected: str, count: int | None = None) -> Range:
+    """Different entries, each of a range; or so many, which may be equal."""
+
+    def holds(values: Any) -> bool:
+        is_size = len(set(values)) == len(values) if count is None else False
+        return (is_size or len(values) == count) and all(map(entries[0], values))
+
+    return holds, expected
+
+
+def or_none(values: Range) -> Range:
+    """A range, or None."""
+    holds, expected = values
+    return lambda value: value is None or holds(value), f"{expected}, or None"
+
+
+POSITIVE: Range = lambda x: _is_number(x, 0) and x > 0, "a number above 0"
+BELOW_ONE: Range = (
+    lambda x: _is_number(x, 0, 1) and x < 1,
+    "a number from 0 to below 1",
+)
+
+
+def check_options(values: Any, section: str, ranges: Mapping[str, Range]) -> None:
+    """Raises `UserError` for the first field of a section that is out of its range."""
+    for name, (holds, expected) in ranges.items():
+        value = values[name]
+        try:
+            is_fine = holds(value)
+        except TypeError:
+            is_fine = False
+        require(is_fine, f"{section}.{name}", value, expected)
+
+
+def _is_number(value: Any, least: float, most: float = math.inf) -> bool:
+    return (
+        not isinstance(value, bool) and math.isfinite(value) and least <= value <= most
+    )

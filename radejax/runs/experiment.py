@@ -13,11 +13,10 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
-from radejax.core.config import renewed
 from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence
 from radejax.inference.saved import PathLike, StartingWeights, starting_weights
-from radejax.runs import check_config
+from radejax.runs import checks
 from radejax.runs.data import Data, open_data
 from radejax.runs.evaluate import evaluate
 from radejax.runs.sources import Sources
@@ -72,8 +71,7 @@ def run(
             belongs to another configuration or is in use, no data, or no space.
     """
     started = time.perf_counter()
-    check_config.check(config)
-    config = ConfigDict(renewed(config.to_dict()))
+    checks.check(config)
     distributed.check_batch_size(config.train.batch_size, distributed.make_mesh())
     model = models.build(config.model)  # what cannot be built fails first
     folder = default_workdir(workdir, name)

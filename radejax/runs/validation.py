@@ -21,7 +21,7 @@ from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.predict import predict_dataset
-from radejax.runs.check_config import check_best_metric
+from radejax.runs.checks import check_best_metric
 from radejax.runs.data import Data
 from radejax.runs.evaluate import make_detector
 from radejax.runs.figures import FrameDrawer

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import json
 import pathlib
 import shlex
@@ -26,12 +25,9 @@ from ml_collections import ConfigDict
 
 import radejax
 from radejax.core import files
-from radejax.core.config import renewed
 from radejax.core.files import PathLike
-from radejax.data.cameras import BEFORE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.sources import DataPaths, saved_path
-from radejax.simulation.config import default_config
 from radejax.training import distributed
 
 
@@ -69,11 +65,6 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     path = workdir / "config.json"
     if distributed.is_main() and not any(workdir.glob("checkpoints/*")):
         path.unlink(missing_ok=True)
-    before: dict[str, Any] = {}  # of what earlier versions have fewer fields
-    if "camera" in config.data:
-        before["data"] = {"camera": BEFORE}
-    if "simulation" in config:
-        before["simulation"] = default_config()
     files.claim(
         path,
         json.loads(config.to_json()),
@@ -81,7 +72,6 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         mend="give another --workdir, or remove that one",
         name="config",
         ignore=("logging",),
-        renewed=functools.partial(renewed, before=before),
     )
 
 

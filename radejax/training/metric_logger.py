@@ -18,7 +18,14 @@ import tqdm
 from jaxtyping import UInt8
 
 from radejax.core import files
-from radejax.core.errors import DataError, UserError, require
+from radejax.core.errors import (
+    DataError,
+    UserError,
+    check_options,
+    integer,
+    require,
+    several,
+)
 from radejax.losses.detection import LOSSES
 from radejax.training import distributed
 from radejax.training.checkpoints import BEST
@@ -41,16 +48,14 @@ class LoggingOptions:
     profile_steps: tuple[int, int]
 
     def __post_init__(self) -> None:
-        count, steps = self.num_visualizations, self.profile_steps
-        name = "config.logging.num_visualizations"
-        require(count >= 0, name, count, "an integer of at least 0")
-        is_range = len(steps) == 2 and all(type(step) is int for step in steps)
-        require(
-            is_range and 0 <= steps[0] <= steps[1],
-            "config.logging.profile_steps",
-            steps,
-            "two integers of at least 0, the first not above the last",
-        )
+        steps = "two integers of at least 0, the first not above the last"
+        ranges = {
+            "num_visualizations": integer(0),
+            "profile_steps": several(integer(0), steps, count=2),
+        }
+        check_options(vars(self), "config.logging", ranges)
+        first, last = self.profile_steps
+        require(first <= last, "config.logging.profile_steps", (first, last), steps)
 
 
 @dataclasses.dataclass(frozen=True)

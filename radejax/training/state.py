@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
@@ -16,18 +15,38 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import (
+    BELOW_ONE,
+    POSITIVE,
+    UserError,
+    check_options,
+    integer,
+    number,
+    one_of,
+    or_none,
+    require,
+)
 
 Schedule = Literal["cosine", "cyclic_cosine"]
 
-_POSITIVE_INTEGERS = (
-    "batch_size",
-    "num_epochs",
-    "gradient_accumulation_steps",
-    "log_every_steps",
-    "checkpoint_every_steps",
-)
-_INTEGERS = ("warmup_steps", "evaluate_every_epochs", "max_skipped_steps")
+_RANGES = {
+    "batch_size": integer(1),
+    "num_epochs": integer(1),
+    "learning_rate": POSITIVE,
+    "final_learning_rate": number(0),
+    "schedule": one_of("cosine", "cyclic_cosine"),
+    "weight_decay": number(0),
+    "warmup_steps": integer(0),
+    "gradient_clip_norm": or_none(POSITIVE),
+    "ema_decay": or_none(BELOW_ONE),
+    "gradient_accumulation_steps": integer(1),
+    "parameter_sharding": one_of("replicated", "fsdp"),
+    "log_every_steps": integer(1),
+    "checkpoint_every_steps": integer(1),
+    "checkpoints_to_keep": or_none(integer(1)),
+    "evaluate_every_epochs": integer(0),
+    "max_skipped_steps": integer(0),
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,36 +76,13 @@ class TrainOptions:
     max_skipped_steps: int
 
     def __post_init__(self) -> None:
-        def check(name: str, holds: bool, expected: str) -> None:
-            require(holds, f"config.train.{name}", getattr(self, name), expected)
-
-        for name in _POSITIVE_INTEGERS:
-            check(name, getattr(self, name) >= 1, "an integer of at least 1")
-        for name in _INTEGERS:
-            check(name, getattr(self, name) >= 0, "an integer of at least 0")
-        keep, clip, ema = (
-            self.checkpoints_to_keep,
-            self.gradient_clip_norm,
-            self.ema_decay,
+        check_options(vars(self), "config.train", _RANGES)
+        require(
+            self.final_learning_rate <= self.learning_rate,
+            "config.train.final_learning_rate",
+            self.final_learning_rate,
+            f"at most config.train.learning_rate, {self.learning_rate}",
         )
-        check("checkpoints_to_keep", keep is None or keep >= 1, "at least 1, or None")
-        rate = self.learning_rate
-        check("learning_rate", 0 < rate < math.inf, "a number above 0")
-        check(
-            "final_learning_rate",
-            0 <= self.final_learning_rate <= rate,
-            f"a number from 0 to config.train.learning_rate, {rate}",
-        )
-        check("weight_decay", 0 <= self.weight_decay < math.inf, "at least 0")
-        is_norm = clip is None or 0 < clip < math.inf
-        check("gradient_clip_norm", is_norm, "a number above 0, or None")
-        is_decay = ema is None or 0 <= ema < 1
-        check("ema_decay", is_decay, "a number from 0 to below 1, or None")
-        schedules = ("cosine", "cyclic_cosine")
-        check("schedule", self.schedule in schedules, f"one of {schedules}")
-        shardings = ("replicated", "fsdp")
-        is_known = self.parameter_sharding in shardings
-        check("parameter_sharding", is_known, f"one of {shardings}")
 
     def make_schedule(self, steps_per_epoch: int) -> optax.Schedule:
         """Learning rate by step."""

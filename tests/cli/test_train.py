@@ -62,21 +62,15 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["--batch_size=4"],
-            "no such option --batch-size; did you mean --config.train.batch_size or "
-            "--config.evaluation.batch_size?",
-        ),
-        (["--train.batchsize=4"], "did you mean --config.train.batch_size?"),
-        (["--learning-rat", "1"], "did you mean --config.train.learning_rate?"),
+        (["--config.train.batchsize=4"], "did you mean config.train.batch_size?"),
         (["--wordkir=a"], "--workdir"),
         (
             ["--config.loss.heatmap_sigma_mode=foo"],
-            "error: config.loss.heatmap_sigma_mode is 'foo', expected one of 'fixed', 'adaptive'",
+            "error: config.loss.heatmap_sigma_mode is 'foo', expected one of",
         ),
         (
             ["--config.evaluation.roi=(0,1)"],
-            "error: config.evaluation.roi is '(0,1)', expected a tuple of 6, each a number",
+            "error: config.evaluation.roi is (0, 1), expected x0, x1, y0, y1, z0, z1",
         ),
         (["--config.train.seed", "1"], "error: config.train.seed is not a field"),
         (

@@ -1,11 +1,11 @@
 """Configs: words, presets, the rows of the papers' tables; every one can be built."""
 
-import json
 import pathlib
 from typing import Any
 
 import jax
 import pytest
+from ml_collections.config_flags import config_path
 
 from radejax import models
 from radejax.core.config import (
@@ -14,8 +14,8 @@ from radejax.core.config import (
     config_name,
     load_config,
     load_module,
+    override,
     parse_options,
-    renewed,
 )
 from radejax.core.errors import UserError
 
@@ -94,20 +94,54 @@ def test_names_of_runs() -> None:
     assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
 
 
-def test_a_config_of_before_is_brought_to_the_present_form() -> None:
-    now = json.loads(base_config().to_json())
-    before = json.loads(base_config().to_json())
-    before["loss"]["weights"] = [2.0, 1.0, 0.5]
-    del before["data"]["sequences"], before["seed"]
-    now["loss"]["weights"]["smooth_l1"] = 0.5
-    assert renewed(before) == renewed(now) == now
-
-
-def test_a_config_file_of_before_lists_the_weights_of_losses() -> None:
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("train.batch_size", "4", 4),
+        ("train.learning_rate", "1", 1.0),
+        ("train.learning_rate", "2e-3", 2e-3),
+        ("train.ema_decay", "none", None),
+        ("data.label_permutation_seed", "7", 7),
+        ("data.label_version", "2.1", "2.1"),
+        ("data.weather", "fog", ("fog",)),
+        ("data.weather", "fog, rain", ("fog", "rain")),
+        ("data.weather", "('fog', 'rain')", ("fog", "rain")),
+        ("data.sequences", "[1, 58]", (1, 58)),
+        ("data.sequences", "()", ()),
+        ("data.visibility", "none", None),
+        ("model.cbam", "off", "off"),
+        ("model.input_stem", "true", True),
+        ("evaluation.iou_thresholds", "0.5", (0.5,)),
+        ("loss.weights.focal", "3", 3.0),
+        ("logging.wandb_project", "123", "123"),
+    ],
+)
+def test_a_text_becomes_the_value_of_a_field(
+    name: str, text: str, expected: Any
+) -> None:
     config = base_config()
-    config.loss.weights = (2.0, 1.0, 0.5)
-    by_name = renewed(config.to_dict())["loss"]["weights"]
-    assert by_name == {"focal": 2.0, "gwd": 1.0, "smooth_l1": 0.5}
+    override(config, {name: text})
+    found = config_path.get_value(name, config)
+    assert found == expected
+    assert type(found) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("train.batch_size", "many", "is 'many', expected a value of type int"),
+        ("train.batch_size", "2.5", "is '2.5', expected a value of type int"),
+        ("train.batch_size", "true", "is 'true', expected a value of type int"),
+        ("model.input_stem", "1", "is '1', expected a value of type bool"),
+        ("train", "1", "config.train is not a field of this config"),
+        ("train.batchsize", "1", "did you mean config.train.batch_size?"),
+        ("train.learning_rate", "((((" * 300, "expected a value of type float"),
+    ],
+)
+def test_other_texts_are_refused_by_name(name: str, text: str, message: str) -> None:
+    with pytest.raises(UserError) as refused:
+        override(base_config(), {name: text})
+    assert message in str(refused.value)
 
 
 def test_configs_that_come_along_are_those_of_the_repository() -> None:

@@ -14,11 +14,10 @@ import pytest
 from click.testing import CliRunner
 
 from radejax.core import files
-from radejax.core.config import load_config
+from radejax.core.config import load_config, override
 from radejax.core.structures import CLASSES
 from radejax.evaluation.report import write_report
-from radejax.runs import check_config
-from radejax.runs.override import override
+from radejax.runs import checks
 
 SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "labels exchanged": 0.1}
 """Of what share of the objects a cell finds; 0.5 where it is not told."""
@@ -162,7 +161,7 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
     seen = []
     for name, cell in study.cells.items():
         config = work.config(cell, 2)
-        check_config.check(config)
+        checks.check(config)
         words = work.command(name, 2).split()
         again = load_config(
             str(ablation.CONFIGS.parent / words[words.index("--config") + 1])

@@ -6,15 +6,11 @@ import subprocess
 import sys
 
 import pytest
-from ml_collections import ConfigDict
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.runs import workdir
 from radejax.runs.sources import DataPaths
-from radejax.simulation.config import default_config
-
-from .. import small_models as small
 
 
 def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
@@ -46,50 +42,6 @@ def test_another_config_is_refused_and_the_difference_named(
         ),
         workdir.claimed(tmp_path, config),
     ):
-        pass
-
-
-def test_a_run_older_than_a_field_of_the_config_goes_on(tmp_path: pathlib.Path) -> None:
-    config = base_config()
-    old = json.loads(config.to_json())
-    config.simulation = ConfigDict(default_config())
-    old["simulation"] = default_config()
-    del old["simulation"]["camera_mode"], old["data"]["validation"]
-    del old["simulation"]["vru_density_scale"]
-    del old["data"]["sequences"], old["seed"], old["train"]["schedule"]
-    old["loss"]["weights"] = [2.0, 1.0, 1.0]
-    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
-    (tmp_path / "config.json").write_text(json.dumps(old))
-    with workdir.claimed(tmp_path, config):
-        pass
-    config.train.schedule = "cyclic_cosine"
-    with (
-        pytest.raises(
-            UserError, match=r"schedule is 'cosine' there and 'cyclic_cosine'"
-        ),
-        workdir.claimed(tmp_path, config),
-    ):
-        pass
-
-
-def test_an_old_run_goes_on_with_the_height_that_it_had(tmp_path: pathlib.Path) -> None:
-    config = small.camera_config()
-    old = json.loads(config.to_json())
-    del (
-        old["data"]["camera"]["radar_from_lidar_z_m"],
-        old["data"]["camera"]["calibration"],
-    )
-    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
-    (tmp_path / "config.json").write_text(json.dumps(old))
-    with (
-        pytest.raises(
-            UserError, match=r"camera\.radar_from_lidar_z_m is 0\.0 there and"
-        ),
-        workdir.claimed(tmp_path, config),
-    ):
-        pass
-    config.data.camera.radar_from_lidar_z_m = 0.0
-    with workdir.claimed(tmp_path, config):
         pass
 
 

@@ -17,7 +17,7 @@ from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import starting_weights
 from radejax.losses.detection import detection_loss
-from radejax.runs import check_config
+from radejax.runs import checks
 from radejax.training import distributed, loop
 from radejax.training.state import create_state, make_optimizer, make_schedule
 from radejax.training.step import make_train_step
@@ -98,7 +98,7 @@ def test_a_word_for_sigma_changes_the_targets_alone(name: str, preset: str) -> N
     fixed = {"sigma3": 3.0, "sigma0.75": 0.75}
     for word in (*fixed, "adaptive", "anisotropic"):
         config = _get(name, f"{preset},{word}").to_dict()
-        check_config.check(ConfigDict(config))
+        checks.check(ConfigDict(config))
         loss = config.pop("loss")
         assert loss["heatmap_sigma_mode"] == ("fixed" if word in fixed else word)
         assert loss["heatmap_sigma_bins"] == fixed.get(

@@ -1,4 +1,4 @@
-"""Impossible values are refused before a run does anything."""
+"""Every field of every section is checked before a run does anything."""
 
 import itertools
 import math
@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 from ml_collections import ConfigDict
 
-from radejax.core.config import base_config, load_config, load_module
+from radejax.core.config import base_config, fields_of, load_config, load_module
 from radejax.core.errors import UserError
 from radejax.runs import experiment, seeds
-from radejax.runs.check_config import RULES, check
+from radejax.runs.checks import check
+from radejax.training import distributed
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 NAN, INF = math.nan, math.inf
@@ -41,16 +42,11 @@ WRONG = [
     ("model.heatmap_prior", 1.0),
     ("model.input_center", NAN),
     ("model.input_scale", 0.0),
-    ("loss", 3),
     ("loss.heatmap_sigma_mode", "adaptiv"),
     ("loss.heatmap_sigma_bins", 0.0),
     ("loss.gwd_tau", 0.0),
     ("loss.gwd_tau", NAN),
     ("loss.gwd_transform", "log"),
-    ("loss.weights", 1.0),
-    ("loss.weights", (1.0, 1.0)),
-    ("loss.weights", (1.0, 1.0, "1")),
-    ("loss.weights", (0.0, 0.0, 0.0)),
     ("loss.weights", {"focal": 1.0, "giou": 1.0}),
     ("loss.weights", {"focal": -1.0}),
     ("loss.weights", {}),
@@ -104,7 +100,6 @@ WRONG = [
     ("simulation.train_sequences", 2.5),
     ("simulation.label_distance_m", NAN),
     ("simulation.radar_from_lidar_m", (0.0, 0.0)),
-    ("simulation.grid", "ars540"),
     ("model.image.num_heads", 0),
     ("model.image.size", (720,)),
     ("model.fusion.dropout", 1.0),
@@ -131,8 +126,7 @@ def _with(field: str, value: Any) -> ConfigDict:
 def test_an_impossible_value_is_named_with_what_is_expected(
     field: str, value: Any
 ) -> None:
-    words = rf"^config\.{re.escape(field)} is {re.escape(repr(value))}, expected .+"
-    with pytest.raises(UserError, match=words) as raised:
+    with pytest.raises(UserError, match=rf"config\.{re.escape(field)}\b") as raised:
         check(_with(field, value))
     assert "\n" not in str(raised.value)
 
@@ -146,10 +140,13 @@ def test_nothing_is_written_or_built_for_a_wrong_config(tmp_path: pathlib.Path) 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_batch_that_does_not_divide_is_refused_first(tmp_path: pathlib.Path) -> None:
-    config = _with("train.gradient_accumulation_steps", 3)
+def test_a_batch_that_does_not_divide_is_refused_first(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = distributed.make_mesh(4)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     with pytest.raises(UserError, match=r"config.train.batch_size=2 does not divide"):
-        experiment.run(config, name="x", workdir=tmp_path / "run")
+        experiment.run(_with("train.batch_size", 2), name="x", workdir=tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
 
@@ -161,22 +158,46 @@ def test_fields_that_are_missing_or_unknown() -> None:
     del config.train["num_epochs"]
     with pytest.raises(UserError, match=r"config.train.num_epochs is missing"):
         check(config)
-    config = base_config()
-    del config["loss"]
-    with pytest.raises(UserError, match=r"config.loss.heatmap_sigma_mode is missing"):
-        check(config)
 
 
-def test_weights_of_losses_have_names_or_are_in_a_row() -> None:
-    for weights in ({"focal": 1, "gwd": 0.0}, (2.0, 1.0, 1.0), [2, 1, 0]):
-        check(_with("loss.weights", weights))
+def _fields() -> list[str]:
+    return [name for name, _ in fields_of(load_config("quickstart_fusion"))]
+
+
+@pytest.mark.parametrize("field", _fields())
+def test_a_value_of_a_wrong_type_is_one_line_that_names_the_field(field: str) -> None:
+    """A section is the type of no field."""
+    kind = dict(fields_of(load_config("quickstart_fusion")))[field]
+    for value in ({"a": 1}, 2.5 if kind is int else 1 if kind is str else "many"):
+        with pytest.raises(UserError, match=rf"config\.{re.escape(field)}\b") as raised:
+            check(_with(field, value))
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("field", _fields())
+def test_a_number_below_its_range_or_not_finite_is_named(field: str) -> None:
+    kind = dict(fields_of(load_config("quickstart_fusion")))[field]
+    named = field.removesuffix(".focal").removesuffix(".gwd").removesuffix(".smooth_l1")
+    anything = (
+        "num_workers",
+        "input_center",
+        "z0_m",
+        "radar_from_lidar_z_m",
+        "layer_scale",
+    )
+    if kind not in (int, float) or field.rpartition(".")[2] in anything:
+        return
+    values = (-1,) if kind is int else (-1.0, NAN, INF)
+    for value in values:
+        with pytest.raises(UserError, match=rf"config\.{re.escape(named)}\b"):
+            check(_with(field, value))
 
 
 def test_what_one_field_asks_of_another() -> None:
     config = _with("train.best_metric", "map_3d_iou70")
     check(config)  # no validation, no best one
     config.train.evaluate_every_epochs = 1
-    with pytest.raises(UserError, match="can be one of map_bev_iou30"):
+    with pytest.raises(UserError, match=r"one of .*map_bev_iou30"):
         check(config)
     with pytest.raises(UserError, match="doppler_bins is 64, expected 16"):
         check(_with("model.doppler_bins", 64))
@@ -195,19 +216,10 @@ def _words(name: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.py")))
-def test_every_preset_passes_and_every_field_has_its_rule(name: str) -> None:
+def test_every_preset_passes(name: str) -> None:
     choices = _words(name)
     for words in choices:
         check(load_config(f"{CONFIGS / name}.py:{words}"))
     check(base_config())
     if name in ("radenet", "dinorade"):
         assert len(choices) > 40  # every row in both worlds
-
-
-def test_rules_are_of_fields_that_exist() -> None:
-    full = load_config(str(CONFIGS / "quickstart_fusion.py")).to_dict()
-    for name in RULES:
-        place: Any = full
-        for part in name.split("."):
-            assert part in place, name
-            place = place[part]
