@@ -316,9 +316,7 @@ def attention(machine):
     def ours(params, feature, scale, places, value):
         module = DeformableAttention(*ATTENTION)
         mean = jnp.full(places.shape[:-1], 1 / elevation)
-        return module.apply(
-            {"params": params}, feature, scale, places, mean, value, method="lifted"
-        )
+        return module.apply({"params": params}, feature, scale, places, mean, value)
 
     arrays = jax.device_put((params, *given))
     program, cost = compiled(ours, *arrays, precision="highest")

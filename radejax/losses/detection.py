@@ -6,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -341,54 +340,3 @@ def _boxes_at(
     # One gather per frame, so that a batch axis sharded over devices stays local.
     gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
     return boxes_at(gather(maps.box_params, bins), bins, grid, z0_m)
-
-
-_WEIGHTS = MappingProxyType({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0})
-
-
-def whole_batch_loss(
-    parts: dict[str, Num[jax.Array, " P"]],
-    num_bins: Number | Int[jax.Array, " P"],
-    weights: Weights = _WEIGHTS,
-    normalize: bool = True,
-) -> tuple[
-    dict[str, Float[jax.Array, " P"]],
-    Float[jax.Array, ""],
-    dict[str, Num[jax.Array, ""]],
-]:
-    """The loss of a batch from those of its equal parts, and how parts sum to it.
-
-    A part divides by its own positive bins and loss values, the batch by those of all.
-
-    Args:
-        parts: `[P]` each, what `detection_loss` gives beside the total for every part.
-        num_bins: Of the heatmaps of one part, as many in all; counts where it has no
-            positive bin.
-        weights: As for `detection_loss`.
-        normalize: Likewise.
-
-    Returns:
-        `[P]` weights by name: the mean over the parts of their losses, so weighted and
-        not normalised, has the gradient of the batch. Then what `detection_loss` gives for
-        the batch: total and its parts.
-
-    Examples:
-        >>> parts = dict.fromkeys(("focal", "gwd", "smooth_l1"), jnp.array([1.0, 3.0]))
-        >>> parts["num_positive"] = jnp.array([1, 1])
-        >>> _, total, whole = whole_batch_loss(parts, 100)
-        >>> float(total), float(whole["focal"])
-        (4.0, 2.0)
-    """
-    positive = parts["num_positive"].astype(jnp.float32)
-    of_part = jnp.where(positive > 0, positive, num_bins)
-    mean = jnp.mean(positive)
-    share = of_part / jnp.where(mean > 0, mean, num_bins)
-    shares = {k: share if k == "focal" else jnp.ones_like(share) for k in weights}
-    whole = {name: jnp.mean(parts[name] * shares[name]) for name in weights}
-    total = _weighted_sum(whole, weights, normalize)
-    for name, weight in weights.items():
-        value = whole[name] if normalize else jnp.float32(0.0)
-        shares[name] *= weight / jnp.where(value > 0, value, 1.0)
-    whole["weighted_sum"] = _weighted_sum(whole, weights, False)
-    counts = {k: jnp.sum(v, axis=0) for k, v in parts.items() if k.startswith("num_")}
-    return shares, total, whole | counts

@@ -134,7 +134,7 @@ class Fusion(nn.Module):
             dtype=self.dtype,
             name="attention",
         )
-        seen = attention.lifted(
+        seen = attention(
             per_bin(radar),
             per_bin(scale),
             per_bin(reference.points),

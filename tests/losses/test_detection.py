@@ -15,7 +15,6 @@ from radejax.losses.detection import (
     NmsAssignment,
     detection_loss,
     smooth_l1,
-    whole_batch_loss,
 )
 from radejax.losses.focal import gaussian_heatmap
 from radejax.losses.gwd import gwd_loss
@@ -298,11 +297,6 @@ def test_another_part_is_a_function_and_a_weight(monkeypatch):
     ]
     np.testing.assert_allclose(parts["height"], np.mean(heights), rtol=1e-5)
     np.testing.assert_allclose(total, 2 * parts["focal"] + 3 * parts["height"], 1e-5)
-    # A batch in parts weighs it likewise.
-    of_parts = jax.tree.map(lambda x: jnp.stack([x, x]), parts)
-    shares, again, _ = whole_batch_loss(of_parts, 9, weights, normalize=False)
-    np.testing.assert_allclose(again, total, rtol=1e-6)
-    assert {name: float(v[0]) for name, v in shares.items()} == weights
 
 
 @pytest.mark.parametrize("assignment", ["center", "nms"])

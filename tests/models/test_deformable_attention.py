@@ -1,9 +1,7 @@
-"""Tests of radejax.models.deformable_attention and deformable_sampling."""
+"""Tests of radejax.models.deformable_attention."""
 
 import functools
-import itertools
 import json
-import math
 
 import chex
 import jax
@@ -12,8 +10,9 @@ import numpy as np
 import pytest
 
 from radejax.core.config import load_module
-from radejax.models.deformable_attention import DeformableAttention
-from radejax.models.deformable_sampling import deformable_attention
+from radejax.models.deformable_attention import DeformableAttention, lifted_attention
+
+from .plain_attention import plain_attention, plain_samples
 
 CORES = ("core_single_level", "core_two_levels", "core_inside")
 MODULES = ("module_single_level", "module_two_levels", "module_box_reference")
@@ -82,43 +81,20 @@ def test_samples_by_hand():
         (np.inf, 0.5): 0.0,
         (np.nan, np.nan): 0.0,
     }
-    locations = jnp.asarray(list(places)).reshape(1, -1, 1, 1, 1, 2)
-    weights = jnp.full(locations.shape[:-1], 2.0)
-    out = deformable_attention(value, [(2, 3)], locations, weights)
-    np.testing.assert_allclose(
-        out[0, :, 0], [2 * v for v in places.values()], atol=1e-6
+    n = len(places)
+    out = lifted_attention(
+        value.reshape(1, 2, 3, 1, 1),
+        jnp.zeros((1, n, 1, 1, 2)),
+        jnp.zeros((1, n, 1, 1)),
+        jnp.ones((1, n, 1)),
+        jnp.asarray(list(places)).reshape(1, n, 1, 2),
+        jnp.full((1, n, 1), 2.0),
+        jnp.zeros((1, 1, 2)),
+        jnp.zeros((1, 1)),
+        chunk_size=4,
     )
-
-
-def naive(value, sizes, locations, weights):
-    """Loops in NumPy: sum over levels and points of weight times bilinear sample."""
-    b, q, heads = weights.shape[:3]
-    out = np.zeros((b, q, heads, value.shape[-1]))
-    starts = np.cumsum([0] + [h * w for h, w in sizes])
-    for i, j, k, n, p in itertools.product(*map(range, weights.shape)):
-        height, width = sizes[n]
-        grid = value[i, starts[n] : starts[n + 1], k].reshape(height, width, -1)
-        x, y = locations[i, j, k, n, p] * [width, height] - 0.5
-        for row, column in itertools.product(
-            (math.floor(y), math.floor(y) + 1), (math.floor(x), math.floor(x) + 1)
-        ):
-            if 0 <= row < height and 0 <= column < width:
-                share = (1 - abs(y - row)) * (1 - abs(x - column))
-                out[i, j, k] += weights[i, j, k, n, p] * share * grid[row, column]
-    return out.reshape(b, q, -1)
-
-
-@pytest.mark.parametrize("chunk_size", [1, 4, 100])
-def test_plain_form_equals_loops(chunk_size):
-    rng = np.random.default_rng(0)
-    sizes = [(3, 4), (2, 5)]
-    value = rng.standard_normal((2, 22, 2, 3))
-    locations = rng.uniform(-0.3, 1.3, (2, 7, 2, 2, 3, 2))
-    weights = rng.standard_normal((2, 7, 2, 2, 3))
-    out = jax.jit(
-        lambda v, x, w: deformable_attention(v, sizes, x, w, chunk_size=chunk_size)
-    )(value, locations, weights)
-    np.testing.assert_allclose(out, naive(value, sizes, locations, weights), atol=2e-5)
+    expected = [2 * v for v in places.values()]
+    np.testing.assert_allclose(out.reshape(n), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", CORES)
@@ -129,7 +105,7 @@ def test_reference_sampling_and_gradients(reference, name):
     @jax.jit
     def run(value, locations, weights, cotangent):
         out, pull = jax.vjp(
-            lambda *a: deformable_attention(a[0], sizes, *a[1:], chunk_size=5),
+            lambda *a: plain_samples(a[0], sizes, *a[1:]),
             value,
             locations,
             weights,
@@ -157,9 +133,7 @@ def test_reference_sampling_and_gradients(reference, name):
 def test_reference_module_and_gradients(reference, name, golden):
     info, case = case_of(reference, name)
     sizes = [tuple(s) for s in info["shapes_hw"]]
-    module = DeformableAttention(
-        info["d_model"], info["n_heads"], info["n_points"], info["n_levels"]
-    )
+    counts = info["n_heads"], info["n_points"]
     params = {}
     for key, tensor in load_make(golden).seeded_state_dict(info["tensors"]).items():
         layer, kind = key.split(".")
@@ -168,7 +142,8 @@ def test_reference_module_and_gradients(reference, name, golden):
     is_valid = jnp.asarray(~case["padding_mask"]) if info["padding_mask"] else None
 
     def apply(params, query, points, value):
-        return module.apply({"params": params}, query, points, value, sizes, is_valid)
+        out, *_ = plain_attention(params, query, points, value, sizes, counts, is_valid)
+        return out
 
     inputs = (params, case["query"], case["reference_points"], case["input_flatten"])
 
@@ -185,31 +160,25 @@ def test_reference_module_and_gradients(reference, name, golden):
     for layer, grad in grads[0].items():
         close_to_maximum(grad["kernel"].T, case[f"grad_param__{layer}.weight"], 1e-5)
         close_to_maximum(grad["bias"], case[f"grad_param__{layer}.bias"], 1e-5)
-    samples = jax.jit(
-        lambda *inputs: module.apply(*inputs, sizes, method="samples"),
-    )
-    locations, weights = samples(
-        {"params": params}, case["query"], case["reference_points"]
-    )
+    _, locations, weights = plain_attention(*inputs, sizes, counts, is_valid)
     np.testing.assert_allclose(locations, case["sampling_locations"], atol=1e-5)
     np.testing.assert_allclose(weights, case["attention_weights"], atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("features", "levels", "heads", "points"),
-    [(128, 1, 4, 4), (128, 1, 4, 8), (256, 1, 4, 8), (256, 4, 8, 4)],
+    ("features", "heads", "points"), [(128, 4, 4), (128, 4, 8), (256, 4, 8)]
 )
-def test_initial_offsets_form_rings(shared, features, levels, heads, points):
+def test_initial_offsets_form_rings(shared, features, heads, points):
     file = np.load(shared / "fixtures" / "deform_attn" / "deform_attn.npz")
-    expected = file[f"initial_bias__d{features}_l{levels}_h{heads}_p{points}"]
-    module = DeformableAttention(features, heads, points, levels)
-    sizes = ((2, 2),) * levels
-    params = jax.jit(module.init, static_argnums=4)(
+    expected = file[f"initial_bias__d{features}_l1_h{heads}_p{points}"]
+    module = DeformableAttention(features, heads, points)
+    params = jax.jit(module.init)(
         jax.random.key(0),
         jnp.zeros((1, 1, features)),
-        jnp.zeros((1, 1, levels, 2)),
-        jnp.zeros((1, 4 * levels, features)),
-        sizes,
+        jnp.zeros((1, 1, 1)),
+        jnp.zeros((1, 1, 1, 2)),
+        jnp.zeros((1, 1, 1)),
+        jnp.zeros((1, 2, 2, features)),
     )["params"]
     np.testing.assert_allclose(params["sampling_offsets"]["bias"], expected, atol=1e-5)
     for name in ("sampling_offsets", "attention_weights"):
@@ -255,12 +224,13 @@ def random_params(rng, module):
 def through_plain_form(module, params, inputs):
     query = inputs["scale"][..., None] * inputs["feature"][:, :, None]
     points = jnp.broadcast_to(inputs["reference"], (B, N, E, 2))
-    out = module.apply(
-        params,
+    out, *_ = plain_attention(
+        params["params"],
         query.reshape(B, N * E, C),
         points.reshape(B, N * E, 1, 2),
         inputs["value"].reshape(B, H * W, C),
         [(H, W)],
+        (module.num_heads, module.num_points),
     )
     weights = inputs["query_weights"][..., None]
     return (out.reshape(B, N, E, C) * weights).sum(2)
@@ -268,7 +238,7 @@ def through_plain_form(module, params, inputs):
 
 @functools.partial(jax.jit, static_argnums=0)
 def through_lifted_form(module, params, inputs):
-    return module.apply(params, **inputs, method="lifted")
+    return module.apply(params, **inputs)
 
 
 @pytest.mark.parametrize("shared_geometry", [True, False])
@@ -348,13 +318,3 @@ def test_memory_follows_the_chunk():
     rows = 4096 * 8 * 4 * 4 * 8 * 4  # one head's sampled rows, all at once
     assert memory(64) < memory(4096) - rows
     assert memory(64) < 0.5 * rows
-
-
-def test_sizes_must_match_the_map():
-    with pytest.raises(ValueError, match="have 6 pixels, value has 7"):
-        deformable_attention(
-            jnp.zeros((1, 7, 1, 1)),
-            [(2, 3)],
-            jnp.zeros((1, 1, 1, 1, 1, 2)),
-            jnp.zeros((1, 1, 1, 1, 1)),
-        )

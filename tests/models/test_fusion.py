@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import ReferencePoints
+
+from .plain_attention import plain_attention
 
 B, R, A, C, E, D, H, W = 2, 4, 3, 8, 3, 5, 6, 7
 SMALL = {
@@ -61,13 +62,13 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
     is_valid = np.broadcast_to(reference.is_valid, (B, R, A, E))
     points = np.broadcast_to(reference.points, (B, R, A, E, 2))
     query = (weights * is_valid)[..., None] * radar[:, :, :, None]
-    attention = DeformableAttention(C, module.num_heads, module.num_points)
-    attended = attention.apply(
-        {"params": params["attention"]},
+    attended, _, _ = plain_attention(
+        params["attention"],
         jnp.asarray(query.reshape(B, -1, C), jnp.float32),
         jnp.asarray(points.reshape(B, -1, 1, 2)),
         jnp.asarray(camera.reshape(B, H * W, C)),
         [(H, W)],
+        (module.num_heads, module.num_points),
     )
     attended = np.asarray(attended).reshape(B, R, A, E, C)
     if module.out_of_view == "official":

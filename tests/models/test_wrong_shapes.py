@@ -11,7 +11,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.geometry.rotated_iou import bev_iou, iou_3d
 from radejax.losses.focal import focal_loss, gaussian_heatmap
 from radejax.models.convolution import conv2d
-from radejax.models.deformable_sampling import deformable_attention
+from radejax.models.deformable_attention import lifted_attention
 
 pytestmark = pytest.mark.wrong_types
 
@@ -53,10 +53,18 @@ def zeros(*shape: int) -> jax.Array:
         (lambda: project(zeros(2, 6, 2), CAMERA), r"\(2, 6, 2\)"),
         (lambda: project(zeros(3, 6, 3), CAMERA), r"\(3, 6, 3\)"),
         (
-            lambda: deformable_attention(
-                zeros(1, 6, 2, 4), [(2, 3)], zeros(1, 5, 2, 1, 4, 2), zeros(1, 5, 2, 1)
+            lambda: lifted_attention(
+                zeros(1, 2, 3, 2, 4),
+                zeros(1, 5, 2, 4, 2),
+                zeros(1, 5, 2, 3),
+                zeros(1, 5, 6),
+                zeros(1, 5, 6, 2),
+                zeros(1, 5, 6),
+                zeros(2, 3, 2),
+                zeros(2, 3),
+                chunk_size=4,
             ),
-            r"\(1, 5, 2, 1, 4, 2\)",
+            r"\(1, 5, 2, 4, 2\)",
         ),
     ],
 )
