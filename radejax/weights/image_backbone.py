@@ -13,7 +13,7 @@ import numpy as np
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, differences
 from radejax.data.records.embeddings import embeddings_sha256
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.vit import ViT
@@ -86,14 +86,10 @@ def check_same_backbone(params: Any, embeddings: PathLike, source: PathLike) -> 
 
 def check_same_vit(found: ViT, configured: ViT, source: PathLike) -> None:
     """`UserError` unless a backbone's weights are those of the configured one."""
-    for name in (field.name for field in dataclasses.fields(ViT)):
-        ours, theirs = getattr(configured, name), getattr(found, name)
-        if name not in _FREE_FIELDS and ours != theirs:
-            is_field = name in dinov3_hf.image_fields(found)
-            where = f"config.model.image.{name}" if is_field else "the configured one"
-            raise UserError(
-                f"{source}: the backbone has {name} = {theirs}, {where} is {ours}"
-            )
+    names = [f.name for f in dataclasses.fields(ViT) if f.name not in _FREE_FIELDS]
+    ours, theirs = ({n: getattr(vit, n) for n in names} for vit in (configured, found))
+    if lines := differences(theirs, ours, "config.model.image"):
+        raise UserError(f"{source}: another backbone: {'; '.join(lines)}")
 
 
 def check_fits(
@@ -101,16 +97,12 @@ def check_fits(
 ) -> None:
     """`UserError` unless variables are those of a model; the backbone may be missing."""
     wanted, found = variable_shapes(model), shapes_of(variables)
-    differing = [
-        f"{name} is {found.get(name, 'missing')}, expected {wanted.get(name, 'none')}"
-        for name in sorted(set(wanted) | set(found))
-        if found.get(name) != wanted.get(name)
-        and not (name not in found and name.startswith(f"params/{IMAGE_BACKBONE}/"))
-    ]
-    if differing:
+    if IMAGE_BACKBONE not in variables.get("params", {}):
+        wanted = {k: s for k, s in wanted.items() if f"/{IMAGE_BACKBONE}/" not in k}
+    if lines := differences(found, wanted, ""):
         raise UserError(
-            f"weights of {source} do not fit config.model ({len(differing)} tensors), "
-            f"for example: {'; '.join(differing[:3])}"
+            f"weights of {source} do not fit config.model ({len(lines)} tensors), "
+            f"for example: {'; '.join(lines[:3])}"
         )
 
 

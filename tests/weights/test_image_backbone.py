@@ -58,7 +58,7 @@ def test_weights_with_other_constants_are_refused(monkeypatch):
     model = build(load_config(str(CONFIG)).model)
     found = model.vit.clone(rope_theta=10.0)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
-    with pytest.raises(UserError, match=r"rope_theta = 10\.0, the configured one"):
+    with pytest.raises(UserError, match=r"rope_theta is 10\.0 there and 100\.0 here"):
         image_backbone.load_image_backbone("folder", model)
     same = model.vit.clone(attention="xla", layer_scale=0.5)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (same, {"params": TRUNK}))
