@@ -9,15 +9,14 @@ from __future__ import annotations
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
 from radejax.models.cbam import CBAM, CBAMKind
 from radejax.models.layers import (
     Conv,
     ConvGNSiLU,
     DoubleConvResidual,
+    Features,
     Upsample,
     max_pool,
 )
@@ -42,9 +41,7 @@ class InputStem(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def __call__(self, x: Features) -> Features:
         def block(features: int, size: int, name: str) -> ConvGNSiLU:
             return ConvGNSiLU(
                 features,
@@ -91,9 +88,7 @@ class Backbone(nn.Module):
     remat: bool = False
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.decoder_width}"]:
+    def __call__(self, x: Features) -> Features:
         wrap = nn.remat if self.remat else lambda module: module
         double_conv, attention = wrap(DoubleConvResidual), wrap(CBAM)
 
@@ -119,7 +114,7 @@ class Backbone(nn.Module):
             x = block(width, f"decoder_{i}")(jnp.concatenate([x, skip], -1))
         return x
 
-    def _start(self, x: Float[jax.Array, "B R A _"]) -> Float[jax.Array, "B R A _"]:
+    def _start(self, x: Features) -> Features:
         width = self.widths[0]
         if self.input_stem:
             return InputStem(

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from radejax.models.layers import Conv, ConvGNSiLU, Dense
+from radejax.models.layers import Conv, ConvGNSiLU, Dense, Map
 
 CBAMKind = Literal["official", "paper"]
 
@@ -36,7 +36,7 @@ class ChannelAttention(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    def __call__(self, x: Map) -> Map:
         channels = x.shape[-1]
         hidden = max(1, channels // self.reduction)
         squeeze = Dense(hidden, dtype=self.dtype, name="squeeze")
@@ -61,7 +61,7 @@ class SpatialAttention(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A 1"]:
+    def __call__(self, x: Map) -> Float[jax.Array, "B R A 1"]:
         mean = x.mean(-1, dtype=jnp.float32).astype(self.dtype)
         pooled = [x.max(-1), mean]
         if self.mean_first:
@@ -88,7 +88,7 @@ class CBAM(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    def __call__(self, x: Map) -> Map:
         is_official = self.kind == "official"
         channels = x.shape[-1]
         if is_official:

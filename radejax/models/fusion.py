@@ -18,7 +18,7 @@ from radejax.core.errors import require
 from radejax.core.structures import Array
 from radejax.models.checks import check_choice, check_size
 from radejax.models.deformable_attention import DeformableAttention
-from radejax.models.layers import Dense
+from radejax.models.layers import Dense, Map
 from radejax.models.lifting import (
     OutOfViewRule,
     ReferencePoints,
@@ -87,13 +87,13 @@ class Fusion(nn.Module):
     @nn.compact
     def __call__(
         self,
-        radar: Float[jax.Array, "B R A C"],
+        radar: Map,
         elevation: Float[jax.Array, "B R A D"],
         camera: Float[jax.Array, "B h w C"] | None,
         reference: ReferencePoints | None,
         *,
         train: bool = False,
-    ) -> Float[jax.Array, "B R A C"]:
+    ) -> Map:
         """Fuses the maps of a batch.
 
         Sows the camera's share of the fused map, averaged over channels, as
@@ -149,9 +149,7 @@ class Fusion(nn.Module):
     def _neck(self, name: str) -> DilatedNeck:
         return DilatedNeck(self.num_groups, self.dtype, self.remat, name=name)
 
-    def _camera_share(
-        self, radar: Float[jax.Array, "B R A C"], seen: Float[jax.Array, "B R A C"]
-    ) -> Float[jax.Array, "B R A #C"]:
+    def _camera_share(self, radar: Map, seen: Map) -> Float[jax.Array, "B R A #C"]:
         """Weight of the camera, of every channel or of all."""
         c = radar.shape[-1]
         x = jnp.concatenate([radar, seen], -1)

@@ -13,12 +13,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
 from radejax.core.structures import DetectionMaps
-from radejax.models.layers import Conv, ConvGNSiLU
+from radejax.models.layers import Conv, ConvGNSiLU, Features, Map
 
 NUM_BOX_PARAMS = 8
 
@@ -40,9 +38,7 @@ class Head(nn.Module):
     remat: bool = False
     initial_bias: float = 0.0
 
-    def convolve(
-        self, x: Float[jax.Array, "B R A _"], widths: Sequence[int]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def convolve(self, x: Features, widths: Sequence[int]) -> Features:
         """`ConvGNSiLU` of these widths, then a 1x1 convolution in float32."""
         block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
         for i, width in enumerate(widths, 1):
@@ -55,9 +51,7 @@ class ExpandedHead(Head):
     """Three blocks of the input's width."""
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def __call__(self, x: Features) -> Features:
         return self.convolve(x, (x.shape[-1],) * 3)
 
 
@@ -65,9 +59,7 @@ class DefaultHead(Head):
     """One block of half the input's width and at most 64 channels."""
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def __call__(self, x: Features) -> Features:
         return self.convolve(x, (min(64, x.shape[-1] // 2),))
 
 
@@ -96,7 +88,7 @@ class Heads(nn.Module):
     heatmap_prior: float = 0.5
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> DetectionMaps:
+    def __call__(self, x: Map) -> DetectionMaps:
         def head(features: int, bias: float, name: str) -> Head:
             return HEADS[self.kind](
                 features,

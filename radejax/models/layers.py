@@ -21,6 +21,9 @@ from radejax.core.structures import Array
 from radejax.models.convolution import conv2d, product
 
 Initializer = Callable[..., jax.Array]
+Map = Float[jax.Array, "B R A C"]
+Features = Float[jax.Array, "B R A _"]
+"""As `Map`, where a layer changes the number of channels."""
 
 
 def uniform_fan_in(fan_in: int) -> Initializer:
@@ -66,9 +69,7 @@ class Conv(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def __call__(self, x: Features) -> Features:
         init = uniform_fan_in(self.size**2 * x.shape[-1])
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", init, shape)
@@ -118,9 +119,7 @@ class Upsample(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B 2*R 2*A {self.features}"]:
+    def __call__(self, x: Features) -> Float[jax.Array, "B 2*R 2*A {self.features}"]:
         b, r, a, c = x.shape
         # torch counts the fan-in of a transposed convolution over its outputs.
         init = uniform_fan_in(4 * self.features)
@@ -133,7 +132,7 @@ class Upsample(nn.Module):
         return y + jnp.expand_dims(bias, (0, 1, 2))
 
 
-def max_pool(x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R//2 A//2 C"]:
+def max_pool(x: Map) -> Float[jax.Array, "B R//2 A//2 C"]:
     """Maximum over 2x2 bins."""
     b, r, a, c = x.shape
     return x.reshape(b, r // 2, 2, a // 2, 2, c).max((2, 4))
@@ -153,7 +152,7 @@ class GroupNorm(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    def __call__(self, x: Map) -> Map:
         channels = x.shape[-1]
         if channels % self.num_groups:
             raise ValueError(
@@ -167,12 +166,12 @@ class GroupNorm(nn.Module):
 
 
 def group_norm(
-    x: Float[jax.Array, "B R A C"],
+    x: Map,
     scale: Float[Array, " C"],
     bias: Float[Array, " C"],
     num_groups: int,
     epsilon: float,
-) -> Float[jax.Array, "B R A C"]:
+) -> Map:
     """Group normalisation with scale and bias, in float32.
 
     Sums run per channel first and are joined into groups after, so that the map is
@@ -214,9 +213,7 @@ class ConvGNSiLU(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def __call__(self, x: Features) -> Features:
         x = Conv(
             self.features,
             self.size,
@@ -245,9 +242,7 @@ class DoubleConvResidual(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B R A _"]
-    ) -> Float[jax.Array, "B R A {self.features}"]:
+    def __call__(self, x: Features) -> Features:
         shortcut = x
         if x.shape[-1] != self.features:
             shortcut = Conv(self.features, 1, dtype=self.dtype, name="shortcut")(x)

@@ -9,11 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
-from radejax.models.layers import Conv, ConvGNSiLU, GroupNorm
+from radejax.models.layers import Conv, ConvGNSiLU, GroupNorm, Map
 
 
 class DilatedResidual(nn.Module):
@@ -30,7 +28,7 @@ class DilatedResidual(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    def __call__(self, x: Map) -> Map:
         features = x.shape[-1]
         y = ConvGNSiLU(
             features,
@@ -62,7 +60,7 @@ class DilatedNeck(Neck):
     """Three `DilatedResidual`, of dilation 1, 2 and 3."""
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    def __call__(self, x: Map) -> Map:
         block = nn.remat(DilatedResidual) if self.remat else DilatedResidual
         for i in (1, 2, 3):
             x = block(i, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
@@ -73,7 +71,7 @@ class PlainNeck(Neck):
     """Three `ConvGNSiLU`."""
 
     @nn.compact
-    def __call__(self, x: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
+    def __call__(self, x: Map) -> Map:
         block, width = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU, x.shape[-1]
         for i in (1, 2, 3):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)

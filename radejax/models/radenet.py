@@ -20,6 +20,7 @@ from radejax.models.backbone import BACKBONES
 from radejax.models.cbam import CBAMKind
 from radejax.models.checks import check_choice, check_number, check_size
 from radejax.models.heads import HEADS, Heads
+from radejax.models.layers import Map
 from radejax.models.neck import NECKS
 
 Projection = Float[jax.Array, "B R A DE"]
@@ -153,7 +154,7 @@ class RadeNet(nn.Module):
             projection = projection * self.input_scale
         return pad_to_multiple(projection.astype(self.dtype), self.pad_multiple)
 
-    def _features(self, padded: Projection) -> Float[jax.Array, "B R A C"]:
+    def _features(self, padded: Projection) -> Map:
         """Features of the backbone."""
         return self._stage(BACKBONES[self.backbone])(
             doppler_bins=self.doppler_bins,
@@ -165,9 +166,7 @@ class RadeNet(nn.Module):
             name="backbone",
         )(padded)
 
-    def _maps(
-        self, features: Float[jax.Array, "B R A C"], projection: Projection
-    ) -> DetectionMaps:
+    def _maps(self, features: Map, projection: Projection) -> DetectionMaps:
         """Neck and heads, on the projection's bins if `crop_output`."""
         neck = self._stage(NECKS[self.neck])(**self._shared(), name="neck")
         heads = self._stage(Heads)(
@@ -194,9 +193,7 @@ class RadeNet(nn.Module):
         }
 
 
-def pad_to_multiple(
-    x: Float[jax.Array, "B R A C"], multiple: int
-) -> Float[jax.Array, "B Rp Ap C"]:
+def pad_to_multiple(x: Map, multiple: int) -> Float[jax.Array, "B Rp Ap C"]:
     """Zero-pads range and azimuth at their ends to a multiple."""
     pad_range, pad_azimuth = (-x.shape[1] % multiple, -x.shape[2] % multiple)
     return jnp.pad(x, ((0, 0), (0, pad_range), (0, pad_azimuth), (0, 0)))
