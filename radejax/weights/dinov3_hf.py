@@ -83,7 +83,10 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
             " as downloaded from Hugging Face"
         )
     config = files.read_json(folder / CONFIG_FILE, dict[str, Any])
-    model = model_from_config(config)
+    try:
+        model = model_from_config(config)
+    except UserError as error:
+        raise UserError(f"{folder / CONFIG_FILE}: {error}") from None
     path = folder / WEIGHTS_FILE
     return model, {"params": to_params(model, read_safetensors(path), str(path))}
 
@@ -120,33 +123,22 @@ def model_from_config(config: Mapping[str, Any]) -> ViT:
     if missing := sorted(set(_FIELDS) - set(config)):
         raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
     defaults = {field.name: field.default for field in dataclasses.fields(ViT)}
-    fields = {}
+    fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
     for theirs, ours in _FIELDS.items():
-        value, kind = config[theirs], type(defaults[ours])
-        least = 0 if ours == "num_registers" else 1
-        holds, expected = {
-            int: (type(value) is int and least <= value <= 65536, f"{least} to 65536"),
-            float: (
-                type(value) in (int, float) and 0 < value < float("inf"),
-                "a finite number above 0",
-            ),
-            bool: (type(value) is bool, "true or false"),
-            str: (value in ("gelu", "silu"), "'gelu' or 'silu'"),
-        }[kind]
-        require(holds, f"DINOv3 config: {theirs}", value, expected)
-        fields[ours] = value
-    channels, heads = fields["hidden_size"], fields["num_heads"]
+        value, kind = fields[ours], type(defaults[ours])
+        fits = type(value) is kind
+        if kind is float:
+            fits = type(value) in (int, float) and 0 < value < float("inf")
+        require(fits, theirs, value, f"{kind.__name__}, such as {defaults[ours]}")
+    activation = fields["activation"]
     require(
-        channels % (4 * heads) == 0,
-        "DINOv3 config: hidden_size",
-        channels,
-        f"a multiple of 4 * num_attention_heads = {4 * heads}",
+        activation in ("gelu", "silu"), "hidden_act", activation, "'gelu' or 'silu'"
     )
     fields["qkv_bias"] = tuple(
         bool(config.get(f"{name}_bias", default))
         for name, default in (("query", True), ("key", False), ("value", True))
     )
-    return ViT(**fields)
+    return ViT(**fields)  # checks ranges
 
 
 def image_fields(model: ViT) -> dict[str, Any]:
