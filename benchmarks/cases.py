@@ -22,9 +22,8 @@ import start
 from case import Case, compiled, difference, timed, waiting
 
 from radejax.core.config import load_config
-from radejax.data.frame_table import make_table
 from radejax.data.kradar.write import write_tesseract
-from radejax.data.pipeline import LoaderOptions, make_loader
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.projection import project_jax, project_plain, project_tensor
 from radejax.data.tesseract import project_file
 from radejax.evaluation import EvaluationSet
@@ -132,35 +131,6 @@ def load(machine):
         yield Case(name="records to batches", columns=columns, frames=count)
 
 
-def compress(machine):
-    """Reading records of the simulator's projections, compressed and not."""
-    projections = list(inputs.simulated(8))
-
-    def read(records):
-        return [records.read(i) for i in range(len(records))]
-
-    with tempfile.TemporaryDirectory() as folder:
-        for dtype in ("float16", "uint8"):
-            written = [
-                inputs.write_records(pathlib.Path(folder), projections, dtype, how)
-                for how in (False, True)
-            ]
-            plain, small = (entry.num_bytes / 8e6 for _, entry in written)
-            arrays = [read(records) for records, _ in written]
-            names = ("radejax", "radejax, compressed")
-            yield Case(
-                name=f"reading records, {dtype}",
-                columns={
-                    name: functools.partial(timed, functools.partial(read, records))
-                    for name, (records, _) in zip(names, written, strict=True)
-                },
-                frames=len(projections),
-                error=difference(*arrays),
-                tolerance=0.0,
-                note=f"{plain:.2f} MB a frame, compressed {small:.2f}",
-            )
-
-
 def simulate(machine):
     """Fused projections of the simulator: one frame, and a batch on an accelerator."""
     count = 1 if machine["platform"] == "cpu" else 16
@@ -226,7 +196,6 @@ BENCHMARKS = {
     "loader": (load, 40),
     "feeding": (networks.feeding, 60),
     "deploy": (deploy, 150),
-    "records": (compress, 40),
     "start": (start.start, 240),
 }
 """Function, and seconds that it takes on two cores, by name for `--only`, in the order in

@@ -6,7 +6,6 @@ Sizes are K-Radar's. Random numbers do where their values do not matter for the 
 import contextlib
 import functools
 import itertools
-import pathlib
 import tempfile
 import types
 
@@ -18,9 +17,7 @@ import shapely
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.data.encoding import encode
 from radejax.data.kradar.conditions import WEATHERS
-from radejax.data.records.arrays import ArrayRecords
-from radejax.data.records.files import RecordFileWriter, file_name
-from radejax.data.records.projections import Manifest, RecordSource, write_manifest
+from radejax.data.records import Records
 from radejax.detection.decode import decode
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
@@ -83,33 +80,19 @@ def simulator_of(count, weather="rain"):
     return inputs, functools.partial(tensor.simulate, grid=grid, parameters=parameters)
 
 
-def simulated(count):
-    """`count` full-size projections of two scenes, float32, their noise included.
-
-    Random numbers would not compress, and empty scenes too well.
-    """
-    for weather in ("rain", "normal"):
-        inputs, run = simulator_of(count // 2, weather)
-        run = jax.jit(run)
-        for given in inputs:
-            yield np.asarray(run(given.scatterers, given.noise_power, given.key))
-
-
 # Records -----------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def folder_of_records(count, grid, dtype):
-    """Random projections as one file of records, while the block runs."""
+    """Random projections as records, while the block runs."""
     levels = np.random.default_rng(0).random(grid.projection_shape, np.float32)
-    stored = encode(levels, dtype)
     with tempfile.TemporaryDirectory() as folder:
-        folder = pathlib.Path(folder)
-        writer = RecordFileWriter(folder, file_name(0, 1))
+        source = {"grid": grid.to_dict()}
+        records = Records.create(folder, grid.projection_shape, dtype, source)
         for k in range(count):
-            writer.write(f"1/{k:05d}", stored)
-        write_manifest(folder, Manifest(grid, dtype, {}, [writer.commit()]))
-        yield RecordSource(folder, grid=grid)
+            records.write(f"1/{k:05d}", encode(levels, dtype))
+        yield records
 
 
 def labelled(records):
@@ -119,19 +102,8 @@ def labelled(records):
         types.SimpleNamespace(
             key=key, boxes=np.repeat(box, 5, 0), classes=np.array(["Sedan"] * 5)
         )
-        for key in records.frames
+        for key in sorted(records.keys())
     ]
-
-
-def write_records(folder, projections, dtype, compress):
-    """Records of projections, and their file's manifest."""
-    name = file_name(int(compress), 2, dtype)
-    with RecordFileWriter(folder, name, compress=compress) as writer:
-        for i, x in enumerate(projections):
-            writer.write(str(i), encode(x, dtype))
-        entry = writer.commit()
-    shape = projections[0].shape
-    return ArrayRecords(folder, [entry], shape, dtype, compressed=compress), entry
 
 
 def write_npy(folder, count, grid):

@@ -19,8 +19,7 @@ from rival import ATTENTION
 
 from radejax import models
 from radejax.core.config import load_config
-from radejax.data.frame_table import make_table
-from radejax.data.pipeline import LoaderOptions, make_loader
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.projection import project_plain
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.deformable_attention import DeformableAttention

@@ -28,7 +28,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
-from radejax.data.records.projections import RecordSource, record_positions
+from radejax.data.records import Records, open_projections
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.simulation.radar.tensor import RadarParameters
@@ -69,10 +69,10 @@ def run_baseline(
         raise UserError(
             f"{fit_data}: no training frames to fit on; --fit-data names a folder with some"
         )
-    settings = fit(RecordSource(fit_data / "records"), to_fit, balanced=balanced)
+    settings = fit(open_projections(fit_data / "records"), to_fit, balanced=balanced)
     for name, least in settings.rcs_steps:
         print(f"{name} from {least:.1f} dBsm")
-    records, frames = RecordSource(data / "records"), KRadar(data, split="test")
+    records, frames = open_projections(data / "records"), KRadar(data, split="test")
     predictions = predict(records, frames, settings)
     ground_truth, table = tables_from_frames(frames, "test")
     return write_report(
@@ -92,13 +92,11 @@ def run_baseline(
     )
 
 
-def fit(
-    records: RecordSource, frames: KRadar, *, balanced: bool = False
-) -> CfarSettings:
+def fit(records: Records, frames: KRadar, *, balanced: bool = False) -> CfarSettings:
     """Settings with class steps from the objects of a split."""
     names, values = [], []
-    for frame, position in _with_records(records, frames, "fit"):
-        projection = decode(records[position]["projection"])
+    for frame in tqdm(frames, unit="frame", desc="fit"):
+        projection = decode(records[frame.key])
         names += list(frame.classes)
         values += [object_rcs_db(projection, frame.boxes, records.grid, PARAMETERS)]
     rcs = np.concatenate([np.zeros(0), *values])
@@ -109,23 +107,18 @@ def fit(
 
 
 def predict(
-    records: RecordSource, frames: KRadar, settings: CfarSettings
+    records: Records, frames: KRadar, settings: CfarSettings
 ) -> dict[str, np.ndarray]:
     """Detections of a split as columns "frame", "box", "cls", "score"."""
     parts = []
-    for index, (_, position) in enumerate(_with_records(records, frames, "detect")):
-        projection = decode(records[position]["projection"])
+    for index, frame in enumerate(tqdm(frames, unit="frame", desc="detect")):
+        projection = decode(records[frame.key])
         found = detect(projection, records.grid, PARAMETERS, settings)
         parts.append({"frame": np.full(len(found["score"]), index), **found})
     return {
         name: np.concatenate([part[name] for part in parts])
         for name in ("frame", "box", "cls", "score")
     }
-
-
-def _with_records(records: RecordSource, frames: KRadar, what: str):
-    pairs = zip(frames, record_positions(records, frames), strict=True)
-    return tqdm(pairs, total=len(frames), unit="frame", desc=what)
 
 
 def main() -> None:

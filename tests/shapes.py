@@ -19,7 +19,7 @@ ROOMS = (
     "evaluation",
     "data.augment",
     "data.encoding",
-    "data.frame_table",
+    "data.records",
     "data.images",
     "data.kradar.dataset",
     "data.kradar.write",

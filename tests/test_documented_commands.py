@@ -42,8 +42,8 @@ RUN_IN = {
     "::test_data_check_finds_simulated_folders_whole",
     "radejax data": "tests/test_documented_commands.py"
     "::test_data_check_finds_simulated_folders_whole",
-    "radejax project": "tests/test_documented_commands.py"
-    "::test_project_then_nothing_is_left_to_project",
+    "radejax preprocess": "tests/test_documented_commands.py"
+    "::test_preprocess_then_nothing_is_left_to_do",
     "radejax overlay": "tests/test_documented_commands.py::test_overlay_draws_a_frame",
     "radejax view": "tests/test_documented_commands.py::test_view_writes_a_recording",
     "radejax demo": ".ci/run: radejax demo",
@@ -285,14 +285,14 @@ def test_data_check_finds_simulated_folders_whole(root: pathlib.Path) -> None:
     assert json.loads(_run("data", "check", root, "--json").stdout)
 
 
-def test_project_then_nothing_is_left_to_project(
+def test_preprocess_then_nothing_is_left_to_do(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     out = tmp_path / "records"
-    first = json.loads(_run("project", root, "--out", out, "--json").stdout)
-    again = json.loads(_run("project", root, "--out", out, "--json").stdout)
-    assert (first["num_projected"], first["num_found"]) == (2, 0)
-    assert (again["num_projected"], again["num_found"]) == (0, 2)
+    first = json.loads(_run("preprocess", root, "--out", out, "--json").stdout)
+    again = json.loads(_run("preprocess", root, "--out", out, "--json").stdout)
+    assert (first["num_written"], first["num_found"]) == (2, 0)
+    assert (again["num_written"], again["num_found"]) == (0, 2)
 
 
 def test_overlay_draws_a_frame(root: pathlib.Path, tmp_path: pathlib.Path) -> None:

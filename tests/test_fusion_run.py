@@ -15,7 +15,7 @@ from radejax.cli.main import main
 from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
-from radejax.data.records.embeddings import open_embeddings
+from radejax.data.records import open_embeddings
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
 from radejax.inference.detector import Detector
@@ -118,9 +118,9 @@ def embeddings(data, from_images, tmp_path_factory):
     variables = image_backbone.load_image_backbone(data.backbone, model)
     frames = opened(from_images)[1].frames
     arguments = (model, variables, config.model.image, frames, out)
-    counts = embed.embed_dataset(*arguments, frames_per_file=5, progress=False)
+    counts = embed.embed_dataset(*arguments, progress=False)
     assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
-    counts = embed.embed_dataset(*arguments, frames_per_file=5, progress=False)
+    counts = embed.embed_dataset(*arguments, progress=False)
     assert counts == {"frames": 12, "embedded": 0, "found": 12, "missing": 0}
     return out
 
@@ -232,8 +232,8 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
         Data.open(config, build(config.model), paths)
     with pytest.raises(FileNotFoundError, match="radejax embed"):
         open_embeddings(tmp_path)
-    (tmp_path / "manifest.json").write_text('{"format": "other", "version": 1}')
-    with pytest.raises(DataError, match="other version 1"):
+    (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
+    with pytest.raises(DataError, match=r"records\.json: corrupted"):
         open_embeddings(tmp_path)
 
 

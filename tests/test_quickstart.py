@@ -78,7 +78,7 @@ def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
     folder, output = undisturbed
     for line in (
         "simulate",
-        "project",
+        "preprocess",
         "train",
         "detect",
         "Done in",
@@ -144,7 +144,7 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
 
     done = evaluate("--data", tmp_path / "other")
     assert done.exit_code == 0, done.output
-    assert (tmp_path / "other" / "records" / "manifest.json").exists()
+    assert (tmp_path / "other" / "records" / "records.json").exists()
     found = folder / "run" / "evaluation_other" / "metrics.json"
     assert json.loads(found.read_text())["ap"] == _metrics(folder)["ap"]
     source = json.loads(found.with_name("source.json").read_text())
@@ -203,9 +203,8 @@ def _simulating(folder: pathlib.Path) -> bool:
     return any((folder / "data").glob("2/info_label_v2_1/*.txt"))
 
 
-def _projecting(folder: pathlib.Path) -> bool:
-    records = folder / "data" / "records"
-    return records.is_dir() and not (records / "manifest.json").exists()
+def _preprocessing(folder: pathlib.Path) -> bool:
+    return (folder / "data" / "records" / "records.json").exists()
 
 
 def _training(folder: pathlib.Path) -> bool:
@@ -221,7 +220,7 @@ def _evaluating(folder: pathlib.Path) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("stage", [_simulating, _projecting, _training, _evaluating])
+@pytest.mark.parametrize("stage", [_simulating, _preprocessing, _training, _evaluating])
 def test_killed_at_any_stage_it_ends_in_the_same_digits(
     stage: Callable[[pathlib.Path], bool], undisturbed: tuple, tmp_path: pathlib.Path
 ) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import click
 
 from radejax.cli import options
-from radejax.cli.data import data, project
+from radejax.cli.data import data
 from radejax.cli.demo import demo
 from radejax.cli.detect import detect
 from radejax.cli.embed import embed
 from radejax.cli.evaluate import compare, evaluate, score
 from radejax.cli.export import export
 from radejax.cli.overlay import overlay
+from radejax.cli.preprocess import preprocess
 from radejax.cli.simulate import simulate
 from radejax.cli.train import train
 from radejax.cli.view import view
@@ -23,7 +24,7 @@ from radejax.cli.view import view
         demo,
         simulate,
         data,
-        project,
+        preprocess,
         overlay,
         view,
         train,

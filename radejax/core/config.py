@@ -286,7 +286,6 @@ def _data() -> ConfigDict:
             "max_objects": 32,  # per frame; 14 is the most in K-Radar v2.1
             "azimuth_mapping": "true",  # "stretched": released checkpoints
             "num_threads": 2,  # that prepare batches
-            "num_workers": 0,  # processes; slower than threads for large frames
             # Augmentation, off as in the papers: share of frames mirrored left to right,
             # standard deviations of a gain at all ranges and of one that grows with range.
             "mirror_probability": 0.0,

@@ -14,7 +14,7 @@ import chex
 import numpy as np
 from jaxtyping import Float, Real
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.data.encoding import decode, encode
 from radejax.data.projection import LOG_SCALE_DB
 from radejax.geometry.camera import Camera
@@ -30,7 +30,7 @@ class Augmentation:
 
     Attributes:
         grid: Sensor axes of the projections.
-        mirror_probability: Of exchanging left and right.
+        mirror_probability: Probability of swapping left and right.
         gain_db: Standard deviation of a gain at all ranges, in decibels of power.
         gain_slope_db: Standard deviation of a gain that grows linearly from 0 at the
             sensor to this at the last range.
@@ -45,23 +45,19 @@ class Augmentation:
     gain_slope_db: float = 2.0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.mirror_probability <= 1:
-            raise UserError(
-                f"mirror_probability {self.mirror_probability} is not in [0, 1]"
-            )
-        if min(self.gain_db, self.gain_slope_db) < 0:
-            raise UserError(
-                "gain_db and gain_slope_db are standard deviations, at least 0"
-            )
+        probability = self.mirror_probability
+        name = "config.data.mirror_probability"
+        require(0 <= probability <= 1, name, probability, "a number from 0 to 1")
+        for name in ("gain_db", "gain_slope_db"):
+            value = getattr(self, name)
+            is_valid = 0 <= value < np.inf
+            require(is_valid, f"config.data.{name}", value, "a number of at least 0")
         azimuth = self.grid.azimuth_rad
-        tolerance = 1e-3 * self.grid.azimuth_step_rad
-        if (
-            self.mirror_probability
-            and np.abs(azimuth + azimuth[::-1]).max() > tolerance
-        ):
+        asymmetry = np.abs(azimuth + azimuth[::-1]).max()
+        if probability and asymmetry > 1e-3 * self.grid.azimuth_step_rad:
             raise UserError(
                 f"cannot mirror: azimuths {azimuth[0]:.4f} to {azimuth[-1]:.4f} rad are "
-                "not symmetric; set mirror_probability to 0"
+                "not symmetric; set config.data.mirror_probability to 0"
             )
 
     def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
@@ -79,17 +75,8 @@ class Augmentation:
         return sample
 
 
-def make_augmentation(
-    grid: RadarGrid, *, mirror_probability: float, gain_db: float, gain_slope_db: float
-) -> Augmentation | None:
-    """An `Augmentation` of these strengths; None where all are 0."""
-    if not (mirror_probability or gain_db or gain_slope_db):
-        return None
-    return Augmentation(grid, mirror_probability, gain_db, gain_slope_db)
-
-
 def mirror(sample: Sample) -> Sample:
-    """Left and right exchanged: y to -y in the radar frame, u to W - u in the image.
+    """Swap left and right: y to -y in the radar frame, u to W - u in the image.
 
     Radial velocity, elevation and range do not change. Padded boxes stay zero.
     """

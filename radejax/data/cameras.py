@@ -6,17 +6,17 @@ import dataclasses
 import logging
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Int, Real
+from jaxtyping import Real
 
 from radejax.core import schema
 from radejax.core.errors import UserError
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.images import read_left_image
-from radejax.data.records.arrays import ArrayRecords
+from radejax.data.records import Records
 from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
 
 _log = logging.getLogger(__name__)
@@ -86,15 +86,15 @@ class CameraInputs:
         options: That they were made with.
         features: What an image backbone made of the images, in their place, or None.
         image_paths: Front image of every frame, None where it is missing.
-        feature_record: Index of each frame's features, -1 where it has none; or None.
+        feature_keys: Key of each frame's features, None where it has none.
     """
 
     cameras: tuple[Camera, ...]
     image_size: tuple[int, int]
     options: CameraOptions
-    features: ArrayRecords | None
+    features: Records | None
     image_paths: tuple[pathlib.Path | None, ...]
-    feature_record: Int[np.ndarray, " F"] | None
+    feature_keys: tuple[str | None, ...]
 
     def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
         """Black images `[count, H, W, 3]` uint8, or zero features."""
@@ -104,11 +104,11 @@ class CameraInputs:
 
     def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
         """Image (or features) of a frame, black where it is missing."""
-        record, path = self.feature_record, self.image_paths[index]
+        key, path = self.feature_keys[index], self.image_paths[index]
         if self.features is None and path is not None:
             return read_left_image(path, self.image_size, resize=self.options.resize)
-        if self.features is not None and record is not None and record[index] >= 0:
-            return self.features.read(int(record[index]))
+        if self.features is not None and key is not None:
+            return self.features[key]
         return self.empty_images(1)[0]
 
 
@@ -116,7 +116,7 @@ def camera_inputs(
     frames: FrameSequence,
     image_size: tuple[int, int],
     options: CameraOptions,
-    features: ArrayRecords | None = None,
+    features: Records | None = None,
 ) -> CameraInputs:
     """Cameras of left front images, each calibration file read once.
 
@@ -134,15 +134,16 @@ def camera_inputs(
             not among the features.
         DataError: A calibration file is damaged.
     """
-    record = None
+    embedded: Collection[str] = ()
     if features is not None:
-        index_of = features.index_of()
-        record = np.array([index_of.get(frame.key, -1) for frame in frames], np.int64)
-        _check_embedded(frames, record, features)
+        embedded = features.keys()
+        _check_embedded(frames, embedded, features)
     has_none = [
         frame.camera_calibration_path is None
-        or (frame.camera_path is None if record is None else record[i] < 0)
-        for i, frame in enumerate(frames)
+        or (
+            frame.camera_path is None if features is None else frame.key not in embedded
+        )
+        for frame in frames
     ]
     missing = [f.key for f, gone in zip(frames, has_none, strict=True) if gone]
     if missing and not options.allow_missing:
@@ -189,18 +190,18 @@ def camera_inputs(
         options,
         features,
         tuple(frame.camera_path for frame in frames),
-        record,
+        tuple(frame.key if frame.key in embedded else None for frame in frames),
     )
 
 
 def _check_embedded(
-    frames: FrameSequence, record: Int[np.ndarray, " F"], features: ArrayRecords
+    frames: FrameSequence, embedded: Collection[str], features: Records
 ) -> None:
     """`UserError` for frames whose image is there but was not embedded."""
     forgotten = [
         frame.key
-        for frame, position in zip(frames, record, strict=True)
-        if position < 0 and frame.camera_path is not None
+        for frame in frames
+        if frame.key not in embedded and frame.camera_path is not None
     ]
     if forgotten:
         raise UserError(

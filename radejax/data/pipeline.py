@@ -1,25 +1,108 @@
 """From records and labels to batches: shuffled, sharded, padded, resumable.
 
 Frames are drawn by index, so that a batch depends only on (seed, epoch, position) and
-never on threads or workers; the state of the iterator is one number.
+never on threads; the state of the iterator is one number.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
+import chex
 import grain
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
-from radejax.core.errors import UserError
-from radejax.core.structures import Batch
+from radejax.core.errors import UserError, require
+from radejax.core.structures import CLASSES, Batch
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import no_camera
-from radejax.data.frame_table import FrameTable
+from radejax.data.cameras import CameraInputs, no_camera
+from radejax.data.dataset import FrameSequence
+from radejax.data.records import Records
+from radejax.geometry.boxes import boxes8_from_7
 from radejax.geometry.camera import Camera, stack_cameras
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameTable:
+    """Labels of a dataset as arrays of fixed shape, F frames with up to N objects.
+
+    Attributes:
+        records: Projections, of these frames at least.
+        keys: Key of each frame's record.
+        boxes: float32 x, y, z, l, w, h, sin yaw, cos yaw; zeros as padding.
+        classes: int32 class indices; -1 as padding.
+        images: Images and cameras of the frames, or None for radar-only models.
+    """
+
+    records: Records
+    keys: tuple[str, ...]
+    boxes: Float[np.ndarray, "F N 8"]
+    classes: Int[np.ndarray, "F N"]
+    images: CameraInputs | None = None
+
+    def __post_init__(self) -> None:
+        chex.assert_shape(self.boxes, (len(self.keys), None, 8))
+        chex.assert_shape(self.classes, self.boxes.shape[:2])
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def is_valid(self) -> Bool[np.ndarray, "F N"]:
+        """True where a row is an object."""
+        return self.classes >= 0
+
+
+def make_table(
+    records: Records,
+    frames: FrameSequence,
+    *,
+    max_objects: int,
+    classes: Sequence[str] = CLASSES,
+    images: CameraInputs | None = None,
+) -> FrameTable:
+    """Labels of the frames, padded, next to their records.
+
+    Args:
+        records: Projections, of these frames at least.
+        frames: Labelled frames, normally a split of a `KRadar`.
+        max_objects: Rows N of every frame; more objects are an error.
+        classes: Class names in the order of the class indices; objects of other
+            classes are not targets and are left out.
+        images: Of the same frames in the same order, see `camera_inputs`; None for
+            radar-only models.
+
+    Raises:
+        UserError: A frame has more than `max_objects` objects (the message says how
+            many would do), or has no record, or there are no frames.
+    """
+    if not len(frames):
+        raise UserError("no frames: the dataset or the split is empty")
+    records.require(frames)
+    if images is not None and len(images.cameras) != len(frames):
+        raise UserError(f"{len(images.cameras)} cameras for {len(frames)} frames")
+    class_index = {cls: index for index, cls in enumerate(classes)}
+    kept = [[cls in class_index for cls in frame.classes] for frame in frames]
+    largest = max(range(len(frames)), key=lambda i: sum(kept[i]))
+    if sum(kept[largest]) > max_objects:
+        raise UserError(
+            f"frame {frames[largest].key} has {sum(kept[largest])} objects, but "
+            f"config.data.max_objects is {max_objects}; {sum(kept[largest])} would do "
+            f"for all {len(frames)} frames"
+        )
+    shape = (len(frames), max_objects)
+    boxes = np.zeros((*shape, 8), np.float32)
+    indices = np.full(shape, -1, np.int32)
+    for i, frame in enumerate(frames):
+        rows = np.flatnonzero(kept[i])
+        boxes[i, : len(rows)] = boxes8_from_7(frame.boxes[rows])
+        indices[i, : len(rows)] = [class_index[frame.classes[row]] for row in rows]
+    keys = tuple(frame.key for frame in frames)
+    return FrameTable(records, keys, boxes, indices, images)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,19 +111,15 @@ class LoaderOptions:
 
     Attributes:
         batch_size: Frames of a batch of this process.
-        seed: Of order and augmentation.
+        seed: Seed of order and augmentation.
         shuffle: A new order every epoch; otherwise the order of the table.
         num_epochs: None repeats without end.
         drop_remainder: Leave out the last, smaller batch of an epoch.
-        pad_remainder: Instead fill it with empty frames of index -1, so that all
-            batches have one shape and all processes have as many.
-        num_threads: Threads that prepare batches; 0: the caller's.
-        prefetch: Batches prepared ahead.
-        num_workers: Worker processes, each with its threads; 0: threads alone, which
-            are faster for large frames (two cores: 0.7 times the frames).
-        process_index: This host of several; None asks jax.
-        process_count: Number of hosts; None asks jax.
-        device: Device or sharding to put batches on ahead of use; None: host arrays.
+        pad_remainder: Fill the last, smaller batch of an epoch with empty frames of
+            index -1 instead, so that all processes have as many batches.
+        num_threads: Threads that prepare batches; 0 prepares them in the caller's.
+        process_index: This host of several; None asks JAX.
+        process_count: Number of hosts; None asks JAX.
     """
 
     batch_size: int
@@ -50,11 +129,14 @@ class LoaderOptions:
     drop_remainder: bool = True
     pad_remainder: bool = False
     num_threads: int = 2
-    prefetch: int = 2
-    num_workers: int = 0
     process_index: int | None = None
     process_count: int | None = None
-    device: Any = None
+
+    def __post_init__(self) -> None:
+        size, threads = self.batch_size, self.num_threads
+        require(size >= 1, "batch_size", size, "an integer of at least 1")
+        name = "config.data.num_threads"
+        require(threads >= 0, name, threads, "an integer of at least 0")
 
 
 def make_loader(
@@ -65,7 +147,7 @@ def make_loader(
     `Batch.projection` has the type of the records; `encoding.to_float` turns it into
     network input on the device. `Batch.frame` is the index into the table's frames.
 
-    Epochs do not mix: with `drop_remainder` every epoch leaves out the last
+    Epochs do not mix: by default every epoch leaves out the last
     `len(table) % batch_size` frames of its own order.
 
     Args:
@@ -76,61 +158,33 @@ def make_loader(
     Returns:
         Iterator with `get_state` and `set_state`; `grain.checkpoint.CheckpointSave`
         saves it with orbax. Restored, it continues with exactly the next batch, with
-        any number of threads or workers.
+        any number of threads.
 
     Raises:
         UserError: There are fewer frames than one batch needs.
     """
     threads = grain.ReadOptions(
         num_threads=options.num_threads,
-        prefetch_buffer_size=max(options.prefetch, options.num_threads),
+        prefetch_buffer_size=max(2, options.num_threads),
     )
     order = _make_order(len(table), options).repeat(options.num_epochs)
     batches: grain.MapDataset[Batch] = order.map(_LoadBatch(table, augment))
-    dataset = batches.to_iter_dataset(threads)
-    if options.num_workers:
-        dataset = dataset.mp_prefetch(
-            grain.MultiprocessingOptions(
-                num_workers=options.num_workers,
-                per_worker_buffer_size=max(1, options.prefetch),
-            )
-        )
-    if options.device is not None:
-        dataset = grain.experimental.device_put(
-            dataset,
-            options.device,
-            cpu_buffer_size=options.prefetch,
-            device_buffer_size=2,
-        )
-    return iter(dataset)
-
-
-def steps_per_epoch(
-    num_frames: int,
-    batch_size: int,
-    *,
-    drop_remainder: bool = True,
-    process_count: int = 1,
-) -> int:
-    """Number of batches that `make_loader` gives per epoch and process."""
-    if drop_remainder:
-        return num_frames // (process_count * batch_size)
-    return -(-num_frames // (process_count * batch_size))
+    return iter(batches.to_iter_dataset(threads))
 
 
 def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
     """`UserError` for fewer frames than one batch.
 
     Args:
-        num_frames: That there are.
-        batch_size: Of one process.
-        count: Of the processes.
+        num_frames: Frames that there are.
+        batch_size: Batch size of one process.
+        count: Number of processes.
     """
     if num_frames < batch_size * count:
         each = f" ({batch_size} on each of {count} processes)" if count > 1 else ""
         raise UserError(
             f"{num_frames} frames are fewer than one batch of {batch_size * count}{each}; "
-            "lower --config.train.batch_size (of LoaderOptions, set pad_remainder)"
+            "lower --config.train.batch_size"
         )
 
 
@@ -145,14 +199,11 @@ def _make_order(
     if index is None or count is None:
         index, count = jax.process_index(), jax.process_count()
     batch_size, seed = options.batch_size, options.seed
-    drop_remainder = options.drop_remainder and not options.pad_remainder
-    if batch_size < 1:
-        raise UserError(f"batch_size must be at least 1, got {batch_size}")
-    if drop_remainder:
-        check_enough(num_frames, batch_size, count)
     total = num_frames
     if options.pad_remainder:
         total = -(-num_frames // (batch_size * count)) * batch_size * count
+    elif options.drop_remainder:
+        check_enough(num_frames, batch_size, count)
     # grain's shuffle in epoch e of seed s is that of epoch e - 1 of seed s + 1.
     spread = np.random.SeedSequence(seed).generate_state(2)
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
@@ -160,7 +211,9 @@ def _make_order(
         dataset = dataset.shuffle(seed=int(spread[1]))
     seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_AddSeed())
     batches = seeded.batch(
-        batch_size * count, drop_remainder=drop_remainder, batch_fn=np.stack
+        batch_size * count,
+        drop_remainder=options.drop_remainder,
+        batch_fn=np.stack,
     )
     # Of every global batch, its own rows: what is trained on, and in which order, does
     # not depend on the number of processes.
@@ -226,7 +279,7 @@ class _LoadBatch(grain.transforms.Map):
         """One frame; image and camera None where they are not asked for."""
         table, images = self._table, self._table.images
         return {
-            "projection": table.records[int(table.record[index])]["projection"],
+            "projection": table.records[table.keys[index]],
             "boxes": table.boxes[index],
             "image": None if images is None else images.image(index),
             "camera": None if images is None else images.cameras[index],

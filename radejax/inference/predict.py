@@ -13,16 +13,15 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.data.cameras import CameraInputs
 from radejax.data.dataset import FrameSequence
-from radejax.data.frame_table import make_table
-from radejax.data.pipeline import LoaderOptions, make_loader
-from radejax.data.records.projections import RecordSource
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.records import Records
 from radejax.inference.detector import Detector
 from radejax.training import distributed
 
 
 def predict_dataset(
     detector: Detector,
-    records: RecordSource,
+    records: Records,
     frames: FrameSequence,
     batch_size: int = 8,
     *,

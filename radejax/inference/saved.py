@@ -35,7 +35,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES
 from radejax.data.cameras import CameraOptions
-from radejax.data.records.embeddings import embeddings_sha256
+from radejax.data.records import open_embeddings
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
@@ -371,7 +371,7 @@ def starting_weights(
         )
     if models.has_camera(model) and model.freeze:
         if embeddings is not None:
-            digest = embeddings_sha256(embeddings)
+            digest = open_embeddings(embeddings).source["weights_sha256"]
         else:
             given = variables if pretrained is None else pretrained
             assert given is not None  # without both there has been an error

@@ -14,12 +14,13 @@ from collections.abc import Sequence
 import flax.linen as nn
 import grain
 import jax
+import numpy as np
 from ml_collections import ConfigDict
 
 from radejax import models
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
-from radejax.data.augment import make_augmentation
+from radejax.data.augment import Augmentation
 from radejax.data.cameras import (
     CameraInputs,
     CameraOptions,
@@ -28,16 +29,14 @@ from radejax.data.cameras import (
     require_images,
 )
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
-from radejax.data.frame_table import make_table
 from radejax.data.kradar.dataset import held_out
-from radejax.data.pipeline import LoaderOptions, check_enough, make_loader
-from radejax.data.records import job
-from radejax.data.records.arrays import ArrayRecords
-from radejax.data.records.embeddings import open_embeddings
-from radejax.data.records.projections import (
-    RecordSource,
+from radejax.data.pipeline import LoaderOptions, check_enough, make_loader, make_table
+from radejax.data.records import (
+    Records,
     describe_grid,
-    skipped_frames,
+    open_embeddings,
+    open_projections,
+    preprocess,
 )
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import SavedModel
@@ -70,7 +69,7 @@ class Data:
     options: ConfigDict
     camera: CameraOptions | None
     image_size: tuple[int, int] | None
-    features: ArrayRecords | None
+    features: Records | None
     grid: RadarGrid | None = None
 
     @classmethod
@@ -127,23 +126,37 @@ class Data:
             grid=grid,
         )
 
-    def project(self) -> None:
-        """Projects the frames that have no record yet.
+    def preprocess(self) -> None:
+        """Write the records that are missing, on one process while others wait.
+
+        `split` then leaves out frames whose radar tensor is missing or corrupted.
 
         Raises:
             UserError: No frames, records of something else, or no space left.
+            DataError: No frame could be read.
         """
-        distributed.main_first(
-            lambda: job.project_dataset(
-                self.frames, self.paths.records, retry_skipped=False
-            )
+        report = distributed.main_only(
+            lambda: preprocess(self.frames, self.paths.records)
         )
-        self._splits.clear()  # frames may have been left out now
+        if report is not None and report.skipped:
+            _log.warning("%s", report.to_text())
+        keys = self.records.keys()
+        self._skipped.update(f.key for f in self.frames if f.key not in keys)
+        if len(self._skipped) == len(self.frames):
+            raise DataError(
+                f"{', '.join(self.paths.roots)}: none of {len(self.frames)} frames has a "
+                "radar tensor that can be read"
+            )
+        self._splits.clear()
 
     @functools.cached_property
-    def records(self) -> RecordSource:
+    def records(self) -> Records:
         """Projections of the frames."""
-        return RecordSource(self.paths.records, grid=self.grid)
+        return open_projections(self.paths.records, self.grid)
+
+    @functools.cached_property
+    def _skipped(self) -> set[str]:
+        return set()
 
     @functools.cached_property
     def _splits(self) -> dict[str | None, LabelledFrames]:
@@ -152,7 +165,7 @@ class Data:
     def split(self, name: str | None) -> LabelledFrames:
         """Frames of "train", "validation", "test" or a split file; all for None.
 
-        Without those that were left out when they were projected, which are counted.
+        Without those that `preprocess` skipped, which are counted.
         Sequences that `options.validation` holds out of "train" are "validation".
 
         Raises:
@@ -163,9 +176,8 @@ class Data:
                 frames = self._part_of_train(name)
             else:
                 frames = self.frames if name is None else self.frames.of_split(name)
-            skipped = skipped_frames(self.paths.records)
-            if any(frame.key in skipped for frame in frames):
-                frames = frames.without(skipped, "no record of them")
+            if any(frame.key in self._skipped for frame in frames):
+                frames = frames.without(self._skipped, "no readable radar tensor")
             self._splits[name] = frames
         return self._splits[name]
 
@@ -227,22 +239,27 @@ class Data:
             max_objects=options.max_objects,
             classes=self.classes,
             images=images,
-            label_permutation_seed=options.label_permutation_seed,
         )
-        augment = make_augmentation(
+        if (shuffled := options.label_permutation_seed) is not None:
+            order = np.random.default_rng(shuffled).permutation(len(table))
+            boxes, classes = table.boxes[order], table.classes[order]
+            table = dataclasses.replace(table, boxes=boxes, classes=classes)
+        augment = Augmentation(
             self.records.grid,
-            mirror_probability=options.mirror_probability,
-            gain_db=options.gain_db,
-            gain_slope_db=options.gain_slope_db,
+            options.mirror_probability,
+            options.gain_db,
+            options.gain_slope_db,
         )
-        loading = {name: options[name] for name in ("num_threads", "num_workers")}
-        batch_size = train.batch_size // jax.process_count()
-        loader = LoaderOptions(batch_size=batch_size, seed=seed, **loading)
+        loader = LoaderOptions(
+            train.batch_size // jax.process_count(),
+            seed,
+            num_threads=options.num_threads,
+        )
         return make_loader(table, loader, augment=augment)
 
 
 def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
-    """Simulates if the config says so, projects what has no record yet, opens all.
+    """Simulate if the config says so, preprocess what has no record yet, open all.
 
     One process of several writes before the others read, see `distributed.main_first`.
 
@@ -261,6 +278,9 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
     data = Data.open(config, model, dataclasses.replace(sources, data=roots).paths())
     _log.info("%s", data.frames.summary().to_text())
     _check_bins(config.model, data)
+    if count := len(data.split("train")):  # preprocessing takes long
+        check_enough(count, config.train.batch_size)
+    data.preprocess()
     if config.data.get("validation"):
         _tell_what_is_held_out(data)
         if not config.train.evaluate_every_epochs:
@@ -268,14 +288,6 @@ def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
                 "config.train.evaluate_every_epochs is 0: nothing is chosen by them; "
                 "evaluate.py --split validation looks at them afterwards"
             )
-    if count := len(data.split("train")):  # projecting takes long
-        check_enough(count, config.train.batch_size)
-    data.project()
-    if lost := len(data.frames) - len(data.split(None)):
-        _log.warning(
-            f"{lost} of {len(data.frames)} frames were left out when they were projected; "
-            f"manifest.json in {data.paths.records} says why"
-        )
     return data
 
 

@@ -174,7 +174,7 @@ def evaluate_run(
         require_images(frames, data.images(frames), split)
         if out is None:
             _check_source(workdir / name, source_of(data, split, shuffle_images))
-        data.project()
+    data.preprocess()
     return evaluate(
         config,
         loaded.model,

@@ -16,11 +16,10 @@ from radejax.core import files
 from radejax.core.structures import Boxes
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.encoding import decode, model_inputs
-from radejax.data.frame_table import make_table
 from radejax.data.images import front_view
 from radejax.data.kradar.conditions import WEATHERS
-from radejax.data.pipeline import LoaderOptions, make_loader
-from radejax.data.records.projections import RecordSource, record_positions
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.records import Records
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LOSSES
 from radejax.runs.data import Data
@@ -61,7 +60,7 @@ class FrameDrawer:
 
     def __init__(
         self,
-        records: RecordSource,
+        records: Records,
         frames: FrameSequence,
         predictions: Boxes,
         *,
@@ -71,7 +70,6 @@ class FrameDrawer:
         assert predictions.score is not None
         self._records = records
         self._frames = frames
-        self._positions = record_positions(records, frames)
         self._predictions = predictions.take(predictions.score >= score_threshold)
         self._fields = {"roi": roi, "score_threshold": score_threshold}
 
@@ -81,10 +79,9 @@ class FrameDrawer:
 
     def _scene(self, index: int, **fields: Any) -> Scene:
         """The frame at a position with its boxes and image."""
-        record = self._records[self._positions[index]]
         return frame_scene(
             self._frames[index],
-            decode(record["projection"]),
+            decode(self._records[self._frames[index].key]),
             self._records.grid,
             predictions=self._predictions.take(self._predictions.frame == index),
             **self._fields,

@@ -14,7 +14,7 @@ import numpy as np
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, differences
-from radejax.data.records.embeddings import embeddings_sha256
+from radejax.data.records import open_embeddings
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.vit import ViT
 from radejax.weights import dinov3_hf, resnet_torch
@@ -76,7 +76,10 @@ def load_image_backbone(
 
 def check_same_backbone(params: Any, embeddings: PathLike, source: PathLike) -> None:
     """`UserError` unless embeddings were made with these weights."""
-    found, wanted = embeddings_sha256(embeddings), weights_sha256(params)
+    found, wanted = (
+        open_embeddings(embeddings).source["weights_sha256"],
+        weights_sha256(params),
+    )
     if found != wanted:
         raise UserError(
             f"{source} is not the backbone that {embeddings} was made with: weights "

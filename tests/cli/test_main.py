@@ -50,8 +50,8 @@ def test_help_shows_an_example(command: list[str]) -> None:
         (["simulate", "--sequences", "5", "--out", "x"], "real labels"),
         (["simulate", "--sequences", "5-6", "--out", "x"], "expected 1,5,58"),
         (["fly"], "No such command 'fly'"),
-        (["project", ".", "--out", "x", "--shard", "3/2"], "3/2"),
-        (["project", ".", "--out", "x", "--workers", "0"], "0 is not in the range"),
+        (["preprocess", ".", "--out", "x", "--shard", "3/2"], "3/2"),
+        (["preprocess", ".", "--out", "x", "--workers", "0"], "0 is not in the range"),
         (["simulate", "--out", "x", "--workers", "0"], "0 is not in the range"),
         (["simulate", "--out", "x", "--seed", "-1"], "-1 is not in the range"),
         (["overlay", "1", "--data", ".", "--max-frames", "0"], "0 is not in the range"),
@@ -266,7 +266,7 @@ def test_a_part_of_the_data_is_chosen(
     monkeypatch.setattr("radejax.data.kradar.KRadar", look)
     part = ("--sequences", "1,58", "--weather", "fog", "--weather", "rain")
     _run("data", "check", tmp_path, *part)
-    assert "opened" in _run("project", tmp_path, "--out", tmp_path, *part).output
+    assert "opened" in _run("preprocess", tmp_path, "--out", tmp_path, *part).output
     assert "opened" in _run("view", tmp_path, *part).output
     assert seen == 3 * [((1, 58), ("fog", "rain"))]
     _run("data", "check", tmp_path)

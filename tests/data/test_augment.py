@@ -179,7 +179,7 @@ def test_wrong_settings():
     with pytest.raises(UserError, match="cannot mirror: azimuths"):
         Augmentation(skewed)
     Augmentation(skewed, mirror_probability=0)
-    with pytest.raises(UserError, match=r"1\.5 is not in"):
+    with pytest.raises(UserError, match=r"probability is 1\.5, expected a number from"):
         Augmentation(GRID, mirror_probability=1.5)
     with pytest.raises(UserError, match="at least 0"):
         Augmentation(GRID, gain_db=-1)

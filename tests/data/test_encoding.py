@@ -7,23 +7,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from radejax.core.errors import UserError
-from radejax.data.encoding import (
-    ENCODINGS,
-    MAX_ERROR_DB,
-    check_encoding,
-    decode,
-    encode,
-    num_clipped,
-    to_float,
-)
+from radejax.data.encoding import ENCODINGS, decode, encode, to_float
+
+# Half a step of the type below 1, in decibels of power.
+MAX_ERROR_DB = {
+    "float16": 2.0**-12 * 184.3,
+    "uint8": 0.5 / 255 * 184.3,
+    "float32": 2.0**-25 * 184.3,
+}
 
 
 def test_eight_bits_by_hand():
     stored = encode(np.array([0.0, 1.0, 0.5, 0.1, -0.2, 1.3], np.float32), "uint8")
     assert stored.tolist() == [0, 255, 128, 26, 0, 255]  # 127.5 to even
-    assert num_clipped(np.array([0.0, 1.0, -0.2, 1.3]), "uint8") == 2
-    assert num_clipped(np.array([-0.2, 1.3]), "float16") == 0
 
 
 @settings(deadline=None)
@@ -47,8 +43,3 @@ def test_device_and_host_decode_alike(encoding, jit):
     found = function(jnp.asarray(stored))
     assert found.dtype == jnp.float32
     chex.assert_trees_all_close(found, decode(stored), rtol=1e-6, atol=0)
-
-
-def test_unknown_encoding():
-    with pytest.raises(UserError, match="'int4', expected one of float16, uint8"):
-        check_encoding("int4")

@@ -1,10 +1,10 @@
 import dataclasses
 import itertools
 import shutil
+import types
 
 import chex
 import grain
-import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
@@ -14,12 +14,10 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, camera_inputs
-from radejax.data.frame_table import make_table
 from radejax.data.images import IMAGE_SIZE
 from radejax.data.kradar import KRadar
-from radejax.data.pipeline import LoaderOptions, make_loader, steps_per_epoch
-from radejax.data.records.job import project_dataset
-from radejax.data.records.projections import RecordSource
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.records import Records, open_projections, preprocess
 from radejax.geometry.camera import CameraCalibration
 
 OPTIONS = LoaderOptions(3, seed=1, process_index=0, process_count=1)
@@ -33,8 +31,8 @@ def data(kradar_root):
 @pytest.fixture(scope="module")
 def records(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("records")
-    project_dataset(data, path, num_workers=0, frames_per_file=5, progress=False)
-    return RecordSource(path)
+    preprocess(data, path, num_workers=0, progress=False)
+    return open_projections(path)
 
 
 @pytest.fixture
@@ -66,9 +64,7 @@ def test_batches_are_the_records_and_labels(loader, records, data):
         )
         for row, index in enumerate(batch.frame):
             frame = data[index]
-            np.testing.assert_array_equal(
-                batch.projection[row], records[index]["projection"]
-            )
+            np.testing.assert_array_equal(batch.projection[row], records[frame.key])
             count = int(batch.is_valid[row].sum())
             assert count == len(frame.boxes)
             found = batch.boxes[row, :count]
@@ -90,8 +86,7 @@ def test_splits_point_to_the_right_records(records, kradar_root):
     table = make_table(records, test, max_objects=5)
     batch = next(make_loader(table, dataclasses.replace(OPTIONS, shuffle=False)))
     for row, index in enumerate(batch.frame):
-        record = records[records.frames.index(test[index].key)]
-        np.testing.assert_array_equal(batch.projection[row], record["projection"])
+        np.testing.assert_array_equal(batch.projection[row], records[test[index].key])
 
 
 # Order --------------------------------------------------------------------------------
@@ -109,7 +104,7 @@ def test_every_epoch_has_every_frame_in_another_order(loader):
 
 def test_order_depends_on_the_seed_alone(loader):
     wanted = frames_of(loader(num_epochs=2))
-    for options in ({"num_threads": 0}, {"num_threads": 5}, {"prefetch": 7}):
+    for options in ({"num_threads": 0}, {"num_threads": 5}):
         assert frames_of(loader(num_epochs=2, **options)) == wanted
     # grain shuffles epoch e of seed s as epoch e - 1 of seed s + 1; we must not.
     others = [frames_of(loader(num_epochs=2, seed=s)) for s in (0, 2, 3)]
@@ -156,7 +151,6 @@ def test_processes_take_as_many_steps_when_frames_do_not_divide(loader):
         options = {"process_count": 5, "num_epochs": 1, "batch_size": batch_size}
         shares = [frames_of(loader(process_index=i, **options)) for i in range(5)]
         assert {len(share) for share in shares} == {steps}
-        assert steps == steps_per_epoch(12, batch_size, process_count=5)
     padded = [
         frames_of(
             loader(
@@ -164,7 +158,6 @@ def test_processes_take_as_many_steps_when_frames_do_not_divide(loader):
                 process_count=5,
                 num_epochs=1,
                 batch_size=2,
-                drop_remainder=False,
                 pad_remainder=True,
                 shuffle=False,
             )
@@ -180,12 +173,10 @@ def test_processes_take_as_many_steps_when_frames_do_not_divide(loader):
 def test_remainders(loader, batch_size):
     options = {"batch_size": batch_size, "num_epochs": 1, "shuffle": False}
     dropped = frames_of(loader(**options))
-    kept = frames_of(loader(drop_remainder=False, **options))
     padded = list(loader(pad_remainder=True, **options))
-    assert len(dropped) == 12 // batch_size == steps_per_epoch(12, batch_size)
-    assert list(itertools.chain(*kept)) == list(range(12))
-    assert len(padded) == len(kept)
-    assert len(kept) == steps_per_epoch(12, batch_size, drop_remainder=False)
+    assert len(dropped) == 12 // batch_size
+    frames = np.concatenate([batch.frame for batch in padded]).tolist()
+    assert frames == [*range(12), *[-1] * (-12 % batch_size)]
     empty = padded[-1].frame == -1
     assert int(empty.sum()) == -12 % batch_size
     assert not padded[-1].projection[empty].any()
@@ -203,7 +194,7 @@ def test_restored_in_mid_epoch_continues_with_the_next_batch(loader, data, step)
         next(first)
     state = first.get_state()
     wanted = list(first)
-    for changes in ({}, {"num_threads": 0}, {"prefetch": 5}):
+    for changes in ({}, {"num_threads": 0}):
         second = loader(**options, **changes)
         next(second)
         second.set_state(state)
@@ -229,23 +220,6 @@ def test_state_travels_with_an_orbax_checkpoint(loader, tmp_path):
     assert frames_of(second) == frames_of(first)
 
 
-@pytest.mark.slow
-def test_worker_processes_give_the_same(loader, data):
-    options = {"num_epochs": 2, "augment": Augmentation(data.grid)}
-    wanted = list(loader(**options))
-    workers = loader(num_workers=2, **options)
-    found = [next(workers) for _ in range(3)]
-    state = workers.get_state()
-    found += list(workers)
-    for a, b in zip(found, wanted, strict=True):
-        chex.assert_trees_all_equal(
-            jax.tree.map(np.asarray, a), jax.tree.map(np.asarray, b)
-        )
-    again = loader(num_workers=2, **options)
-    again.set_state(state)
-    assert frames_of(again) == [batch.frame.tolist() for batch in wanted[3:]]
-
-
 # Options ------------------------------------------------------------------------------
 
 
@@ -254,7 +228,7 @@ def test_augmentation_changes_per_epoch_and_stays_in_register(loader, data, reco
     mirrored = {index: set() for index in range(12)}
     for batch in loader(num_epochs=6, augment=augment):
         for row, index in enumerate(batch.frame):
-            plain = records[index]["projection"]
+            plain = records[data[index].key]
             is_mirrored = not np.array_equal(batch.projection[row], plain)
             if is_mirrored:
                 np.testing.assert_array_equal(batch.projection[row], plain[:, ::-1])
@@ -265,14 +239,6 @@ def test_augmentation_changes_per_epoch_and_stays_in_register(loader, data, reco
                 batch.boxes[row, :count, 1], sign * data[index].boxes[:, 1], rtol=1e-6
             )
     assert sum(len(seen) == 2 for seen in mirrored.values()) >= 9
-
-
-def test_on_device(loader):
-    wanted = list(loader(num_epochs=1))
-    found = list(loader(num_epochs=1, device=jax.devices()[0]))
-    assert all(isinstance(batch.projection, jax.Array) for batch in found)
-    for a, b in zip(found, wanted, strict=True):
-        chex.assert_trees_all_equal(a, b)
 
 
 def test_images_and_cameras(records, data, tmp_path):
@@ -327,25 +293,81 @@ def test_wrong_sizes(loader, records, data):
         loader(batch_size=13)
     with pytest.raises(UserError, match=r"of 15 \(3 on each of 5 .*--config\.train"):
         loader(process_count=5)
-    with pytest.raises(UserError, match="must be at least 1, got 0"):
+    with pytest.raises(
+        UserError, match="batch_size is 0, expected an integer of at least 1"
+    ):
         loader(batch_size=0)
     with pytest.raises(UserError, match="would do"):
         make_table(records, data, max_objects=0)
 
 
 @pytest.mark.parametrize("num_threads", [0, 2])
-def test_a_damaged_record_is_named_when_it_is_read(
+def test_a_corrupted_record_is_named_when_it_is_read(
     records, data, tmp_path, num_threads
 ):
-    folder = shutil.copytree(records.folder, tmp_path / "copy")
-    path = folder / "projections-00000-of-00003.arrayrecord"
-    content = bytearray(path.read_bytes())
-    content[content.index(records[4]["projection"].tobytes()) + 10] ^= 1
-    path.write_bytes(content)
-    damaged = make_loader(
-        make_table(RecordSource(folder), data, max_objects=5),
+    copy = open_projections(shutil.copytree(records.folder, tmp_path / "copy"))
+    path = copy.path(data[4].key)
+    path.write_bytes(path.read_bytes()[:-1])
+    corrupted = make_loader(
+        make_table(copy, data, max_objects=5),
         dataclasses.replace(OPTIONS, shuffle=False, num_threads=num_threads),
     )
-    next(damaged)
-    with pytest.raises(DataError, match=r"00000-of-00003\.arrayrecord: record 4"):
-        next(damaged)
+    next(corrupted)
+    with pytest.raises(DataError, match=rf"{data[4].key}\.npy: corrupted record"):
+        next(corrupted)
+
+
+# Tables ------------------------------------------------------------------------------
+
+BOX = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, np.pi / 6]
+
+
+def frame_of(key, boxes=(), classes=()):
+    """What of a frame the table reads."""
+    boxes = np.array(boxes, np.float64).reshape(-1, 7)
+    return types.SimpleNamespace(key=key, boxes=boxes, classes=np.array(classes, str))
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Records of frames 1/a, 1/b and 1/c."""
+    written = Records.create(tmp_path / "written", (2, 3, 4), "float16", {})
+    for key in ("1/a", "1/b", "1/c"):
+        written.write(key, np.zeros((2, 3, 4), np.float16))
+    return written
+
+
+@pytest.mark.wrong_types
+def test_table_by_hand(written):
+    frames = [
+        frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"]),
+        frame_of("1/a"),
+        frame_of("1/c", [BOX], ["Pedestrian"]),
+    ]
+    table = make_table(written, frames, max_objects=2, classes=("Sedan", "Bicycle"))
+    assert table.keys == ("1/b", "1/a", "1/c")
+    assert table.classes.tolist() == [[1, 0], [-1, -1], [-1, -1]]
+    assert table.is_valid.tolist() == [[True, True], [False, False], [False, False]]
+    wanted = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, 0.5, np.sqrt(3) / 2]
+    np.testing.assert_allclose(table.boxes[0, 1], wanted, rtol=1e-6)
+    assert table.boxes.dtype == np.float32
+    assert not table.boxes[1:].any()
+
+
+@pytest.mark.wrong_types
+def test_too_many_objects_and_missing_records(written):
+    frames = [
+        frame_of("1/a", [BOX] * 2, ["Sedan"] * 2),
+        frame_of("1/b", [BOX] * 5, ["Sedan"] * 5),
+    ]
+    with pytest.raises(UserError, match=r"frame 1/b has 5 objects.* is 3; 5 would do"):
+        make_table(written, frames, max_objects=3)
+    # Objects of other classes take no rows.
+    make_table(written, frames, max_objects=0, classes=("Bicycle",))
+    with pytest.raises(UserError, match=r"1 of 2 frames have no record, .* is 1/x"):
+        make_table(written, [frames[0], frame_of("1/x")], max_objects=2)
+    with pytest.raises(UserError, match="no frames"):
+        make_table(written, [], max_objects=1)
+    images = types.SimpleNamespace(cameras=(None,))
+    with pytest.raises(UserError, match="1 cameras for 2 frames"):
+        make_table(written, frames, max_objects=5, images=images)

@@ -11,8 +11,7 @@ from cfar import detect
 from radejax.core.errors import UserError
 from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
-from radejax.data.records.job import project_dataset
-from radejax.data.records.projections import RecordSource
+from radejax.data.records import open_projections, preprocess
 from radejax.simulation.dataset import default_config, simulate_dataset
 
 
@@ -28,7 +27,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
         "output": "projection",
     }
     simulate_dataset(config, root, progress=False)
-    project_dataset(KRadar(root), root / "records", num_workers=0, progress=False)
+    preprocess(KRadar(root), root / "records", num_workers=0, progress=False)
     return root
 
 
@@ -47,14 +46,14 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     )
     assert again.text == report.text
     # Fitted on training frames; each frame's predictions are those of the detector.
-    records = RecordSource(data / "records")
+    records = open_projections(data / "records")
     settings = module.fit(records, KRadar(data, split="train"))
     levels = [least for _, least in settings.rcs_steps]
     assert levels == sorted(levels, reverse=True)
     frames = KRadar(data, split="test")
     found = module.predict(records, frames, settings)
     last = len(frames) - 1
-    projection = decode(records[records.index_of()[frames[last].key]]["projection"])
+    projection = decode(records[frames[last].key])
     expected = detect(projection, records.grid, module.PARAMETERS, settings)
     assert len(expected["score"]) > 0
     np.testing.assert_array_equal(found["box"][found["frame"] == last], expected["box"])

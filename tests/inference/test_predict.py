@@ -10,7 +10,7 @@ from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
-from radejax.data.records.job import project_dataset
+from radejax.data.records import preprocess
 from radejax.inference import inputs as detector_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
@@ -52,7 +52,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     data = Data.open(
         config, model, DataPaths((str(root),), None, str(folder / "records"))
     )
-    project_dataset(data.frames, data.paths.records, num_workers=0, progress=False)
+    preprocess(data.frames, data.paths.records, num_workers=0, progress=False)
     records = data.records
     variables = drawn(model, np.zeros((1, *records.grid.projection_shape)))
     return SimpleNamespace(

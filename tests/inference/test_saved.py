@@ -17,6 +17,7 @@ from radejax import Detector, UserError, models
 from radejax.cli.demo import MODEL
 from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
+from radejax.data.records import Records
 from radejax.inference import exported_loader, saved
 from radejax.inference.saved import load_model, save_model, starting_weights
 from radejax.runs import workdir
@@ -134,8 +135,8 @@ def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> No
     assert found.pretrained is None
     assert found.frozen_sha256 == weights_sha256(weights)
     # Embeddings of the same backbone stand for it.
-    content = {"weights_sha256": found.frozen_sha256}
-    (tmp_path / "manifest.json").write_text(json.dumps(content))
+    source = {"image": {}, "weights_sha256": found.frozen_sha256}
+    Records.create(tmp_path, (2, 3, 4), "float32", source)
     embedded = starting_weights(config, embeddings=tmp_path)
     assert embedded.frozen_sha256 == found.frozen_sha256
     assert embedded.variables is embedded.pretrained is None

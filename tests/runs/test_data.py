@@ -1,23 +1,20 @@
 """Data folders of a run: found, checked, projected once."""
 
 import dataclasses
-import hashlib
 import pathlib
 import shutil
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
-from radejax.data.records.job import project_dataset
+from radejax.data.records import preprocess
 from radejax.runs.data import (
     Data,
-    _simulated_root,
     data_of_run,
     open_data,
 )
@@ -74,31 +71,18 @@ def test_frames_are_projected_beside_their_data_once(
     paths = data.paths
     assert paths.roots == (str(tmp_path / "sim"),)
     assert paths.records == str(tmp_path / "sim" / "records")
-    assert len(data.records) == 4
+    assert len(data.records.keys()) == 4
     assert len(data.split("test")) == 2
 
     def written() -> dict[pathlib.Path, int]:
-        files = (tmp_path / "sim" / "records").iterdir()
-        return {p: p.stat().st_mtime_ns for p in files if p.suffix != ".json"}
+        files = (tmp_path / "sim" / "records").rglob("*.npy")
+        return {path: path.stat().st_mtime_ns for path in files}
 
     before = written()
-    assert "project: 100%" in capsys.readouterr().err
+    assert "preprocess: 100%" in capsys.readouterr().err
     assert prepare().paths == paths
-    assert "project" not in capsys.readouterr().err
+    assert "preprocess" not in capsys.readouterr().err
     assert written() == before
-
-
-def test_a_folder_of_before_the_config_had_more_fields_is_found_again() -> None:
-    simulation = ConfigDict(default_config())
-    before = simulation.copy_and_resolve_references()
-    del before["camera_mode"], before["vru_density_scale"]
-    # As runs have it, whose configs are sorted; a command reads the file's own order.
-    text = ConfigDict(before.to_dict()).to_json()
-    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    for config in (simulation, ConfigDict(simulation.to_dict())):
-        assert _simulated_root(config, ()) == f"data/simulated-{digest}"
-    simulation.camera_mode = "oracle"
-    assert _simulated_root(simulation, ()) != f"data/simulated-{digest}"
 
 
 def test_other_data_keep_what_the_run_had_of_the_same_folders(
@@ -143,15 +127,15 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     frames = KRadar(root)
     damaged = next(frame for frame in frames if frame.sequence == 1)
     damaged.projection_path.write_bytes(b"half")
-    project_dataset(frames, root / "records", skip_bad=True, progress=False)
+    preprocess(frames, root / "records", progress=False)
     config.train.batch_size = 1
     config.model.update(doppler_bins=16, elevation_bins=9)
     model, sources = models.build(config.model), Sources(data=(str(root),))
     with caplog.at_level("WARNING", "radejax"):
         data = open_data(config, model, sources)
-    assert "1 of 6 frames were left out when they were projected" in caplog.text
+    assert "6 frames: 5 were done, 0 preprocessed, 1 skipped" in caplog.text
     assert damaged.key not in [frame.key for frame in data.split("train")]
-    assert len(data.split(None)) == len(data.records) == 5
+    assert len(data.split(None)) == len(data.records.keys()) == 5
     config.data.sequences = (1, 3)
     part = open_data(config, model, sources)  # the same records
     assert {frame.sequence for frame in part.frames} == {1, 3}

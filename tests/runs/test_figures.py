@@ -22,7 +22,6 @@ def test_scenes_are_the_fullest_of_each_weather_in_the_order_of_tables(
         for weather, size in zip(weathers, sizes, strict=True)
     ]
     drawn = []
-    monkeypatch.setattr(figures, "record_positions", lambda *_: range(5))
     monkeypatch.setattr(figures.FrameDrawer, "_scene", lambda _, index, title: index)
     monkeypatch.setattr(figures, "draw_scenes", drawn.extend)
     monkeypatch.setattr(figures, "save_figure", lambda *_: None)

@@ -1,6 +1,5 @@
 """What radar-camera runs take from files, in place of real weights."""
 
-import json
 import pathlib
 
 import flax.linen as nn
@@ -9,6 +8,7 @@ import pytest
 
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
+from radejax.data.records import Records
 from radejax.models import build
 from radejax.weights import dinov3_hf, image_backbone, resnet_torch
 
@@ -28,8 +28,8 @@ def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
 
 
 def _write_manifest(folder, params):
-    content = {"weights_sha256": image_backbone.weights_sha256(params)}
-    (folder / "manifest.json").write_text(json.dumps(content))
+    source = {"image": {}, "weights_sha256": image_backbone.weights_sha256(params)}
+    Records.create(folder, (2, 3, 4), "float32", source)
 
 
 def test_embeddings_leave_the_last_stage_to_load(resnet, tmp_path):

@@ -1,0 +1,334 @@
+"""Records: one file per frame, resumable, sharded, never half written."""
+
+import concurrent.futures
+import dataclasses
+import errno
+import json
+import multiprocessing
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from radejax.core import files
+from radejax.core.errors import DataError, UserError
+from radejax.data.kradar import KRadar
+from radejax.data.records import Records, open_embeddings, open_projections, preprocess
+from radejax.data.tesseract import project_file
+from radejax.geometry.radar_grid import RadarGrid
+
+
+@pytest.fixture(scope="module")
+def data(kradar_root):
+    return KRadar(kradar_root)
+
+
+@pytest.fixture(scope="module")
+def folder(data, tmp_path_factory):
+    path = tmp_path_factory.mktemp("records")
+    run(data, path)
+    return path
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "records")
+
+
+@pytest.fixture
+def root(kradar_root, tmp_path):
+    return shutil.copytree(kradar_root, tmp_path / "kradar")
+
+
+def run(data, out, **options):
+    return preprocess(data, out, **{"num_workers": 0, "progress": False, **options})
+
+
+def contents(folder):
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def wait_until(condition, seconds=120.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+# Reading -----------------------------------------------------------------------------
+
+
+def test_every_frame_is_its_projection(data, folder):
+    records = open_projections(folder, data.grid)
+    assert records.keys() == {frame.key for frame in data}
+    assert (records.grid, records.dtype) == (data.grid, "float16")
+    for frame in data:
+        wanted = project_file(frame.tesseract_path).astype(np.float16)
+        np.testing.assert_array_equal(records[frame.key], wanted)
+        assert records[frame.key].dtype == np.float16
+    with pytest.raises(FileNotFoundError):
+        records["1/none"]
+
+
+def test_threads_and_pickles_read_the_same(data, folder):
+    records = open_projections(folder)
+    wanted = [records[frame.key] for frame in data]
+    copy = pickle.loads(pickle.dumps(records))
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda i: copy[data[i % 12].key], range(96)))
+    for i, projection in enumerate(found):
+        np.testing.assert_array_equal(projection, wanted[i % 12])
+
+
+def test_another_grid_is_an_error(folder, data):
+    with pytest.raises(
+        UserError, match=r"6 x 16 x 5 x 12 bins.*expected 64 x 256 x 37"
+    ):
+        open_projections(folder, RadarGrid.kradar())
+    moved = dataclasses.replace(data.grid, range_m=data.grid.range_m * 1.1)
+    with pytest.raises(UserError, match=r"to 118\.00 m.*to 129\.80 m"):
+        open_projections(folder, moved)
+
+
+def test_corrupted_records_are_named(data, copy):
+    records, key = open_projections(copy), data[4].key
+    path = records.path(key)
+    content = path.read_bytes()
+    other = np.zeros(records.shape, np.float32)
+    for part in (content[:-1], content[:100], content[:7], b"", b"PK\3\4", b"x" * 300):
+        path.write_bytes(part)
+        with pytest.raises(DataError, match=rf"{key}\.npy: corrupted.*delete the file"):
+            records[key]
+    for array in (other, other[:1].astype(np.float16), np.array([None])):
+        np.save(path, array, allow_pickle=True)
+        with pytest.raises(DataError, match=r"expected a float16 array of shape \(16,"):
+            records[key]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dtype": "int4"}, "dtype is 'int4'"),
+        ({"shape": None}, "corrupted"),
+        ({"source": 3}, "corrupted"),
+        ({"source": {}}, r"not the records of a radar \(KeyError\('grid'\)"),
+        ({"source": {"grid": {}}}, "not the records of a radar"),
+        ({"shape": [2, 3, 4]}, "arrays of shape"),
+    ],
+)
+def test_corrupted_descriptions_are_named(copy, change, message):
+    path = copy / "records.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(DataError, match=rf"records\.json: .*{message}"):
+        _ = open_projections(copy).grid
+    path.write_text("{")
+    with pytest.raises(DataError, match="is not valid JSON"):
+        open_projections(copy)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"no records\.json; expected a folder"):
+        open_projections(copy)
+
+
+def test_projections_are_no_embeddings(folder):
+    with pytest.raises(DataError, match="not embeddings of images"):
+        open_embeddings(folder)
+
+
+# Writing -----------------------------------------------------------------------------
+
+
+def test_processes_shards_and_one_process_write_the_same(data, folder, tmp_path):
+    wanted = contents(folder)
+    assert len(wanted) == 13
+    report = run(data, tmp_path / "many", num_workers=2)
+    assert (report.num_frames, report.num_found, report.num_written) == (12, 0, 12)
+    assert "12 frames: 0 were done, 12 preprocessed, 0 skipped" in report.to_text()
+    assert contents(tmp_path / "many") == wanted
+    for index in (1, 0):
+        assert run(data, tmp_path / "shards", shard=(index, 2)).num_frames == 6
+    assert contents(tmp_path / "shards") == wanted
+
+
+def test_another_run_writes_what_is_missing(data, folder, copy):
+    records = open_projections(copy)
+    for frame in (data[1], data[7]):
+        records.path(frame.key).unlink()
+    before = {path: path.stat().st_mtime_ns for path in copy.rglob("*.npy")}
+    report = run(data[2:9], copy, grid=data.grid)
+    assert (report.num_frames, report.num_found, report.num_written) == (7, 6, 1)
+    assert run(data, copy).num_written == 1
+    assert contents(copy) == contents(folder)
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+
+
+_JOB = """
+import sys
+from radejax.data.kradar import KRadar
+from radejax.data.records import preprocess
+if __name__ == "__main__":
+    preprocess(KRadar(sys.argv[1]), sys.argv[2], num_workers=1, progress=False)
+"""
+
+
+def test_resumes_after_a_kill(data, folder, root, tmp_path):
+    out = tmp_path / "out"
+    blocked = root / "2/radar_tesseract/tesseract_00005.mat"  # the 8th frame
+    content = blocked.read_bytes()
+    blocked.unlink()
+    os.mkfifo(blocked)  # a worker waits there forever
+    (tmp_path / "job.py").write_text(_JOB)
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    job = subprocess.Popen(
+        [sys.executable, tmp_path / "job.py", root, out], env=environment
+    )
+    wait_until(lambda: len(list(out.rglob("*.npy"))) == 7)
+    job.send_signal(signal.SIGKILL)
+    job.wait()
+    blocked.unlink()
+    blocked.write_bytes(content)
+    report = run(KRadar(root), out)
+    assert (report.num_written, report.num_found) == (5, 7)
+    assert contents(out) == contents(folder)
+
+
+@pytest.mark.slow
+def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
+    out = tmp_path / "out"
+    blocked = min(root.glob("1/radar_tesseract/*.mat"))  # of the first frame
+    blocked.unlink()
+    os.mkfifo(blocked)  # the worker waits there until it is opened below
+    # Started in the background, Ctrl-C would be ignored by all of them.
+    command = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from radejax.cli.main import main; main(prog_name='radejax')"
+    )
+    job = subprocess.Popen(
+        [
+            *(sys.executable, "-c", command, "preprocess"),
+            root,
+            "--out",
+            out,
+            "--workers=2",
+        ],
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    wait_until(lambda: list(out.rglob("*.npy")))
+    os.killpg(job.pid, signal.SIGINT)
+    time.sleep(1.0)
+    assert job.poll() is None  # waits for its workers
+    with blocked.open("wb"):
+        pass
+    _, errors = job.communicate(timeout=120)
+    assert job.returncode == 130
+    assert errors.rstrip().splitlines()[-1] == "error: interrupted"
+    assert "Traceback" not in errors
+
+
+def test_a_killed_worker_is_one_line(root, tmp_path):
+    blocked = root / "1/radar_tesseract/tesseract_00005.mat"
+    blocked.unlink()
+    os.mkfifo(blocked)
+    out = tmp_path / "out"
+
+    def kill_workers() -> None:
+        wait_until(lambda: list(out.rglob("*.npy")))
+        for process in multiprocessing.active_children():
+            process.kill()
+
+    killer = threading.Thread(target=kill_workers)
+    killer.start()
+    with pytest.raises(UserError, match=r"a worker process .*run the same"):
+        run(KRadar(root), out, num_workers=1)
+    killer.join()
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path, num_workers):
+    bad = root / "1/radar_tesseract/tesseract_00005.mat"
+    content = bad.read_bytes()
+    bad.write_bytes(content[:-7])
+    (root / "2/radar_tesseract/tesseract_00009.mat").unlink()
+    data, out = KRadar(root), tmp_path / "out"
+    report = run(data, out, num_workers=num_workers)
+    assert report.num_written == 10
+    assert list(report.skipped) == ["1/00005_00002", "2/00009_00006"]
+    assert "skipped 2/00009_00006: no tesseract in any root" in report.to_text()
+    assert "skipped 1/00005_00002: " in report.to_text()
+    many = dataclasses.replace(
+        report, skipped=dict.fromkeys("abcdefghijklmnopqrstuvwxyz", "")
+    )
+    assert "... and 6 more skipped" in many.to_text()
+    with pytest.raises(
+        UserError, match=r"2 of 12 .* is 1/00005_00002: run `radejax pr"
+    ):
+        open_projections(out).require(data)
+    bad.write_bytes(content)
+    report = run(data, out)
+    assert (report.num_found, report.num_written) == (10, 1)
+    assert list(report.skipped) == ["2/00009_00006"]
+
+
+def test_released_projections_are_taken_as_input(root, tmp_path):
+    wanted = {}
+    for frame in KRadar(root):
+        projection = project_file(frame.tesseract_path, dtype=np.float64)
+        folder = root / str(frame.sequence) / "DERA_tesseract"
+        folder.mkdir(exist_ok=True)
+        name = f"DERA_tesseract_{frame.header.radar:05d}.npy"
+        np.save(folder / name, projection.transpose(2, 0, 1))
+        wanted[frame.key] = projection.astype(np.float16)
+        frame.tesseract_path.unlink()
+    assert run(KRadar(root), tmp_path / "out").num_written == 12
+    records = open_projections(tmp_path / "out")
+    for key, projection in wanted.items():
+        np.testing.assert_array_equal(records[key], projection)
+
+
+def test_a_folder_has_records_of_one_kind(data, tmp_path):
+    run(data, tmp_path, dtype="uint8", shard=(0, 2))
+    run(data, tmp_path)  # the type that is there
+    records = open_projections(tmp_path)
+    exact = project_file(data[0].tesseract_path)
+    assert np.abs(records[data[0].key] / 255 - exact).max() <= 0.5001 / 255
+    with pytest.raises(UserError, match=r"other records: dtype is 'uint8' there and"):
+        run(data, tmp_path, dtype="float16")
+    with pytest.raises(UserError, match=r"source\.grid\.azimuth_rad differs"):
+        run(data, tmp_path, grid=RadarGrid.kradar())
+
+
+def test_wrong_arguments(data, tmp_path):
+    with pytest.raises(UserError, match="no frames to preprocess"):
+        run([], tmp_path, grid=data.grid)
+    with pytest.raises(UserError, match="a plain list of frames has no grid"):
+        run(list(data), tmp_path)
+    with pytest.raises(UserError, match="dtype is 'int4', expected one of float16"):
+        run(data, tmp_path, dtype="int4")
+    for shard in ((2, 2), (-1, 2)):
+        with pytest.raises(UserError, match="i from 0 to n - 1"):
+            run(data, tmp_path, shard=shard)
+
+
+def test_a_full_disk_keeps_nothing_half_written(data, tmp_path, monkeypatch):
+    def full(file, array, **_):
+        file.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises((OSError, UserError), match=r"(?i)no space left"):
+        run(data, tmp_path)
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [
+        "records.json"
+    ]
+    assert Records.open(tmp_path).keys() == set()
+    assert files.read_json(tmp_path / "records.json")["dtype"] == "float16"
