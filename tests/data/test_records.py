@@ -263,7 +263,7 @@ def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path, num_work
     report = run(data, out, num_workers=num_workers)
     assert report.num_written == 10
     assert list(report.skipped) == ["1/00005_00002", "2/00009_00006"]
-    assert "skipped 2/00009_00006: no tesseract in any root" in report.to_text()
+    assert "skipped 2/00009_00006: no radar tensor in any root" in report.to_text()
     assert "skipped 1/00005_00002: " in report.to_text()
     many = dataclasses.replace(
         report, skipped=dict.fromkeys("abcdefghijklmnopqrstuvwxyz", "")
