@@ -1,4 +1,4 @@
-"""Curves over data: precision and recall, training, score calibration."""
+"""Curves over data: precision and recall, training."""
 
 from __future__ import annotations
 
