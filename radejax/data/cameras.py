@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import os
+import math
 import pathlib
 from collections.abc import Collection, Mapping
 from typing import Any, Literal
@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Real
 
-from radejax.core import schema
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.images import read_left_image
 from radejax.data.records import Records
@@ -22,26 +21,25 @@ from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
 _log = logging.getLogger(__name__)
 
 
-BEFORE = {"radar_from_lidar_z_m": 0.0, "calibration": "sequence"}
-"""What models were trained with when these were no fields yet."""
-
-
 @dataclasses.dataclass(frozen=True)
 class CameraOptions:
-    """How images and calibrations are used; `config.data.camera` states the same.
+    """How images and calibrations are used: `config.data.camera`.
 
     Attributes:
         projection: "raw" or "pinhole", see `CameraCalibration.camera`.
-        radar_from_lidar_m: Shift from LiDAR to radar in place of each frame's own; or
-            None.
-        radar_from_lidar_z_m: Its z, which boxes are not moved by; None for what the
-            sensors' set-up says. No part of `radar_from_lidar_m` where that is given.
+        radar_from_lidar_m: t of `p_radar = p_lidar + t` for all frames; None: each
+            frame's own.
+        radar_from_lidar_z_m: z of each frame's own t, which boxes are not moved by;
+            None: as the sensors are mounted. Unused with `radar_from_lidar_m`.
         calibration: "sequence" for each sequence's own file, where it has one;
             "common" for `cam_front0.yml` everywhere, as released.
         resize: Image files of another size than the model's are resized, and their
             calibration with them; otherwise they are an error.
-        allow_missing: Frames without an image are predicted from the radar alone and
+        allow_missing: Frames without an image are predicted from the radar only and
             counted; otherwise they are an error.
+
+    Raises:
+        UserError: An option is out of its range.
     """
 
     projection: ImageKind = "raw"
@@ -51,29 +49,45 @@ class CameraOptions:
     resize: bool = False
     allow_missing: bool = True
 
+    def __post_init__(self) -> None:
+        shift, z = self.radar_from_lidar_m, self.radar_from_lidar_z_m
+        require(
+            self.projection in ("raw", "pinhole"),
+            "config.data.camera.projection",
+            self.projection,
+            "raw or pinhole",
+        )
+        require(
+            self.calibration in ("sequence", "common"),
+            "config.data.camera.calibration",
+            self.calibration,
+            "sequence or common",
+        )
+        require(
+            shift is None or (len(shift) == 3 and all(map(math.isfinite, shift))),
+            "config.data.camera.radar_from_lidar_m",
+            shift,
+            "three finite numbers or None",
+        )
+        require(
+            z is None or math.isfinite(z),
+            "config.data.camera.radar_from_lidar_z_m",
+            z,
+            "a finite number or None",
+        )
+
     @classmethod
-    def of_config(cls, data: Mapping[str, Any]) -> CameraOptions:
+    def from_config(cls, data: Mapping[str, Any]) -> CameraOptions:
         """Options of `config.data`; the defaults where it has no camera."""
-        return cls.of_fields(data["camera"]) if "camera" in data else cls()
-
-    @classmethod
-    def of_fields(
-        cls, fields: Mapping[str, Any], where: str | os.PathLike = ""
-    ) -> CameraOptions:
-        """Options by name, also of a model of before that lacks some.
-
-        Raises:
-            DataError: One is of another type; names the file `where` they are from.
-        """
-        return schema.check(BEFORE | dict(fields), cls, str(where), "camera")
+        return cls(**data.get("camera", {}))
 
     def shift(self, frame: LabelledFrame) -> tuple[float, ...]:
         """Metres to add to LiDAR positions to get where the radar sees them."""
         if self.radar_from_lidar_m is not None:
-            return self.radar_from_lidar_m
+            return tuple(map(float, self.radar_from_lidar_m))
         z = self.radar_from_lidar_z_m
         z = frame.radar_from_lidar_z_m if z is None else z
-        return (*frame.radar_from_lidar_m[:2], z)
+        return tuple(map(float, (*frame.radar_from_lidar_m[:2], z)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,71 +135,57 @@ def camera_inputs(
     """Cameras of left front images, each calibration file read once.
 
     Args:
-        frames: Of a data set.
+        frames: Frames of a data set.
         image_size: Height and width of the images that the model sees.
         options: With `allow_missing`, frames without an image or a calibration get a
             black image and a camera whose `is_valid` is False, and how many is logged.
-        features: What `radejax embed` made of the images, see `open_embeddings`; the
-            image files may then be gone.
+        features: Output of `radejax embed`, see `open_embeddings`; the image files may
+            then be gone.
 
     Raises:
         UserError: A frame has no image or calibration, and not `allow_missing`; the
             calibration is of images of another size, and not `resize`; or an image is
             not among the features.
-        DataError: A calibration file is damaged.
+        DataError: A calibration file is corrupted.
     """
+    has_image = [frame.camera_path is not None for frame in frames]
     embedded: Collection[str] = ()
     if features is not None:
         embedded = features.keys()
-        _check_embedded(frames, embedded, features)
-    has_none = [
-        frame.camera_calibration_path is None
-        or (
-            frame.camera_path is None if features is None else frame.key not in embedded
-        )
-        for frame in frames
-    ]
-    missing = [f.key for f, gone in zip(frames, has_none, strict=True) if gone]
+        files = zip(frames, has_image, strict=True)
+        has_image = [frame.key in embedded for frame in frames]
+        if absent := [f.key for f, has in files if has and f.key not in embedded]:
+            raise UserError(
+                f"{features.folder}: {len(absent)} of {len(frames)} frames have an image "
+                f"that is not embedded, the first is {absent[0]}; embed all of the data: "
+                "`radejax embed`"
+            )
+    cameras: list[Camera] = []
+    missing: list[str] = []
+    known: dict[Any, Camera] = {}
+    for frame, has in zip(frames, has_image, strict=True):
+        if not has or frame.camera_calibration_path is None:
+            missing.append(frame.key)
+            cameras.append(no_camera(image_size))
+            continue
+        source = frame.camera_calibration_path, options.shift(frame)
+        if source not in known:
+            known[source] = _read_camera(frame, image_size, options)
+        cameras.append(known[source])
     if missing and not options.allow_missing:
         raise UserError(
             f"{len(missing)} of {len(frames)} frames have no front image or no camera "
             f"calibration, the first is {missing[0]}; "
-            "config.data.camera.allow_missing=True goes by the radar alone there"
+            "config.data.camera.allow_missing=True uses only the radar there"
         )
     if missing:
         _log.warning(
-            "%d of %d frames have no front image or no camera calibration: radar alone",
+            "%d of %d frames have no front image or no camera calibration: radar only",
             len(missing),
             len(frames),
         )
-
-    cameras: dict[Any, Camera] = {}
-
-    def read(frame: LabelledFrame, shift: tuple[float, ...]) -> Camera:
-        path, calibration = frame.camera_calibration_path, frame.read_calibration(shift)
-        if (calibration.height, calibration.width) != tuple(image_size):
-            height, width = image_size
-            if not options.resize:
-                raise UserError(
-                    f"{path}: calibration of {calibration.width} x "
-                    f"{calibration.height} images, the model sees {width} x {height} "
-                    "(config.model.image.size); config.data.camera.resize=True resizes"
-                )
-            calibration = calibration.resized(width, height)
-        return calibration.camera(options.projection)
-
-    def camera(frame: LabelledFrame) -> Camera:
-        shift = tuple(map(float, options.shift(frame)))
-        place = frame.camera_calibration_path, shift
-        if place not in cameras:
-            cameras[place] = read(frame, shift)
-        return cameras[place]
-
     return CameraInputs(
-        tuple(
-            no_camera(image_size) if gone else camera(frame)
-            for frame, gone in zip(frames, has_none, strict=True)
-        ),
+        tuple(cameras),
         (*image_size,),
         options,
         features,
@@ -194,39 +194,32 @@ def camera_inputs(
     )
 
 
-def _check_embedded(
-    frames: FrameSequence, embedded: Collection[str], features: Records
-) -> None:
-    """`UserError` for frames whose image is there but was not embedded."""
-    forgotten = [
-        frame.key
-        for frame in frames
-        if frame.key not in embedded and frame.camera_path is not None
-    ]
-    if forgotten:
-        raise UserError(
-            f"{features.folder}: {len(forgotten)} of {len(frames)} frames have an image "
-            f"that is not embedded, the first is {forgotten[0]}; embed all of the data: "
-            "`radejax embed`"
-        )
+def _read_camera(
+    frame: LabelledFrame, image_size: tuple[int, int], options: CameraOptions
+) -> Camera:
+    """The camera of a frame, for images of the model's size."""
+    calibration = frame.read_calibration(options.shift(frame))
+    height, width = image_size
+    if (calibration.height, calibration.width) != (height, width):
+        if not options.resize:
+            raise UserError(
+                f"{frame.camera_calibration_path}: calibration of {calibration.width} x "
+                f"{calibration.height} images, the model sees {width} x {height} "
+                "(config.model.image.size); config.data.camera.resize=True resizes"
+            )
+        calibration = calibration.resized(width, height)
+    return calibration.camera(options.projection)
 
 
 def check_embeddable(*, freeze: bool, mirror_probability: float) -> None:
-    """`UserError` where embeddings cannot stand for the images.
-
-    Args:
-        freeze: Whether the image backbone is not trained.
-        mirror_probability: Of training frames.
-    """
-    if not freeze:
-        raise UserError(
-            "embeddings are what a frozen backbone makes of images, but "
-            "config.model.image.freeze is False"
-        )
-    if mirror_probability:
-        raise UserError(
-            "embeddings cannot be mirrored: set config.data.mirror_probability to 0"
-        )
+    """`UserError` where embeddings cannot replace the images."""
+    require(freeze, "config.model.image.freeze", freeze, "True with embeddings")
+    require(
+        not mirror_probability,
+        "config.data.mirror_probability",
+        mirror_probability,
+        "0 with embeddings, which cannot be mirrored",
+    )
 
 
 def require_images(
@@ -235,24 +228,19 @@ def require_images(
     """`UserError` if no frame has both an image and a calibration.
 
     Args:
-        frames: Of the split.
-        inputs: Of these frames; None for models without a camera.
+        frames: Frames of the split.
+        inputs: Inputs of these frames; None for models without a camera.
         split: Its name, for the message.
     """
     if inputs is None or any(camera.is_valid for camera in inputs.cameras):
         return
-    lacking = {
-        "front image (cam-front/cam-front_*.png)": sum(
-            frame.camera_path is None for frame in frames
-        ),
-        "camera calibration (calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of "
-        "K-Radar's repository: --camera_calibration FOLDER)": sum(
-            frame.camera_calibration_path is None for frame in frames
-        ),
-    }
-    reasons = "; ".join(f"{n} have no {what}" for what, n in lacking.items() if n)
+    images = sum(frame.camera_path is None for frame in frames)
+    calibrations = sum(frame.camera_calibration_path is None for frame in frames)
     raise UserError(
-        f"no frame of the {split} split ({len(frames)}) can use the camera: {reasons}"
+        f"no frame of the {split} split ({len(frames)}) can use the camera: {images} have "
+        f"no front image (cam-front/cam-front_*.png), {calibrations} no camera calibration "
+        "(calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of K-Radar's repository: "
+        "--camera_calibration FOLDER)"
     )
 
 

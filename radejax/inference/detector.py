@@ -83,7 +83,7 @@ class Detector:
         self.grid, self.step = saved.grid, saved.step
         self.model: Any = self.saved.model
         self.takes_camera = models.has_camera(self.model)
-        self.camera_options = CameraOptions.of_config(config.data)
+        self.camera_options = CameraOptions.from_config(config.data)
         self.classes = tuple(config.classes)
         decode = dataclasses.asdict(DecodeOptions(**config.decode))
         self.score_threshold: float = decode.pop("score_threshold")

@@ -61,14 +61,6 @@ _DATA = {
     "gain_slope_db": number(0),
     "label_permutation_seed": or_none(integer(0)),
 }
-_CAMERA = {
-    "projection": one_of("raw", "pinhole"),
-    "radar_from_lidar_m": or_none(
-        several(number(-1e6), "three finite numbers", count=3)
-    ),
-    "radar_from_lidar_z_m": or_none(number(-1e6)),
-    "calibration": one_of("sequence", "common"),
-}
 _MODEL = {
     "widths": (
         lambda value: len(value) > 0 and all(map(integer(1)[0], value)),
@@ -126,9 +118,7 @@ def check(config: ConfigDict) -> None:
         options = config[name].to_dict()
         _construct(f"config.{name}", lambda x, c=constructor: c(**x), options)
     check_options(config.data, "config.data", _DATA)
-    if "camera" in config.data:
-        check_options(config.data.camera, "config.data.camera", _CAMERA)
-        _construct("config.data.camera", CameraOptions.of_fields, config.data.camera)
+    _construct("config.data.camera", CameraOptions.from_config, config.data)
     _check_together(config)
 
 

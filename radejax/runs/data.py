@@ -88,7 +88,7 @@ class Data:
         """
         camera = features = None
         if models.has_camera(model):
-            camera = CameraOptions.of_config(config.data)
+            camera = CameraOptions.from_config(config.data)
             if paths.embeddings is not None:
                 check_embeddable(
                     freeze=model.freeze,
