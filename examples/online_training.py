@@ -26,7 +26,7 @@ from radejax.cli import entry
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.runs.workdir import checkpoint_info, claimed
+from radejax.runs.experiment import checkpoint_info, claimed
 from radejax.simulation.config import plain
 from radejax.training import distributed, loop
 

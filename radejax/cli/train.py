@@ -120,8 +120,7 @@ def train(
     Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
     """
     from radejax.core.config import config_name, load_config, override
-    from radejax.runs.experiment import run
-    from radejax.runs.seeds import run_seeds
+    from radejax.runs.experiment import run, run_seeds
     from radejax.runs.sources import Sources
 
     entry.check_leftovers(others)

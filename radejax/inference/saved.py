@@ -62,7 +62,7 @@ class SavedModel:
         grid: Axes of the sensor.
         variables: Parameters and other collections of the model, NumPy arrays.
         step: Step of the checkpoint, or None.
-        run: Data and versions of the run, see `radejax.runs.workdir.run_info`; empty
+        run: Data and versions of the run, see `radejax.runs.experiment.run_info`; empty
             for what is not a checkpoint.
     """
 

@@ -20,7 +20,7 @@ from radejax.core.errors import DataError
 from radejax.data.records import Records
 from radejax.inference import exported_loader, saved
 from radejax.inference.saved import load_model, save_model, starting_weights
-from radejax.runs import workdir
+from radejax.runs import experiment
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import radenet_torch
 from radejax.weights.image_backbone import weights_sha256
@@ -81,11 +81,11 @@ def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(
 ) -> None:
     """A checkpoint has its own config; a training compares its config with the folder's."""
     config, grid = small.radar_config(), small.small_grid()
-    info = workdir.checkpoint_info(config, grid, {}, {})
+    info = experiment.checkpoint_info(config, grid, {}, {})
     state = {"params": small.detector().variables["params"]}
     positions = iter(grain.MapDataset.range(9).to_iter_dataset())
     with (
-        workdir.claimed(tmp_path, config),
+        experiment.claimed(tmp_path, config),
         Checkpoints(tmp_path / "checkpoints") as checkpoints,
     ):
         checkpoints.save(1, state, positions, info=info)
@@ -96,7 +96,7 @@ def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(
     assert tuple(load_model(tmp_path).config.classes) == tuple(config.classes)
     with (
         pytest.raises(UserError, match="a run with another config: config"),
-        workdir.claimed(tmp_path, config),
+        experiment.claimed(tmp_path, config),
     ):
         pass
 

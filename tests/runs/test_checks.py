@@ -11,7 +11,7 @@ from ml_collections import ConfigDict
 
 from radejax.core.config import base_config, fields_of, load_config, load_module
 from radejax.core.errors import UserError
-from radejax.runs import experiment, seeds
+from radejax.runs import experiment
 from radejax.runs.checks import check
 from radejax.training import distributed
 
@@ -136,7 +136,7 @@ def test_nothing_is_written_or_built_for_a_wrong_config(tmp_path: pathlib.Path) 
     with pytest.raises(UserError, match=r"evaluation.protocols"):
         experiment.run(config, name="x", workdir=tmp_path / "run")
     with pytest.raises(UserError, match=r"evaluation.protocols"):
-        seeds.run_seeds(config, (0, 1), name="x", workdir=tmp_path / "run")
+        experiment.run_seeds(config, (0, 1), name="x", workdir=tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
 

@@ -14,8 +14,8 @@ from radejax.data.kradar import dataset
 from radejax.inference.saved import StartingWeights
 from radejax.losses.detection import NmsAssignment
 from radejax.runs import experiment, validation
+from radejax.runs.experiment import claimed
 from radejax.runs.sources import Sources
-from radejax.runs.workdir import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
@@ -78,7 +78,7 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     def stays(keys: list[str], frozen: str | None = None) -> dict:
         frames = [SimpleNamespace(key=key) for key in keys]
         weights = StartingWeights(frozen_sha256=frozen)
-        return experiment._what_stays(frames, weights)
+        return experiment._invariants(frames, weights)
 
     first = stays(["1/a", "1/b"])
     assert first == stays(["1/a", "1/b"])
@@ -134,9 +134,7 @@ def test_labels_are_read_once(
     assert [frame.sequence for frame in evaluated] == [2, 2]
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
-    assert "chosen on the validation split: its numbers on the test split may" in (
-        caplog.text
-    )
+    assert "Best checkpoint, chosen on the validation split: " in caplog.text
     with Checkpoints(folder / "checkpoints", read_only=True) as checkpoints:
         _, info, _ = checkpoints.restore_variables()
         assert info["same"]["frames to train on"] == 4

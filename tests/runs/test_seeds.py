@@ -10,7 +10,7 @@ import pytest
 from radejax.cli.train import train
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.runs import seeds
+from radejax.runs import experiment
 from radejax.runs.sources import Sources
 
 HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
@@ -34,10 +34,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         )
         return pathlib.Path(workdir)
 
-    monkeypatch.setattr(seeds, "run", run)
+    monkeypatch.setattr(experiment, "run", run)
     config = base_config()
     sources = Sources(data=("d",))
-    seeds.run_seeds(
+    experiment.run_seeds(
         config, range(3), name="x", workdir=tmp_path / "runs", sources=sources
     )
     assert seen == [(i, f"seed{i}", sources) for i in range(3)]
@@ -54,7 +54,7 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 
 def test_a_seed_twice_is_refused() -> None:
     with pytest.raises(UserError, match=r"--seeds is \(1, 2, 1\), expected different"):
-        seeds.run_seeds(base_config(), (1, 2, 1), name="x")
+        experiment.run_seeds(base_config(), (1, 2, 1), name="x")
 
 
 def test_train_takes_several_seeds(tmp_path: pathlib.Path) -> None:

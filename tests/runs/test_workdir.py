@@ -9,14 +9,14 @@ import pytest
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.runs import workdir
+from radejax.runs import experiment
 from radejax.runs.sources import DataPaths
 
 
 def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
     config = base_config()
     for _ in range(2):
-        with workdir.claimed(tmp_path / "run", config):
+        with experiment.claimed(tmp_path / "run", config):
             kept = json.loads((tmp_path / "run" / "config.json").read_text())
             assert kept == json.loads(config.to_json())
 
@@ -25,10 +25,10 @@ def test_another_config_is_refused_and_the_difference_named(
     tmp_path: pathlib.Path,
 ) -> None:
     config = base_config()
-    with workdir.claimed(tmp_path, config):
+    with experiment.claimed(tmp_path, config):
         pass
     config.train.num_epochs = 7  # nothing is trained: the folder takes it
-    with workdir.claimed(tmp_path, config):
+    with experiment.claimed(tmp_path, config):
         kept = json.loads((tmp_path / "config.json").read_text())
         assert kept["train"]["num_epochs"] == 7
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
@@ -40,7 +40,7 @@ def test_another_config_is_refused_and_the_difference_named(
             match=r"config\.seed is 0 there and 5 here; "
             r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
         ),
-        workdir.claimed(tmp_path, config),
+        experiment.claimed(tmp_path, config),
     ):
         pass
 
@@ -48,12 +48,12 @@ def test_another_config_is_refused_and_the_difference_named(
 def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
     folder = tmp_path / "run"
     with (
-        workdir.claimed(folder, base_config()),
+        experiment.claimed(folder, base_config()),
         pytest.raises(UserError, match=r"another training is at work in .*run: wait"),
-        workdir.claimed(folder, base_config()),
+        experiment.claimed(folder, base_config()),
     ):
         pass
-    with workdir.claimed(folder, base_config()):  # let go, though the file is there
+    with experiment.claimed(folder, base_config()):  # let go, though the file is there
         pass
 
 
@@ -69,19 +69,19 @@ def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) ->
         [sys.executable, "-c", code, str(tmp_path / "lock")], stdout=subprocess.PIPE
     ) as other:
         assert other.stdout.readline() == b"held\n"
-        with pytest.raises(UserError), workdir.claimed(tmp_path, base_config()):
+        with pytest.raises(UserError), experiment.claimed(tmp_path, base_config()):
             pass
         other.kill()
         other.wait()
-        with workdir.claimed(tmp_path, base_config()):
+        with experiment.claimed(tmp_path, base_config()):
             pass
 
 
 def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
     paths = DataPaths(roots=("a",), labels=None, records="r")
-    info = workdir.run_info(tmp_path, paths, tmp_path / "model.pth")
+    info = experiment.run_info(tmp_path, paths, tmp_path / "model.pth")
     assert info["init_from"] == str(tmp_path / "model.pth")
     (tmp_path / "run.json").write_text(json.dumps(info))
-    again = workdir.run_info(tmp_path, paths)
+    again = experiment.run_info(tmp_path, paths)
     assert again["init_from"] == info["init_from"]
     assert again["data"]["roots"] == ("a",)
