@@ -21,11 +21,13 @@ from radejax.cli import entry, options
     help="Run of train.py, or what `radejax export` takes.",
 )
 @click.option("--out", required=True, type=options.FOLDER, help="Folder of the boxes.")
-@click.option("--step", type=options.STEP, help="Of a run; the newest by default.")
+@click.option(
+    "--step", type=options.STEP, help='Checkpoint step or "best". Default: latest.'
+)
 @options.sequences
 @options.weather
-@click.option("--score-threshold", type=float, help="Instead of the config's.")
-@click.option("--nms-iou", type=float, help="Instead of the config's.")
+@click.option("--score-threshold", type=float, help="Default: that of the config.")
+@click.option("--nms-iou", type=float, help="Default: that of the config.")
 @click.option(
     "--format",
     "file_format",
@@ -36,9 +38,13 @@ from radejax.cli import entry, options
 )
 @click.option("--batch-size", type=options.COUNT, default=8, show_default=True)
 @click.option(
-    "--labels", type=options.EXISTING, help="Revision that names frames' images."
+    "--labels",
+    type=options.EXISTING,
+    help="Label revision used to find each frame's camera image.",
 )
-@click.option("--image-backbone", type=options.EXISTING)
+@click.option(
+    "--image-backbone", type=options.EXISTING, help="Weights of the image backbone."
+)
 def detect(
     roots: tuple[pathlib.Path, ...],
     source: pathlib.Path,
@@ -46,12 +52,12 @@ def detect(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Find boxes in every frame below the folders; one file a frame.
+    """Find boxes in every frame below the folders; one file per frame.
 
     The model is a run, its checkpoints, one of them, an exported folder or an official
     .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
     files, or such a file itself. No labels are needed; a radar-camera model finds a
-    frame's image by its label file, and goes by the radar alone without. What is
+    frame's image by its label file, and uses the radar only without. What is
     written is scored by `radejax score OUT --data ROOT`.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
@@ -64,7 +70,5 @@ def detect(
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
     if "radar_only" in count:
-        text += (
-            f"; {count['radar_alone']} without an image, predicted from the radar only"
-        )
+        text += f"; {count['radar_only']} without an image, from the radar only"
     options.echo_result(as_json, {**count, "out": str(out)}, text)
