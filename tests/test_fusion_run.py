@@ -294,7 +294,7 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
         boxes = {path.name: json.loads(path.read_text()) for path in out.iterdir()}
         assert counts["frames"] == len(boxes) == len(frames)
         assert counts["boxes"] == sum(map(len, boxes.values()))
-        return counts["radar_alone"], boxes
+        return counts["radar_only"], boxes
 
     none_missing, seen = detect("seen")
     assert none_missing == 0
