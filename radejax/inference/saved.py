@@ -218,7 +218,7 @@ def save_model(
 def _read_exported(folder: pathlib.Path) -> SavedModel:
     """Inverse of `save_model`."""
     path, weights = folder / CONFIG_FILE, folder / WEIGHTS_FILE
-    content = files.read_json(path, dict[str, Any])
+    content = files.read_object(path)
     if content.get("format") != FORMAT:
         raise DataError(
             f"{path}: format is {content.get('format')!r}, expected {FORMAT!r}"

@@ -213,9 +213,10 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     names = ("roots", "labels", "label_version", "split", "sequences", "weather")
     found, wanted = (
         {name: values.get(name) or None for name in names}
-        for values in (files.read_json(out / "source.json", dict[str, Any]), source)
+        for values in (files.read_object(out / "source.json"), source)
     )
-    files.require_same(found, wanted, f"{out} has other results", mend="give --out")
+    if lines := files.differences(found, wanted, ""):
+        raise UserError(f"{out} has other results: {'; '.join(lines)}; give --out")
 
 
 def _frames(

@@ -185,7 +185,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         path,
         json.loads(config.to_json()),
         "a run with another config",
-        mend="give another --workdir, or remove that one",
+        fix="give another --workdir, or remove that one",
         name="config",
         ignore=("logging",),
     )
@@ -200,7 +200,7 @@ def run_info(
     """
     init_from = saved_path(init_from)
     if init_from is None and (workdir / "run.json").exists():
-        saved = files.read_json(workdir / "run.json", {"init_from?": str | None})
+        saved = files.read_object(workdir / "run.json")
         init_from = saved.get("init_from")
     return {
         "data": dataclasses.asdict(paths),

@@ -123,7 +123,7 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
         "a data set of another simulation config",
         ignore=("finished",),
     )
-    return files.read_json(marker, {"finished": bool})["finished"]
+    return files.read_object(marker, "finished")["finished"] is True
 
 
 def _marker(config: SimulationConfig) -> dict[str, Any]:

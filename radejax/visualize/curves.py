@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from radejax.core import files
+from radejax.core.errors import DataError
 from radejax.visualize.style import SERIES_COLORS, new_figure
 
 _LINE_STYLES = ("-", "--", "-.", ":")
@@ -70,8 +72,11 @@ def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndar
     series: dict[str, list[tuple[float, float]]] = {}
     *lines, _ = files.read_text(path).split("\n")
     for number, line in enumerate(lines, 1):
-        record = files.parse_json(line, {"step": float}, f"{path}, line {number}")
-        step = float(record.pop("step"))
+        try:
+            record = json.loads(line)
+            step = float(record.pop("step"))
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
+            raise DataError(f"{path}, line {number} is corrupted: {error}") from None
         for name, value in record.items():
             if isinstance(value, int | float):
                 series.setdefault(name, []).append((step, float(value)))

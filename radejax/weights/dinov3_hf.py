@@ -82,7 +82,7 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
             f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 model folder"
             " as downloaded from Hugging Face"
         )
-    config = files.read_json(folder / CONFIG_FILE, dict[str, Any])
+    config = files.read_object(folder / CONFIG_FILE)
     try:
         model = model_from_config(config)
     except UserError as error:

@@ -75,7 +75,7 @@ def test_a_folder_is_one_jobs(tmp_path: pathlib.Path) -> None:
         match=r"new holds another job: a\.b is \[1, 2\] there and \[1, 3\] here; "
         r"a\.long differs; seed is 0 there and None here; give --out",
     ):
-        files.claim(path, other, "another job", mend="give --out")
+        files.claim(path, other, "another job", fix="give --out")
     with pytest.raises(UserError, match=r"plan\.json is a file, expected a folder"):
         files.claim(path / "plan.json", plan, "another job")
 

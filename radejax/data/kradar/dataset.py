@@ -751,7 +751,12 @@ def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
         DataError: The file is malformed, or two roots have different axes.
     """
     paths = [root / "radar_grid.json" for root in roots]
-    found = {path: read_json(path, RadarGrid) for path in paths if path.is_file()}
+    found: dict[pathlib.Path, RadarGrid] = {}
+    for path in filter(pathlib.Path.is_file, paths):
+        try:
+            found[path] = RadarGrid.from_dict(read_json(path))
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{path}: not the axes of a sensor ({error})") from None
     return _the_same(found, "sensor axes", RadarGrid.kradar())
 
 

@@ -179,5 +179,7 @@ def test_grid_of_the_roots(tmp_path):
     with pytest.raises(DataError, match="different sensor axes"):
         dataset.read_grid([a, b])
     touch(b / "radar_grid.json", '{"range_m": 3}')
-    with pytest.raises(DataError, match=r"radar_grid\.json: it lacks azimuth_rad"):
+    with pytest.raises(
+        DataError, match=r"radar_grid\.json: not the axes of a sensor \('azimuth_rad"
+    ):
         dataset.read_grid([b])
