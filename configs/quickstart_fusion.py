@@ -2,7 +2,7 @@
 
     python examples/pretrain_backbone.py --out backbones/small
     python train.py --config configs/quickstart_fusion.py:pretrained \\
-        --image_backbone backbones/small
+        --image-backbone backbones/small
     python train.py --config configs/quickstart_fusion.py:radar
 
 The second trains a narrow DinoRADE with the small image transformer of the first,
@@ -14,7 +14,7 @@ little to learn it by.
 Options: `radar` for the model without the camera; `silhouettes` for images of the objects
 alone, in the colour of their class and brighter when nearer, a control of what a perfect
 image would give; `pretrained` for an image transformer that stays as it is given, by
-`--image_backbone` (`examples/pretrain_backbone.py` makes one), `resnet50` for a ResNet-50
+`--image-backbone` (`examples/pretrain_backbone.py` makes one), `resnet50` for a ResNet-50
 of a quarter of the width in its place; `long` for the scenes and the training of
 `configs/quickstart.py` itself, three times what it is without; `short` makes a run of two
 minutes that learns next to nothing, to see that everything works.

@@ -153,7 +153,7 @@ class Work:
         parts += [f"--config.{key}={value}" for key, value in fields]
         parts.append(f"--data {data} --workdir RUN")
         if backbone := self.backbone(cell):
-            parts.append(f"--image_backbone {os.path.relpath(backbone)}")
+            parts.append(f"--image-backbone {os.path.relpath(backbone)}")
         parts.append(f"&& python evaluate.py --workdir RUN --split all --data {held}")
         return " ".join([*parts, *["--shuffle-images 0"] * bool(cell.exchanges)])
 
@@ -348,7 +348,7 @@ def main(table, seeds, cells, out, minutes, resamples, table_only):
     """Trains what is missing of a table, and writes it."""
     entry.set_up_jax()
     with entry.exit_codes():
-        seeds = entry.numbers("--seeds", [seeds])
+        seeds = tuple(map(int, seeds.split(",")))
         work = Work(STUDIES[table], out.absolute())
         every = list(itertools.product(seeds, chosen(work.study, cells)))
 

@@ -2,7 +2,7 @@
 
     python examples/pretrain_backbone.py --out backbones/small
     python train.py --config configs/quickstart_fusion.py:pretrained \\
-        --image_backbone backbones/small
+        --image-backbone backbones/small
 
 What DINOv3 is for K-Radar, this is for simulated data: a backbone that knows images
 before the detector is trained, and stays as it is. It learns from images alone, of
@@ -237,7 +237,7 @@ def patch_ap(model: Patches, variables: Any, data: Images) -> dict[str, float]:
 
 
 def save(backbone: ViT | ResNetTrunk, variables: Any, out: pathlib.Path) -> None:
-    """Writes what `--image_backbone` reads."""
+    """Writes what `--image-backbone` reads."""
     own = {name: part["backbone"] for name, part in variables.items()}
     if isinstance(backbone, ViT):
         dinov3_hf.save(backbone, own["params"], out)

@@ -182,6 +182,8 @@ def _check_train(arguments: list[str]) -> None:
     """Config, words, fields and their values are understood."""
     if not arguments:  # mentioned by name alone
         return
+    pairs = zip(["", *arguments], arguments, strict=False)
+    arguments = [word for old, word in pairs if word != "..." or old == "--config"]
     names = ["radenet" if word == "..." else word for word in arguments]
     context = click.Context(train, **train.context_settings)
     train.parse_args(context, names)
@@ -307,7 +309,7 @@ def test_overlay_draws_a_frame(root: pathlib.Path, tmp_path: pathlib.Path) -> No
 def test_view_writes_a_recording(root: pathlib.Path, tmp_path: pathlib.Path) -> None:
     pytest.importorskip("rerun")
     out = tmp_path / "one.rrd"
-    result = _run("view", root, "--sequence", 1, "--out", out, "--json")
+    result = _run("view", root, "--sequences", 1, "--out", out, "--json")
     assert json.loads(result.stdout) == {
         "frames": 2,
         "without_radar": 0,

@@ -156,7 +156,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     ]
     assert reports[0]["ap"] == reports[1]["ap"]
     other = shutil.copytree(data.folder, tmp_path / "other")
-    with pytest.raises(UserError, match="give --image_backbone FOLDER, or --embedd"):
+    with pytest.raises(UserError, match="give --image-backbone FOLDER, or --embedd"):
         evaluate_run(workdir, other=Sources(data=(str(other),)))
     given = Sources(data=(str(other),), embeddings=str(embeddings))
     evaluate_run(workdir, other=given, num_visualizations=0)
@@ -165,7 +165,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
 
 
 def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
-    # No --image_backbone: the weights come with those that the run starts from.
+    # No --image-backbone: the weights come with those that the run starts from.
     workdir = data.train("continued", init_from=str(from_images))
     assert (workdir / "evaluation" / "metrics.json").exists()
     first, second = (load_model(w).variables for w in (from_images, workdir))
@@ -239,7 +239,7 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
 
 def test_weights_that_do_not_fit_are_refused(data, tmp_path):
     config = small_config()
-    with pytest.raises(UserError, match="--image_backbone FOLDER"):
+    with pytest.raises(UserError, match="--image-backbone FOLDER"):
         image_backbone.load_image_backbone(None, build(config.model))
     with pytest.raises(FileNotFoundError, match=r"lacks config.json"):
         image_backbone.load_image_backbone(tmp_path, build(config.model))

@@ -50,8 +50,8 @@ def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) 
     command += [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
     started = []
     for i in range(num_processes):
-        more = [f"--coordinator={coordinator}", f"--num_processes={num_processes}"]
-        more = [*more, f"--process_id={i}"] if num_processes > 1 else []
+        more = [f"--coordinator={coordinator}", f"--num-processes={num_processes}"]
+        more = [*more, f"--process-id={i}"] if num_processes > 1 else []
         started.append(
             subprocess.Popen(
                 command + more,

@@ -11,11 +11,10 @@ import logging
 import os
 import pathlib
 import signal
-import socket
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, one_line
 from radejax.core.files import is_no_space
 
 FAILED = 1
@@ -74,33 +73,6 @@ def _fail(error: Exception, code: int, debug: bool) -> None:
     raise SystemExit(code)
 
 
-def words(values: Iterable[str]) -> tuple[str, ...]:
-    """Of `--data A,B --data C`, which comes as ["A,B", "C"]: A, B and C."""
-    found = (word.strip() for value in values for word in value.split(","))
-    return tuple(filter(None, found))
-
-
-def numbers(name: str, values: Iterable[str]) -> tuple[int, ...]:
-    """Of `--sequences 1,5 --sequences 58`: 1, 5 and 58.
-
-    Raises:
-        UserError: A word is no number; names the flag.
-    """
-    found = words(values)
-    if wrong := [word for word in found if not word.isdecimal()]:
-        raise UserError(f"{name}: {wrong[0]!r} is no number, expected 1,5,58")
-    return tuple(map(int, found))
-
-
-def check_leftovers(arguments: Sequence[str]) -> None:
-    """`UserError` for arguments that belong to no flag, such as a second folder."""
-    if arguments:
-        raise UserError(
-            f"unexpected arguments: {' '.join(arguments)}; several folders are "
-            "--data A,B or --data A --data B"
-        )
-
-
 def join_processes(
     coordinator: str | None = None,
     num_processes: int | None = None,
@@ -116,46 +88,22 @@ def join_processes(
         process_id: Of this process, from 0.
 
     Raises:
-        UserError: JAX finds no cluster, and not all arguments are given; or the
-            coordinator's port is taken or not reached.
+        UserError: JAX finds no cluster, or the coordinator is not reached.
     """
     import jax
 
-    given = [coordinator, num_processes, process_id]
-    if None in given and given != [None] * 3:
-        raise UserError("give --coordinator, --num_processes and --process_id together")
-    if coordinator is not None and process_id == 0:
-        _check_port(coordinator)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(coordinator, num_processes, process_id)
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         raise UserError(
-            f"--distributed finds no cluster to join ({error}); without Slurm, Open MPI "
-            "or a TPU pod give --coordinator HOST:PORT, --num_processes and --process_id"
+            f"cannot join the other processes ({one_line(error)}); without Slurm, Open "
+            "MPI or a TPU pod give --coordinator HOST:PORT, --num-processes and "
+            "--process-id"
         ) from error
-    except RuntimeError as error:  # of its service, without a class of their own
-        line = str(error).strip().split("\n")[0]
-        where = coordinator or "the coordinator that the cluster names"
-        raise UserError(f"cannot join the processes at {where}: {line}") from error
     if jax.process_index():
         logging.getLogger("radejax").setLevel(logging.ERROR)
         os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
-
-
-def _check_port(coordinator: str) -> None:
-    """`UserError` unless process 0 can listen there; JAX's service would crash."""
-    host, _, port = coordinator.rpartition(":")
-    if not host or not port.isdigit():
-        raise UserError(f"--coordinator must be HOST:PORT, got {coordinator}")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("", int(port)))
-        except (OSError, OverflowError) as error:
-            raise UserError(
-                f"process 0 cannot listen on port {port} of --coordinator: {error}"
-            ) from error
 
 
 def set_up_jax(*, cache: bool = True) -> None:
@@ -176,7 +124,8 @@ def set_up_jax(*, cache: bool = True) -> None:
         log.addHandler(handler)
         log.setLevel(logging.INFO)
         log.propagate = False
-    absl_logging.set_verbosity(absl_logging.WARNING)  # orbax tells every step it takes
+    # Orbax logs every step it takes; its errors are raised as well.
+    absl_logging.set_verbosity(absl_logging.FATAL)
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read one of theirs
     if not cache:
         return

@@ -1,11 +1,9 @@
-"""What the commands of `radejax` share: options, output, exit codes."""
+"""Options, output and exit codes that the commands of `radejax` share."""
 
 from __future__ import annotations
 
 import gc
-import itertools
 import json
-import os
 import pathlib
 from typing import Any
 
@@ -13,7 +11,6 @@ import click
 
 from radejax.cli import entry
 from radejax.core import memory
-from radejax.core.errors import UserError
 
 COUNT = click.IntRange(1)
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
@@ -21,40 +18,32 @@ FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(path_type=pathlib.Path, exists=True)
 
 
-class Paths(click.ParamType):
-    """Existing folders or files: A,B, or one path that has a comma in its name."""
-
-    name = "A,B,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[pathlib.Path, ...]:
-        """The paths; click's error for one that is not there."""
-        names = (value,) if os.path.exists(value) else entry.words([value]) or (value,)
-        return tuple(EXISTING.convert(name, param, ctx) for name in names)
-
-
 def split_words(_: click.Context, __: click.Parameter, values: Any) -> tuple[str, ...]:
-    """Callback of options that are repeated, or given once with commas."""
-    return entry.words(values)
+    """Callback of list options: `--data A,B --data C` gives A, B and C."""
+    words = (word.strip() for value in values for word in value.split(","))
+    return tuple(filter(None, words))
 
 
-def _chained(
-    _: click.Context, __: click.Parameter, values: tuple[tuple[pathlib.Path, ...], ...]
-) -> tuple[pathlib.Path, ...]:
-    return tuple(itertools.chain(*values))
+def numbers(
+    context: click.Context, parameter: click.Parameter, values: Any
+) -> tuple[int, ...] | None:
+    """Callback of `--sequences`: None for all."""
+    words = split_words(context, parameter, values)
+    if wrong := [word for word in words if not word.isdecimal()]:
+        message = f"{wrong[0]!r} is not a number, expected 1,5,58"
+        raise click.BadParameter(message, context, parameter)
+    return tuple(map(int, words)) or None
 
 
-_roots: dict[str, Any] = {"nargs": -1, "type": Paths(), "callback": _chained}
-roots = click.argument("roots", required=True, **_roots)
-roots_or_none = click.argument("roots", **_roots)
+roots = click.argument("roots", nargs=-1, required=True, type=EXISTING)
+roots_or_none = click.argument("roots", nargs=-1, type=EXISTING)
 data_roots = click.option(
     "--data",
     "roots",
     multiple=True,
     required=True,
-    type=Paths(),
-    callback=_chained,
+    callback=lambda *given: tuple(map(pathlib.Path, split_words(*given))),
+    metavar="A,B,...",
     help="Roots of K-Radar.",
 )
 labels = click.option(
@@ -63,19 +52,8 @@ labels = click.option(
 label_version = click.option("--label-version", default="v2.1", show_default=True)
 
 
-def numbers(
-    context: click.Context, parameter: click.Parameter, values: Any
-) -> tuple[int, ...] | None:
-    """Callback of `--sequences`: None for all."""
-    try:
-        return entry.numbers(parameter.opts[0], values) or None
-    except UserError as error:
-        raise click.BadParameter(str(error), context, parameter) from None
-
-
 sequences = click.option(
     "--sequences",
-    "--sequence",
     "sequence_numbers",
     multiple=True,
     callback=numbers,
@@ -128,15 +106,13 @@ class Group(Program, click.Group):
 
 
 class Command(Program):
-    """A command with `--json`, whose user's errors are one line and an exit code.
+    """A command with `--json`; errors of the user are one line and an exit code.
 
-    `--with_underscores` is understood as `--with-hyphens` is. `--debug`, of the command
-    or before it, lets tracebacks through.
+    `--debug`, of the command or before it, lets tracebacks through.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.context_settings["token_normalize_func"] = _hyphenated
         self.context_settings["help_option_names"] = ["-h", "--help"]
         self.params.append(
             click.Option(
@@ -144,27 +120,10 @@ class Command(Program):
             )
         )
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        try:
-            return super().parse_args(ctx, args)
-        except click.NoSuchOption as error:
-            is_argument = any(
-                param.name == "roots" and isinstance(param, click.Argument)
-                for param in self.params
-            )
-            if error.option_name == "--data" and is_argument:
-                text = f"folders are given without --data: {ctx.command_path} FOLDER"
-                raise click.UsageError(text, ctx) from None
-            raise
-
     def invoke(self, ctx: click.Context) -> Any:
         debug = any(c.params.get("debug") for c in (ctx, ctx.find_root()))
         with entry.exit_codes(debug=debug):
             return super().invoke(ctx)
-
-
-def _hyphenated(name: str) -> str:
-    return name.replace("_", "-")
 
 
 def echo_result(as_json: bool, values: Any, text: str) -> None:

@@ -36,7 +36,6 @@ class _Command(options.Command):
 
 
 @click.command(cls=_Command)
-@click.argument("others", nargs=-1, metavar="")
 @click.option(
     "--config",
     required=True,
@@ -93,7 +92,6 @@ class _Command(options.Command):
 def train(
     ctx: click.Context,
     *,
-    others: tuple[str, ...],
     config: str,
     workdir: str | None,
     sequence_numbers: tuple[int, ...] | None,
@@ -123,7 +121,6 @@ def train(
     from radejax.runs.experiment import run, run_seeds
     from radejax.runs.sources import Sources
 
-    entry.check_leftovers(others)
     settings = load_config(config)
     override(settings, ctx.meta["fields"])
     if sequence_numbers is not None:

@@ -44,7 +44,7 @@ def view(
 
     Frames without radar tensor and projection are skipped and counted.
 
-    Example: radejax view data/kradar --sequence 5 --out five.rrd --open
+    Example: radejax view data/kradar --sequences 5 --out five.rrd --open
     """
     import tqdm
 

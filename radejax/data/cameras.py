@@ -240,7 +240,7 @@ def require_images(
         f"no frame of the {split} split ({len(frames)}) can use the camera: {images} have "
         f"no front image (cam-front/cam-front_*.png), {calibrations} no camera calibration "
         "(calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of K-Radar's repository: "
-        "--camera_calibration FOLDER)"
+        "--camera-calibration FOLDER)"
     )
 
 

@@ -357,7 +357,7 @@ def data_of_run(
         if is_blind and paths.embeddings is None:
             raise UserError(
                 f"{workdir} is without the weights of its image backbone: give "
-                "--image_backbone FOLDER, or --embeddings FOLDER of these images"
+                "--image-backbone FOLDER, or --embeddings FOLDER of these images"
             )
     data = Data.open(config, loaded.model, paths, grid=loaded.grid)
     if other is not None and data.frames.grid != loaded.grid:

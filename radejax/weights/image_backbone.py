@@ -51,7 +51,7 @@ def load_image_backbone(
         if has_camera and model.freeze and not is_embedded:
             raise UserError(
                 "config.model.image.freeze is True, but no weights are given: "
-                "--image_backbone FOLDER (DINOv3 from Hugging Face: config.json and "
+                "--image-backbone FOLDER (DINOv3 from Hugging Face: config.json and "
                 "model.safetensors; for resnet50 torchvision's .pth file), or train it "
                 "with --config.model.image.freeze=False"
             )

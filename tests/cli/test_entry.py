@@ -1,7 +1,6 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
-import socket
 import sys
 
 import jax
@@ -94,21 +93,6 @@ def test_a_coordinator_that_is_not_reached_is_one_line(
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
     with pytest.raises(
-        UserError, match=r"cannot join the processes at h:1: DEADLINE.*timed out\.$"
+        UserError, match=r"cannot join the other processes \(DEADLINE.*"
     ):
         entry.join_processes("h:1", 2, 1)
-
-
-def test_a_port_that_is_taken_is_one_line() -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(UserError, match=rf"cannot listen on port {port} .*in use"):
-            entry.join_processes(f"127.0.0.1:{port}", 2, 0)
-    with pytest.raises(UserError, match="must be HOST:PORT, got 1234"):
-        entry.join_processes("1234", 2, 0)
-
-
-def test_words_are_repeated_or_with_commas() -> None:
-    assert entry.words(["a, b", "c", ""]) == ("a", "b", "c")

@@ -26,19 +26,16 @@ def test_a_second_folder_without_its_flag_is_wrong_use(tmp_path: pathlib.Path) -
     run = tmp_path / "run"
     ended = _train("--config=quickstart", f"--workdir={run}", "--data", "one", "two")
     assert ended.exit_code == entry.WRONG_USE
-    assert ended.stderr == (
-        "error: unexpected arguments: two; several folders are --data A,B or "
-        "--data A --data B\n"
-    )
+    assert "unexpected extra argument (two)" in ended.stderr
     assert not run.exists()
 
 
 def test_processes_without_a_coordinator_are_wrong_use(tmp_path: pathlib.Path) -> None:
     run = tmp_path / "run"
-    place = ["--num_processes=2", "--process-id=1"]
+    place = ["--num-processes=2", "--process-id=1"]
     ended = _train("--config=quickstart:short", f"--workdir={run}", *place)
     assert ended.exit_code == entry.WRONG_USE
-    assert "--num_processes and --process_id together" in ended.stderr
+    assert "give --coordinator HOST:PORT, --num-processes and" in ended.stderr
     assert not run.exists()
 
 
@@ -47,7 +44,7 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
     arguments = ["--config=radenet", "--config.train.batch_size=8"]
     arguments += [f"--data={tmp_path}", f"--workdir={run}"]
     for words, message in (
-        (["--sequences=1,x"], "'x' is no number, expected 1,5,58"),
+        (["--sequences=1,x"], "'x' is not a number, expected 1,5,58"),
         (["--weather=fog", "--weather=mist"], "config.data.weather is ('fog', 'mist')"),
         (["--sequences=1,58", "--weather=fog", "--weather=rain"], "no sequence"),
     ):
@@ -96,34 +93,9 @@ def test_fields_are_read_in_every_spelling() -> None:
         "--config.seed=1",
         "--config.seed",
         "2",
-        "--init_from=a",
+        "--init-from=a",
     ]
     train.parse_args(context, [*words, "--config.logging.wandb", "--weather=fog"])
     fields = context.meta["fields"]
     assert fields == {"seed": "2", "logging.wandb": "true"}
     assert context.params["init_from"] == "a"
-
-
-def _commands(group: click.Group) -> list[click.Command]:
-    """All commands, those of groups inside of it too."""
-    found: list[click.Command] = []
-    for command in group.commands.values():
-        found += _commands(command) if isinstance(command, click.Group) else [command]
-    return found
-
-
-@pytest.mark.parametrize("command", _commands(main), ids=lambda command: command.name)
-def test_options_are_understood_with_hyphens_and_underscores(
-    command: click.Command,
-) -> None:
-    context = click.Context(command, **command.context_settings)
-    parser = command.make_parser(context)
-    names = [name for option in command.params for name in option.opts if "--" in name]
-    assert names
-    for name in names:
-        option = next(option for option in command.params if name in option.opts)
-        words = [] if getattr(option, "is_flag", False) else ["1"]
-        word = name[2:]
-        for spelled in (word.replace("_", "-"), word.replace("-", "_")):
-            given, _, _ = parser.parse_args([f"--{spelled}", *words])
-            assert option.name in given

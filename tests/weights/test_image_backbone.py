@@ -39,7 +39,7 @@ def test_embeddings_leave_the_last_stage_to_load(resnet, tmp_path):
     part = image_backbone.load_image_backbone("resnet50.pth", resnet, tmp_path)
     assert set(part["params"]) == {"image_neck"}
     assert part["batch_stats"] == whole["batch_stats"]
-    with pytest.raises(UserError, match="--image_backbone FOLDER"):
+    with pytest.raises(UserError, match="--image-backbone FOLDER"):
         image_backbone.load_image_backbone(None, resnet, tmp_path)
 
 
