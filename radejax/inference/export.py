@@ -6,6 +6,7 @@ docs/deploy.md says how to use each of them.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import pathlib
 import warnings
@@ -39,6 +40,9 @@ CAMERA_SHAPES = {
     "size_px": (2,),
 }
 """Float fields of `radejax.geometry.camera.Camera`, beside the bool `is_valid`."""
+
+CHUNK_SIZE = 1024
+"""Queries at once of the deformable attention in ONNX files, unless the config says."""
 
 SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
 RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
@@ -249,6 +253,10 @@ def onnx_files(
             'format "onnx" needs jax2onnx: pip install "radejax[onnx]"'
         ) from error
 
+    if detector.takes_camera:  # no choice by platform, which does not convert
+        config = detector.saved.config.copy_and_resolve_references()
+        config.model.fusion.chunk_size = config.model.fusion.chunk_size or CHUNK_SIZE
+        detector = Detector(dataclasses.replace(detector.saved, config=config))
     variables, shapes = _exported(detector, batch_size, with_backbone)
     leaves, tree = jax.tree.flatten(shapes)
     names = ["projection", "image"][: len(shapes)]
