@@ -33,8 +33,8 @@ from radejax.core.config import load_config
 from radejax.core.structures import Batch
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.detector import detect
 from radejax.inference.export import CAMERA_SHAPES
-from radejax.inference.program import detect
 from radejax.simulation.radar import tensor
 from radejax.training.state import create_state, make_optimizer
 from radejax.training.step import make_train_step

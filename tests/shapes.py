@@ -32,7 +32,6 @@ ROOMS = (
     "simulation",
     "inference.inputs",
     "inference.predict",
-    "inference.program",
     "visualize",
 )
 """Rooms whose annotations have shapes."""

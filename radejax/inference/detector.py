@@ -8,23 +8,56 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Shaped
+from jaxtyping import Real, Shaped
 
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
 from radejax.core.structures import Array, Batch, Detections
 from radejax.data.cameras import CameraOptions
-from radejax.detection.decode import DecodeOptions
+from radejax.data.encoding import to_float
+from radejax.data.projection import project_jax
+from radejax.detection.decode import DecodeOptions, decode
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs
-from radejax.inference.program import detect
 from radejax.inference.saved import SavedModel, Step, load_model, load_torch
 
 UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
+
+
+def detect(
+    model: nn.Module,
+    grid: RadarGrid,
+    options: Mapping[str, Any],
+    variables: Any,
+    frames: Real[Array, "B R A DE"] | Real[Array, "B D R E A"],
+    image: Real[Array, "B _ _ _"] | None = None,
+    camera: Any = None,
+    *,
+    is_tesseract: bool = False,
+) -> Detections:
+    """From a batch of radar tensors to detections; pure, to be jitted.
+
+    Args:
+        model: Radar or radar-camera detector.
+        grid: Of its maps, see `models.map_grid`.
+        options: Keyword arguments of `radejax.detection.decode.decode`.
+        variables: Of the model.
+        frames: Projections as they are stored, or tesseracts.
+        image: Of a radar-camera model, or None for the radar alone.
+        camera: Likewise.
+        is_tesseract: `frames` are tesseracts, linear power.
+    """
+    if is_tesseract:
+        frames = project_jax(frames)
+    inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
+    maps: Any = model.apply(variables, *inputs, train=False)
+    return decode(maps, grid, **options)
 
 
 class Detector:
@@ -85,11 +118,11 @@ class Detector:
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = CameraOptions.from_config(config.data)
         self.classes = tuple(config.classes)
-        decode = dataclasses.asdict(DecodeOptions(**config.decode))
-        self.score_threshold: float = decode.pop("score_threshold")
-        self.nms_iou: float = decode.pop("nms_iou")
-        self.roi = decode.pop("roi")
-        self.decode_options: dict[str, Any] = decode
+        options = dataclasses.asdict(DecodeOptions(**config.decode))
+        self.score_threshold: float = options.pop("score_threshold")
+        self.nms_iou: float = options.pop("nms_iou")
+        self.roi = options.pop("roi")
+        self.decode_options: dict[str, Any] = options
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = (
             NamedSharding(self.sharding.mesh, PartitionSpec())
