@@ -6,13 +6,13 @@ import collections
 import dataclasses
 import logging
 import pathlib
-import time
 from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
 import flax.linen as nn
 import jax
 import numpy as np
+import optax
 from ml_collections import ConfigDict
 
 from radejax.core import files
@@ -80,88 +80,45 @@ def train(
         model: Called as `model.apply(variables, *inputs, train=True)`.
         loader: Checkpointable grain iterator of `Batch`; endless.
         grid: Grid of the model's maps.
-        workdir: Checkpoints and logs go here.
+        workdir: Folder of checkpoints and logs.
         info: Plain values that each checkpoint carries. Those under "same" must be the
             same on every start of a run; "config" is shown by Weights & Biases.
         steps_per_epoch: Batches of one pass over the data.
-        variables: To start from, an imported checkpoint's for example; initialized from
-            the seed if None.
-        pretrained: Part of the variables that replaces initialized ones, the weights of
-            an image backbone for example.
+        variables: To start from; initialized from the seed if None.
+        pretrained: Part of the variables that replaces initialized ones.
         mesh: Devices to use; all by default.
-        evaluate: Called every `evaluate_every_epochs` epochs and at the end. Its result
-            is logged and saved with the checkpoint, of which the best is kept.
+        evaluate: Called every `evaluate_every_epochs` epochs and at the end.
         profile: Folder for a trace of the steps `config.logging.profile_steps`.
 
     Raises:
-        DataError: More than `max_skipped_steps` steps in a row without a finite loss
-            and gradient, or no checkpoint restores.
-        UserError: A batch size that does not divide over the devices, other data than
-            the run began with, a full disk.
+        DataError: No checkpoint restores, or too many steps in a row are not finite.
+        UserError: The batch does not divide over the devices, other data, a full disk.
     """
     options, folder = TrainOptions(**config.train), pathlib.Path(workdir)
     mesh = distributed.make_mesh() if mesh is None else mesh
     distributed.check_batch_size(options.batch_size, mesh)
     num_steps = steps_per_epoch * options.num_epochs
     optimizer = options.make_optimizer(steps_per_epoch)
-
-    # Initial state -------------------------------------------------------------------
-    def create(batch: Batch, variables: Any, pretrained: Any) -> TrainState:
-        if variables is None:
-            keys = jax.random.split(jax.random.key(config.seed))
-            rngs = {"params": keys[0], "dropout": keys[1]}
-            variables = model.init(rngs, *model_inputs(batch), train=False)
-        if pretrained is not None:
-            variables = with_pretrained(variables, pretrained)
-        is_frozen = getattr(model, "is_frozen", None)
-        use_ema = options.ema_decay is not None
-        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
-
-    # NumPy arrays: the same on every process, and so on every device.
-    given = jax.tree.map(np.asarray, (_first_batch(loader), variables, pretrained))
-    abstract = jax.eval_shape(create, *given)
-    placement = distributed.state_sharding(abstract, mesh, options.parameter_sharding)
-
-    # Restore or initialize -----------------------------------------------------------
-    keep = options.checkpoints_to_keep
+    create = _initializer(config.seed, options, model, optimizer)
+    given = (_first_batch(loader), variables, pretrained)
+    loss, ema_decay = loss_options(config), options.ema_decay
+    step_fn = make_train_step(model, optimizer, grid, loss=loss, ema_decay=ema_decay)
+    keep, size = options.checkpoints_to_keep, options.batch_size
     with Checkpoints(folder / "checkpoints", max_to_keep=keep) as checkpoints:
-        saved = abstract_state(abstract, placement).replace(frozen={})
-        state, saved_info, step = checkpoints.restore(saved, loader) or (None, {}, 0)
-        if state is None:
-            state = jax.jit(create, out_shardings=placement)(*given)
-        else:
-            _check_same(saved_info.get("same", {}), info.get("same", {}), folder)
-            _log.info("continuing from step %d of %d", step, num_steps)
-            # Frozen parameters are not saved: they come from where they came from.
-            frozen = jax.jit(
-                lambda *x: create(*x).frozen, out_shardings=placement.frozen
-            )
-            state = state.replace(frozen=frozen(*given) if abstract.frozen else {})
-        step_fn = make_train_step(
-            model,
-            optimizer,
-            grid,
-            loss=loss_options(config),
-            ema_decay=options.ema_decay,
-        )
-        train_step = _compile(step_fn, placement, mesh, config.seed)
-
-        # Loop ------------------------------------------------------------------------
+        placed = create, given, mesh, options.parameter_sharding
+        state, step = _restore_or_initialize(checkpoints, loader, info, *placed)
+        train_step = _compile(step_fn, state, mesh, config.seed)
         trace = _trace(profile, *LoggingOptions(**config.logging).profile_steps)
-        batch_size, wandb = options.batch_size, _wandb_arguments(config, info)
+        wandb = _wandb_arguments(config, info)
         with (
-            MetricLogger(folder, step, num_steps, batch_size, wandb) as logger,
+            MetricLogger(folder, step, num_steps, size, wandb) as logger,
             distributed.stop_on_signal(mesh) as stop,
         ):
             metrics, is_stopped, is_cut, num_skipped = None, stop(), False, 0
             while step < num_steps and not is_stopped:
-                started = time.perf_counter()
-                batch = next(loader)
-                if all(x.is_ready() for x in jax.tree.leaves(metrics)):
-                    logger.waited(time.perf_counter() - started)
+                batch = logger.next_batch(loader, metrics)
                 trace.send(metrics)
-                batch = distributed.put_batch(batch, mesh)
-                state, metrics = train_step(state, batch)
+                state, metrics = train_step(state, distributed.put_batch(batch, mesh))
                 step += 1
                 logger.advance(step, metrics)
                 if _is_due(step, options.log_every_steps, num_steps):
@@ -172,8 +129,6 @@ def train(
                     scores = _evaluate(evaluate, state, step, stop, logger)
                     is_cut = scores is None
                 is_stopped = stop()
-
-                # Save ----------------------------------------------------------------
                 is_due = _is_due(step, options.checkpoint_every_steps, num_steps)
                 if is_due or is_stopped or scores is not None:
                     num_skipped = _check_skipped(state, options, num_skipped)
@@ -183,6 +138,65 @@ def train(
             trace.close()
             checkpoints.wait()
     return TrainResult(state, step, finished=step >= num_steps and not is_cut)
+
+
+def _initializer(
+    seed: int,
+    options: TrainOptions,
+    model: nn.Module,
+    optimizer: optax.GradientTransformation,
+) -> Callable[[Batch, Any, Any], TrainState]:
+    """A function of (batch, variables, pretrained) that makes the state of step 0."""
+
+    def create(batch: Batch, variables: Any, pretrained: Any) -> TrainState:
+        if variables is None:
+            keys = jax.random.split(jax.random.key(seed))
+            rngs = {"params": keys[0], "dropout": keys[1]}
+            variables = model.init(rngs, *model_inputs(batch), train=False)
+        if pretrained is not None:
+            variables = with_pretrained(variables, pretrained)
+        is_frozen = getattr(model, "is_frozen", None)
+        use_ema = options.ema_decay is not None
+        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
+
+    return create
+
+
+def _restore_or_initialize(
+    checkpoints: Checkpoints,
+    loader: Any,
+    info: Mapping[str, Any],
+    create: Callable[..., TrainState],
+    given: tuple[Any, ...],
+    mesh: jax.sharding.Mesh,
+    parameters: distributed.ParameterSharding,
+) -> tuple[TrainState, int]:
+    """State and step of the newest checkpoint, or those before the first step.
+
+    Args:
+        checkpoints: Of the run.
+        loader: Set to the position that was saved.
+        info: Its "same" must be what was saved.
+        create: From `_initializer`.
+        given: Its arguments, with NumPy arrays: the same on every process.
+        mesh: Devices that the state is placed on.
+        parameters: How they are placed.
+    """
+    given = jax.tree.map(np.asarray, given)
+    abstract = jax.eval_shape(create, *given)
+    placement = distributed.state_sharding(abstract, mesh, parameters)
+    saved = abstract_state(abstract, placement).replace(frozen={})
+    restored = checkpoints.restore(saved, loader)
+    if restored is None:
+        return jax.jit(create, out_shardings=placement)(*given), 0
+    state, saved_info, step = restored
+    folder = checkpoints.folder.parent
+    _check_same(saved_info.get("same", {}), info.get("same", {}), folder)
+    _log.info("continuing from step %d", step)
+    if abstract.frozen:  # not saved: these parameters come from where they came from
+        frozen = jax.jit(lambda *x: create(*x).frozen, out_shardings=placement.frozen)
+        state = state.replace(frozen=frozen(*given))
+    return state, step
 
 
 def loss_options(config: ConfigDict) -> dict[str, Any]:
@@ -220,13 +234,14 @@ def _check_same(
 
 
 def _compile(
-    step: Step, placement: Any, mesh: jax.sharding.Mesh, seed: int
+    step: Step, state: TrainState, mesh: jax.sharding.Mesh, seed: int
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
-    """The step of a run, which consumes its state.
+    """The step of a run, for states placed as this one; it consumes its state.
 
     It returns before it is computed, unless too many steps are under way.
     """
     whole = distributed.replicated(mesh)
+    placement = jax.tree.map(lambda x: x.sharding, state)
     compiled = jax.jit(step, donate_argnums=0, out_shardings=(placement, whole))
     rng = jax.jit(jax.random.key, out_shardings=whole)(np.uint32(seed + 1))
     in_flight: collections.deque[Metrics] = collections.deque()

@@ -127,9 +127,18 @@ class MetricLogger:
         self._start = self._last_step = start_step
         self._waited, self._since = 0.0, time.perf_counter()
 
-    def waited(self, seconds: float) -> None:
-        """Counts time in which the devices were idle because a batch was missing."""
-        self._waited += seconds
+    def next_batch(self, loader: Any, metrics: Any) -> Any:
+        """The next batch; counts the time in which devices were idle because of it.
+
+        Args:
+            loader: Iterator of batches.
+            metrics: Results of the previous step: until they are ready, devices work.
+        """
+        started = time.perf_counter()
+        batch = next(loader)
+        if all(x.is_ready() for x in jax.tree.leaves(metrics)):
+            self._waited += time.perf_counter() - started
+        return batch
 
     def advance(self, step: int, metrics: Any) -> None:
         """Moves the progress bar; the first step, which compiles, is not timed."""
