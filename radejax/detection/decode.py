@@ -347,7 +347,12 @@ def _flat_bins(values: Num[jax.Array, "B R A C"]) -> Num[jax.Array, "B R*A C"]:
 
 
 def check_maps(maps: DetectionMaps, grid: RadarGrid) -> None:
-    """Raise `ValueError` where shapes of maps and grid differ."""
+    """Raise `ValueError` where shapes of maps and grid differ.
+
+    Examples:
+        >>> maps = DetectionMaps(jnp.zeros((1, 256, 107, 5)), jnp.zeros((1, 256, 107, 8)))
+        >>> check_maps(maps, RadarGrid.kradar())
+    """
     logits, params = maps.heatmap_logits.shape, maps.box_params.shape
     expected = (grid.num_range, grid.num_azimuth)
     if len(logits) != 4 or params != (*logits[:3], 8):
