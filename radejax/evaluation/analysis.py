@@ -222,7 +222,7 @@ MIN_OBJECTS = 10
 
 def sanity_checks(data: EvaluationSet) -> list[str]:
     """Warnings about another unit, frame or height of the predicted boxes."""
-    box, lines = data.all_predictions.box, []
+    box, lines = data.predictions.box, []
     is_large = np.abs(box[:, 6]) > 2 * np.pi
     if is_large.any():
         lines.append(

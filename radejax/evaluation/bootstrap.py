@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import protocols
-from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 
 LEVEL = 0.95
@@ -85,46 +83,6 @@ def interval(
         return float("nan"), float("nan")
     low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
-
-
-def intervals(
-    data: EvaluationSet,
-    frames: Columns,
-    metrics: Sequence[tuple[str, str, float]],
-    *,
-    resamples: int,
-    seed: int,
-    masks: Mapping[str, Bool[np.ndarray, " F"]] | None = None,
-    **settings: Any,
-) -> dict[tuple[str, str, str, str, float], tuple[float, float]]:
-    """95 % intervals by (protocol, condition, class, space, IoU).
-
-    Args:
-        data: The evaluation set.
-        frames: Frame table with a column sequence.
-        metrics: (protocol, space, IoU) to resample.
-        resamples: Number of resamples.
-        seed: Seed of the resampling.
-        masks: Frames by condition, resampled within the condition's sequences.
-            Conditions of a single sequence get no interval.
-        **settings: `empty_frames` and `score_threshold`, as in `evaluate`.
-    """
-    if "sequence" not in frames:
-        raise UserError("intervals need a column 'sequence' in the frame table")
-    sequence = np.asarray(frames["sequence"])
-    found = {}
-    everything = np.ones(sequence.size, bool)
-    for condition, mask in {"all": everything, **(masks or {})}.items():
-        if np.unique(sequence[mask]).size < 2:
-            continue
-        part = data if mask.all() else data.of_frames(mask)
-        weights = sequence_weights(sequence[mask], resamples=resamples, seed=seed)
-        for protocol, space, iou in metrics:
-            ap = resample(part, weights, protocol, space, iou, **settings)
-            for index, name in enumerate((*data.classes, "mean")):
-                key = (protocol, condition, name, space, iou)
-                found[key] = interval(ap[:, index])
-    return found
 
 
 @dataclasses.dataclass(frozen=True)

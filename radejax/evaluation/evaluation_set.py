@@ -131,7 +131,6 @@ class EvaluationSet:
             order, with positions in `frame` and in `classes` as their frame and cls.
         pred: Predictions of the classes inside the region, likewise.
         score: Scores of `pred`.
-        all_predictions: The predictions as given.
         left_out: Counts of boxes that do not take part, by reason.
         roi: Name of the region.
         label_version: Label revision or None.
@@ -159,7 +158,7 @@ class EvaluationSet:
             self.frame = np.unique(np.concatenate([truth.frame, found.frame]))
         else:
             self.frame = boxes.frame_ids(frames)
-        self.all_predictions = found
+        self._roi, self._tables = roi, (truth, found)
         self.left_out: dict[str, int] = {}
         self.gt, _ = self._select(truth, "ground truth", roi)
         self.pred, self._pred_row = self._select(found, "predictions", roi)
@@ -211,30 +210,24 @@ class EvaluationSet:
                 "with the highest scores"
             )
 
+    @property
+    def predictions(self) -> Boxes:
+        """The predictions as given."""
+        return self._tables[1]
+
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """The set of some frames, for many evaluations of a condition."""
-        names = np.array(self.classes)
-        tables = [
-            Boxes(self.frame[t.frame], t.box, names[t.cls], t.score).take(rows)
-            for t, rows in (
-                (self.gt, np.flatnonzero(is_chosen[self.gt.frame])),
-                # By row, which breaks ties between equal scores.
-                (self.pred, self._rows_in_order(is_chosen)),
-            )
-        ]
-        part = EvaluationSet(
-            *tables, classes=self.classes, frames={"frame": self.frame[is_chosen]}
+        ids = self.frame[is_chosen]
+        truth, found = (t.take(np.isin(t.frame, ids)) for t in self._tables)
+        frames = {"frame": ids, "simulated": np.full(ids.size, self.is_simulated)}
+        return EvaluationSet(
+            truth,
+            found,
+            classes=self.classes,
+            frames=frames,
+            roi=self._roi,
+            label_version=self.label_version,
         )
-        part.roi, part.label_version = self.roi, self.label_version
-        part.is_simulated = self.is_simulated
-        return part
-
-    def _rows_in_order(
-        self, is_chosen: Bool[np.ndarray, " F"]
-    ) -> Int[np.ndarray, " _"]:
-        """Predictions of some frames in the given order."""
-        order = np.argsort(self._pred_row, kind="stable")
-        return order[is_chosen[self.pred.frame[order]]]
 
     # Shared work ---------------------------------------------------------------------
 
@@ -317,6 +310,7 @@ class EvaluationSet:
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
         curves: bool = True,
+        condition: tuple[str, str] = ("all", "all"),
     ) -> list[Result]:
         """Results in one protocol, over all frames or over weighted ones.
 
@@ -328,6 +322,7 @@ class EvaluationSet:
             spaces: As in `evaluate`.
             weights: bool or int weight of every frame; a condition is a mask.
             curves: Keep the precision, recall and score arrays.
+            condition: Kind and condition that the weights stand for.
         """
         chosen = protocols.get_protocol(protocol)
         empty_frames = chosen.resolve_empty_frames(empty_frames)
@@ -354,6 +349,8 @@ class EvaluationSet:
                 roi=self.roi,
                 label_version=self.label_version,
                 is_simulated=self.is_simulated,
+                kind=condition[0],
+                condition=condition[1],
                 **(vars(curve) | dropped),
             )
             results.append(result)

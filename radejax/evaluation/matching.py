@@ -143,8 +143,20 @@ def match_kradar(
     preference = score[pairs.pred]
     chosen = greedy(pairs.gt, pairs.pred, preference, gt_group[pairs.gt], score.size)
     first = pairs.take(chosen)
-    steps = _steps(pairs, score, gt_group[pairs.gt])
-    return KradarMatches(first.gt, first.pred, *steps)
+    # A ground truth that shares no prediction is found once its best score is reached.
+    has_rival = np.zeros(gt_group.size, bool)
+    has_rival[pairs.gt[np.bincount(pairs.pred)[pairs.pred] > 1]] = True
+    alone = pairs.take(~has_rival[pairs.gt])
+    alone = alone.take(np.lexsort((-score[alone.pred], alone.gt)))
+    best = alone.pred[_is_new(alone.gt)]
+    rivals = pairs.take(has_rival[pairs.gt])
+    step_pred, step_delta = _steps(rivals, score, gt_group[rivals.gt])
+    return KradarMatches(
+        first.gt,
+        first.pred,
+        np.concatenate([best, step_pred]),
+        np.concatenate([np.ones(best.size, np.int64), step_delta]),
+    )
 
 
 def _steps(

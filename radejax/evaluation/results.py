@@ -190,7 +190,7 @@ def evaluate_tables(
     }
     results = compute_results(data, frames, options, kinds)
     if why_no_intervals(frames, options) is None:
-        results = _with_intervals(data, frames, results, options)
+        results = with_intervals(data, frames, results, options)
     return data, results
 
 
@@ -214,14 +214,12 @@ def compute_results(
             iou_thresholds=options.iou_thresholds,
             weights=mask,
             curves=False,
+            condition=(kind, condition),
             **options.settings_of(protocol),
         )
         for start in range(0, len(results), len(data.classes)):
             group = results[start : start + len(data.classes)]
-            rows += [
-                dataclasses.replace(result, kind=kind, condition=condition)
-                for result in (*group, _mean(group))
-            ]
+            rows += [*group, _mean(group)]
     return rows
 
 
@@ -260,31 +258,40 @@ def why_no_intervals(frames: Columns, options: EvaluationOptions) -> str | None:
     return None
 
 
-def _with_intervals(
+def with_intervals(
     data: EvaluationSet,
     frames: Columns,
     results: list[Result],
     options: EvaluationOptions,
 ) -> list[Result]:
-    """The results with 95 % intervals: all over all frames, the main ones per weather."""
-    main = (protocols.RECOMMENDED, "kradar_r40", options.paper_protocol)
-    weathers = condition_masks(frames, "weather")
+    """The results with 95 % intervals: all over all frames, the main ones per weather.
+
+    Conditions are resampled within their sequences; those of one sequence get none.
+    """
+    main = {protocols.RECOMMENDED, "kradar_r40", options.paper_protocol}
+    sequence = np.asarray(frames["sequence"])
+    conditions = {"all": np.ones(sequence.size, bool)}
     found: dict[tuple, tuple[float, float]] = {}
-    for name in options.protocols:
-        found |= bootstrap.intervals(
-            data,
-            frames,
-            list(itertools.product([name], SPACES, options.iou_thresholds)),
-            resamples=options.bootstrap,
-            seed=options.seed,
-            masks=weathers if name in main else {},
-            **options.settings_of(name),
+    for condition, mask in (conditions | condition_masks(frames, "weather")).items():
+        if np.unique(sequence[mask]).size < 2:
+            continue
+        part = data if mask.all() else data.of_frames(mask)
+        weights = bootstrap.sequence_weights(
+            sequence[mask], resamples=options.bootstrap, seed=options.seed
         )
-    rows = []
-    for row in results:
-        low, high = found.get(row.key, (None, None)) if row.is_defined else (None, None)
-        rows.append(dataclasses.replace(row, low=low, high=high))
-    return rows
+        names = [p for p in options.protocols if condition == "all" or p in main]
+        for metric in itertools.product(names, SPACES, options.iou_thresholds):
+            settings = options.settings_of(metric[0])
+            samples = bootstrap.resample(part, weights, *metric, **settings)
+            for cls, column in zip((*data.classes, "mean"), samples.T, strict=True):
+                key = (metric[0], condition, cls, *metric[1:])
+                found[key] = bootstrap.interval(column)
+    return [
+        dataclasses.replace(row, low=found[row.key][0], high=found[row.key][1])
+        if row.is_defined and row.key in found
+        else row
+        for row in results
+    ]
 
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:

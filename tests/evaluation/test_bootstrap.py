@@ -4,6 +4,7 @@ import pytest
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -59,40 +60,42 @@ def test_weights_of_a_condition_give_the_condition(scene):
     np.testing.assert_allclose(ap[0], ap[1], atol=1e-9)
 
 
-def test_interval_covers_the_number_and_grows_with_the_level(scene):
-    data = make(*scene)
-    found = bootstrap.intervals(
-        data, scene[2], [("all_point", "3d", 0.3)], resamples=200, seed=1
+def intervals(scene, frames, **changes):
+    settings = {"bootstrap": 200, "seed": 1, "protocols": ("all_point",), **changes}
+    options = EvaluationOptions(
+        classes=CLASSES, iou_thresholds=(0.3,), roi=None, **settings
     )
-    result = data.results("all_point", iou_thresholds=0.3, spaces="3d")[0]
-    low, high = found["all_point", "all", "Sedan", "3d", 0.3]
-    assert low < result.ap < high
+    _, results = evaluate_tables(*scene[:2], frames, options)
+    return {r.key[1:4]: (r.low, r.ap, r.high) for r in results}
+
+
+def test_interval_covers_the_number_and_grows_with_the_level(scene):
+    low, ap, high = intervals(scene, scene[2])["all", "Sedan", "3d"]
+    assert low < ap < high
     samples = np.arange(101.0)
     assert bootstrap.interval(samples) == pytest.approx((2.5, 97.5))
     assert np.isnan(bootstrap.interval(np.full(5, np.nan))).all()
 
 
 def test_conditions_of_one_sequence_get_no_interval(scene):
-    truth, found, frames = scene
-    sequence = frames["sequence"]
-    masks = {"one": sequence == 0, "two": sequence < 2}
-    intervals = bootstrap.intervals(
-        make(truth, found, frames),
-        frames,
-        [("all_point", "bev", 0.3)],
-        resamples=20,
-        seed=0,
-        masks=masks,
-    )
-    assert {key[1] for key in intervals} == {"all", "two"}
-    with pytest.raises(UserError, match="need a column 'sequence'"):
-        bootstrap.intervals(
-            make(truth, found, frames),
-            {"frame": frames["frame"]},
-            [],
-            resamples=1,
-            seed=0,
-        )
+    frames = scene[2]
+    weather = np.where(frames["sequence"] == 0, "fog", "rain")
+    found = intervals(scene, {**frames, "weather": weather}, bootstrap=20)
+    has_interval = {key[0]: low is not None for key, (low, *_) in found.items()}
+    assert has_interval == {"all": True, "fog": False, "rain": True}
+    # The intervals of a condition are those of its frames as a dataset of their own.
+    rain = np.flatnonzero(weather == "rain")
+    part = {name: column[rain] for name, column in frames.items()} | {
+        "weather": weather[rain]
+    }
+    tables = [
+        {k: v[np.isin(t["frame"], rain)] for k, v in t.items()} for t in scene[:2]
+    ]
+    apart = intervals(tables, part, bootstrap=20)
+    for key in (k for k in found if k[0] == "rain"):
+        assert found[key] == apart["all", *key[1:]]
+    whole = intervals(scene, {"frame": frames["frame"]})
+    assert all(low is None for low, *_ in whole.values())
 
 
 def test_a_run_does_not_differ_from_itself(scene):
