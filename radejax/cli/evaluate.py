@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import click
@@ -13,145 +13,100 @@ from radejax.cli import entry
 from radejax.cli.options import STEP, Command, echo_result, numbers, split_words
 from radejax.core.errors import UserError
 
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+def _flag(name: str, text: str, **settings: Any) -> click.Option:
+    return click.Option([f"--{name}"], help=text, **settings)
 
 
-def _option(*names: str, **settings: Any) -> Decorator:
-    return click.option(*names, default=None, **settings)
-
-
-def _list(name: str, text: str) -> Decorator:
+def _list(name: str, text: str, *others: str, **settings: Any) -> click.Option:
     """A list option: `--data A,B --data C` gives A, B and C."""
-    return click.option(
-        name, multiple=True, callback=split_words, metavar="A,B,...", help=text
-    )
+    settings = {"callback": split_words, "metavar": "A,B,...", **settings}
+    return click.Option([f"--{name}", *others], help=text, multiple=True, **settings)
 
 
-def _all(*decorators: Decorator) -> Decorator:
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for decorator in reversed(decorators):
-            function = decorator(function)
-        return function
-
-    return decorate
-
-
-_data = _all(
-    _list("--data", "Roots of K-Radar; for a run, other ones than its own."),
-    _option("--labels", help="Folder or zip of a label revision."),
-    _option("--label-version", help="v1.0, v1.1, v2.0 or v2.1. Default: v2.1."),
-    click.option(
-        "--sequences",
-        multiple=True,
-        callback=numbers,
-        metavar="1,58",
-        help="Only frames of these sequences.",
-    ),
-    _list("--weather", "Only frames of these weathers, such as fog,rain."),
-    click.option(
-        "--split",
-        default="test",
-        show_default=True,
-        help="train, test, all or a split file; for a run also validation.",
-    ),
+_DATA = (
+    _list("data", "Roots of K-Radar; for a run, other ones than its own."),
+    _flag("labels", "Folder or zip of a label revision."),
+    _flag("label-version", "v1.0, v1.1, v2.0 or v2.1. Default: v2.1, or the run's."),
+    _list("sequences", "Only frames of these.", callback=numbers, metavar="1,58"),
+    _list("weather", "Only frames of these weathers, such as fog,rain."),
 )
-_settings = _all(
-    _list("--classes", "Classes. Default: K-Radar's five, or the run's."),
-    _list("--protocols", "In addition to all_point. Default: all, or the run's."),
-    click.option(
-        "--iou",
+_DATA_OF_RUN = (
+    _flag("records", "Preprocessed frames of --data; made there if missing."),
+    _flag("camera-calibration", "Folder of camera calibrations of --data."),
+    _flag("embeddings", "Folder of `radejax embed` of the images of --data."),
+)
+_RUN = (
+    click.Argument(["run"], required=False),
+    _flag("workdir", "The same as RUN."),
+    click.Option(
+        ["--checkpoint", "--step", "checkpoint"],
+        type=STEP,
+        help='Checkpoint step or "best". Default: latest.',
+    ),
+    _flag("image-backbone", "Weights of the image backbone, if they were moved."),
+    _flag(
+        "shuffle-images",
+        "Seed. Sanity check: pair every frame with another frame's image.",
+        type=int,
+    ),
+    _flag("min-score", "Discard predictions below before storing.", type=float),
+    _flag("batch-size", "Frames per batch.", type=int),
+    _flag("num-visualizations", "Number of frames to draw.", type=int),
+)
+_FILES = (
+    _flag("ground-truth", "Ground-truth file, or folder of a report or of a run."),
+    _flag("frames", "Frame table of --ground-truth. Default: frames.json next to it."),
+    _flag("z-offset", "Meters to add to the z of predictions.", default=0.0),
+    _flag("yaw-degrees", "Yaws of predictions are in degrees.", is_flag=True),
+)
+_COMMON = (
+    _flag("out", "Output folder. Default: in the workdir or next to the predictions."),
+    _flag("split", "train, test, all, a split file, or validation.", default="test"),
+    _flag("name", "Name of the run in tables."),
+    _flag("debug", "Show tracebacks of user errors.", is_flag=True),
+)
+_SETTINGS = (
+    _list("classes", "Default: K-Radar's five, or the run's."),
+    _list("protocols", "In addition to all_point. Default: all, or the run's."),
+    _list(
+        "iou",
+        "IoU thresholds. Default: 0.3,0.5,0.7, or the run's.",
         "--iou-thresholds",
         "iou_thresholds",
-        multiple=True,
-        callback=split_words,
-        metavar="A,B,...",
-        help="IoU thresholds. Default: 0.3,0.5,0.7, or the run's.",
     ),
-    _option(
-        "--roi",
-        help="narrow, wide, none or x0,x1,y0,y1,z0,z1. Default: narrow, or the run's.",
+    _flag(
+        "roi", "narrow, wide, none or x0,x1,y0,y1,z0,z1. Default: narrow, or the run's."
     ),
-    _option(
-        "--score-threshold",
+    _flag(
+        "score-threshold",
+        "Score threshold of all protocols except all_point. Default: 0, or the run's.",
         type=float,
-        help="Score threshold of all protocols except all_point. Default: 0, or the "
-        "run's.",
     ),
-    _option(
-        "--empty-frames",
+    _flag(
+        "empty-frames",
+        "Frames to ignore: without the class, without any object, none, or as each "
+        "protocol does (default).",
         type=click.Choice(["protocol", "class", "frame", "none"]),
-        help="Frames to ignore: without the class, without any object, or none. "
-        "Default: as each protocol does.",
     ),
-    _option(
-        "--invalid-sizes",
+    _flag(
+        "invalid-sizes",
+        "Predicted sizes that are not positive. Default: error; false_positive for runs.",
         type=click.Choice(["error", "false_positive"]),
-        help="Treatment of predicted sizes that are not positive. Default: error, or "
-        "false_positive for a run.",
     ),
-    _option(
-        "--bootstrap",
+    _flag(
+        "bootstrap",
+        "Resamples of sequences for 95 % intervals; 0: none. Default: 200 (score), 2000 "
+        "(compare), or the run's.",
         type=int,
-        help="Resamples of sequences for 95 % intervals. Default: 200 (score), 2000 "
-        "(compare), the run's (evaluate); 0: none.",
     ),
 )
-_of_files = _all(
-    _option(
-        "--ground-truth", help="Ground-truth file, or folder of a report or of a run."
-    ),
-    _option(
-        "--frames",
-        help="Frame table (JSON) for --ground-truth. Default: frames.json next to it.",
-    ),
-    click.option(
-        "--z-offset", default=0.0, help="Meters to add to the z of predictions."
-    ),
-    click.option("--yaw-degrees", is_flag=True, help="Yaws are in degrees."),
-)
-_debug = click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
-_name = _option("--name", help="Name of the run in tables.")
-_OTHER_DATA = [
-    "data",
-    "labels",
-    "label_version",
-    "sequences",
-    "weather",
-    "records",
-    "camera_calibration",
-    "embeddings",
-]
+_OTHER = [option.name for option in _DATA + _DATA_OF_RUN]
 
 
-@click.command(cls=Command)
-@click.argument("run", required=False)
-@_option("--workdir", help="The same as RUN.")
-@_option("--out", help="Folder of the report. Default: evaluation/ in the workdir.")
-@_option(
-    "--checkpoint",
-    "--step",
-    "checkpoint",
-    type=STEP,
-    help='Checkpoint step or "best". Default: latest.',
-)
-@_data
-@_option("--records", help="Preprocessed frames of --data; made there if missing.")
-@_option("--camera-calibration", help="Folder of camera calibrations of --data.")
-@_option("--embeddings", help="Folder of `radejax embed` of the images of --data.")
-@_option("--image-backbone", help="Weights of the image backbone, if they were moved.")
-@_option(
-    "--shuffle-images",
-    type=int,
-    metavar="SEED",
-    help="Sanity check: pair every frame with another frame's image.",
-)
-@_settings
-@_option("--min-score", type=float, help="Discard predictions below before storing.")
-@_option("--batch-size", type=int, help="Frames per batch.")
-@_option("--num-visualizations", type=int, help="Number of frames to draw.")
-@_name
-@_debug
-def evaluate(run: str | None, workdir: str | None, as_json: bool, **flags: Any) -> None:
+@click.command(cls=Command, params=[*_RUN, *_COMMON, *_DATA, *_DATA_OF_RUN, *_SETTINGS])
+@click.pass_context
+def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     """Evaluate a checkpoint of a run of `radejax train` on a split.
 
     Example: radejax evaluate runs/quickstart
@@ -159,43 +114,33 @@ def evaluate(run: str | None, workdir: str | None, as_json: bool, **flags: Any) 
     from radejax.runs.evaluate import evaluate_run
     from radejax.runs.sources import Sources
 
-    workdir = workdir or run
+    workdir = flags["run"] or flags["workdir"]
     if workdir is None:
         raise UserError("give the workdir of a run: radejax evaluate RUN")
-    context = click.get_current_context()
     typed = click.core.ParameterSource.COMMANDLINE
-    is_other = [context.get_parameter_source(name) is typed for name in _OTHER_DATA]
-    if context.get_parameter_source("data") is typed and not flags["data"]:
+    given = [name for name in _OTHER if ctx.get_parameter_source(name or "") is typed]
+    if "data" in given and not flags["data"]:
         raise UserError("--data names no folder")
-    other = {name: flags[name] for name in _OTHER_DATA}
-    for name in ("sequences", "weather"):
-        other[name] = other[name] or ()
+    other: dict[str, Any] = {str(name): flags[str(name)] for name in _OTHER}
+    other |= {name: other[name] or () for name in ("sequences", "weather")}
     entry.set_up_jax()
     report = evaluate_run(
         workdir,
         step=flags["checkpoint"],
-        split=flags["split"],
-        out=flags["out"],
-        image_backbone=flags["image_backbone"],
-        shuffle_images=flags["shuffle_images"],
-        other=Sources(**other) if any(is_other) else None,
         run=flags["name"],
+        other=Sources(**other) if given else None,
+        **{n: flags[n] for n in ("split", "out", "image_backbone", "shuffle_images")},
         **_scoring(flags, "min_score", "batch_size", "num_visualizations"),
     )
     assert report is not None  # as this is the only process
     # The tables have been logged to standard error.
-    text = f"Written to {report.files[0].parent}"
-    echo_result(as_json, report.metrics, text)
+    echo_result(as_json, report.metrics, f"Written to {report.files[0].parent}")
 
 
-@click.command(cls=Command)
-@click.argument("predictions")
-@_option("--out", help="Folder of the report. Default: next to the predictions.")
-@_data
-@_of_files
-@_settings
-@_name
-@_debug
+@click.command(
+    cls=Command,
+    params=[click.Argument(["predictions"]), *_COMMON, *_DATA, *_FILES, *_SETTINGS],
+)
 def score(predictions: str, as_json: bool, **flags: Any) -> None:
     """Evaluate predictions in files.
 
@@ -209,19 +154,18 @@ def score(predictions: str, as_json: bool, **flags: Any) -> None:
 
     path = pathlib.Path(predictions)
     out = flags["out"] or path.with_name(f"{path.stem}_evaluation")
-    options = _options(flags, bootstrap=200)
-    name = flags["name"] or path.stem
+    options, name = _options(flags, bootstrap=200), flags["name"] or path.stem
     report = evaluate_files(path, out, _source(flags), options, run=name)
     echo_result(as_json, report.metrics, f"{report.text}\nWritten to {out}")
 
 
-@click.command(cls=Command)
-@click.argument("runs", nargs=-1, required=True, metavar="A B [C ...]")
-@_option("--out", help="Folder for comparison.txt and comparison.json.")
-@_data
-@_of_files
-@_settings
-@_debug
+@click.command(
+    cls=Command,
+    params=[
+        click.Argument(["runs"], nargs=-1, metavar="A B [C ...]"),
+        *(*_COMMON, *_DATA, *_FILES, *_SETTINGS),
+    ],
+)
 def compare(runs: tuple[str, ...], as_json: bool, **flags: Any) -> None:
     """Compare runs with the first of them.
 
@@ -232,11 +176,7 @@ def compare(runs: tuple[str, ...], as_json: bool, **flags: Any) -> None:
     from radejax.evaluation.report import compare_files, plain
 
     options = _options(flags, bootstrap=2000)
-    if options.bootstrap == 0:
-        raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
-    text, rows = compare_files(
-        runs, flags["out"], _source(flags), options, resamples=options.bootstrap
-    )
+    text, rows = compare_files(runs, flags["out"], _source(flags), options)
     values = plain([dataclasses.asdict(row) for row in rows])
     echo_result(as_json, values, text.rstrip("\n"))
 
@@ -262,11 +202,8 @@ def _options(flags: dict[str, Any], bootstrap: int) -> Any:
 
 
 def _scoring(flags: dict[str, Any], *others: str) -> dict[str, Any]:
-    """The flags of `_settings` that were given, by the names of `EvaluationOptions`."""
-    names = (
-        *("classes", "protocols", "iou_thresholds", "roi", "score_threshold"),
-        *("empty_frames", "invalid_sizes", "bootstrap", *others),
-    )
+    """The settings that were given, by the names of `EvaluationOptions`."""
+    names = [*(str(option.name) for option in _SETTINGS), *others]
     values = {name: flags[name] for name in names if flags[name] not in (None, ())}
     if "iou_thresholds" in values:
         values["iou_thresholds"] = _floats("iou", values["iou_thresholds"])

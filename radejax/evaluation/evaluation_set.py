@@ -405,9 +405,10 @@ class EvaluationSet:
         for pred, count in counts:
             keep = (self.pred.cls[pred] == cls) & (self.score[pred] > threshold)
             pred, count = pred[keep], count[keep]
-            order = np.argsort(-self.score[pred], kind="stable")
-            pred = pred[order]
-            ranked.append((self.score[pred], self.pred.frame[pred], count[order]))
+            if np.any(np.diff(self.score[pred]) > 0):
+                order = np.argsort(-self.score[pred], kind="stable")
+                pred, count = pred[order], count[order]
+            ranked.append((self.score[pred], self.pred.frame[pred], count))
         return ranked
 
 

@@ -301,8 +301,6 @@ def compare_files(
     out_dir: PathLike | None,
     source: Source,
     options: EvaluationOptions,
-    *,
-    resamples: int = 2000,
 ) -> tuple[str, list[bootstrap.Comparison]]:
     """Compare runs on the same frames: each with the first, and all in Table III.
 
@@ -310,8 +308,8 @@ def compare_files(
         paths: Predictions or report folders, at least two; the first is run A.
         out_dir: Where to write comparison.txt and comparison.json, or None.
         source: Ground truth, unless the paths bring their own.
-        options: Classes, protocols, IoU thresholds, region, score threshold, seed.
-        resamples: Number of resamples of sequences.
+        options: Classes, protocols, IoU thresholds, region, score threshold, number of
+            resamples of sequences (`bootstrap`) and seed.
 
     Returns:
         The tables as text, and all comparisons (B is the second run first).
@@ -321,6 +319,8 @@ def compare_files(
     """
     if len(paths) < 2:
         raise UserError("a comparison needs at least two runs")
+    if options.bootstrap < 1:
+        raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
     # What one run has not stored must not count for another one.
     threshold = max(options.score_threshold, *map(stored_from, paths))
     options = dataclasses.replace(
@@ -338,7 +338,7 @@ def compare_files(
             protocol_names=named,
             iou_thresholds=options.iou_thresholds[:1],
             score_threshold=threshold,
-            resamples=resamples,
+            resamples=options.bootstrap,
             seed=options.seed,
         )
         table = tables.comparison(found, str(paths[0]), str(path))
@@ -352,7 +352,6 @@ def compare_files(
     if out_dir is not None:
         content = {
             "runs": list(map(str, paths)),
-            "resamples": resamples,
             "options": dataclasses.asdict(options),
             "rows": [dataclasses.asdict(row) for row in rows],
         }

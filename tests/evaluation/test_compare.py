@@ -12,7 +12,7 @@ from radejax.evaluation.files import Source
 from radejax.evaluation.results import EvaluationOptions
 
 OPTIONS = EvaluationOptions(
-    roi=None, plots=False, protocols=("all_point", "kradar_r40")
+    bootstrap=30, roi=None, plots=False, protocols=("all_point", "kradar_r40")
 )
 
 
@@ -55,11 +55,7 @@ def test_comparison_of_two_reports(stored, scene):
     for name in ("found", "few"):
         report.evaluate_files(folder / f"{name}.json", folder / name, source, OPTIONS)
     text, rows = report.compare_files(
-        [folder / "few", folder / "found"],
-        folder / "out",
-        Source(),
-        OPTIONS,
-        resamples=50,
+        [folder / "few", folder / "found"], folder / "out", Source(), OPTIONS
     )
     sedan = next(row for row in rows if row.cls == "Sedan")
     assert sedan.difference > 0
@@ -67,19 +63,11 @@ def test_comparison_of_two_reports(stored, scene):
     assert (folder / "out" / "comparison.txt").read_text() == text
     assert (folder / "out" / "comparison.json").is_file()
     again, _ = report.compare_files(
-        [folder / "few.json", folder / "found.json"],
-        None,
-        source,
-        OPTIONS,
-        resamples=50,
+        [folder / "few.json", folder / "found.json"], None, source, OPTIONS
     )
     assert again.splitlines()[3:14] == text.splitlines()[3:14]
     three, rows = report.compare_files(
-        [folder / "few", folder / "found", folder / "few"],
-        None,
-        Source(),
-        OPTIONS,
-        resamples=10,
+        [folder / "few", folder / "found", folder / "few"], None, Source(), OPTIONS
     )
     assert three.count("B - A") == 2
     assert "RADE-Net, Table III" in three
@@ -105,7 +93,7 @@ def test_predictions_that_were_stored_cut_say_so(stored, scene):
     new = report.evaluate_files(folder / "new", folder / "b", Source(), OPTIONS)
     assert new.metrics["warnings"] == []
     runs = [folder / "old", folder / "new"]
-    _, rows = report.compare_files(runs, None, Source(), OPTIONS, resamples=10)
+    _, rows = report.compare_files(runs, None, Source(), OPTIONS)
     assert {row.difference for row in rows} == {0.0}  # both above what one has stored
 
 

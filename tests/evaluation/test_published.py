@@ -213,11 +213,9 @@ def test_simulated_frames_have_no_published_row_anywhere(random_scene, tmp_path)
     assert all(row["name"].endswith("/simulated") for row in made.metrics["ap"])
     assert "30 simulated frames" in made.text
     # A report that is evaluated or compared again still says so.
-    options = EvaluationOptions()
+    options = EvaluationOptions(bootstrap=20)
     again = report.evaluate_files(tmp_path, tmp_path / "b", Source(), options)
     assert again.metrics["is_simulated"]
-    text, _ = report.compare_files(
-        [tmp_path, tmp_path / "b"], None, Source(), options, resamples=20
-    )
+    text, _ = report.compare_files([tmp_path, tmp_path / "b"], None, Source(), options)
     assert text.count("Simulated data: ") == 2
     assert "RADE-Net" not in text
