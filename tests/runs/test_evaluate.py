@@ -157,7 +157,7 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     written: dict[str, Any] = {}
-    data = SimpleNamespace(choosing_split=choosing)
+    data = SimpleNamespace(choosing_split=choosing, preprocess=lambda: None)
     loaded = _Loaded(_config())
     monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
     monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
