@@ -28,7 +28,6 @@ from radejax.cli import entry
 from radejax.core.config import load_module
 from radejax.inference.saved import load_model
 from radejax.runs import experiment
-from radejax.runs.sources import Sources
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
@@ -66,12 +65,9 @@ def run(folder, name, steps):
     sys.stdout = sys.stderr = (folder / f"{name}.log").open("a")
     jax.config.update("jax_platforms", "cpu")
     entry.set_up_jax()
-    experiment.run(
-        make_config(steps),
-        name=name,
-        workdir=folder / name,
-        sources=Sources(data=(str(folder / "data"),)),
-    )
+    config = make_config(steps)
+    config.data.roots = (str(folder / "data"),)
+    experiment.run(config, name=name, workdir=folder / name)
 
 
 def start(folder, name, steps):

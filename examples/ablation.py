@@ -51,7 +51,6 @@ from radejax.evaluation.files import Source, load
 from radejax.evaluation.results import repair_sizes
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
-from radejax.runs.sources import Sources
 from radejax.simulation.config import plain
 from radejax.simulation.dataset import simulate_dataset
 
@@ -163,13 +162,10 @@ class Work:
         started, backbone = time.perf_counter(), self.image_backbone(cell)
         trained = folder / "evaluation" / "metrics.json"
         if not trained.exists():
-            data = (self.data(cell, seed),)
-            experiment.run(
-                self.config(cell, seed),
-                name=name,
-                sources=Sources(data=data, image_backbone=backbone),
-                workdir=folder,
-            )
+            config = self.config(cell, seed)
+            config.data.roots = (str(self.data(cell, seed)),)
+            config.data.image_backbone = backbone
+            experiment.run(config, name=name, workdir=folder)
         if not trained.exists():
             return False
         with self.alone():  # the held-out scenes are simulated and projected once
@@ -179,7 +175,7 @@ class Work:
                 out=self.report(name, seed),
                 image_backbone=backbone,
                 shuffle_images=0 if cell.exchanges else None,
-                other=Sources(data=(self.data(cell, None),)),
+                other={"roots": (self.data(cell, None),)},
                 num_visualizations=0,
             )
         minutes = (time.perf_counter() - started) / 60

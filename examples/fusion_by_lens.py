@@ -28,9 +28,8 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, frame_keys, load
 from radejax.evaluation.results import repair_sizes
 from radejax.inference.saved import load_model as open_model
-from radejax.runs.data import data_of_run
+from radejax.runs.data import data_name, data_of_run
 from radejax.runs.figures import frame_shares, mean_share
-from radejax.runs.sources import Sources
 from radejax.simulation.camera.lens import cover_level
 
 GROUPS = {
@@ -160,9 +159,9 @@ def main(fusion, radar, out, data, split, resamples):
     entry.set_up_jax()
     with entry.exit_codes():
         run = open_model(fusion)
-        other = None if data is None else Sources(data=(data,))
-        name = "" if other is None else f"_{other.name}"
-        config, opened = data_of_run(run, fusion, other)
+        other = None if data is None else {"roots": (data,)}
+        name = "" if other is None else f"_{data_name(other)}"
+        config, opened = data_of_run(run, other)
         out = out or fusion / f"by_lens{name}"
         reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]
         dataset = opened.split(None if split == "all" else split)
@@ -171,9 +170,9 @@ def main(fusion, radar, out, data, split, resamples):
             if frame_keys(frames) != [frame.key for frame in dataset]:
                 raise UserError(
                     f"{report} is of other frames than split {split} of "
-                    f"{opened.paths.roots[0]}: evaluate both runs on it first"
+                    f"{opened.options.roots[0]}: evaluate both runs on it first"
                 )
-        lens = lens_of_frames(opened.paths.roots[0], frames)
+        lens = lens_of_frames(opened.options.roots[0], frames)
         groups = conditions(frames["weather"], lens)
         found = frame_shares(run.model, run.variables, opened, list(dataset))
         means = [mean_share(share, run.grid) for _, share in found]

@@ -18,7 +18,6 @@ _LAZY = {
     "RadarGrid": "geometry.radar_grid",
     "SavedModel": "inference.saved",
     "Scene": "visualize.style",
-    "Sources": "runs.sources",
     "UserError": "core.errors",
     "data_of_run": "runs.data",
     "draw_frame": "visualize.draw",

@@ -25,7 +25,6 @@ from radejax.models.neck import NECKS
 from radejax.runs import checks, experiment
 from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run
-from radejax.runs.sources import Sources
 from radejax.training import distributed
 
 from . import small_models as small
@@ -129,7 +128,7 @@ def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
     with pytest.raises(
         UserError, match=r"format is 'nuscenes', expected .*kradar, toy"
     ):
-        Data.open(config, models.build(config.model), Sources(data=("/",)).paths())
+        Data.open(config, models.build(config.model))
 
 
 @pytest.mark.slow
@@ -140,8 +139,9 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     mesh = distributed.make_mesh(1)
     monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
-    sources = Sources(data=(str(root),))
-    experiment.run(_config(), name="toy", workdir=folder, sources=sources)
+    config = _config()
+    config.data.roots = (str(root),)
+    experiment.run(config, name="toy", workdir=folder)
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     assert np.isfinite([row[name] for name in ("focal", "gwd", "height")]).all()

@@ -25,7 +25,6 @@ from radejax.models import build
 from radejax.runs import experiment
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.evaluate import evaluate_run
-from radejax.runs.sources import DataPaths, Sources
 from radejax.training import distributed
 from radejax.weights import image_backbone
 
@@ -66,14 +65,14 @@ class _Data:
     backbone: pathlib.Path
     runs: pathlib.Path
 
-    def train(self, name, config=None, init_from=None, **sources):
+    def train(self, name, config=None, init_from=None, **paths):
         config = small_config() if config is None else config
+        config.data.update(paths, roots=(str(self.folder),))
         workdir = self.runs / name
         experiment.run(
             config,
             name=name,
             workdir=workdir,
-            sources=Sources(data=(str(self.folder),), **sources),
             init_from=init_from,
         )
         return workdir
@@ -86,7 +85,7 @@ class _Data:
 def opened(workdir):
     """Model and data of a run."""
     loaded = load_model(workdir)
-    return loaded, data_of_run(loaded, workdir)[1]
+    return loaded, data_of_run(loaded)[1]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -157,8 +156,8 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     assert reports[0]["ap"] == reports[1]["ap"]
     other = shutil.copytree(data.folder, tmp_path / "other")
     with pytest.raises(UserError, match="give --image-backbone FOLDER, or --embedd"):
-        evaluate_run(workdir, other=Sources(data=(str(other),)))
-    given = Sources(data=(str(other),), embeddings=str(embeddings))
+        evaluate_run(workdir, other={"roots": (str(other),)})
+    given = {"roots": (str(other),), "embeddings": str(embeddings)}
     evaluate_run(workdir, other=given, num_visualizations=0)
     report = json.loads((workdir / "evaluation_other/metrics.json").read_text())
     assert report["ap"] == reports[0]["ap"]
@@ -221,15 +220,17 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
     config.model.image.standardize = False
     with pytest.raises(UserError, match=r"standardize is True there and False here"):
         open_embeddings(embeddings, config.model.image)
-    paths = DataPaths((str(data.folder),), None, "records", str(embeddings))
+    paths = {"roots": (str(data.folder),), "embeddings": str(embeddings)}
     config = small_config()
+    config.data.update(paths)
     config.data.mirror_probability = 0.5
     with pytest.raises(UserError, match="cannot be mirrored"):
-        Data.open(config, build(config.model), paths)
+        Data.open(config, build(config.model))
     config = small_config()
+    config.data.update(paths)
     config.model.image.freeze = False
     with pytest.raises(UserError, match="freeze is False"):
-        Data.open(config, build(config.model), paths)
+        Data.open(config, build(config.model))
     with pytest.raises(FileNotFoundError, match="radejax embed"):
         open_embeddings(tmp_path)
     (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
@@ -379,7 +380,7 @@ def test_example_compares_on_another_data_set(
 ):
     run = shutil.copytree(from_images, tmp_path / "run")
     other = shutil.copytree(data.folder, tmp_path / "other")
-    for data in (None, Sources(data=(str(other),))):
+    for data in (None, {"roots": (str(other),)}):
         evaluate_run(run, num_visualizations=0, other=data)
     results = []
     monkeypatch.chdir(other)
@@ -400,7 +401,7 @@ def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
     for image in other.rglob("cam-front*.png"):
         image.unlink()
     with pytest.raises(UserError, match=r"no frame of the test split .* front image"):
-        evaluate_run(from_images, other=Sources(data=(str(other),)))
+        evaluate_run(from_images, other={"roots": (str(other),)})
     assert not (other / "records").exists()
 
 

@@ -50,7 +50,7 @@ def embed(
     from radejax.core.config import load_config
     from radejax.data.kradar import KRadar
     from radejax.inference.embed import embed_dataset
-    from radejax.runs.data import existing_roots
+    from radejax.runs.data import located, simulate_missing
     from radejax.weights.image_backbone import load_image_backbone
 
     entry.set_up_jax()
@@ -58,8 +58,15 @@ def embed(
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
     assert variables is not None  # as there is a path
-    places = roots or existing_roots(settings.get("simulation"), ())
-    frames = KRadar(places, labels, version=settings.data.label_version, **part)
+    if not roots:
+        settings = located(settings)
+        simulate_missing(settings)
+    frames = KRadar(
+        roots or settings.data.roots,
+        labels,
+        version=settings.data.label_version,
+        **part,
+    )
     counts = embed_dataset(
         model,
         variables,

@@ -112,23 +112,23 @@ def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     Example: radejax evaluate runs/quickstart
     """
     from radejax.runs.evaluate import evaluate_run
-    from radejax.runs.sources import Sources
 
     workdir = flags["run"] or flags["workdir"]
     if workdir is None:
         raise UserError("give the workdir of a run: radejax evaluate RUN")
     typed = click.core.ParameterSource.COMMANDLINE
-    given = [name for name in _OTHER if ctx.get_parameter_source(name or "") is typed]
-    if "data" in given and not flags["data"]:
+    source = ctx.get_parameter_source
+    if source("data") is typed and not flags["data"]:
         raise UserError("--data names no folder")
-    other: dict[str, Any] = {str(name): flags[str(name)] for name in _OTHER}
-    other |= {name: other[name] or () for name in ("sequences", "weather")}
+    other = {str(name): flags[str(name)] for name in _OTHER if flags[str(name)]}
+    if "data" in other:
+        other["roots"] = other.pop("data")
     entry.set_up_jax()
     report = evaluate_run(
         workdir,
         step=flags["checkpoint"],
         run=flags["name"],
-        other=Sources(**other) if given else None,
+        other=other or None,
         **{n: flags[n] for n in ("split", "out", "image_backbone", "shuffle_images")},
         **_scoring(flags, "min_score", "batch_size", "num_visualizations"),
     )

@@ -94,6 +94,7 @@ def train(
     *,
     config: str,
     workdir: str | None,
+    data: tuple[str, ...],
     sequence_numbers: tuple[int, ...] | None,
     weather: tuple[str, ...] | None,
     init_from: str | None,
@@ -105,7 +106,7 @@ def train(
     process_id: int | None,
     debug: bool,
     as_json: bool,
-    **sources: Any,
+    **paths: Any,
 ) -> None:
     """Train a detector, then evaluate it.
 
@@ -119,21 +120,17 @@ def train(
     """
     from radejax.core.config import config_name, load_config, override
     from radejax.runs.experiment import run, run_seeds
-    from radejax.runs.sources import Sources
 
     settings = load_config(config)
     override(settings, ctx.meta["fields"])
-    if sequence_numbers is not None:
-        settings.data.sequences = sequence_numbers
-    if weather is not None:
-        settings.data.weather = weather
+    paths |= {"roots": data, "sequences": sequence_numbers, "weather": weather}
+    settings.data.update({name: value for name, value in paths.items() if value})
     entry.set_up_jax()
     place = coordinator, num_processes, process_id
     if distributed or place != (None,) * 3:
         entry.join_processes(*place)
     given: dict[str, Any] = {
         "name": config_name(config),
-        "sources": Sources(**sources),
         "workdir": workdir,
         "init_from": init_from,
         "profile": profile or "",

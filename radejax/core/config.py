@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import difflib
 import importlib.util
+import json
 import os
 import pathlib
 import types
@@ -107,6 +108,20 @@ def load_config(path_and_options: str) -> ConfigDict:
         raise UserError(f"{path} has no function get_config()")
     config = get_config(options) if options else get_config()
     return config.lock()
+
+
+DATA_PATHS = (
+    *("roots", "labels", "records", "embeddings", "image_backbone"),
+    "camera_calibration",
+)
+"""Fields of `config.data` that differ from machine to machine."""
+
+
+def without_data_paths(config: ConfigDict) -> dict[str, Any]:
+    """Plain values of a config whose data paths are empty."""
+    values = json.loads(config.to_json())
+    empty: dict[str, Any] = {**dict.fromkeys(DATA_PATHS), "roots": []}
+    return {**values, "data": {**values["data"], **empty}}
 
 
 def base_config() -> ConfigDict:
@@ -274,6 +289,15 @@ def _data() -> ConfigDict:
     return ConfigDict(
         {
             "format": "kradar",
+            # Folders of the dataset; () for what `config.simulation` describes.
+            "roots": (),
+            "labels": placeholder(str),  # folder or zip of a revision; else the roots'
+            "records": placeholder(
+                str
+            ),  # folder of projections; else in the first root
+            "embeddings": placeholder(str),  # folder of `radejax embed`, for images
+            "image_backbone": placeholder(str),  # its weights, see training.md
+            "camera_calibration": placeholder(str),  # folder; else the roots'
             "label_version": "v2.1",
             "visibility": ("R",),  # what the radar can see
             "include_unstarred_v11_labels": False,  # v1.1 lines without a *, as released

@@ -185,7 +185,7 @@ def detect_files(
     saved, out = detector.saved, pathlib.Path(out)
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or (saved.run.get("data") or {}).get("labels")
+        labels = labels or saved.config.data.labels
         known = front_images(frames, detector, labels, saved.config.data.label_version)
     out.mkdir(parents=True, exist_ok=True)
     if file_format == "kitti":

@@ -30,7 +30,7 @@ from ml_collections import ConfigDict
 import radejax
 from radejax import models
 from radejax.core import files
-from radejax.core.config import base_config
+from radejax.core.config import base_config, without_data_paths
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES
@@ -206,7 +206,7 @@ def save_model(
     description = {
         "format": FORMAT,
         "radejax": radejax.__version__,
-        "config": json.loads(saved.config.to_json()),
+        "config": without_data_paths(saved.config),
         "grid": saved.grid.to_dict(),
         "left_out": [f"params/{IMAGE_BACKBONE}"] if is_incomplete else [],
         "sha256": {k: hashlib.sha256(v).hexdigest() for k, v in contents.items()},
@@ -298,9 +298,8 @@ def _find_backbone(saved: SavedModel, given: PathLike | None) -> dict[str, Any]:
 
     In this order: what is given, what the run was trained with, what it started from.
     """
-    data = saved.run.get("data") or {}
-    embeddings, start = data.get("embeddings"), saved.run.get("init_from")
-    source = given or data.get("image_backbone")
+    data, start = saved.config.data, saved.run.get("init_from")
+    embeddings, source = data.embeddings, given or data.image_backbone
     if given is None and source is not None and not pathlib.Path(source).exists():
         _log.warning(
             "image backbone weights not found at %s; the model accepts embedded images "

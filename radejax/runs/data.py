@@ -9,7 +9,8 @@ import hashlib
 import json
 import logging
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import flax.linen as nn
 import grain
@@ -18,7 +19,8 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from radejax import models
-from radejax.core.errors import DataError, UserError
+from radejax.core.config import DATA_PATHS
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import (
@@ -41,7 +43,6 @@ from radejax.data.records import (
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import SavedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.runs.sources import DataPaths, Sources, check_folders
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
 
@@ -53,20 +54,18 @@ class Data:
     """Frames, records and cameras of a run, opened once.
 
     Attributes:
-        paths: Where they are.
-        frames: All of them, with the labels that the config asks for.
+        options: `config.data`, see `located`.
+        frames: All frames, with the labels that the config asks for.
         classes: Names in the order of the class indices.
-        options: `config.data`.
-        camera: How images and calibrations are used; None for the radar alone.
+        camera: How images and calibrations are used; None for radar-only models.
         image_size: Height and width that the model takes, or None.
         features: Embedded images, or None.
-        grid: That the records must have; None takes any.
+        grid: Grid that the records must have; None takes any.
     """
 
-    paths: DataPaths
+    options: ConfigDict
     frames: LabelledFrames
     classes: tuple[str, ...]
-    options: ConfigDict
     camera: CameraOptions | None
     image_size: tuple[int, int] | None
     features: Records | None
@@ -74,52 +73,45 @@ class Data:
 
     @classmethod
     def open(
-        cls,
-        config: ConfigDict,
-        model: nn.Module,
-        paths: DataPaths,
-        grid: RadarGrid | None = None,
+        cls, config: ConfigDict, model: nn.Module, grid: RadarGrid | None = None
     ) -> Data:
-        """Reads the labels; nothing is written.
+        """Read the labels; nothing is written.
 
         Raises:
-            UserError: Embeddings are given and are of another backbone, or the model
+            UserError: Embeddings are given and another backbone made them, or the model
                 has none.
+            FileNotFoundError: A folder is missing.
         """
-        camera = features = None
+        options, camera, features = config.data, None, None
+        _require_folders(*options.roots, options.camera_calibration)
         if models.has_camera(model):
-            camera = CameraOptions.from_config(config.data)
-            if paths.embeddings is not None:
+            camera = CameraOptions.from_config(options)
+            if options.embeddings is not None:
                 check_embeddable(
-                    freeze=model.freeze,
-                    mirror_probability=config.data.mirror_probability,
+                    freeze=model.freeze, mirror_probability=options.mirror_probability
                 )
-                features = open_embeddings(paths.embeddings, config.model.image)
-        elif paths.embeddings is not None:
+                features = open_embeddings(options.embeddings, config.model.image)
+        elif options.embeddings is not None:
             raise UserError(
                 "embeddings are given, but config.model.name is "
                 f"{config.model.name!r}, which has no camera"
             )
-        frames = data_set(config.data.get("format", "kradar"))(
-            paths.roots,
-            paths.labels,
-            version=config.data.label_version,
-            visibility=config.data.visibility,
+        frames = data_set(options.format)(
+            options.roots,
+            options.labels,
+            version=options.label_version,
+            visibility=options.visibility,
             classes=config.classes,
-            camera_calibration=paths.camera_calibration,
+            camera_calibration=options.camera_calibration,
             common_camera=camera is not None and camera.calibration == "common",
-            # Runs of before are without these fields.
-            include_unstarred_v11_labels=config.data.get(
-                "include_unstarred_v11_labels", False
-            ),
-            sequence_numbers=config.data.get("sequences") or None,
-            weather=config.data.get("weather") or None,
+            include_unstarred_v11_labels=options.include_unstarred_v11_labels,
+            sequence_numbers=options.sequences or None,
+            weather=options.weather or None,
         )
         return cls(
-            paths=paths,
+            options=options,
             frames=frames,
             classes=tuple(config.classes),
-            options=config.data,
             camera=camera,
             image_size=None if camera is None else tuple(model.image_size),
             features=features,
@@ -136,7 +128,7 @@ class Data:
             DataError: No frame could be read.
         """
         report = distributed.main_only(
-            lambda: preprocess(self.frames, self.paths.records)
+            lambda: preprocess(self.frames, self.options.records)
         )
         if report is not None and report.skipped:
             _log.warning("%s", report.to_text())
@@ -144,7 +136,7 @@ class Data:
         self._skipped.update(f.key for f in self.frames if f.key not in keys)
         if len(self._skipped) == len(self.frames):
             raise DataError(
-                f"{', '.join(self.paths.roots)}: none of {len(self.frames)} frames has a "
+                f"{', '.join(self.options.roots)}: none of {len(self.frames)} frames has a "
                 "radar tensor that can be read"
             )
         self._splits.clear()
@@ -152,7 +144,7 @@ class Data:
     @functools.cached_property
     def records(self) -> Records:
         """Projections of the frames."""
-        return open_projections(self.paths.records, self.grid)
+        return open_projections(self.options.records, self.grid)
 
     @functools.cached_property
     def _skipped(self) -> set[str]:
@@ -184,8 +176,7 @@ class Data:
     def _part_of_train(self, name: str) -> LabelledFrames:
         """What the train split leaves to train on, or what is held out of it."""
         frames = self.frames.of_split("train")
-        # Runs of before are without these two fields.
-        chosen = self.options.get("validation") or ()
+        chosen = self.options.validation
         if name == "validation" and not chosen:
             raise UserError(
                 "there is no validation split: config.data.validation holds no sequences "
@@ -194,7 +185,7 @@ class Data:
         if not chosen or not len(frames):
             return frames
         numbers = {frame.sequence for frame in frames}
-        held = held_out(numbers, chosen, self.options.get("validation_seed", 0))
+        held = held_out(numbers, chosen, self.options.validation_seed)
         if name == "train":
             other, reason = set(held), "held out for validation"
         else:
@@ -205,7 +196,7 @@ class Data:
     @property
     def choosing_split(self) -> str:
         """By which the best checkpoint is chosen: "validation", "test" without one."""
-        return "validation" if self.options.get("validation") else "test"
+        return "validation" if self.options.validation else "test"
 
     def images(self, frames: FrameSequence) -> CameraInputs | None:
         """Images and cameras of frames; None for a model without a camera.
@@ -258,35 +249,89 @@ class Data:
         return make_loader(table, loader, augment=augment)
 
 
-def open_data(config: ConfigDict, model: nn.Module, sources: Sources) -> Data:
+def located(config: ConfigDict) -> ConfigDict:
+    """A copy of a config whose `config.data` has absolute paths, roots and records.
+
+    Raises:
+        UserError: Neither data nor a simulation is given.
+    """
+    config = config.copy_and_resolve_references()
+    roots = config.data.roots
+    is_list = not isinstance(roots, str) and all(roots)
+    require(is_list, "config.data.roots", roots, "a tuple of folders")
+    if "simulation" in config:
+        name, one = "config.data.roots", "one folder, as the config simulates it"
+        require(len(roots) <= 1, name, tuple(roots), one)
+        roots = roots or (_simulated_root(config.simulation),)
+    if not roots:
+        raise UserError(
+            "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
+            "config that simulates them, such as quickstart"
+        )
+    _set_paths(config.data, {**{n: config.data[n] for n in DATA_PATHS}, "roots": roots})
+    return config
+
+
+def _simulated_root(simulation: ConfigDict) -> str:
+    """Folder of a simulated dataset, named by its config."""
+    text = json.dumps(json.loads(simulation.to_json()), sort_keys=True)
+    return f"data/simulated-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _set_paths(options: ConfigDict, paths: Mapping[str, Any]) -> None:
+    """Set paths of `config.data`, made absolute, and where records are by default."""
+    absolute: dict[str, Any] = {
+        name: path and str(pathlib.Path(path).absolute())
+        for name, path in paths.items()
+        if name != "roots"
+    }
+    roots = tuple(str(pathlib.Path(root).absolute()) for root in paths["roots"])
+    absolute["records"] = absolute["records"] or str(pathlib.Path(roots[0], "records"))
+    with options.ignore_type():
+        options.update(absolute, roots=roots)
+
+
+def _require_folders(*paths: str | None) -> None:
+    """Raise `FileNotFoundError` for a folder that is missing; None is not looked for."""
+    for path in filter(None, paths):
+        if not pathlib.Path(path).is_dir():
+            raise FileNotFoundError(f"no such folder: {path}")
+
+
+def simulate_missing(config: ConfigDict) -> None:
+    """Simulate the dataset of a located config that has a `simulation` section."""
+    if "simulation" in config:
+        values, root = dict(config.simulation), config.data.roots[0]
+        distributed.main_first(lambda: simulate_dataset(values, root))
+
+
+def open_data(config: ConfigDict, model: nn.Module) -> Data:
     """Simulate if the config says so, preprocess what has no record yet, open all.
 
     One process of several writes before the others read, see `distributed.main_first`.
 
     Args:
-        config: Of the run.
+        config: Config of the run, see `located`.
         model: What `config.model` describes.
-        sources: What the user says of the data.
 
     Raises:
-        UserError: No data and nothing to simulate; the embeddings are of another
-            backbone; no space left.
-        FileNotFoundError: A folder that was named is not there.
+        UserError: Another backbone made the embeddings, or no space is left.
+        FileNotFoundError: A folder is missing.
     """
-    check_folders(filter(None, [sources.camera_calibration]))  # simulating takes long
-    roots = existing_roots(config.get("simulation"), sources.data)
-    data = Data.open(config, model, dataclasses.replace(sources, data=roots).paths())
+    _require_folders(config.data.camera_calibration)  # simulating takes long
+    simulate_missing(config)
+    data = Data.open(config, model)
     _log.info("%s", data.frames.summary().to_text())
     _check_bins(config.model, data)
     if count := len(data.split("train")):  # preprocessing takes long
         check_enough(count, config.train.batch_size)
     data.preprocess()
-    if config.data.get("validation"):
-        _tell_what_is_held_out(data)
+    if config.data.validation:
+        _log_held_out(data)
         if not config.train.evaluate_every_epochs:
             _log.info(
                 "config.train.evaluate_every_epochs is 0: nothing is chosen by them; "
-                "evaluate.py --split validation looks at them afterwards"
+                "evaluate.py --split validation evaluates on them afterwards"
             )
     return data
 
@@ -297,13 +342,13 @@ def _check_bins(model: ConfigDict, data: Data) -> None:
     if (model.doppler_bins, model.elevation_bins) != (doppler, elevation):
         raise UserError(
             f"config.model has {model.doppler_bins} Doppler and {model.elevation_bins} "
-            f"elevation bins, the radar of {', '.join(data.paths.roots)} {doppler} and "
+            f"elevation bins, the radar of {', '.join(data.options.roots)} {doppler} and "
             f"{elevation}; give --config.model.doppler_bins={doppler} "
             f"--config.model.elevation_bins={elevation}"
         )
 
 
-def _tell_what_is_held_out(data: Data) -> None:
+def _log_held_out(data: Data) -> None:
     """The sequences and their objects, with a warning for a class that they lack."""
     frames, num_left = data.split("validation"), len(data.split("train"))
     found = collections.Counter(cls for frame in frames for cls in frame.classes)
@@ -324,81 +369,56 @@ def _tell_what_is_held_out(data: Data) -> None:
 
 
 def data_of_run(
-    loaded: SavedModel, workdir: pathlib.Path, other: Sources | None = None
+    saved: SavedModel, changes: Mapping[str, Any] | None = None
 ) -> tuple[ConfigDict, Data]:
-    """A run's data, or others in their place, and its config with their label version.
+    """The config of a run with changes of `config.data`, and these data.
 
-    Nothing is projected.
+    Other roots have labels, records, embeddings and calibrations of their own, and are
+    taken whole, unless `changes` say otherwise. Nothing is preprocessed.
 
     Raises:
         UserError: The run has no data and none are given; they are of another radar
             grid, or without what a frozen image backbone makes of their images.
-        FileNotFoundError: A folder is not there.
+        FileNotFoundError: A folder is missing.
     """
-    config, own = loaded.config, loaded.run.get("data")
-    own = own and DataPaths.from_dict(own)
-    paths = own if other is None else other.paths(own)
-    if paths is None:
+    config = saved.config.copy_and_resolve_references()
+    options, changes = config.data, dict(changes or {})
+    paths = {name: options[name] for name in DATA_PATHS}
+    roots = tuple(changes.get("roots") or options.roots)
+    if [str(pathlib.Path(root).absolute()) for root in roots] != list(options.roots):
+        paths = dict.fromkeys(DATA_PATHS)
+        changes = {"sequences": (), "weather": (), **changes}
+    if not roots:
         raise UserError(
-            f"{workdir}: trained on frames that were never written, there is no "
-            "split to evaluate on; give --data ROOT, or use `radejax detect`"
+            "the model was trained on frames that were never written, there is no split "
+            "to evaluate on; give --data ROOT, or use `radejax detect`"
         )
-    if other is not None:
-        config = config.copy_and_resolve_references()
-        if other.label_version is not None:
-            config.data.label_version = other.label_version
-        is_own = own is not None and paths.roots == own.roots
-        for name in ("sequences", "weather"):
-            if (part := getattr(other, name)) or not is_own:
-                config.data[name] = tuple(part)
-        is_blind = models.has_camera(loaded.model) and (
-            IMAGE_BACKBONE not in loaded.variables["params"]
-        )
-        if is_blind and paths.embeddings is None:
-            raise UserError(
-                f"{workdir} is without the weights of its image backbone: give "
-                "--image-backbone FOLDER, or --embeddings FOLDER of these images"
-            )
-    data = Data.open(config, loaded.model, paths, grid=loaded.grid)
-    if other is not None and data.frames.grid != loaded.grid:
+    with options.ignore_type():
+        options.update({k: v for k, v in changes.items() if k not in DATA_PATHS})
+    given = {k: v for k, v in changes.items() if k in DATA_PATHS}
+    _set_paths(options, {**paths, **given, "roots": roots})
+    has_backbone = IMAGE_BACKBONE in saved.variables["params"]
+    is_blind = models.has_camera(saved.model) and not has_backbone
+    if changes and is_blind and options.embeddings is None:
         raise UserError(
-            f"{', '.join(paths.roots)}: the radar has {describe_grid(data.frames.grid)}, "
-            f"{workdir} was trained on {describe_grid(loaded.grid)}"
+            "the run is without the weights of its image backbone: give "
+            "--image_backbone FOLDER, or --embeddings FOLDER of these images"
+        )
+    data = Data.open(config, saved.model, saved.grid)
+    if data.frames.grid != saved.grid:
+        raise UserError(
+            f"{', '.join(options.roots)}: the radar has "
+            f"{describe_grid(data.frames.grid)}, the model was trained on "
+            f"{describe_grid(saved.grid)}"
         )
     return config, data
 
 
-def existing_roots(
-    simulation: ConfigDict | None, roots: Sequence[str]
-) -> Sequence[str]:
-    """Folders of the data, those of a config that simulates them made if missing.
-
-    Args:
-        simulation: `config.simulation`; None for real data.
-        roots: What the user says.
-
-    Raises:
-        UserError: Neither is there.
-    """
-    if simulation is not None:
-        root = _simulated_root(simulation, roots)
-        values = dict(simulation)
-        distributed.main_first(lambda: simulate_dataset(values, root))
-        return (root,)
-    if not roots:
-        raise UserError(
-            "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
-            "config that simulates them, such as quickstart"
-        )
-    return roots
-
-
-def _simulated_root(simulation: ConfigDict, data: Sequence[str]) -> str:
-    """Folder of a simulated data set, named by its config where none is given."""
-    if not data:
-        text = json.dumps(json.loads(simulation.to_json()), sort_keys=True)
-        digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-        return str(pathlib.Path("data") / f"simulated-{digest}")
-    if len(data) != 1:
-        raise UserError(f"a simulated data set has one folder, got {list(data)}")
-    return data[0]
+def data_name(changes: Mapping[str, Any]) -> str:
+    """Name of results on other data: folder, labels, sequences and weather."""
+    parts = [pathlib.Path(path).resolve().name for path in changes.get("roots", ())[:1]]
+    if changes.get("labels") is not None:
+        parts.append(pathlib.Path(changes["labels"]).resolve().stem)
+    for name in ("sequences", "weather"):
+        parts.append("-".join(map(str, changes.get(name, ()))))
+    return "_".join(filter(None, parts)) or "other"

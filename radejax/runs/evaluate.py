@@ -15,6 +15,7 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core import files
+from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
@@ -26,8 +27,7 @@ from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import figures
-from radejax.runs.data import Data, data_of_run
-from radejax.runs.sources import Sources
+from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ def evaluate_run(
     out: PathLike | None = None,
     image_backbone: PathLike | None = None,
     shuffle_images: int | None = None,
-    other: Sources | None = None,
+    other: Mapping[str, Any] | None = None,
     run: str | None = None,
     **changes: Any,
 ) -> Report | None:
@@ -138,7 +138,7 @@ def evaluate_run(
         shuffle_images: Seed; every frame gets the image and camera of another one, a
             sanity check of what a radar-camera model takes from the images. The default
             `out` then ends in `_shuffled`.
-        other: Other data than the run's own; preprocessed if they are not yet.
+        other: Fields of `config.data` to replace, such as `{"roots": ("/data",)}`.
         run: Name of the run in the report; that of the workdir if None.
         **changes: Fields of `EvaluationOptions` to replace.
 
@@ -155,10 +155,10 @@ def evaluate_run(
     if not loaded.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
     options = EvaluationOptions.from_config(loaded.config, **changes)
-    config, data = data_of_run(loaded, workdir, other)
+    config, data = data_of_run(loaded, other)
     # Other labels may have been given.
     options = dataclasses.replace(options, label_version=config.data.label_version)
-    name = "evaluation" if other is None else f"evaluation_{other.name}"
+    name = "evaluation" if other is None else f"evaluation_{data_name(other)}"
     name += "_validation" if split == "validation" else ""
     name += "" if shuffle_images is None else "_shuffled"
     run = run or workdir.name
@@ -198,11 +198,11 @@ def source_of(
         "split": split,
         "shuffle_images": shuffle_images,
         "label_version": data.options.label_version,
-        "sequences": list(data.options.get("sequences") or ()),
-        "weather": list(data.options.get("weather") or ()),
+        "sequences": list(data.options.sequences),
+        "weather": list(data.options.weather),
         "simulated": data.frames.is_simulated,
-        **dataclasses.asdict(data.paths),
-        "roots": list(data.paths.roots),  # as JSON has them
+        **{name: data.options[name] for name in DATA_PATHS},
+        "roots": list(data.options.roots),  # as JSON has them
     }
 
 
@@ -225,7 +225,9 @@ def _frames(
     """Frames of a split, and the same as the model is to see them."""
     frames = data.split(None if split == "all" else split)
     if not len(frames):
-        raise UserError(f"no frames of split {split} in {', '.join(data.paths.roots)}")
+        raise UserError(
+            f"no frames of split {split} in {', '.join(data.options.roots)}"
+        )
     if shuffle_images is None:
         return frames, frames
     if data.camera is None:

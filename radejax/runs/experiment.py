@@ -2,8 +2,9 @@
 
 The workdir of a run contains
 
-config.json      the configuration; it never changes after the first checkpoint
-run.json         paths of the data, versions, command
+config.json      the configuration without the paths of the data, which checkpoints
+                 contain; it never changes after the first checkpoint
+run.json         versions, command, weights that training started from
 checkpoints/     newest, best and last, by step
 metrics.jsonl    losses by step; tensorboard/ has the same
 evaluation/      metrics.json, metrics.csv, tables, figures of the last evaluation;
@@ -15,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import dataclasses
 import hashlib
 import json
 import logging
@@ -34,15 +34,15 @@ from tabulate import tabulate
 import radejax
 from radejax import models
 from radejax.core import files
+from radejax.core.config import without_data_paths
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.data.dataset import FrameSequence
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import StartingWeights, starting_weights
 from radejax.runs import checks
-from radejax.runs.data import Data, open_data
+from radejax.runs.data import Data, located, open_data
 from radejax.runs.evaluate import evaluate
-from radejax.runs.sources import DataPaths, Sources, saved_path
 from radejax.runs.validation import Validation
 from radejax.training import distributed, loop
 
@@ -53,7 +53,6 @@ def run(
     config: ConfigDict,
     *,
     name: str,
-    sources: Sources = Sources(),  # noqa: B008, frozen
     workdir: PathLike | None = None,
     init_from: PathLike | None = None,
     profile: PathLike = "",
@@ -63,8 +62,6 @@ def run(
     Args:
         config: Complete configuration of one seed; `run_seeds` takes several.
         name: Of the config, for the default workdir.
-        sources: Paths of the data; without any they are simulated if the config has a
-            `simulation` section.
         workdir: `runs/<name>` if None.
         init_from: Weights to start from: official .pth file or another workdir.
         profile: Folder for a trace of the steps `config.logging.profile_steps`.
@@ -77,19 +74,21 @@ def run(
             another configuration or is in use, no data, or no space.
     """
     checks.check(config)
+    config = located(config)
     distributed.check_batch_size(config.train.batch_size, distributed.make_mesh())
     model = models.build(config.model)
     folder = default_workdir(workdir, name)
     with claimed(folder, config):
         weights = starting_weights(
-            config.model, init_from, sources.image_backbone, sources.embeddings
+            *(config.model, init_from),
+            *(config.data.image_backbone, config.data.embeddings),
         )
-        data = open_data(config, model, sources)
+        data = open_data(config, model)
         has_test = len(data.split("test")) > 0
         if not has_test:
             _log.warning(
                 "no frames of the test split in %s: the run is trained and not evaluated",
-                ", ".join(data.paths.roots),
+                ", ".join(data.options.roots),
             )
         result = _train(model, weights, data, folder, config, str(profile))
         if not result.finished:
@@ -122,10 +121,10 @@ def _train(
     frames = data.split("train")
     if not len(frames):
         raise UserError(
-            f"no frames of the train split in {', '.join(data.paths.roots)}"
+            f"no frames of the train split in {', '.join(data.options.roots)}"
         )
     loader = data.training_batches(frames, config.train, config.seed)
-    info = run_info(folder, data.paths, weights.source)
+    info = run_info(folder, weights.source)
     if distributed.is_main():
         files.write_json(folder / "run.json", info)
     validation = None
@@ -183,7 +182,7 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
         path.unlink(missing_ok=True)
     files.claim(
         path,
-        json.loads(config.to_json()),
+        without_data_paths(config),
         "a run with another config",
         fix="give another --workdir, or remove that one",
         name="config",
@@ -192,18 +191,17 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
 
 
 def run_info(
-    workdir: pathlib.Path, paths: DataPaths, init_from: PathLike | None = None
+    workdir: pathlib.Path, init_from: PathLike | None = None
 ) -> dict[str, Any]:
-    """Paths and versions of a run; plain values.
+    """Versions, command and starting weights of a run; plain values.
 
     A run that continues keeps the weights that it started from.
     """
-    init_from = saved_path(init_from)
+    init_from = init_from and str(pathlib.Path(init_from).absolute())
     if init_from is None and (workdir / "run.json").exists():
         saved = files.read_object(workdir / "run.json")
         init_from = saved.get("init_from")
     return {
-        "data": dataclasses.asdict(paths),
         "init_from": init_from,
         "versions": {
             "radejax": radejax.__version__,

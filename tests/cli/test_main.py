@@ -131,7 +131,7 @@ def test_evaluate_takes_flags_as_its_script_does(
     assert "Written to there" in _run("evaluate", "--workdir", "run", *flags).output
     ((workdir, step, other),) = seen
     assert (workdir, step) == ("run", "best")
-    assert (other.data, other.label_version) == (("a", "b", "c"), "v1.0")
+    assert other == {"roots": ("a", "b", "c"), "label_version": "v1.0"}
     _run("evaluate", "--workdir=run", "--split=train")
     assert seen[1] == ("run", None, None)
     flags = "--roi=0,50,-5,5,-2,6 --min-score=0.01 --iou=0.5 --classes Sedan --name n"

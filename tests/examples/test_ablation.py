@@ -38,8 +38,8 @@ class _Runs:
         self.simulated.add((root.name, json.dumps(simulation)))
         return root
 
-    def run(self, config: Any, *, name: str, sources: Any, workdir: Any) -> None:
-        self.trained.append((name, config, sources))
+    def run(self, config: Any, *, name: str, workdir: Any) -> None:
+        self.trained.append((name, config))
         if name != self.stops_at:
             (workdir / "evaluation").mkdir(parents=True)
             (workdir / "evaluation" / "metrics.json").write_text("{}")
@@ -78,7 +78,7 @@ def test_what_is_missing_is_run_and_judged(
     runs.stops_at = None
     text = _call(tmp_path, "--seeds", "0,4")
     assert "12 of 12 cells are done" in text
-    names = [(name, config.seed) for name, config, _ in runs.trained]
+    names = [(name, config.seed) for name, config in runs.trained]
     cells = list(ablation.STUDIES["sigma"].cells)
     assert names == [(n, 0) for n in [*cells[:4], *cells[3:]]] + [(n, 4) for n in cells]
     # Scenes are those of the seed, the same for all cells; no cell is trained on those
@@ -91,8 +91,8 @@ def test_what_is_missing_is_run_and_judged(
     assert len(runs.simulated) == 3
     seeds = {n: json.loads(text)["seed"] for n, text in runs.simulated}
     assert len(set(seeds.values())) == 3
-    for _, config, sources in runs.trained:
-        assert sources.data[0].endswith(f"quickstart-640-seed{config.seed}")
+    for _, config in runs.trained:
+        assert config.data.roots[0].endswith(f"quickstart-640-seed{config.seed}")
         assert config.simulation.seed == config.seed
 
     content = json.loads((tmp_path / "table_sigma.json").read_text())
@@ -122,7 +122,7 @@ def test_each_of_several_processes_has_seeds_of_its_own(
     with files.lock(tmp_path / "seed0.lock", "of another"):
         text = _call(tmp_path, "--seeds", "0,4")
     assert "seed 0: another process is at it" in text
-    assert {config.seed for _, config, _ in runs.trained} == {4}
+    assert {config.seed for _, config in runs.trained} == {4}
     assert "12 of 12 cells are done" in _call(tmp_path, "--seeds", "0,4")
 
 

@@ -11,7 +11,6 @@ from radejax import Detector
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.runs.evaluate import evaluate_run
-from radejax.runs.sources import Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints
@@ -64,13 +63,13 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     with pytest.raises(UserError, match=r"never written, .* give --data ROOT"):
         evaluate_run(whole)
     data = simulate_dataset(_config().simulation, tmp_path / "data", progress=False)
-    evaluate_run(whole, other=Sources(data=(str(data),)), num_visualizations=0)
+    evaluate_run(whole, other={"roots": (str(data),)}, num_visualizations=0)
     assert (whole / "evaluation_data" / "metrics.json").exists()
     finer = default_config() | {"train_sequences": 0, "test_sequences": 1}
     finer |= {"frames_per_sequence": 1, "output": "projection"}
     data = simulate_dataset(finer, tmp_path / "finer", progress=False)
     with pytest.raises(UserError, match=r"the radar has 16 x 64 .* trained on 4 x 16"):
-        evaluate_run(whole, other=Sources(data=(str(data),)))
+        evaluate_run(whole, other={"roots": (str(data),)})
     assert not (data / "records").exists()
     rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
     assert len({row["focal"] for row in rows if "focal" in row}) == 4

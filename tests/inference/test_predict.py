@@ -17,7 +17,6 @@ from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
 from radejax.runs.data import Data
 from radejax.runs.evaluate import make_detector
-from radejax.runs.sources import DataPaths
 from radejax.runs.validation import Validation
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import distributed
@@ -49,10 +48,9 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     config.evaluation.update(score_threshold=0.45, batch_size=3)
     config.logging.num_visualizations = 1
     model = models.build(config.model)
-    data = Data.open(
-        config, model, DataPaths((str(root),), None, str(folder / "records"))
-    )
-    preprocess(data.frames, data.paths.records, num_workers=0, progress=False)
+    config.data.update(roots=(str(root),), records=str(folder / "records"))
+    data = Data.open(config, model)
+    preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records
     variables = drawn(model, np.zeros((1, *records.grid.projection_shape)))
     return SimpleNamespace(

@@ -1,46 +1,65 @@
 """Data folders of a run: found, checked, projected once."""
 
-import dataclasses
 import pathlib
 import shutil
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.records import preprocess
-from radejax.runs.data import (
-    Data,
-    data_of_run,
-    open_data,
-)
-from radejax.runs.sources import DataPaths, Sources
+from radejax.runs.data import Data, data_name, data_of_run, located, open_data
 from radejax.simulation.dataset import default_config, simulate_dataset
+
+
+def _located(model: Any = None, **paths: Any) -> Any:
+    config = base_config()
+    config.data.update(paths)
+    return located(config)
 
 
 def test_without_data_and_simulation_the_flag_is_named() -> None:
     with pytest.raises(UserError, match=r"give --data ROOT"):
-        open_data(base_config(), None, Sources())
+        _located()
 
 
-@pytest.mark.parametrize("missing", ["data", "camera_calibration"])
+@pytest.mark.parametrize("missing", ["roots", "camera_calibration"])
 def test_a_missing_folder_is_named(missing: str, tmp_path: pathlib.Path) -> None:
-    nowhere = str(tmp_path / "nowhere")
-    given = {"data": (str(tmp_path),)} | {
-        missing: (nowhere,) if missing == "data" else nowhere
-    }
+    nowhere: Any = str(tmp_path / "nowhere")
+    given = {"roots": (str(tmp_path),)}
+    given[missing] = (nowhere,) if missing == "roots" else nowhere
+    config = _located(**given)
     with pytest.raises(FileNotFoundError, match=r"no such folder: .*nowhere"):
-        open_data(base_config(), None, Sources(**given))
+        open_data(config, models.build(config.model))
 
 
-@pytest.mark.parametrize("data", [[""], "/data/kradar"])
-def test_no_list_of_folders_is_an_error(data: object) -> None:
-    with pytest.raises(UserError, match="must be a list of folders"):
-        open_data(base_config(), None, Sources(data=data))
+def test_no_list_of_folders_is_an_error() -> None:
+    with pytest.raises(UserError, match=r"roots is \('',\), expected a tuple of fold"):
+        _located(roots=("",))
+
+
+def test_paths_are_absolute_and_simulations_named_by_their_config(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = base_config()
+    config.simulation = ConfigDict(default_config())
+    config.data.labels = "v2.zip"
+    here = located(config).data
+    (root,) = here.roots
+    assert root.startswith(str(tmp_path / "data" / "simulated-"))
+    assert here.records == f"{root}/records"
+    assert here.labels == str(tmp_path / "v2.zip")
+    config.simulation.seed += 1
+    assert located(config).data.roots != here.roots
+    config.data.roots = ("a", "b")
+    with pytest.raises(UserError, match="expected one folder, as the config simulates"):
+        located(config)
 
 
 def test_frames_are_projected_beside_their_data_once(
@@ -55,9 +74,10 @@ def test_frames_are_projected_beside_their_data_once(
     monkeypatch.chdir(tmp_path)
 
     def prepare() -> Data:
-        return open_data(config, models.build(config.model), Sources(data=("sim",)))
+        return open_data(located(config), models.build(config.model))
 
     config = base_config()
+    config.data.roots = ("sim",)
     with pytest.raises(
         UserError, match=r"64 Doppler.*doppler_bins=16 --config.model.elev"
     ):
@@ -68,9 +88,8 @@ def test_frames_are_projected_beside_their_data_once(
     assert not (tmp_path / "sim" / "records").exists()
     config.train.batch_size = 2
     data = prepare()
-    paths = data.paths
-    assert paths.roots == (str(tmp_path / "sim"),)
-    assert paths.records == str(tmp_path / "sim" / "records")
+    assert data.options.roots == (str(tmp_path / "sim"),)
+    assert data.options.records == str(tmp_path / "sim" / "records")
     assert len(data.records.keys()) == 4
     assert len(data.split("test")) == 2
 
@@ -80,25 +99,9 @@ def test_frames_are_projected_beside_their_data_once(
 
     before = written()
     assert "preprocess: 100%" in capsys.readouterr().err
-    assert prepare().paths == paths
+    prepare()
     assert "preprocess" not in capsys.readouterr().err
     assert written() == before
-
-
-def test_other_data_keep_what_the_run_had_of_the_same_folders(
-    tmp_path: pathlib.Path,
-) -> None:
-    own = DataPaths((str(tmp_path),), "l", "/fast/records", embeddings="/embeddings")
-    for data in ((), (str(tmp_path),)):
-        found = Sources(data=data, labels=str(tmp_path / "v2.zip")).paths(own)
-        assert found.records == "/fast/records"
-        assert found.embeddings == "/embeddings"
-        assert found.labels == str(tmp_path / "v2.zip")
-    (tmp_path / "b").mkdir()
-    other = Sources(data=(str(tmp_path / "b"),)).paths(own)
-    assert other == DataPaths((str(tmp_path / "b"),), None, str(tmp_path / "b/records"))
-    with pytest.raises(UserError, match="must be a list of folders"):
-        Sources(labels="x").paths(None)
 
 
 def test_results_on_other_data_are_named_by_folder_and_labels(
@@ -106,17 +109,19 @@ def test_results_on_other_data_are_named_by_folder_and_labels(
 ) -> None:
     (tmp_path / "kradar").mkdir()
     monkeypatch.chdir(tmp_path / "kradar")
-    assert Sources(data=("..",)).name == tmp_path.name
-    assert Sources(data=(".",)).name == "kradar"
-    assert Sources(data=("/a/b", "/c"), labels="/x/v1.zip").name == "b_v1"
-    assert Sources(labels="/x/v1.zip").name == "v1"
-    assert Sources(label_version="v1.1").name == "other"
+    assert data_name({"roots": ("..",)}) == tmp_path.name
+    assert data_name({"roots": (".",)}) == "kradar"
+    assert data_name({"roots": ("/a/b", "/c"), "labels": "/x/v1.zip"}) == "b_v1"
+    assert data_name({"labels": "/x/v1.zip"}) == "v1"
+    assert data_name({"label_version": "v1.1"}) == "other"
     part = {"sequences": (1, 58), "weather": ("fog",)}
-    assert Sources(data=("/a/b",), **part).name == "b_1-58_fog"
+    assert data_name({"roots": ("/a/b",), **part}) == "b_1-58_fog"
 
 
 def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
-    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+    tmp_path: pathlib.Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     simulation = default_config()
     simulation.update(train_sequences=2, test_sequences=1, frames_per_sequence=2)
@@ -130,40 +135,50 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
     preprocess(frames, root / "records", progress=False)
     config.train.batch_size = 1
     config.model.update(doppler_bins=16, elevation_bins=9)
-    model, sources = models.build(config.model), Sources(data=(str(root),))
+    config.data.roots = (str(root),)
+    model = models.build(config.model)
     with caplog.at_level("WARNING", "radejax"):
-        data = open_data(config, model, sources)
+        data = open_data(located(config), model)
     assert "6 frames: 5 were done, 0 preprocessed, 1 skipped" in caplog.text
     assert damaged.key not in [frame.key for frame in data.split("train")]
     assert len(data.split(None)) == len(data.records.keys()) == 5
     config.data.sequences = (1, 3)
-    part = open_data(config, model, sources)  # the same records
+    part = open_data(located(config), model)  # the same records
     assert {frame.sequence for frame in part.frames} == {1, 3}
     assert len(part.split(None)) == 3
 
     # Of a run: its own part, another one, and all of other folders.
-    shutil.copytree(root, tmp_path / "copy")
-    run = {"data": dataclasses.asdict(data.paths)}
-    loaded = SimpleNamespace(config=config, run=run, model=model, grid=frames.grid)
-    loaded.variables = {"params": {}}
+    copy = str(shutil.copytree(root, tmp_path / "copy"))
+    own = located(config)
+    own.data.update(labels=str(tmp_path / "l"), embeddings="/embeddings")
+    saved = SimpleNamespace(config=own, model=model, grid=frames.grid)
+    saved.variables = {"params": {}}
+    monkeypatch.setattr(Data, "open", lambda *_: SimpleNamespace(frames=frames))
+    chosen, _ = data_of_run(saved, {"roots": (str(root),), "label_version": "v2.0"})
+    assert (chosen.data.embeddings, chosen.data.sequences) == ("/embeddings", (1, 3))
+    assert (chosen.data.label_version, own.data.label_version) == ("v2.0", "v2.1")
+    chosen, _ = data_of_run(saved, {"roots": (copy,)})
+    assert (chosen.data.embeddings, chosen.data.labels) == (None, None)
+    assert chosen.data.records == f"{copy}/records"
+    monkeypatch.undo()
+    own.data.update(labels=None, embeddings=None)
     for other, expected in (
         (None, {1, 3}),
-        (Sources(label_version="v2.1"), {1, 3}),
-        (Sources(sequences=(2,)), {2}),
-        (Sources(weather=tuple({frame.weather for frame in frames})), {1, 3}),
-        (Sources(data=(str(tmp_path / "copy"),)), {1, 2, 3}),
-        (Sources(data=(str(tmp_path / "copy"),), sequences=(3,)), {3}),
+        ({"label_version": "v2.1"}, {1, 3}),
+        ({"sequences": (2,)}, {2}),
+        ({"weather": tuple({frame.weather for frame in frames})}, {1, 3}),
+        ({"roots": (copy,)}, {1, 2, 3}),
+        ({"roots": (copy,), "sequences": (3,)}, {3}),
     ):
-        _, chosen = data_of_run(loaded, tmp_path, other)
-        assert {frame.sequence for frame in chosen.frames} == expected
-    assert tuple(config.data.sequences) == (1, 3)
-    del config.data["sequences"], config.data["weather"]  # as runs of before
-    assert len(open_data(config, model, sources).frames) == 6
-    _check_validation(config, model, sources, caplog)
+        _, found = data_of_run(saved, other)
+        assert {frame.sequence for frame in found.frames} == expected
+    assert tuple(own.data.sequences) == (1, 3)
+    config.data.sequences = ()
+    _check_validation(config, model, caplog)
 
 
 def _check_validation(
-    config: Any, model: Any, sources: Sources, caplog: pytest.LogCaptureFixture
+    config: Any, model: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Sequence 1 with its damaged frame, and 2, are of the train split; 3 of the test."""
 
@@ -174,7 +189,7 @@ def _check_validation(
     config.data.validation = (1,)
     config.classes = ("Sedan", "Motorcycle")
     with caplog.at_level("INFO", "radejax"):
-        data = open_data(config, model, sources)
+        data = open_data(located(config), model)
     assert sequences(data) == {"train": [2, 2], "validation": [1], "test": [3, 3]}
     assert data.choosing_split == "validation"
     assert "frames left out: held out for validation" in data.split("train").counts
@@ -186,16 +201,16 @@ def _check_validation(
     lacking = [cls for cls, number in held.items() if not number]
     assert ("in the validation split" in caplog.text) == bool(lacking)
     config.data.validation = (0.5,)
-    drawn = sequences(open_data(config, model, sources))
+    drawn = sequences(open_data(located(config), model))
     assert sorted({*drawn["train"], *drawn["validation"]}) == [1, 2]
     assert not {*drawn["train"]} & {*drawn["validation"]}
     config.data.validation = (3,)
     with pytest.raises(
         UserError, match=r"sequences \[3\], which have no frames in the"
     ):
-        open_data(config, model, sources)
-    del config.data["validation"], config.data["validation_seed"]  # as runs of before
-    data = open_data(config, model, sources)
+        open_data(located(config), model)
+    config.data.validation = ()
+    data = open_data(located(config), model)
     assert len(data.split("train")) == 3
     assert data.choosing_split == "test"
     with pytest.raises(UserError, match="there is no validation split"):

@@ -15,7 +15,6 @@ from radejax.inference.saved import StartingWeights
 from radejax.losses.detection import NmsAssignment
 from radejax.runs import experiment, validation
 from radejax.runs.experiment import claimed
-from radejax.runs.sources import Sources
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
@@ -26,13 +25,12 @@ CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:
     folder, config = tmp_path / "run", base_config()
     config.train.batch_size = 8  # as many as the tests have devices
+    config.data.roots = (str(tmp_path),)
     with (
         claimed(folder, config),
         pytest.raises(UserError, match="another training"),
     ):
-        experiment.run(
-            config, name="x", workdir=folder, sources=Sources(data=(str(tmp_path),))
-        )
+        experiment.run(config, name="x", workdir=folder)
     assert sorted(path.name for path in folder.iterdir()) == ["config.json", "lock"]
 
 
@@ -59,9 +57,8 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     monkeypatch.setattr(loop, "train", train)
     mesh = distributed.make_mesh(1)
     monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
-    experiment.run(
-        config, name="x", workdir=tmp_path / "run", sources=Sources(data=(str(root),))
-    )
+    config.data.roots = (str(root),)
+    experiment.run(config, name="x", workdir=tmp_path / "run")
     assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
     assert "checkpoints/" in caplog.text
@@ -125,12 +122,8 @@ def test_labels_are_read_once(
         validation, "tables_from_frames", lambda f: evaluated.extend(f) or make(f)
     )
     with caplog.at_level("INFO", "radejax"):
-        folder = experiment.run(
-            config,
-            name="x",
-            workdir=tmp_path / "run",
-            sources=Sources(data=(str(tmp_path / "data"),)),
-        )
+        config.data.roots = (str(tmp_path / "data"),)
+        folder = experiment.run(config, name="x", workdir=tmp_path / "run")
     assert [frame.sequence for frame in evaluated] == [2, 2]
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
@@ -147,9 +140,9 @@ def test_a_batch_that_does_not_divide_is_told_before_anything_is_written(
 ) -> None:
     config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
     config.train.batch_size = 3  # of eight devices
-    sources = Sources(data=(str(tmp_path / "data"),))
+    config.data.roots = (str(tmp_path / "data"),)
     with pytest.raises(
         UserError, match=r"config\.train\.batch_size=3 does not divide over 8 devices"
     ):
-        experiment.run(config, name="x", workdir=tmp_path / "run", sources=sources)
+        experiment.run(config, name="x", workdir=tmp_path / "run")
     assert not list(tmp_path.iterdir())

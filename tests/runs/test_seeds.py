@@ -11,7 +11,6 @@ from radejax.cli.train import train
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.runs import experiment
-from radejax.runs.sources import Sources
 
 HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
 
@@ -23,7 +22,7 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     seen = []
 
     def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
-        seen.append((config.seed, pathlib.Path(workdir).name, options["sources"]))
+        seen.append((config.seed, pathlib.Path(workdir).name, options["init_from"]))
         folder = pathlib.Path(workdir) / "evaluation"
         folder.mkdir(parents=True)
         (folder / "metrics.csv").write_text(
@@ -36,11 +35,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 
     monkeypatch.setattr(experiment, "run", run)
     config = base_config()
-    sources = Sources(data=("d",))
     experiment.run_seeds(
-        config, range(3), name="x", workdir=tmp_path / "runs", sources=sources
+        config, range(3), name="x", workdir=tmp_path / "runs", init_from="w"
     )
-    assert seen == [(i, f"seed{i}", sources) for i in range(3)]
+    assert seen == [(i, f"seed{i}", "w") for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
     assert rows[0]["mean"] == pytest.approx(54.0)

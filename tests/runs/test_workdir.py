@@ -10,7 +10,6 @@ import pytest
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.runs import experiment
-from radejax.runs.sources import DataPaths
 
 
 def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
@@ -78,10 +77,8 @@ def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) ->
 
 
 def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
-    paths = DataPaths(roots=("a",), labels=None, records="r")
-    info = experiment.run_info(tmp_path, paths, tmp_path / "model.pth")
+    info = experiment.run_info(tmp_path, tmp_path / "model.pth")
     assert info["init_from"] == str(tmp_path / "model.pth")
     (tmp_path / "run.json").write_text(json.dumps(info))
-    again = experiment.run_info(tmp_path, paths)
+    again = experiment.run_info(tmp_path)
     assert again["init_from"] == info["init_from"]
-    assert again["data"]["roots"] == ("a",)

@@ -56,7 +56,7 @@ def tree(tmp_path_factory):
 
 class TestTree:
     def test_reads_as_kradar_without_a_problem(self, tree):
-        data = KRadar(tree, split="train", strict=True)
+        data = KRadar(tree, split="train")
         assert len(data) == 6
         assert data.grid.shape_drea == (8, 32, 5, 24)
         assert len(KRadar(tree, split="test")) == 3
