@@ -26,7 +26,7 @@ ROOMS = (
     "data.pipeline",
     "data.projection",
     "data.tesseract",
-    "training.sharding",
+    "training.distributed",
     "training.state",
     "training.step",
     "simulation",

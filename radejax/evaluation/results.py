@@ -76,11 +76,13 @@ class EvaluationOptions:
             require(bool(holds), field, getattr(self, name), expected)
 
         known = protocols.PROTOCOLS
-        names = self.protocols if isinstance(self.protocols, tuple) else ()
+        names = self.protocols if isinstance(self.protocols, tuple | list) else ()
         is_known = names and all(name in known for name in names)
         is_distinct = is_known and len(set(names)) == len(names)
         check("protocols", is_distinct, f"different ones of {', '.join(known)}")
-        ious = self.iou_thresholds if isinstance(self.iou_thresholds, tuple) else ()
+        ious = (
+            self.iou_thresholds if isinstance(self.iou_thresholds, tuple | list) else ()
+        )
         is_good = ious and all(0 <= iou < 1 for iou in ious)
         check("iou_thresholds", is_good, "numbers in [0, 1)")
         for name in ("score_threshold", "min_score", "operating_score"):
