@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PURE = ("geometry", "losses", "detection")
+PURE = ("geometry", "losses", "detection", "evaluation")
 """Rooms of functions from arrays to arrays; what is in folders below reads or writes."""
 
 Documented = ast.FunctionDef | ast.ClassDef

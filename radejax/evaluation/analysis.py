@@ -43,7 +43,14 @@ class Subset:
 def matched_objects(
     data: EvaluationSet, space: str, iou: float
 ) -> Int[np.ndarray, " M"]:
-    """Ground truth that each prediction found, or -1 (recommended protocol)."""
+    """Ground truth that each prediction found, or -1 (recommended protocol).
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> matched_objects(data, "bev", 0.5).tolist()
+        [0]
+    """
     match = data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
     assert isinstance(match, np.ndarray)  # the recommended protocol is not K-Radar's
     return match
@@ -61,6 +68,12 @@ def by_distance(
 
     A prediction that found an object belongs to the object's band, any other to its own:
     a detection does not become a false positive for lying just across a border.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> by_distance(data, "bev", 0.5)["20-40 m", "Sedan"].num_gt
+        1
     """
     match = matched_objects(data, space, iou)
     far_gt = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
@@ -82,7 +95,14 @@ def by_condition(
     *,
     operating_score: float = 0.3,
 ) -> dict[tuple[str, str], Subset]:
-    """Numbers by (condition, class); a condition is a mask of frames."""
+    """Numbers by (condition, class); a condition is a mask of frames.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> by_condition(data, {"fog": np.array([True])}, "bev", 0.5)["fog", "Sedan"].ap
+        100.0
+    """
     masks = {
         name: (mask[data.gt.frame], mask[data.pred.frame])
         for name, mask in conditions.items()
@@ -139,6 +159,12 @@ def box_errors(
         heading_deg (absolute, 0 to 180), axis_deg (heading up to a half turn, 0 to 90),
         and "reversed", the share of headings off by more than 90 degrees. NaN without
         matches.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> box_errors(data, "bev", 0.5)["Sedan"]["center_m_mean"]
+        0.0
     """
     match = matched_objects(data, space, iou)
     rows = np.flatnonzero((match >= 0) & (data.score > operating_score))
@@ -186,6 +212,12 @@ def worst_frames(
         Up to `count` entries, worst first: "index" in the frame table, "frame" id,
         "missed" objects, "false" predictions, "found". Ties: more missed first, then the
         order of the frame table. Frames without a mistake are never listed.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> worst_frames(data, "bev", 0.5)
+        []
     """
     match = matched_objects(data, space, iou)
     above = data.score > operating_score
@@ -221,7 +253,14 @@ MIN_OBJECTS = 10
 
 
 def sanity_checks(data: EvaluationSet) -> list[str]:
-    """Warnings about another unit, frame or height of the predicted boxes."""
+    """Warnings about another unit, frame or height of the predicted boxes.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> sanity_checks(data)
+        []
+    """
     box, lines = data.predictions.box, []
     is_large = np.abs(box[:, 6]) > 2 * np.pi
     if is_large.any():
