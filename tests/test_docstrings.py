@@ -1,4 +1,4 @@
-"""Examples in docstrings run, and every public function of the pure rooms has one."""
+"""Examples in docstrings run, and every public function of the pure packages has one."""
 
 import ast
 import doctest
@@ -10,7 +10,12 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PURE = ("geometry", "losses", "detection", "evaluation")
-"""Rooms of functions from arrays to arrays; what is in folders below reads or writes."""
+"""Packages of functions from arrays to arrays."""
+
+REPORTS = (
+    "bootstrap", "files", "kitti", "plots", "published", "report", "results", "tables"
+)  # fmt: skip
+"""Modules of `evaluation` that read, write or compose reports."""
 
 Documented = ast.FunctionDef | ast.ClassDef
 
@@ -46,12 +51,13 @@ def test_examples_run(name: str) -> None:
     assert not said, "".join(said)
 
 
-def test_every_public_function_of_the_pure_rooms_has_an_example() -> None:
+def test_every_public_function_of_the_pure_packages_has_an_example() -> None:
     lacking = [
         name
         for name, (module, node) in NODES.items()
         if module.split(".")[1] in PURE
         and module.count(".") == 2
+        and module.split(".")[2] not in REPORTS
         and name == f"{module}.{node.name}"
         and isinstance(node, ast.FunctionDef)
         and not node.name.startswith("_")

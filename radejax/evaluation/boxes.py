@@ -179,7 +179,12 @@ def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
 
 
 def are_simulated(frames: AnyColumns | None) -> bool:
-    """Whether a frame table says that some of its frames are simulated."""
+    """Whether a frame table says that some of its frames are simulated.
+
+    Examples:
+        >>> are_simulated({"frame": [0, 1], "simulated": [False, True]})
+        True
+    """
     return frames is not None and bool(np.any(frames.get("simulated", False)))
 
 
@@ -236,7 +241,13 @@ def frame_positions(
 
 
 def take_frames(table: Columns, ids: Shaped[np.ndarray, " F"]) -> Columns:
-    """Rows of a table that are of some frames."""
+    """Rows of a table that are of some frames.
+
+    Examples:
+        >>> table = {"frame": np.array([0, 1, 1]), "cls": np.array(["a", "b", "c"])}
+        >>> take_frames(table, np.array([1]))["cls"].tolist()
+        ['b', 'c']
+    """
     rows = np.isin(table["frame"], ids)
     return {name: np.asarray(column)[rows] for name, column in table.items()}
 
@@ -245,7 +256,12 @@ def take_frames(table: Columns, ids: Shaped[np.ndarray, " F"]) -> Columns:
 
 
 def frame_keys(frames: Columns) -> list[str]:
-    """Key "sequence/name" of every frame; the id where these are not known."""
+    """Key "sequence/name" of every frame; the id where these are not known.
+
+    Examples:
+        >>> frame_keys({"frame": [0], "sequence": [5], "name": ["00012_00001.txt"]})
+        ['5/00012_00001']
+    """
     if "name" not in frames:
         return [str(frame) for frame in np.asarray(frames["frame"]).tolist()]
     names = [_strip(str(name)) for name in np.asarray(frames["name"]).tolist()]
@@ -274,6 +290,11 @@ def find_frames(named: Any, frames: Columns | None, *, where: str) -> np.ndarray
 
     Raises:
         DataError: A frame that the table does not have, or names without a table.
+
+    Examples:
+        >>> frames = {"frame": [7], "name": ["5/00012_00001"]}
+        >>> find_frames(["5/00012_00001"], frames, where="boxes.json").tolist()
+        [7]
     """
     named = np.asarray(named)
     if named.size == 0:
@@ -301,7 +322,14 @@ def find_frames(named: Any, frames: Columns | None, *, where: str) -> np.ndarray
 
 
 def of_known_frames(columns: Columns, frames: Columns) -> Columns:
-    """Rows of frames that the table has; all rows if there are none."""
+    """Rows of frames that the table has; all rows if there are none.
+
+    Examples:
+        >>> frames = {"frame": [0], "name": ["5/00012_00001"]}
+        >>> columns = {"frame": np.array(["5/00012", "5/00013"])}
+        >>> of_known_frames(columns, frames)["frame"].tolist()
+        ['5/00012']
+    """
     known = _known_frames(frames)
     is_known = [_strip(str(name)) in known for name in columns["frame"].tolist()]
     if not any(is_known):
