@@ -315,7 +315,9 @@ def _after_nms(
     is_valid: Mask,
     grid: RadarGrid,
     z0_m: Number,
-) -> Assigned:
+) -> tuple[
+    Float[jax.Array, "B K 8"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]
+]:
     """Predictions that survive NMS, and the objects that they overlap."""
     # Which boxes are compared is a choice, not a function to differentiate.
     peaks = find_peaks(

@@ -139,7 +139,7 @@ class RadeNet(nn.Module):
         features = self._features(self._padded(projection))
         return self._maps(features, projection)
 
-    def _padded(self, projection: Projection) -> Projection:
+    def _padded(self, projection: Projection) -> Float[jax.Array, "B Rp Ap DE"]:
         """The projection less `input_center`, scaled, in the model's dtype, padded."""
         channels = self.doppler_bins + self.elevation_bins
         if projection.ndim != 4 or projection.shape[-1] != channels:
@@ -166,7 +166,9 @@ class RadeNet(nn.Module):
             name="backbone",
         )(padded)
 
-    def _maps(self, features: Map, projection: Projection) -> DetectionMaps:
+    def _maps(
+        self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection
+    ) -> DetectionMaps:
         """Neck and heads, on the projection's bins if `crop_output`."""
         neck = self._stage(NECKS[self.neck])(**self._shared(), name="neck")
         heads = self._stage(Heads)(
