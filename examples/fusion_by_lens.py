@@ -29,7 +29,7 @@ from radejax.evaluation.files import Source, frame_keys, load
 from radejax.evaluation.results import repair_sizes
 from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_name, data_of_run
-from radejax.runs.figures import frame_shares, mean_share
+from radejax.runs.figures import average_by_group, frame_shares, mean_share
 from radejax.simulation.camera.lens import cover_level
 
 GROUPS = {
@@ -174,8 +174,22 @@ def main(fusion, radar, out, data, split, resamples):
                 )
         lens = lens_of_frames(opened.options.roots[0], frames)
         groups = conditions(frames["weather"], lens)
-        found = frame_shares(run.model, run.variables, opened, list(dataset))
-        means = [mean_share(share, run.grid) for _, share in found]
+        level_of = {f.key: level for f, level in zip(dataset, lens, strict=True)}
+        means = []
+
+        def by_lens():
+            found = frame_shares(run.model, run.variables, opened, list(dataset))
+            for frame, share in found:
+                means.append(mean_share(share, run.grid))
+                place = frame.weather, level_of[frame.key]
+                yield next(n for n, rule in GROUPS.items() if rule(*place)), share
+
+        maps, counts = average_by_group(by_lens())
+        gates = {
+            name: {"mean": mean_share(share, run.grid), "frames": counts[name]}
+            for name, share in maps.items()
+        }
+        files.write_json(out / "camera_share.json", gates)
         sequences = np.asarray(frames["sequence"])
         # Intervals come from resampled sequences: one alone has none.
         is_small = {

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from radejax.cli import entry
+from radejax.core.structures import Boxes
 from radejax.data.images import read_left_image
 from radejax.data.kradar import read_labels
 from radejax.geometry.camera import RADAR_FROM_LIDAR_M, CameraCalibration
@@ -85,7 +86,7 @@ def main(image, calibration, label, version, out):
             labels = read_labels(label, version)
             shift = np.array([*RADAR_FROM_LIDAR_M, 0, 0, 0, 0])
             boxes = np.array([x.box for x in labels]).reshape(-1, 7) + shift
-            ground_truth = (boxes, [x.cls for x in labels])
+            ground_truth = Boxes.one_frame(boxes, [x.cls for x in labels])
         ax = draw_camera(pixels, camera, ground_truth=ground_truth)
         count = draw_reference_points(
             ax, reference.points[0], reference.is_valid[0], camera

@@ -402,7 +402,7 @@ def data_of_run(
     if changes and is_blind and options.embeddings is None:
         raise UserError(
             "the run is without the weights of its image backbone: give "
-            "--image_backbone FOLDER, or --embeddings FOLDER of these images"
+            "--image-backbone FOLDER, or --embeddings FOLDER of these images"
         )
     data = Data.open(config, saved.model, saved.grid)
     if data.frames.grid != saved.grid:

@@ -100,11 +100,12 @@ def run(
             variables, step = result.state.eval_variables, result.step
             evaluate(config, model, variables, data, folder, step=step)
     place = files.relative(folder)
-    _log.info("Done: checkpoints/, metrics.jsonl and evaluation/ are in %s", place)
+    _log.info("Done in %s: checkpoints/, metrics.jsonl and evaluation/", place)
     if config.train.evaluate_every_epochs:
         best = f"radejax evaluate --workdir {place} --checkpoint best"
         split = data.choosing_split
         _log.info("Best checkpoint, chosen on the %s split: %s", split, best)
+    _log.info("Evaluate again: radejax evaluate --workdir %s", place)
     _log.info("Boxes of frames: radejax detect --workdir %s --out boxes FOLDER", place)
     return folder
 

@@ -109,6 +109,7 @@ def train(
         state, step = _restore_or_initialize(checkpoints, loader, info, *placed)
         train_step = _compile(step_fn, state, mesh, config.seed)
         trace = _trace(profile, *LoggingOptions(**config.logging).profile_steps)
+        next(trace)
         wandb = _wandb_arguments(config, info)
         with (
             MetricLogger(folder, step, num_steps, size, wandb) as logger,
@@ -259,16 +260,16 @@ def _compile(
 
 def _trace(folder: str, first: int, last: int) -> Generator[None, Any, None]:
     """Traces steps `first` to `last`; each step begins with `send(metrics before it)`."""
-    step, metrics = 0, None
+    step = -1
     try:
         while True:
+            metrics = yield
+            step += 1
             if folder and step == first:
                 jax.profiler.start_trace(folder)
             if folder and step == last + 1:
                 jax.block_until_ready(metrics)
                 jax.profiler.stop_trace()
-            metrics = yield
-            step += 1
     finally:
         if folder and first <= step <= last:
             jax.profiler.stop_trace()

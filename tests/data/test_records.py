@@ -204,7 +204,7 @@ def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
     out = tmp_path / "out"
     blocked = min(root.glob("1/radar_tesseract/*.mat"))  # of the first frame
     blocked.unlink()
-    os.mkfifo(blocked)  # the worker waits there until it is opened below
+    os.mkfifo(blocked)  # a worker waits there forever
     # Started in the background, Ctrl-C would be ignored by all of them.
     command = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
@@ -225,11 +225,7 @@ def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
     )
     wait_until(lambda: list(out.rglob("*.npy")))
     os.killpg(job.pid, signal.SIGINT)
-    time.sleep(1.0)
-    assert job.poll() is None  # waits for its workers
-    with blocked.open("wb"):
-        pass
-    _, errors = job.communicate(timeout=120)
+    _, errors = job.communicate(timeout=20)  # does not wait for its workers
     assert job.returncode == 130
     assert errors.rstrip().splitlines()[-1] == "error: interrupted"
     assert "Traceback" not in errors
