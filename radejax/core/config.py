@@ -1,7 +1,8 @@
 """The sections that every config has, and the options that choose a variant.
 
 A config file builds on `base_config` and `parse_options`, so that all configs have the
-same fields. Values are plain and resolved: no paths, no devices, nothing computed later.
+same fields. Values are plain and resolved: nothing is computed later. The paths of the
+data (`DATA_PATHS`) are ignored when a run compares its config.
 """
 
 from __future__ import annotations
@@ -129,7 +130,8 @@ def base_config() -> ConfigDict:
 
     Two fields are not the paper's, because the released weights and the reported
     parameter count are not either: `model.cbam` ("official", the released block) and
-    `loss.assignment` ("center"). `configs/radenet.py` has presets for both worlds.
+    `loss.assignment` ("center"). `configs/radenet.py` has presets for the paper and the
+    released code.
     """
     config = ConfigDict()
     config.seed = 0
@@ -269,9 +271,8 @@ def _train() -> ConfigDict:
             "weight_decay": 0.01,
             "warmup_steps": 0,
             "gradient_clip_norm": placeholder(float),
-            "ema_decay": placeholder(
-                float
-            ),  # moving average of the parameters, per batch
+            # Decay per batch of the parameters' moving average; None for no average.
+            "ema_decay": placeholder(float),
             "gradient_accumulation_steps": 1,  # batches per update of the parameters
             "parameter_sharding": "replicated",  # "fsdp"
             "log_every_steps": 20,
@@ -292,9 +293,8 @@ def _data() -> ConfigDict:
             # Folders of the dataset; () for what `config.simulation` describes.
             "roots": (),
             "labels": placeholder(str),  # folder or zip of a revision; else the roots'
-            "records": placeholder(
-                str
-            ),  # folder of projections; else in the first root
+            # Folder of projections; None: in the first root.
+            "records": placeholder(str),
             "embeddings": placeholder(str),  # folder of `radejax embed`, for images
             "image_backbone": placeholder(str),  # its weights, see training.md
             "camera_calibration": placeholder(str),  # folder; else the roots'
@@ -329,7 +329,7 @@ def _evaluation() -> ConfigDict:
             "protocols": ("coco101", "all_point", "kradar_r40"),
             "empty_frames": "protocol",  # each one's own; "class", "frame", "none"
             "iou_thresholds": (0.3, 0.5),
-            "score_threshold": 0.3,  # of all protocols but "all_point", which has no cut
+            "score_threshold": 0.3,  # of all protocols but "all_point", which has none
             "min_score": 0.05,  # predictions are kept from here on
             "bootstrap": 0,  # resamples of sequences for intervals; 1000 is plenty
             "batch_size": 8,
