@@ -15,8 +15,8 @@ import numpy as np
 import shapely
 
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
-from radejax.data.encoding import encode
 from radejax.data.kradar.conditions import WEATHERS
+from radejax.data.projection import encode
 from radejax.data.records import Records
 from radejax.detection.decode import decode
 from radejax.geometry.boxes import bev_corners

@@ -26,8 +26,8 @@ from tqdm import tqdm
 from radejax.cli import entry
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
-from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
+from radejax.data.projection import decode
 from radejax.data.records import Records, open_projections
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 
 from radejax.cli import entry
 from radejax.core.structures import Boxes
-from radejax.data.images import read_left_image
+from radejax.data.cameras import read_left_image
 from radejax.data.kradar import read_labels
 from radejax.geometry.camera import RADAR_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid

@@ -23,7 +23,7 @@ Submit = Callable[..., concurrent.futures.Future[Any]]
 
 @contextlib.contextmanager
 def process_pool(
-    num_workers: int, start: Callable[..., None], *arguments: Any
+    num_workers: int, start: Callable[..., Any] | None = None, *arguments: Any
 ) -> Iterator[Submit]:
     """Processes for the time of a block, which gets a function to submit work with.
 
@@ -34,7 +34,7 @@ def process_pool(
 
     Args:
         num_workers: Number of processes.
-        start: Called first in each of them.
+        start: Called first in each of them, or None.
         *arguments: Arguments of `start`.
 
     Yields:
@@ -80,9 +80,10 @@ def _start_processes(
         signal.pthread_sigmask(signal.SIG_SETMASK, old)
 
 
-def _start(start: Callable[..., None], *arguments: Any) -> None:
+def _start(start: Callable[..., Any] | None, *arguments: Any) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    start(*arguments)
+    if start is not None:
+        start(*arguments)
 
 
 def _end_with_parent() -> None:

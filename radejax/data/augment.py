@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError, require
-from radejax.data.encoding import decode, encode
-from radejax.data.projection import LOG_SCALE_DB
+from radejax.data.projection import LOG_SCALE_DB, decode, encode
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 

@@ -29,7 +29,7 @@ from radejax.core import files
 from radejax.core.errors import DataError, UserError, one_line, require
 from radejax.core.workers import process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame
-from radejax.data.encoding import ENCODINGS, encode
+from radejax.data.projection import ENCODINGS, encode
 from radejax.geometry.radar_grid import RadarGrid
 
 _DESCRIPTION = "records.json"
@@ -134,16 +134,11 @@ class Records:
 
     def keys(self) -> set[str]:
         """Keys of the frames that have a record now; reads the folder."""
-        found = set()
-        for place, _, names in os.walk(self.folder):
-            prefix = pathlib.Path(place).relative_to(self.folder).as_posix()
-            prefix = "" if prefix == "." else f"{prefix}/"
-            found |= {
-                f"{prefix}{name.removesuffix('.npy')}"
-                for name in names
-                if name.endswith(".npy") and not name.startswith(".")
-            }
-        return found
+        return {
+            path.relative_to(self.folder).as_posix().removesuffix(".npy")
+            for path in self.folder.rglob("*.npy")
+            if not path.name.startswith(".")
+        }
 
     def path(self, key: str) -> pathlib.Path:
         """File of the record of a frame."""
@@ -363,14 +358,10 @@ def _write_all(
         yield from (_write(records, frame) for frame in frames)
         return
     num_workers = min(num_workers, len(frames))
-    with process_pool(num_workers, _nothing) as submit:
+    with process_pool(num_workers) as submit:
         work = [submit(_write, records, frame) for frame in frames]
         for future in concurrent.futures.as_completed(work):
             yield future.result()
-
-
-def _nothing() -> None:
-    """Start of a worker."""
 
 
 def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:

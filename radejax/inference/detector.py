@@ -20,8 +20,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
 from radejax.core.structures import Array, Batch, Detections
 from radejax.data.cameras import CameraOptions
-from radejax.data.encoding import to_float
-from radejax.data.projection import project_jax
+from radejax.data.projection import project_jax, to_float
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs

@@ -15,8 +15,8 @@ from jaxtyping import UInt8
 from tqdm import tqdm
 
 from radejax.core.errors import UserError
+from radejax.data.cameras import read_left_image
 from radejax.data.dataset import LabelledFrame
-from radejax.data.images import read_left_image
 from radejax.data.records import Records, embedding_fields
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.weights.image_backbone import weights_sha256

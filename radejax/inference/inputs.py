@@ -17,8 +17,7 @@ from jaxtyping import Bool, Real, UInt8
 
 from radejax.core.errors import UserError
 from radejax.core.structures import ROIS, Array
-from radejax.data.cameras import CameraOptions, no_camera
-from radejax.data.images import read_left_image
+from radejax.data.cameras import CameraOptions, no_camera, read_left_image
 from radejax.data.projection import MAX_LEVEL
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import (

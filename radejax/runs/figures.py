@@ -14,11 +14,11 @@ from jaxtyping import Float
 
 from radejax.core import files
 from radejax.core.structures import Boxes
+from radejax.data.cameras import front_view
 from radejax.data.dataset import FrameSequence, LabelledFrame
-from radejax.data.encoding import decode, model_inputs
-from radejax.data.images import front_view
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.projection import decode, model_inputs
 from radejax.data.records import Records
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LOSSES

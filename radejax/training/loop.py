@@ -18,7 +18,7 @@ from ml_collections import ConfigDict
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
-from radejax.data.encoding import model_inputs
+from radejax.data.projection import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import NmsAssignment
 from radejax.training import distributed

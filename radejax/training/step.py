@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Float, Num
 
 from radejax.core.structures import Batch
-from radejax.data.encoding import model_inputs
+from radejax.data.projection import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
 from radejax.training.state import TrainState, merge_parameters

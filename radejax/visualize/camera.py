@@ -64,7 +64,7 @@ def draw_camera(
     if image.shape != expected:
         raise UserError(
             f"image has shape {image.shape}, the calibration is for {expected}; use "
-            "the left half of K-Radar's stereo pairs (radejax.data.images."
+            "the left half of K-Radar's stereo pairs (radejax.data.cameras."
             "read_left_image) and CameraCalibration.resized for a resized image"
         )
     focal_x, focal_y = np.asarray(calibration.intrinsics)[:2]

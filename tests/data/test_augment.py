@@ -14,8 +14,8 @@ from radejax.data.augment import (
     mirror_boxes,
     mirror_camera,
 )
-from radejax.data.encoding import decode, encode
-from radejax.data.images import read_left_image
+from radejax.data.cameras import read_left_image
+from radejax.data.projection import decode, encode
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.geometry.radar_grid import RadarGrid
 

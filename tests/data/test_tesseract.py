@@ -8,9 +8,9 @@ import scipy.io
 
 from radejax.core.errors import DataError
 from radejax.data.kradar.write import write_tesseract
-from radejax.data.mat5 import Layout
 from radejax.data.projection import project_tensor
 from radejax.data.tesseract import (
+    Layout,
     _read_columns,
     check_tesseract,
     project_file,

@@ -9,8 +9,8 @@ import pytest
 from cfar import detect
 
 from radejax.core.errors import UserError
-from radejax.data.encoding import decode
 from radejax.data.kradar import KRadar
+from radejax.data.projection import decode
 from radejax.data.records import open_projections, preprocess
 from radejax.simulation.dataset import default_config, simulate_dataset
 

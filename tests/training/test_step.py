@@ -14,7 +14,7 @@ import optax
 import pytest
 
 from radejax.core.structures import DetectionMaps
-from radejax.data.encoding import to_float
+from radejax.data.projection import to_float
 from radejax.detection.decode import decode
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.rotated_iou import bev_iou
