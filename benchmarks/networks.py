@@ -25,8 +25,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import ReferencePoints, static_reference_points
 from radejax.models.vit import rotary_angles
-from radejax.training.state import create_state, make_optimizer
-from radejax.training.step import make_train_step
+from radejax.training.step import create_state, make_optimizer, make_train_step
 from radejax.weights import convert, radenet_torch
 
 CONFIGS = pathlib.Path(__file__).parents[1] / "configs"

@@ -36,8 +36,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import detect
 from radejax.inference.export import CAMERA_SHAPES
 from radejax.simulation.radar import tensor
-from radejax.training.state import create_state, make_optimizer
-from radejax.training.step import make_train_step
+from radejax.training.step import create_state, make_optimizer, make_train_step
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import page

@@ -29,6 +29,7 @@ from radejax.core.structures import CLASSES
 from radejax.runs.experiment import checkpoint_info, claimed
 from radejax.simulation.config import plain
 from radejax.training import distributed, loop
+from radejax.training.step import TrainState
 
 SEED_OFFSET = 1_000_003
 """Added to the seed of scenes: those of a data set of the same config stay unseen."""
@@ -38,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 def train_online(
     config: ConfigDict, workdir: str | os.PathLike, *, num_sequences: int = 1000
-) -> loop.TrainResult:
+) -> tuple[TrainState, bool]:
     """Trains a radar model on fresh frames; run again, it continues.
 
     An epoch is as many frames as the sequences have. Frames are drawn with
@@ -110,8 +111,8 @@ def main(config, workdir, sequences, epochs):
         settings = load_config(config)
         if epochs is not None:
             settings.train.num_epochs = epochs
-        result = train_online(settings, workdir, num_sequences=sequences)
-        click.echo(f"{result.step} steps; checkpoints in {workdir / 'checkpoints'}")
+        state, _ = train_online(settings, workdir, num_sequences=sequences)
+        click.echo(f"{state.step} steps; checkpoints in {workdir / 'checkpoints'}")
 
 
 if __name__ == "__main__":

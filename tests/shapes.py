@@ -27,7 +27,6 @@ ROOMS = (
     "data.projection",
     "data.tesseract",
     "training.distributed",
-    "training.state",
     "training.step",
     "simulation",
     "inference.inputs",

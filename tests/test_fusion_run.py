@@ -184,13 +184,12 @@ def test_a_backbone_that_is_gone_leaves_embedded_images(
     shutil.copytree(from_images, copy)
     info = copy / "checkpoints"
     newest = max(info.iterdir(), key=lambda path: int(path.name))
-    stored = newest / "info" / "metadata"
+    stored = newest / "description" / "metadata"
     text = stored.read_text().replace(str(data.backbone), str(tmp_path / "gone"))
-    stored.write_text(text)
-    checksums = newest / "checksums" / "metadata"
-    content = json.loads(checksums.read_text())
-    content["info"] = checkpoints._text_checksum(json.loads(text))
-    checksums.write_text(json.dumps(content))
+    content = json.loads(text)
+    del content["sha256"]
+    content["sha256"] = checkpoints._text_checksum(content)
+    stored.write_text(json.dumps(content))
     with caplog.at_level(logging.WARNING):
         run = load_model(copy)
     assert "image backbone" in caplog.text

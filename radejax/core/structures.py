@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int, Real, Shaped
@@ -66,6 +67,26 @@ class Batch(struct.PyTreeNode):
     frame: Int[Array, " B"]
     image: Real[Array, "B _ _ _"] | None = None
     camera: Any = None
+
+    def model_inputs(self) -> tuple[Any, ...]:
+        """Positional inputs of a model: the projection; with images, the camera's too."""
+        projection = to_float(self.projection)
+        if self.image is None:
+            return (projection,)
+        return projection, self.image, self.camera
+
+
+def to_float(projection: Real[Array, "*axes"]) -> Float[jax.Array, "*axes"]:
+    """Stored values of projections to float32 network input, on the device.
+
+    Batches travel in the type of the records (a quarter to a half of the bytes); the
+    jitted train step starts with this cast.
+
+    Args:
+        projection: uint8 (p = q / 255), float16, bfloat16 or float32.
+    """
+    values = jnp.asarray(projection).astype(jnp.float32)
+    return values / 255.0 if projection.dtype == jnp.uint8 else values
 
 
 class DetectionMaps(struct.PyTreeNode):

@@ -144,7 +144,7 @@ def make_loader(
 ) -> grain.DatasetIterator[Batch]:
     """A checkpointable iterator over batches of NumPy arrays.
 
-    `Batch.projection` has the type of the records; `encoding.to_float` turns it into
+    `Batch.projection` has the type of the records; `structures.to_float` turns it into
     network input on the device. `Batch.frame` is the index into the table's frames.
 
     Epochs do not mix: by default every epoch leaves out the last

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from radejax.core.errors import UserError
-from radejax.core.structures import Array, Batch
 
 POWER_FLOOR = 1e-10
 LOG_OFFSET_DB = 1.2
@@ -197,24 +196,3 @@ def decode(stored: Real[np.ndarray, "*axes"]) -> Float[np.ndarray, "*axes"]:
     if stored.dtype == np.uint8:
         return stored.astype(np.float32) / np.float32(255.0)
     return stored.astype(np.float32)
-
-
-def to_float(projection: Real[Array, "*axes"]) -> Float[jax.Array, "*axes"]:
-    """`decode` on the device: stored values of a batch to float32 network input.
-
-    Batches travel in the type of the records (a quarter to a half of the bytes); the
-    jitted train step starts with this cast.
-
-    Args:
-        projection: uint8 (p = q / 255), float16, bfloat16 or float32.
-    """
-    values = jnp.asarray(projection).astype(jnp.float32)
-    return values / 255.0 if projection.dtype == jnp.uint8 else values
-
-
-def model_inputs(batch: Batch) -> tuple[Any, ...]:
-    """Positional inputs of the model: the projection, and the camera's if there is one."""
-    projection = to_float(batch.projection)
-    if batch.image is None:
-        return (projection,)
-    return projection, batch.image, batch.camera

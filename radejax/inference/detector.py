@@ -18,9 +18,9 @@ from jaxtyping import Real, Shaped
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
-from radejax.core.structures import Array, Batch, Detections
+from radejax.core.structures import Array, Batch, Detections, to_float
 from radejax.data.cameras import CameraOptions
-from radejax.data.projection import project_jax, to_float
+from radejax.data.projection import project_jax
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as detector_inputs

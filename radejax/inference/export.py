@@ -20,7 +20,7 @@ from flax import traverse_util
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.projection import to_float
+from radejax.core.structures import to_float
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
 from radejax.inference.detector import Detector

@@ -30,8 +30,7 @@ from radejax.detection.decode import DecodeOptions
 from radejax.evaluation.results import EvaluationOptions
 from radejax.losses.detection import LossOptions
 from radejax.simulation.config import SimulationConfig, default_config
-from radejax.training.metric_logger import LoggingOptions
-from radejax.training.state import TrainOptions
+from radejax.training.step import check_train_section
 
 _SEED = integer(0, 2**32 - 2)  # of 32 bits; a training uses the next one too
 _VERSIONS = one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
@@ -82,6 +81,13 @@ _EVALUATION = {
     ),
     "min_score": number(0, 1),
 }
+_LOGGING = {
+    "num_visualizations": integer(0),
+    "profile_steps": (
+        lambda v: len(v) == 2 and all(map(integer(0)[0], v)) and v[0] <= v[1],
+        "two integers of at least 0, the first not above the last",
+    ),
+}
 _KINDS: dict[type, Any] = {float: int | float, tuple: tuple | list}
 _OPTIONAL = ["data.visibility", "evaluation.roi", "train.checkpoints_to_keep"]
 _OPTIONAL += ["model.cbam"]
@@ -112,11 +118,11 @@ def check(config: ConfigDict) -> None:
     for name, constructor in (
         ("loss", LossOptions),
         ("decode", DecodeOptions),
-        ("train", TrainOptions),
-        ("logging", LoggingOptions),
     ):
         options = config[name].to_dict()
         _construct(f"config.{name}", lambda x, c=constructor: c(**x), options)
+    check_train_section(config.train)
+    check_options(config.logging, "config.logging", _LOGGING)
     check_options(config.data, "config.data", _DATA)
     _construct("config.data.camera", CameraOptions.from_config, config.data)
     _check_together(config)

@@ -45,6 +45,7 @@ from radejax.runs.data import Data, located, open_data
 from radejax.runs.evaluate import evaluate
 from radejax.runs.validation import Validation
 from radejax.training import distributed, loop
+from radejax.training.step import TrainState
 
 _log = logging.getLogger(__name__)
 
@@ -90,15 +91,13 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        result = _train(model, weights, data, folder, config, str(profile))
-        if not result.finished:
-            _log.info(
-                "stopped at step %d; run the same command to continue", result.step
-            )
+        state, is_finished = _train(model, weights, data, folder, config, str(profile))
+        step = int(state.step)
+        if not is_finished:
+            _log.info("stopped at step %d; run the same command to continue", step)
             return folder
         if has_test:
-            variables, step = result.state.eval_variables, result.step
-            evaluate(config, model, variables, data, folder, step=step)
+            evaluate(config, model, state.eval_variables, data, folder, step=step)
     place = files.relative(folder)
     _log.info("Done in %s: checkpoints/, metrics.jsonl and evaluation/", place)
     if config.train.evaluate_every_epochs:
@@ -117,7 +116,7 @@ def _train(
     folder: pathlib.Path,
     config: ConfigDict,
     profile: str,
-) -> loop.TrainResult:
+) -> tuple[TrainState, bool]:
     """Trains on the train split until the configured epochs are done."""
     frames = data.split("train")
     if not len(frames):

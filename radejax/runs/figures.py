@@ -18,7 +18,7 @@ from radejax.data.cameras import front_view
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
-from radejax.data.projection import decode, model_inputs
+from radejax.data.projection import decode
 from radejax.data.records import Records
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LOSSES
@@ -179,7 +179,7 @@ def frame_shares(
 
     variables = jax.device_put(dict(variables))
     for batch in make_loader(table, options):
-        found = np.asarray(share_of(variables, model_inputs(batch)), np.float64)
+        found = np.asarray(share_of(variables, batch.model_inputs()), np.float64)
         for index, share in zip(batch.frame, found, strict=True):
             if index >= 0:
                 yield frames[index], share

@@ -27,7 +27,7 @@ from radejax.runs.evaluate import make_detector
 from radejax.runs.figures import FrameDrawer
 from radejax.training import distributed
 from radejax.training.metric_logger import Scores
-from radejax.training.state import TrainState
+from radejax.training.step import TrainState
 
 
 class Validation:

@@ -7,16 +7,14 @@ restored.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import logging
 import pathlib
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,9 +57,8 @@ class Checkpoints:
         best = policies.BestN(
             get_metric_fn=_best_of, n=1, keep_checkpoints_without_metrics=False
         )
-        kept = policies.AnyPreservationPolicy([newest, best])
         options = ocp.CheckpointManagerOptions(
-            preservation_policy=None if read_only else kept,
+            preservation_policy=policies.AnyPreservationPolicy([newest, best]),
             best_fn=_best_of,
             create=not read_only,
             cleanup_tmp_directories=not read_only,
@@ -110,7 +107,8 @@ class Checkpoints:
         Args:
             step: Name of the checkpoint; an existing one is not replaced.
             state: Pytree of arrays.
-            data_iterator: The grain iterator whose next batch belongs to `step`.
+            data_iterator: The grain iterator whose next batch belongs to `step`. All
+                processes share each batch and are at the same position.
             info: Plain values: configuration, versions.
             metrics: Of an evaluation at this step; `BEST` is one of them.
 
@@ -119,19 +117,19 @@ class Checkpoints:
         """
         if step in self._manager.all_steps():
             return
-        sums = {
-            "arrays": array_checksums(state),
-            "info": _text_checksum(dict(info)),
-            "data": _text_checksum(data_iterator.get_state()),
+        description = {
+            "info": dict(info),
+            "position": data_iterator.get_state(),
+            "checksums": array_checksums(state),
         }
-        with self._disk_full():
+        with files.disk_full(self.folder):
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
-                    state=ocp.args.StandardSave(state),
-                    data=grain.checkpoint.CheckpointSave(data_iterator),
-                    info=ocp.args.JsonSave(dict(info)),
-                    checksums=ocp.args.JsonSave(sums),
+                    state=ocp.args.PyTreeSave(state),
+                    description=ocp.args.JsonSave(
+                        description | {"sha256": _text_checksum(description)}
+                    ),
                 ),
                 metrics=dict(metrics) if metrics else None,
             )
@@ -142,7 +140,7 @@ class Checkpoints:
         Raises:
             DiskFullError: Earlier checkpoints stay intact.
         """
-        with self._disk_full():
+        with files.disk_full(self.folder):
             self._manager.wait_until_finished()
 
     def restore(
@@ -166,22 +164,17 @@ class Checkpoints:
         corrupted: list[int] = []
         steps = self.steps()
         for step in reversed(steps):
-            found, reason = None, "another process could not read it"
-            args = ocp.args.Composite(
-                state=ocp.args.StandardRestore(state), info=ocp.args.JsonRestore()
-            )
+            found = None
             try:
-                found = self._manager.restore(step, args=args)
-                self._verify(step, found["state"], found["info"])
-                self._restore_position(step, data_iterator)
-            # A corrupted file makes orbax, tensorstore or json raise anything.
-            except Exception as error:
-                found, reason = None, one_line(error)
+                found = self._read(step, lambda: state)
+            except DataError as error:
+                _log.warning("%s", error)
             if distributed.all_agree(found is not None) and found is not None:
                 distributed.main_only(lambda: self._move_away(corrupted))
                 self._manager.reload()
-                return found["state"], found["info"], step
-            _log.warning("checkpoint %d is corrupted: %s", step, reason)
+                restored, description = found
+                data_iterator.set_state(description["position"])
+                return restored, description["info"], step
             corrupted.append(step)
         if steps:
             raise DataError(
@@ -212,62 +205,46 @@ class Checkpoints:
             raise FileNotFoundError(
                 f"no checkpoint of step {step} in {self.folder}; there are {steps}"
             )
+        found, description = self._read(step, lambda: self._saved_variables(step))
+        state = {name: found.get(name) for name in _VARIABLES}
+        return jax.tree.map(np.asarray, state), description["info"], step
+
+    def _read(self, step: int, wanted: Callable[[], Any]) -> tuple[Any, dict[str, Any]]:
+        """A part of the state, or all, and its description; `DataError` if corrupted."""
         try:
-            return *self._read_variables(step), step
+            state = wanted()
+            restore_args = ocp.checkpoint_utils.construct_restore_args(state)
+            found = self._manager.restore(
+                step,
+                args=ocp.args.Composite(
+                    state=ocp.args.PyTreeRestore(
+                        state, restore_args=restore_args, partial_restore=True
+                    ),
+                    description=ocp.args.JsonRestore(),
+                ),
+            )
+            description = found["description"]
+            if description.pop("sha256") != _text_checksum(description):
+                raise DataError("the checksum of its description differs")
+            for name, value in array_checksums(found["state"]).items():
+                if description["checksums"].get(name) != value:
+                    raise DataError(f"the checksum of array {name} differs")
         # A corrupted file makes orbax, tensorstore or json raise anything.
         except Exception as error:
             raise DataError(
                 f"checkpoint {step} in {self.folder} is corrupted ({one_line(error)}); "
-                f"there are {steps}"
+                f"there are {self.steps()}"
             ) from error
+        return found["state"], description
 
-    def _read_variables(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _saved_variables(self, step: int) -> dict[str, Any]:
+        """Shapes of the variables of a model in a checkpoint, for every device."""
         with ocp.PyTreeCheckpointer() as reader:
             folder = self.folder / str(step) / "state"
             saved = reader.metadata(folder).item_metadata.tree
+        saved = {name: saved[name] for name in _VARIABLES if name in saved}
         whole = distributed.replicated(distributed.make_mesh())
-        wanted = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole),
-            {name: saved[name] for name in _VARIABLES if name in saved},
-        )
-        found = self._manager.restore(
-            step,
-            args=ocp.args.Composite(
-                state=ocp.args.PyTreeRestore(
-                    wanted,
-                    restore_args=ocp.checkpoint_utils.construct_restore_args(wanted),
-                    partial_restore=True,
-                ),
-                info=ocp.args.JsonRestore(),
-            ),
-        )
-        self._verify(step, found["state"], found["info"])
-        state = {name: found["state"].get(name) for name in _VARIABLES}
-        return jax.tree.map(np.asarray, state), found["info"]
-
-    def _verify(self, step: int, state: Any, info: Mapping[str, Any]) -> None:
-        """Raises `DataError` if what was restored is not what was saved."""
-        saved = self._checksums(step)
-        for name, value in array_checksums(state).items():
-            if saved["arrays"].get(name) != value:
-                raise DataError(f"the checksum of array {name} differs")
-        if saved["info"] != _text_checksum(info):
-            raise DataError("the checksum of its configuration differs")
-
-    def _restore_position(self, step: int, data_iterator: Any) -> None:
-        """Sets the iterator to its saved position, for any number of processes.
-
-        All processes share each batch and are at the same position, so that the file of
-        the first one is right for all.
-        """
-        folder = self.folder / str(step) / "data"
-        position = files.read_json(next(folder.glob("process_0-of-*.json")))
-        if self._checksums(step)["data"] != _text_checksum(position):
-            raise DataError("the checksum of the position in the data differs")
-        data_iterator.set_state(position)
-
-    def _checksums(self, step: int) -> Any:
-        return files.read_json(self.folder / str(step) / "checksums" / "metadata")
+        return abstract_state(saved, jax.tree.map(lambda _: whole, saved))
 
     def _move_away(self, steps: list[int]) -> None:
         """Renames corrupted checkpoints, so that these steps can be saved again."""
@@ -277,15 +254,6 @@ class Checkpoints:
             target.mkdir(exist_ok=True)
             (self.folder / str(step)).rename(target / str(step))
             _log.warning("moved checkpoint %d to %s", step, target)
-
-    @contextlib.contextmanager
-    def _disk_full(self) -> Iterator[None]:
-        message = (
-            f"no space left for a checkpoint in {self.folder}; earlier checkpoints are "
-            "intact, free some and run the same command again"
-        )
-        with files.disk_full(self.folder, message):
-            yield
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -329,11 +297,8 @@ def array_checksums(tree: Any) -> dict[str, int]:
 
 
 def _text_checksum(values: Any) -> str:
-    """SHA-256 of plain values as JSON; bytes are taken as such a text."""
-    if isinstance(values, bytes):
-        values = json.loads(values)
-    text = json.dumps(values, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    """SHA-256 of plain values as JSON."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 @jax.jit
@@ -342,11 +307,8 @@ def _sum(array: jax.Array) -> jax.Array:
         array = array.astype(jnp.uint8)
     bits = jnp.dtype(f"uint{8 * array.dtype.itemsize}")
     values = jax.lax.bitcast_convert_type(array, bits).astype(jnp.uint32)
-    position = jnp.zeros(array.shape, jnp.uint32)
-    for axis, size in enumerate(array.shape):
-        place = jax.lax.broadcasted_iota(jnp.uint32, array.shape, axis)
-        position = position * jnp.uint32(size) + place
-    return jnp.sum(_mixed(values ^ _mixed(position + jnp.uint32(1))), dtype=jnp.uint32)
+    position = jnp.arange(1, 1 + array.size, dtype=jnp.uint32).reshape(array.shape)
+    return jnp.sum(_mixed(values ^ _mixed(position)), dtype=jnp.uint32)
 
 
 def _mixed(x: jax.Array) -> jax.Array:

@@ -61,14 +61,8 @@ def check_batch_size(
     batch_size: int, mesh: Mesh, name: str = "config.train.batch_size"
 ) -> None:
     """Raises `UserError` for a global batch that does not divide over the mesh."""
-    devices = mesh.devices.size
-    if batch_size % devices:
-        lower = batch_size // devices * devices
-        choices = f"{lower} or {lower + devices}" if lower else f"{devices}"
-        raise UserError(
-            f"{name}={batch_size} does not divide over {devices} devices; use a "
-            f"multiple, for example {choices}"
-        )
+    count = mesh.devices.size
+    require(batch_size % count == 0, name, batch_size, f"a multiple of {count} devices")
 
 
 def put_batch(
@@ -126,7 +120,7 @@ def main_first(prepare: Callable[[], T]) -> T:
     result = main_only(prepare)
     if not is_main():
         result = prepare()
-    wait_for_all("main_first")
+    wait_for_all()
     return cast(T, result)  # it is None on the other processes only
 
 
@@ -147,8 +141,8 @@ def main_only(work: Callable[[], T]) -> T | None:
             result = work()
         except Exception as failed:
             error = failed
-    wait_for_all("main_only")
-    is_fine = bool(multihost_utils.broadcast_one_to_all(np.int32(error is None)))
+    wait_for_all()
+    is_fine = all_agree(error is None)
     if error is not None:
         raise error
     if not is_fine:
@@ -156,12 +150,12 @@ def main_only(work: Callable[[], T]) -> T | None:
     return result
 
 
-def wait_for_all(name: str) -> None:
+def wait_for_all() -> None:
     """Returns when every process has called it, which may take hours."""
     if jax.process_count() == 1:
         return
     ocp.multihost.sync_global_processes(
-        f"radejax {name} {next(_numbers)}",
+        f"radejax {next(_numbers)}",
         timeout=_WAIT_S,
         # All processes are named, so that they wait at the coordinator and not in a
         # collective, which would give up after minutes.

@@ -18,44 +18,12 @@ import tqdm
 from jaxtyping import UInt8
 
 from radejax.core import files
-from radejax.core.errors import (
-    DataError,
-    UserError,
-    check_options,
-    integer,
-    require,
-    several,
-)
+from radejax.core.errors import DataError, UserError
 from radejax.losses.detection import LOSSES
 from radejax.training import distributed
-from radejax.training.checkpoints import BEST
 
 Values = Mapping[str, float]
 Figures = Mapping[str, UInt8[np.ndarray, "_ _ 3"]]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LoggingOptions:
-    """The fields of `config.logging`, described there.
-
-    Raises:
-        UserError: A field is out of its range.
-    """
-
-    num_visualizations: int
-    wandb: bool
-    wandb_project: str
-    profile_steps: tuple[int, int]
-
-    def __post_init__(self) -> None:
-        steps = "two integers of at least 0, the first not above the last"
-        ranges = {
-            "num_visualizations": integer(0),
-            "profile_steps": several(integer(0), steps, count=2),
-        }
-        check_options(vars(self), "config.logging", ranges)
-        first, last = self.profile_steps
-        require(first <= last, "config.logging.profile_steps", (first, last), steps)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,10 +39,6 @@ class Scores:
     values: Values
     best: float | None = None
     pictures: Figures = dataclasses.field(default_factory=dict)
-
-    def with_best(self) -> dict[str, float] | None:
-        """Metrics of a checkpoint; None if it cannot become the best."""
-        return None if self.best is None else {**self.values, BEST: self.best}
 
 
 class MetricLogger:
@@ -104,10 +68,9 @@ class MetricLogger:
         wandb: Mapping[str, Any] | None = None,
     ) -> None:
         is_main = distributed.is_main()
-        self._folder, self._frames_per_step = folder, frames_per_step
-        self._path = folder / "metrics.jsonl" if is_main else None
+        self._path, self._frames_per_step = folder / "metrics.jsonl", frames_per_step
         self._board, self._wandb = None, None
-        if self._path is not None:
+        if is_main:
             if self._path.exists():
                 _remove_after(start_step, self._path)
             if wandb is not None:
@@ -145,9 +108,9 @@ class MetricLogger:
         self._bar.update(step - self._bar.n)
         if step == self._start + 1:
             jax.block_until_ready(metrics)
-            self.restart_timer(step)
+            self._restart_timer(step)
 
-    def restart_timer(self, step: int) -> None:
+    def _restart_timer(self, step: int) -> None:
         """Leaves the time since the last record out of the rate."""
         self._waited, self._since, self._last_step = 0.0, time.perf_counter(), step
 
@@ -160,22 +123,19 @@ class MetricLogger:
             values["frames_per_s"] = steps * self._frames_per_step / elapsed
             values["data_wait_share"] = self._waited / elapsed
             text.append(f"{values['frames_per_s']:.1f} frames/s")
-        self.restart_timer(step)
+        self._restart_timer(step)
         self._bar.set_postfix_str(" ".join(text))
         self._write(step, {**values, "epoch": epoch}, {})
 
     def log_scores(self, step: int, scores: Scores) -> None:
-        """Writes the result of an evaluation."""
+        """Writes the result of an evaluation, whose time is left out of the rate."""
         self._write(step, scores.values, scores.pictures)
+        self._restart_timer(step)
 
     def _write(self, step: int, values: Values, figures: Figures) -> None:
-        if self._path is None or self._board is None:
+        if self._board is None:
             return
-        message = (
-            f"no space left to write logs in {self._folder}; checkpoints are intact, "
-            "free some and run the same command again"
-        )
-        with files.disk_full(self._folder, message):
+        with files.disk_full(self._path):
             with self._path.open("a") as file:
                 file.write(json.dumps({"step": step, **values}) + "\n")
             self._board.flush()  # raises if its thread could not write
@@ -202,16 +162,12 @@ class MetricLogger:
 
 
 def _remove_after(step: int, path: pathlib.Path) -> None:
-    kept, lines = [], files.read_text(path).splitlines()
-    for number, line in enumerate(lines, 1):
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line + "\n")
-        except (ValueError, LookupError, TypeError) as error:
-            if number < len(lines):  # the last is the one a killed run was writing
-                raise DataError(
-                    f"{path}, line {number} is corrupted: {error}"
-                ) from None
+    """Keeps the records up to a step; a killed run may have left half a line."""
+    lines = files.read_text(path).splitlines(keepends=True)
+    try:
+        kept = [x for x in lines if x.endswith("\n") and json.loads(x)["step"] <= step]
+    except (ValueError, LookupError, TypeError) as error:
+        raise DataError(f"{path} is corrupted: {error}") from None
     files.write_text(path, "".join(kept))
 
 

@@ -1,25 +1,268 @@
-"""One training step, as a pure function to be jitted."""
+"""Train state, optimizer, and one training step as a pure function to be jitted."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import chex
 import flax.linen as nn
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
-from jaxtyping import Float, Num
+from flax import struct
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int, Num
+from ml_collections import ConfigDict
 
+from radejax.core.errors import (
+    BELOW_ONE,
+    POSITIVE,
+    UserError,
+    check_options,
+    integer,
+    number,
+    one_of,
+    or_none,
+    require,
+)
 from radejax.core.structures import Batch
-from radejax.data.projection import model_inputs
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
-from radejax.training.state import TrainState, merge_parameters
 
 Metrics = dict[str, Num[jax.Array, ""]]
-Step = Callable[[TrainState, Batch, jax.Array], tuple[TrainState, Metrics]]
+Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
+
+_RANGES = {
+    "batch_size": integer(1),
+    "num_epochs": integer(1),
+    "learning_rate": POSITIVE,
+    "final_learning_rate": number(0),
+    "schedule": one_of("cosine", "cyclic_cosine"),
+    "weight_decay": number(0),
+    "warmup_steps": integer(0),
+    "gradient_clip_norm": or_none(POSITIVE),
+    "ema_decay": or_none(BELOW_ONE),
+    "gradient_accumulation_steps": integer(1),
+    "parameter_sharding": one_of("replicated", "fsdp"),
+    "log_every_steps": integer(1),
+    "checkpoint_every_steps": integer(1),
+    "checkpoints_to_keep": or_none(integer(1)),
+    "evaluate_every_epochs": integer(0),
+    "max_skipped_steps": integer(0),
+}
+
+
+def check_train_section(train: ConfigDict) -> None:
+    """Raises `UserError` for a field of `config.train` that is out of its range."""
+    check_options(train, "config.train", _RANGES)
+    require(
+        train.final_learning_rate <= train.learning_rate,
+        "config.train.final_learning_rate",
+        train.final_learning_rate,
+        f"at most config.train.learning_rate, {train.learning_rate}",
+    )
+
+
+# Optimizer ---------------------------------------------------------------------------
+
+
+def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
+    """Linear warm-up from zero, then a cosine between the peak and the floor.
+
+    RADE-Net section IV-B: cosine per step from 1e-3 to 1e-4, no warm-up.
+
+    Args:
+        train: `config.train`. Its `schedule` is "cosine": falls once, over the training;
+            or "cyclic_cosine", as released: falls in one epoch and climbs back in the
+            next, and so on, which is torch's `CosineAnnealingLR` with
+            `T_max = steps_per_epoch`, stepped per batch.
+        steps_per_epoch: Batches of one pass over the data.
+
+    Returns:
+        Learning rate by step, float32.
+
+    Raises:
+        UserError: The warm-up is not shorter than the training.
+    """
+    peak, floor = train.learning_rate, train.final_learning_rate
+    num_steps, warmup_steps = steps_per_epoch * train.num_epochs, train.warmup_steps
+    require(
+        warmup_steps < num_steps,
+        "config.train.warmup_steps",
+        warmup_steps,
+        f"less than the {num_steps} steps of the training",
+    )
+    if train.schedule == "cosine":
+        return optax.warmup_cosine_decay_schedule(
+            0.0, peak, warmup_steps, num_steps, floor
+        )
+    warmup = optax.linear_schedule(0.0, peak, warmup_steps)
+    cyclic = _cyclic_cosine(peak, floor, steps_per_epoch)
+    return optax.join_schedules([warmup, cyclic], [warmup_steps])
+
+
+def _cyclic_cosine(peak: float, floor: float, half_period: int) -> optax.Schedule:
+    """What torch's recursion comes to: floor + (peak - floor) cos^2(pi t / 2T).
+
+    In whole steps from the nearest floor, so that float32 keeps all digits of the rate
+    where it is small and after any number of epochs.
+    """
+
+    def rate(step: ArrayLike) -> Float[jax.Array, "..."]:
+        from_floor = jnp.abs(jnp.mod(step, 2 * half_period) - half_period)
+        angle = jnp.asarray(from_floor, jnp.float32) * (jnp.pi / (2 * half_period))
+        return floor + (peak - floor) * jnp.square(jnp.sin(angle))
+
+    return rate
+
+
+def make_optimizer(
+    schedule: optax.Schedule,
+    *,
+    weight_decay: float,
+    gradient_clip_norm: float | None = None,
+    gradient_accumulation_steps: int = 1,
+) -> optax.GradientTransformation:
+    """AdamW with torch's defaults, decaying every parameter as the papers' runs do.
+
+    A step whose gradient is not finite changes nothing and is counted in the state, see
+    `optax.apply_if_finite`.
+
+    Args:
+        schedule: Learning rate by step.
+        weight_decay: Decoupled weight decay.
+        gradient_clip_norm: Global norm to clip to, or None.
+        gradient_accumulation_steps: The mean gradient of this many steps updates the
+            parameters, see `optax.MultiSteps`.
+    """
+    count = gradient_accumulation_steps
+    if count == 1:
+        adamw = optax.adamw(schedule, weight_decay=weight_decay)
+    else:  # which counts updates
+        adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)
+    optimizer: optax.GradientTransformation = optax.chain(adamw)
+    if gradient_clip_norm is not None:
+        optimizer = optax.chain(optax.clip_by_global_norm(gradient_clip_norm), adamw)
+    if count > 1:
+        optimizer = optax.MultiSteps(optimizer, count).gradient_transformation()
+    return skip_not_finite(optimizer)
+
+
+def skip_not_finite(
+    optimizer: optax.GradientTransformation,
+) -> optax.GradientTransformation:
+    """An optimizer that ignores gradients that are not finite, any number in a row."""
+    return optax.apply_if_finite(optimizer, np.iinfo(np.int32).max)
+
+
+# State -------------------------------------------------------------------------------
+
+
+class TrainState(struct.PyTreeNode):
+    """Everything a training step reads and writes.
+
+    Attributes:
+        step: Number of steps taken, including skipped ones; int32.
+        params: Parameters that are trained, float32.
+        model_state: Other variable collections, such as running batch statistics.
+        opt_state: State of the optimizer. It counts skipped steps, see
+            `optax.ApplyIfFiniteState`.
+        ema_params: Moving average of `params`, or None.
+        frozen: Parameters that are not trained. They have no gradient, optimizer state
+            or average, and are not saved in checkpoints.
+    """
+
+    step: Int[jax.Array, ""]
+    params: Any
+    model_state: Any
+    opt_state: Any
+    ema_params: Any
+    frozen: Any = dataclasses.field(default_factory=dict)
+
+    @property
+    def eval_variables(self) -> dict[str, Any]:
+        """Variables to run the model with: averaged parameters where there are any."""
+        params = self.params if self.ema_params is None else self.ema_params
+        return {"params": merge_parameters(params, self.frozen), **self.model_state}
+
+
+def create_state(
+    variables: Mapping[str, Any],
+    optimizer: optax.GradientTransformation,
+    *,
+    use_ema: bool,
+    is_frozen: Callable[[str], bool] | None = None,
+) -> TrainState:
+    """State before the first step.
+
+    Args:
+        variables: Of the model: "params" and any other collections.
+        optimizer: From `make_optimizer`.
+        use_ema: Keep a moving average of the parameters.
+        is_frozen: Called with the path of a parameter; True if it is not trained.
+    """
+    params, frozen = split_parameters(variables["params"], is_frozen)
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        params=params,
+        model_state={k: v for k, v in variables.items() if k != "params"},
+        opt_state=optimizer.init(params),
+        ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
+        frozen=frozen,
+    )
+
+
+def split_parameters(
+    params: Mapping[str, Any], is_frozen: Callable[[str], bool] | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Parameters that are trained, and those that are not, as two trees."""
+    if is_frozen is None:
+        return dict(params), {}
+    flat = flax.traverse_util.flatten_dict(params, sep="/")
+    parts: tuple[dict, dict] = ({}, {})
+    for name, leaf in flat.items():
+        parts[is_frozen(name)][name] = leaf
+    return tuple(flax.traverse_util.unflatten_dict(part, sep="/") for part in parts)
+
+
+def merge_parameters(
+    params: Mapping[str, Any], frozen: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Inverse of `split_parameters`."""
+    if not frozen:
+        return dict(params)
+    trees = [flax.traverse_util.flatten_dict(t, sep="/") for t in (params, frozen)]
+    return flax.traverse_util.unflatten_dict({**trees[0], **trees[1]}, sep="/")
+
+
+def with_pretrained(
+    variables: Mapping[str, Any], part: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Variables with some of them replaced, such as a pretrained image backbone.
+
+    Args:
+        variables: Of a model: "params" and other collections.
+        part: The same tree or a part of it, e.g.
+            `{"params": {"image_backbone": params}}`. What `variables` lack is added.
+
+    Raises:
+        UserError: Shapes differ.
+    """
+    merged = flax.traverse_util.flatten_dict(variables, sep="/")
+    for path, new in flax.traverse_util.flatten_dict(part, sep="/").items():
+        if path in merged and merged[path].shape != new.shape:
+            raise UserError(
+                f"pretrained {path} is {new.shape}, the model has {merged[path].shape}"
+            )
+        merged[path] = new
+    return flax.traverse_util.unflatten_dict(merged, sep="/")
+
+
+# Step --------------------------------------------------------------------------------
 
 
 def make_train_step(
@@ -52,7 +295,7 @@ def make_train_step(
     ) -> tuple[Float[jax.Array, ""], tuple[Any, Metrics]]:
         maps, model_state = model.apply(
             {"params": merge_parameters(params, state.frozen), **state.model_state},
-            *model_inputs(batch),
+            *batch.model_inputs(),
             train=True,
             rngs={"dropout": rng},
             mutable=list(state.model_state),

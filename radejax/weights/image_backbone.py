@@ -27,7 +27,7 @@ _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
 def load_image_backbone(
     path: PathLike | None, model: nn.Module, embeddings: PathLike | None = None
 ) -> Mapping[str, Any] | None:
-    """Pretrained part of the variables, for `radejax.training.state.with_pretrained`.
+    """Pretrained part of the variables, for `radejax.training.step.with_pretrained`.
 
     Args:
         path: A DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.

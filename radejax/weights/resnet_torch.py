@@ -56,7 +56,7 @@ def load(
     Returns:
         `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}`,
         without the 1x1 projection, which is DinoRADE's own: for
-        `radejax.training.state.with_pretrained`. Of a file of `save`, which has no
+        `radejax.training.step.with_pretrained`. Of a file of `save`, which has no
         last stage, only "image_backbone".
 
     Raises:

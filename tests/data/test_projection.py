@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from radejax.core.errors import UserError
+from radejax.core.structures import to_float
 from radejax.data.projection import (
     ENCODINGS,
     decode,
@@ -16,7 +17,6 @@ from radejax.data.projection import (
     project_jax,
     project_plain,
     project_tensor,
-    to_float,
     to_log_scale,
 )
 

@@ -145,7 +145,9 @@ def test_a_batch_that_does_not_divide_is_refused_first(
 ) -> None:
     mesh = distributed.make_mesh(4)
     monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
-    with pytest.raises(UserError, match=r"config.train.batch_size=2 does not divide"):
+    with pytest.raises(
+        UserError, match=r"batch_size is 2, expected a multiple of 4 devices"
+    ):
         experiment.run(_with("train.batch_size", 2), name="x", workdir=tmp_path / "run")
     assert not list(tmp_path.iterdir())
 

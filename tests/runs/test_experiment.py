@@ -142,7 +142,8 @@ def test_a_batch_that_does_not_divide_is_told_before_anything_is_written(
     config.train.batch_size = 3  # of eight devices
     config.data.roots = (str(tmp_path / "data"),)
     with pytest.raises(
-        UserError, match=r"config\.train\.batch_size=3 does not divide over 8 devices"
+        UserError,
+        match=r"config\.train\.batch_size is 3, expected a multiple of 8 devices",
     ):
         experiment.run(config, name="x", workdir=tmp_path / "run")
     assert not list(tmp_path.iterdir())

@@ -13,12 +13,12 @@ import grain
 import jax
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
 from radejax.core.errors import DataError, UserError
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints, abstract_state
 from radejax.training.metric_logger import Scores
-from radejax.training.state import TrainOptions
 
 Tiny = Any  # the fixture `tiny` of conftest.py
 STEPS_PER_EPOCH = 4
@@ -30,24 +30,26 @@ def compiled_once() -> Iterator[None]:
 
     Runs differ in what happens around their steps, and tracing takes the longest.
     """
-    optimizers, steps = {}, {}
-    make_optimizer, make_step = TrainOptions.make_optimizer, loop.make_train_step
-    fields = ("learning_rate", "final_learning_rate", "warmup_steps", "schedule")
-    fields += ("weight_decay", "gradient_clip_norm")
+    fields = ("learning_rate", "final_learning_rate", "warmup_steps", "num_epochs")
 
-    def optimizer(options: TrainOptions, steps_per_epoch: int) -> Any:
-        assert options.schedule == "cosine"  # does not count epochs
-        key = tuple(getattr(options, name) for name in fields)
-        key += (steps_per_epoch * options.num_epochs,)
-        return optimizers.setdefault(key, make_optimizer(options, steps_per_epoch))
+    def key(x: Any) -> Any:
+        if isinstance(x, ConfigDict):
+            assert x.schedule == "cosine"  # does not count epochs
+            return tuple(x[name] for name in fields)
+        return x if isinstance(x, int) else id(x)
 
-    def step(*parts: Any, **options: Any) -> Any:
-        key = (*map(id, parts), repr(options))
-        return steps.setdefault(key, make_step(*parts, **options))
+    def cached(make: Any) -> Any:
+        found = {}
+
+        def call(*parts: Any, **options: Any) -> Any:
+            made = make(*parts, **options)
+            return found.setdefault((*map(key, parts), repr(options)), made)
+
+        return call
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TrainOptions, "make_optimizer", optimizer)
-        patch.setattr(loop, "make_train_step", step)
+        for name in ("make_schedule", "make_optimizer", "make_train_step"):
+            patch.setattr(loop, name, cached(getattr(loop, name)))
         yield
 
 
@@ -109,10 +111,17 @@ def _losses(folder: pathlib.Path) -> list[tuple[int, float]]:
     return [(r["step"], r["focal"]) for r in map(json.loads, lines)]
 
 
+def check_equal(result: Any, undisturbed: Any) -> None:
+    """A run that is finished has the state of the undisturbed one, bit for bit."""
+    state, is_finished = result
+    assert is_finished
+    chex.assert_trees_all_equal(state, undisturbed[0][0])
+
+
 def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
-    result, folder = undisturbed
-    assert result.finished
-    assert result.step == int(result.state.step) == 8
+    (state, is_finished), folder = undisturbed
+    assert is_finished
+    assert state.step == 8
     losses = _losses(folder)
     assert [step for step, _ in losses] == list(range(1, 9))
     assert losses[-1][1] < losses[0][1]
@@ -121,8 +130,7 @@ def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
 def test_two_runs_of_one_seed_are_equal_bit_for_bit(
     run: Any, undisturbed: Any, workdir: pathlib.Path
 ) -> None:
-    again = run(workdir)
-    chex.assert_trees_all_equal(again.state, undisturbed[0].state)
+    check_equal(run(workdir), undisturbed)
     assert _losses(workdir) == _losses(undisturbed[1])
 
 
@@ -135,7 +143,7 @@ def test_a_seed_initializes_the_variables(
         config.seed = seed
         config.train.update(num_epochs=1, learning_rate=1e-30, final_learning_rate=0.0)
         options = {"steps_per_epoch": 1, "variables": None, "config": config}
-        return run(tmp_path / name, **options).state.params
+        return run(tmp_path / name, **options)[0].params
 
     first = initial("a", 0)
     chex.assert_trees_all_equal(first, initial("b", 0))
@@ -153,8 +161,7 @@ def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
     # One batch is looked at for its shapes before the first step.
     with pytest.raises(RuntimeError, match="power cut"):
         run(workdir, Stopping(tiny.loader(), batch + 1, crash))
-    again = run(workdir)
-    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+    check_equal(run(workdir), undisturbed)
     assert _losses(workdir) == _losses(undisturbed[1])
 
 
@@ -162,13 +169,11 @@ def test_sigterm_saves_and_stops(
     run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
 ) -> None:
     terminate = functools.partial(os.kill, os.getpid(), signal.SIGTERM)
-    stopped = run(workdir, Stopping(tiny.loader(), 6, terminate))
-    assert not stopped.finished
+    state, is_finished = run(workdir, Stopping(tiny.loader(), 6, terminate))
+    assert not is_finished
     with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
-        assert checkpoints.steps()[-1] == stopped.step == 5
-    again = run(workdir)
-    assert again.finished
-    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+        assert checkpoints.steps()[-1] == state.step == 5
+    check_equal(run(workdir), undisturbed)
 
 
 def test_sigterm_in_an_evaluation_saves_and_stops(
@@ -190,22 +195,19 @@ def test_sigterm_in_an_evaluation_saves_and_stops(
     def start() -> Any:
         return run(workdir, config=config, evaluate=evaluate)
 
-    stopped = start()
-    assert (stopped.step, stopped.finished) == (4, False)
-    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
-        assert checkpoints.steps()[-1] == 4
-    last = start()  # cut in the evaluation at the end
-    assert (last.step, last.finished) == (8, False)
-    again = start()
-    assert again.finished
-    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
+    for step in (4, 8):  # the second time in the evaluation at the end
+        state, is_finished = start()
+        assert (int(state.step), is_finished) == (step, False)
+        with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
+            assert checkpoints.steps()[-1] == step
+    check_equal(start(), undisturbed)
 
 
 def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
     run: Any, workdir: pathlib.Path
 ) -> None:
     same = {"frames to train on": 16, "sha256 of their keys": "ab"}
-    first = run(workdir, info={"same": same})
+    first, _ = run(workdir, info={"same": same})
     losses = _losses(workdir)
     with pytest.raises(
         UserError,
@@ -213,7 +215,7 @@ def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
     ):
         run(workdir, info={"same": same | {"sha256 of their keys": "cd"}})
     assert _losses(workdir) == losses
-    assert run(workdir, info={"same": same}).step == first.step
+    assert run(workdir, info={"same": same})[0].step == first.step
 
 
 def test_no_more_than_two_steps_are_under_way(
@@ -240,15 +242,13 @@ def test_a_damaged_newest_checkpoint_falls_back(
     workdir: pathlib.Path,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    result = run(workdir)
-    newest = workdir / "checkpoints" / str(result.step)
-    for path in (newest / "state").rglob("*"):
+    run(workdir)
+    for path in (workdir / "checkpoints/8/state").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    again = run(workdir)
-    assert "checkpoint 8 is corrupted" in caplog.text
+    check_equal(run(workdir), undisturbed)
+    assert "/checkpoints is corrupted" in caplog.text
     assert (workdir / "checkpoints_corrupted" / "8").is_dir()
-    chex.assert_trees_all_equal(again.state.params, undisturbed[0].state.params)
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_a_damaged_newest_checkpoint_falls_back(
 def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
     first: int, then: int, undisturbed: Any, tmp_path: pathlib.Path, tiny: Tiny
 ) -> None:
-    state = undisturbed[0].state
+    state = undisturbed[0][0]
 
     def placed(count: int) -> Any:
         return distributed.state_sharding(
@@ -296,8 +296,7 @@ def test_a_run_continues_on_another_number_of_devices(
         run(
             workdir, Stopping(tiny.loader(), 6, stop), mesh=distributed.make_mesh(first)
         )
-    again = run(workdir, mesh=distributed.make_mesh(then))
-    assert again.finished
+    assert run(workdir, mesh=distributed.make_mesh(then))[1]
     losses, expected = _losses(workdir), _losses(undisturbed[1])
     np.testing.assert_allclose(
         [v for _, v in losses], [v for _, v in expected], rtol=0.05
@@ -318,8 +317,7 @@ def test_steps_without_finite_loss_end_the_run(
         run(workdir, Poisoned(tiny.loader(), 99, lambda: None))
     assert "2 steps so far were skipped because loss" in caplog.text
     # Two of them, after the batch that is looked at for its shapes.
-    result = run(workdir / "few", Poisoned(tiny.loader(), 3, lambda: None))
-    assert result.finished
+    assert run(workdir / "few", Poisoned(tiny.loader(), 3, lambda: None))[1]
     rows = (workdir / "few" / "metrics.jsonl").read_text().splitlines()
     assert json.loads(rows[-1])["skipped"] == 2
 
@@ -355,4 +353,4 @@ def test_a_trace_is_written(
     assert list((workdir / "trace").rglob("*.xplane.pb"))
     assert "no trace" not in caplog.text
     run(workdir, profile=str(workdir / "none"))
-    assert "no trace: this start ended before step 2" in caplog.text
+    assert "no trace: 0 steps are left" in caplog.text

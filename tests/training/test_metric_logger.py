@@ -57,7 +57,7 @@ needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
 def test_metrics_on_a_full_disk_are_one_clear_error(tmp_path: pathlib.Path) -> None:
     with _logger(tmp_path, 0) as logger:
         (tmp_path / "metrics.jsonl").symlink_to(FULL)
-        with pytest.raises(DiskFullError, match=r"logs in .*intact"):
+        with pytest.raises(DiskFullError, match="no space left"):
             logger.log(1, {"focal": 1.0}, epoch=1.0)
 
 
@@ -87,7 +87,7 @@ def test_tensorboard_on_a_full_disk_is_an_error_and_blocks_nothing(
             for step in range(1000):
                 logger.log(step, values, epoch=1.0)
 
-        with pytest.raises(DiskFullError, match=r"logs in .*; checkpoints are intact"):
+        with pytest.raises(DiskFullError, match="no space left"):
             log()
 
 

@@ -1,17 +1,19 @@
 """Schedule and optimizer against numbers worked out by hand and torch's AdamW rule."""
 
 import math
+from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.training.state import (
-    TrainOptions,
+from radejax.training.step import (
+    check_train_section,
     create_state,
     make_optimizer,
     make_schedule,
@@ -21,12 +23,34 @@ from radejax.training.state import (
 )
 
 
-def test_cosine_at_start_middle_and_end() -> None:
-    schedule = make_schedule(
-        learning_rate=1e-3, final_learning_rate=1e-4, num_steps=100, warmup_steps=0
-    )
-    values = [float(schedule(step)) for step in (0, 50, 100, 150)]
-    np.testing.assert_allclose(values, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
+def _schedule(steps_per_epoch: int, num_epochs: int = 1, **fields: Any) -> Any:
+    train = base_config().train
+    train.update(learning_rate=1e-3, final_learning_rate=1e-4, schedule="cosine")
+    train.update({"warmup_steps": 0, "num_epochs": num_epochs} | fields)
+    return make_schedule(train, steps_per_epoch)
+
+
+CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
+
+
+@pytest.mark.parametrize(
+    ("schedule", "steps", "rates"),
+    [
+        (_schedule(100), (0, 50, 100, 150), (1e-3, 5.5e-4, 1e-4, 1e-4)),
+        (
+            _schedule(50, 2, warmup_steps=10),
+            (0, 5, 10, 55, 100),
+            (0, 5e-4, 1e-3, 5.5e-4, 1e-4),
+        ),
+        (
+            _schedule(10, 6, warmup_steps=4, **CYCLIC),
+            (0, 2, 4, 14, 24),
+            (0, 5e-4, 1e-3, 1e-5, 1e-3),
+        ),
+    ],
+)
+def test_rates_by_step(schedule: Any, steps: tuple, rates: tuple) -> None:
+    np.testing.assert_allclose([float(schedule(x)) for x in steps], rates, rtol=1e-5)
 
 
 def _torch_recursion(peak: float, floor: float, period: int, steps: int) -> np.ndarray:
@@ -47,14 +71,7 @@ def _torch_recursion(peak: float, floor: float, period: int, steps: int) -> np.n
 @pytest.mark.parametrize("steps_per_epoch", [1, 2, 3, 7, 10, 1745, 2909])
 def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch: int) -> None:
     num_steps = 11 * steps_per_epoch
-    schedule = make_schedule(
-        learning_rate=1e-3,
-        final_learning_rate=1e-5,
-        num_steps=num_steps,
-        warmup_steps=0,
-        kind="cyclic_cosine",
-        steps_per_epoch=steps_per_epoch,
-    )
+    schedule = _schedule(steps_per_epoch, 11, **CYCLIC)
     rates = np.asarray(jax.jit(schedule)(jnp.arange(num_steps)))
     assert rates.dtype == np.float32
     expected = _torch_recursion(1e-3, 1e-5, steps_per_epoch, num_steps)
@@ -64,34 +81,11 @@ def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch: int) -
     assert len(floors) == 5
 
 
-def test_cyclic_cosine_begins_after_the_warm_up() -> None:
-    schedule = make_schedule(
-        learning_rate=1e-3,
-        final_learning_rate=1e-5,
-        num_steps=60,
-        warmup_steps=4,
-        kind="cyclic_cosine",
-        steps_per_epoch=10,
-    )
-    rates = [float(schedule(step)) for step in (0, 2, 4, 14, 24)]
-    np.testing.assert_allclose(rates, [0, 5e-4, 1e-3, 1e-5, 1e-3], rtol=1e-6)
-
-
-def test_warm_up_is_linear_from_zero() -> None:
-    schedule = make_schedule(
-        learning_rate=1e-3, final_learning_rate=1e-4, num_steps=100, warmup_steps=10
-    )
-    values = [float(schedule(step)) for step in (0, 5, 10, 55, 100)]
-    np.testing.assert_allclose(values, [0, 5e-4, 1e-3, 5.5e-4, 1e-4], rtol=1e-5)
-
-
 def test_warm_up_longer_than_the_training_is_refused() -> None:
     with pytest.raises(
         UserError, match=r"warmup_steps is 100, expected less than the 100"
     ):
-        make_schedule(
-            learning_rate=1e-3, final_learning_rate=0.0, num_steps=100, warmup_steps=100
-        )
+        _schedule(50, 2, warmup_steps=100)
 
 
 @pytest.mark.parametrize(
@@ -122,9 +116,9 @@ def test_warm_up_longer_than_the_training_is_refused() -> None:
     ],
 )
 def test_an_option_out_of_its_range_is_named(name: str, value: object) -> None:
-    fields = {**base_config().train, name: value}
+    train = ConfigDict(base_config().train.to_dict() | {name: value})
     with pytest.raises(UserError, match=f"^config.train.{name} is .*, expected"):
-        TrainOptions(**fields)
+        check_train_section(train)
 
 
 def test_accumulated_steps_update_once_with_the_mean_and_at_the_rate_of_their_step() -> (

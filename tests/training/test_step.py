@@ -13,14 +13,17 @@ import numpy as np
 import optax
 import pytest
 
-from radejax.core.structures import DetectionMaps
-from radejax.data.projection import to_float
+from radejax.core.structures import DetectionMaps, to_float
 from radejax.detection.decode import decode
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.training import distributed
-from radejax.training.state import create_state, make_optimizer, skip_not_finite
-from radejax.training.step import make_train_step
+from radejax.training.step import (
+    create_state,
+    make_optimizer,
+    make_train_step,
+    skip_not_finite,
+)
 
 RNG = jax.random.key(7)
 COLLECTIVES = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"

@@ -24,8 +24,13 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training import distributed
 from radejax.training.loop import loss_options
-from radejax.training.state import TrainOptions, TrainState, create_state
-from radejax.training.step import make_train_step
+from radejax.training.step import (
+    TrainState,
+    create_state,
+    make_optimizer,
+    make_schedule,
+    make_train_step,
+)
 from radejax.weights import dinorade_torch, dinov3_hf, radenet_torch
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
@@ -63,9 +68,10 @@ def train(
     """State after batches of two in order, and what each step measured."""
     config.train.batch_size = 2
     config.train.num_epochs = -(-num_steps // STEPS_PER_EPOCH)
-    options = TrainOptions(**config.train)
+    schedule = make_schedule(config.train, STEPS_PER_EPOCH)
+    optimizer = make_optimizer(schedule, weight_decay=config.train.weight_decay)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
-    mesh, optimizer = distributed.make_mesh(1), options.make_optimizer(STEPS_PER_EPOCH)
+    mesh = distributed.make_mesh(1)
     state = create_state(
         variables,
         optimizer,
@@ -76,8 +82,7 @@ def train(
     state = jax.device_put(state, placement)
     step = make_train_step(model, optimizer, grid, loss=loss_options(config))
     step = jax.jit(step, donate_argnums=0, out_shardings=(placement, None))
-    schedule, rng = options.make_schedule(STEPS_PER_EPOCH), jax.random.key(1)
-    measured = []
+    measured, rng = [], jax.random.key(1)
     for i in range(num_steps):
         first = 2 * (i % STEPS_PER_EPOCH)
         part = jax.tree.map(lambda x, a=first: x[a : a + 2], batch)
