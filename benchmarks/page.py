@@ -1,11 +1,14 @@
-"""The tables of `docs/benchmarks.md`, from the JSON files in `docs/benchmarks/`."""
+"""The tables of `docs/reports/benchmarks.md`, from the JSON files in `docs/reports/benchmarks/`."""
 
 import json
 import pathlib
 import re
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-RESULTS, PAGE = ROOT / "docs" / "benchmarks", ROOT / "docs" / "benchmarks.md"
+RESULTS, PAGE = (
+    ROOT / "docs" / "reports" / "benchmarks",
+    ROOT / "docs" / "reports" / "benchmarks.md",
+)
 BEGIN, END = "<!-- tables: benchmarks/run.py -->", "<!-- end of tables -->"
 
 
@@ -51,7 +54,7 @@ def devices_table(runs):
     lines = [
         f"### {runs[-1]['device']}",
         "",
-        "| what | dtype | frames | radejax, a frame | others, a frame | times faster | "
+        "| stage | dtype | frames | radejax, per frame | compared with, per frame | speedup | "
         "greatest difference | memory | |",
         "|---|---|---|---|---|---|---|---|---|",
     ]

@@ -2,7 +2,7 @@
 
     python benchmarks/programs.py             # full size, bfloat16; a minute, no accelerator
 
-Written are `docs/benchmarks/programs.json` and its table in `docs/benchmarks.md`.
+Written are `docs/reports/benchmarks/programs.json` and its table in `docs/reports/benchmarks.md`.
 
 Every program is lowered by `jax.export` for a platform that need not be there. `facts`
 reads its text: types, host callbacks, convolutions, transposes, loops. `work` counts the

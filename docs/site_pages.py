@@ -3,16 +3,27 @@
     pip install -e '.[docs]' && mkdocs build --strict
     python docs/site_pages.py site
 
-README, CHANGELOG, CONTRIBUTING and the notebooks keep their places in the repository, and
-the reference has a page for every room of `radejax/`, written from its docstrings. The
-second command says which public names a built site lacks, and fails if there are any.
+README, CHANGELOG, CONTRIBUTING and the notebooks keep their places in the repository. The
+reference is generated: a page per package of `radejax/` from its docstrings, a page of all
+commands from their options, and a page of all config fields from `radejax/core/config.py`.
+The second command lists the public names that a built site lacks, and fails if there are any.
 """
 
 import ast
+import io
 import pathlib
 import re
 import sys
+import tokenize
 from collections.abc import Iterator
+from typing import Any
+
+import click
+from ml_collections import ConfigDict
+from ml_collections.config_flags import config_path
+
+from radejax.cli.main import main
+from radejax.core.config import fields_of, load_config
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 HOME = {"README.md": "index.md"}
@@ -32,15 +43,113 @@ def modules() -> dict[str, pathlib.Path]:
 
 
 def reference() -> dict[str, str]:
-    """Pages of the reference: a room each, with all modules of the room."""
-    pages: dict[str, str] = {}
+    """Pages of the reference: commands, config fields, and one per package."""
+    pages = {
+        "reference/commands.md": commands_page(),
+        "reference/config_fields.md": config_page(),
+    }
     for name in modules():
-        room = [*name.split("."), "radejax"][1]
-        page = f"reference/{room}.md"
-        title = "radejax" if room == "radejax" else f"radejax.{room}"
+        package = [*name.split("."), "radejax"][1]
+        page = f"reference/{package}.md"
+        title = "radejax" if package == "radejax" else f"radejax.{package}"
         pages.setdefault(page, f"# {title}\n")
         pages[page] += f"\n::: {name}\n"
     return pages
+
+
+def commands_page() -> str:
+    """All commands of `radejax` with their arguments and options."""
+    parts = ["# Commands", ""]
+    for name, command in commands(main, "radejax"):
+        context = click.Context(command, info_name=name)
+        parts += [f"## {name}", "", f"`{command.get_usage(context)[7:]}`", ""]
+        parts += [re.sub(r"\x08\n", "", command.help or ""), ""]
+        rows = [parameter.get_help_record(context) for parameter in command.params]
+        parts += ["| option | meaning |", "|---|---|"]
+        parts += [
+            "| `{}` | {} |".format(
+                *(" ".join(x.split()).replace("|", "\\|") for x in row)
+            )
+            for row in rows
+            if row
+        ]
+        parts.append("")
+    return "\n".join(parts)
+
+
+def commands(group: click.Group, path: str) -> Iterator[tuple[str, click.Command]]:
+    """Every command below a group with its full name."""
+    for name, command in sorted(group.commands.items()):
+        if isinstance(command, click.Group):
+            yield from commands(command, f"{path} {name}")
+        else:
+            yield f"{path} {name}", command
+
+
+def config_page() -> str:
+    """All fields of the bundled configs: type, values of the presets, meaning."""
+    parts = [
+        "# Config fields",
+        "",
+        "Every field can be set on the command line, for example "
+        "`--config.train.batch_size=4`. [Differences](../deviations.md) explains where the "
+        "paper and the released code disagree.",
+    ]
+    comments = field_comments(
+        (ROOT / "radejax/core/config.py").read_text(encoding="utf-8")
+    )
+    for name in ("radenet", "dinorade"):
+        path = str(ROOT / "configs" / f"{name}.py")
+        configs = [load_config(path + end) for end in ("", ":paper", ":official")]
+        if name == "dinorade":
+            source = (ROOT / "configs" / "dinorade.py").read_text(encoding="utf-8")
+            comments |= field_comments(source)
+        parts += [
+            "",
+            f"## {name}",
+            "",
+            "| field | type | default | paper | official | meaning |",
+        ]
+        parts.append("|---|---|---|---|---|---|")
+        for field, kind in fields_of(configs[0]):
+            values = [_text(config_path.get_value(field, config)) for config in configs]
+            kind_name = getattr(kind, "__name__", str(kind))
+            meaning = comments.get(field.split(".")[-1], "")
+            cells = [
+                f"`{field}`",
+                kind_name,
+                *(f"`{value}`" for value in values),
+                meaning,
+            ]
+            parts.append(f"| {' | '.join(cells)} |")
+    return "\n".join(parts) + "\n"
+
+
+def _text(value: Any) -> str:
+    return repr(value.to_dict() if isinstance(value, ConfigDict) else value)
+
+
+def field_comments(source: str) -> dict[str, str]:
+    """The comment above and behind every key of the dictionaries of a config module."""
+    found, above = {}, []
+    lines = source.splitlines()
+    comments = {
+        token.start[0]: (token.start[1], token.string.lstrip("# ").rstrip())
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    for number, line in enumerate(lines, 1):
+        key = re.match(r'\s*"(\w+)":', line)
+        column, text = comments.get(number, (0, ""))
+        if text and not line[:column].strip():
+            above.append(text)
+            continue
+        if key:
+            found[key[1]] = " ".join([*above, *([text] if text else [])]).replace(
+                "|", "\\|"
+            )
+        above = []
+    return found
 
 
 def root_page(name: str) -> str:

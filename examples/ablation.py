@@ -13,8 +13,8 @@ killed, also within a run. `--table_only` writes the tables of what is there. Gi
 once it works on as many seeds, best one a core (`taskset -c 0 python ...`).
 
 AP is BEV at IoU 0.3, protocol `all_point`, mean over seeds; intervals are of 95 %, paired,
-over resampled sequences of the scenes to evaluate on. A claim is shown where the interval
-lies above 0 (and the difference reaches what is claimed), refuted where it ends below.
+over resampled sequences of the scenes to evaluate on. A claim is supported where the interval
+lies above 0 (and the difference reaches the claimed one), contradicted where it ends below.
 """
 
 from __future__ import annotations
@@ -231,8 +231,8 @@ def resampled(
 def verdict(difference: float, low: float, high: float, least: float = 0.0) -> str:
     """Of a claim that a difference is positive, and reaches what is claimed."""
     if low > 0 and difference >= least:
-        return "shown"
-    return "refuted" if high < least or high < 0 else "undecided"
+        return "supported"
+    return "contradicted" if high < least or high < 0 else "inconclusive"
 
 
 @dataclasses.dataclass

@@ -81,7 +81,7 @@ STUDIES = {
         "RADE-Net's Table III",
         "base",
         {n: _row(n) for n in ("base", "cbam", "cbam_heads", "model", "no_cbam", "stem", "expand")}
-        | {"labels exchanged": Cell(_RADAR, _LABELS)},
+        | {"shuffled labels": Cell(_RADAR, _LABELS)},
         (
             Claim("the whole network beats the plain one (64.06 to 57.96)", "model", "base"),
             Claim("attention alone does not pay (55.13 to 57.96)", "base", "cbam"),
@@ -90,7 +90,7 @@ STUDIES = {
             Claim("attention pays with neck and heads (64.06 to 59.81)", "model", "no_cbam"),
             Claim("without a second stem it is better (64.06 to 63.47)", "model", "stem"),
             Claim("with a narrow decoder it is better (64.06 to 63.12)", "model", "expand"),
-            Claim("control: labels teach", "model", "labels exchanged"),
+            Claim("sanity check: labels matter", "model", "shuffled labels"),
         ),
         1024,
     ),
@@ -103,7 +103,7 @@ STUDIES = {
             "sigma 0.75": _radar(loss__heatmap_sigma_bins=0.75),
             "adaptive": _radar(loss__heatmap_sigma_mode="adaptive"),
             "anisotropic": _radar(loss__heatmap_sigma_mode="anisotropic"),
-            "labels exchanged": Cell(_RADAR, _LABELS),
+            "shuffled labels": Cell(_RADAR, _LABELS),
         },
         (
             Claim("0.75 is best for all classes", "sigma 0.75", "sigma 3", "mean"),
@@ -114,7 +114,7 @@ STUDIES = {
             ),
             Claim("a spread of the box's size is better than 1", "adaptive", "model", "mean"),
             Claim("a spread of its shape is better than 1", "anisotropic", "model", "mean"),
-            Claim("control: labels teach", "model", "labels exchanged"),
+            Claim("sanity check: labels matter", "model", "shuffled labels"),
         ),
         1024,
     ),
@@ -126,8 +126,8 @@ STUDIES = {
             "R+C": Cell("quickstart_fusion:pretrained", {"model.fusion.weighting": "off"}),
             "R+C+W": Cell("quickstart_fusion:pretrained"),
             "R+C+W ResNet": Cell("quickstart_fusion:resnet50"),
-            "images exchanged": Cell("quickstart_fusion:pretrained", exchanges="R+C+W"),
-            "labels exchanged": Cell("quickstart_fusion:pretrained", _LABELS),
+            "shuffled images": Cell("quickstart_fusion:pretrained", exchanges="R+C+W"),
+            "shuffled labels": Cell("quickstart_fusion:pretrained", _LABELS),
         },
         (
             Claim("the camera helps (69.61 to 61.65)", "R+C", "R"),
@@ -136,8 +136,8 @@ STUDIES = {
             Claim("elevation weights help (71.38 to 69.61)", "R+C+W", "R+C"),
             Claim("a transformer beats a ResNet (71.38 to 68.43)", "R+C+W", "R+C+W ResNet"),
             Claim("a transformer does in the mean", "R+C+W", "R+C+W ResNet", "mean"),
-            Claim("control: its own images count", "R+C+W", "images exchanged"),
-            Claim("control: labels teach", "R+C+W", "labels exchanged"),
+            Claim("sanity check: images matter", "R+C+W", "shuffled images"),
+            Claim("sanity check: labels matter", "R+C+W", "shuffled labels"),
         ),
         1024,
     ),
@@ -147,7 +147,7 @@ STUDIES = {
         {
             "R long": Cell("quickstart_fusion:radar,long"),
             "R+C+W long": Cell("quickstart_fusion:pretrained,long"),
-            "images exchanged long": Cell(
+            "shuffled images long": Cell(
                 "quickstart_fusion:pretrained,long", exchanges="R+C+W long"
             ),
         },
@@ -157,7 +157,7 @@ STUDIES = {
                 for cls in CLASSES
             ),
             Claim("it does in the mean", "R+C+W long", "R long", "mean"),
-            Claim("control: its own images count", "R+C+W long", "images exchanged long", "mean"),
+            Claim("sanity check: images matter", "R+C+W long", "shuffled images long", "mean"),
         ),
         1024,
     ),

@@ -176,6 +176,6 @@ def test_the_committed_page_is_what_the_committed_files_give(
     monkeypatch.setattr(modules.page, "PAGE", page)
     modules.page.write_page()
     assert page.read_text() == committed, (
-        "docs/benchmarks.md is not what docs/benchmarks/*.json say: "
+        "docs/reports/benchmarks.md is not what docs/reports/benchmarks/*.json say: "
         "python benchmarks/run.py --tables"
     )

@@ -1,4 +1,4 @@
-"""docs/deviations.md lists every field of both presets with what it stands at now."""
+"""docs/reports/preset_sources.md lists every field of both presets with what it stands at now."""
 
 import pathlib
 import re
@@ -15,7 +15,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 def _tables() -> dict[str, dict[str, tuple[str, str, str]]]:
     """Values in `paper` and `official` and the source, by field, of both tables."""
-    text = (ROOT / "docs" / "deviations.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reports" / "preset_sources.md").read_text(encoding="utf-8")
     part = text.partition("## Every field of both presets\n")[2].partition("\n## ")[0]
     tables = {}
     for name in ("RADE-Net", "DinoRADE"):
