@@ -11,11 +11,11 @@ import numpy as np
 
 @dataclasses.dataclass(kw_only=True)
 class Case:
-    """Something measured in turns with its rivals.
+    """A measurement that alternates with those it is compared with.
 
     Attributes:
         name: What is done.
-        columns: Name -> function that runs it once and gives wall and processor seconds;
+        columns: Name -> function that runs it once and gives wall and CPU seconds;
             "radejax" is ours.
         frames: Frames of one call.
         dtype: Of the computation.
@@ -60,7 +60,7 @@ def compiled(function, *arguments, precision=None, **options):
 
 
 def timed(function):
-    """Wall and processor seconds of one call."""
+    """Wall and CPU seconds of one call."""
     wall, processor = time.perf_counter(), time.process_time()
     function()
     return time.perf_counter() - wall, time.process_time() - processor

@@ -364,7 +364,7 @@ def detector(machine):
 
 
 def released_chain(frames, network, maps):
-    """Wall and processor seconds of projection, network and loops over peaks, in turn."""
+    """Wall and CPU seconds of projection, network and loops over peaks, in turn."""
     parts = [
         timed(lambda: [project_plain(frame) for frame in frames]),
         network(),

@@ -78,7 +78,7 @@ def devices_table(runs):
 
 
 def row_text(row, where):
-    """A line of a device's table; on a CPU processor time is shown and compared too."""
+    """A line of a device's table; on a CPU, CPU time is shown and compared too."""
     is_cpu = where == "cpu"
     clock = row["processor_s" if is_cpu else "wall_s"]
     others = [name for name in clock if name != "radejax"]
@@ -125,8 +125,8 @@ def programs_table(result):
         "those of matrix products, convolutions, gathers and scatters alone. The least time "
         "is by published dense peaks.",
         "",
-        "| program | batch | GFLOP a frame | MiB a frame | convolutions | products | loops | "
-        f"other ops | {' | '.join(f'{d}, ms a frame at least' for d in devices)} |",
+        "| program | batch | GFLOP per frame | MiB per frame | convolutions | products | loops | "
+        f"other ops | {' | '.join(f'{d}, ms per frame at least' for d in devices)} |",
         f"|{'---|' * (8 + len(devices))}",
     ]
     for row in result["programs"]:

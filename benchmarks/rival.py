@@ -46,7 +46,7 @@ class Rival:
         return answer
 
     def columns(self, what, *arguments):
-        """Name -> function that gives wall and processor seconds of what is built."""
+        """Name -> function that gives wall and CPU seconds of what is built."""
         names = self.ask("build", what, *arguments)
         return {name: functools.partial(self.ask, "time", name) for name in names}
 

@@ -6,10 +6,10 @@
     python benchmarks/run.py --tables                 # only write the page's tables again
 
 Ours and torch (where it is installed: eager, and `torch.compile` on a GPU) are a pair of
-processes that run in turns; results are compared first, and a case whose numbers differ
+processes that alternate; results are compared first, and a case whose numbers differ
 is an error and no measurement. Written are `docs/reports/benchmarks/DEVICE.json`, and from all
 such files the tables of `docs/reports/benchmarks.md`. Times are medians of wall and processor
-time a frame; ratios are of processor time on a CPU, where others may be at work, else of
+time a frame; ratios are of CPU time on a CPU, where others may be at work, else of
 wall time. What is measured again takes the place of what the file had, the rest stays.
 """
 

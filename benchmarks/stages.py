@@ -171,7 +171,7 @@ def _parts(
 
 
 def _best(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Shortest time of each, in turns, after one call that compiles."""
+    """Shortest time of each, interleaved, after one call that compiles."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for repeat in range(repeats + 1):
         for name, function in functions.items():

@@ -63,7 +63,7 @@ def start(machine):
 
 
 def until(text, words, folder, programs):
-    """Wall and processor seconds of a Python process until it writes a text.
+    """Wall and CPU seconds of a Python process until it writes a text.
 
     Args:
         text: Part of the line that ends the time; the process is ended then.
