@@ -36,8 +36,7 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.models.image import normalize
-from radejax.models.resnet import STRIDE, ResNetTrunk, frozen_params
+from radejax.models.image import STRIDE, ResNetTrunk, frozen_params, normalize
 from radejax.models.vit import ViT
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.camera.shapes import camera_position

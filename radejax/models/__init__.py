@@ -1,5 +1,141 @@
-"""Detectors as Flax modules; `build` makes one from its config."""
+"""Detectors from their configs, and what can be asked of any of them."""
 
-from radejax.models.detectors import build, has_camera, map_grid, with_dtype
+from __future__ import annotations
 
-__all__ = ["build", "has_camera", "map_grid", "with_dtype"]
+import dataclasses
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import flax.linen as nn
+
+from radejax.core.errors import UserError
+from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
+from radejax.models.checks import check_choice
+from radejax.models.dinorade import DinoRade
+from radejax.models.fusion import Fusion
+from radejax.models.lifting import LiftingAxes
+from radejax.models.radenet import DTYPES, RadeNet
+from radejax.models.vit import ViT
+
+_VIT_FIELDS = (
+    "hidden_size",
+    "num_layers",
+    "num_heads",
+    "mlp_dim",
+    "patch_size",
+    "num_registers",
+    "gated_mlp",
+    "layer_scale",
+    "attention",
+)
+_IMAGE_FIELDS = ("kind", "size", "freeze", "standardize", "resnet_width", *_VIT_FIELDS)
+_GRID_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
+
+
+def build(config: Mapping[str, Any]) -> nn.Module:
+    """The model that `config.model` describes.
+
+    Args:
+        config: A mapping with `name`, "radenet" or "dinorade", and exactly the fields of
+            that model. Those of RADE-Net are attributes of `RadeNet`, `cbam` may be
+            "off"; DinoRADE has the sections `image`, `fusion` and `query_grid` as well.
+
+    Returns:
+        A Flax module, without parameters.
+
+    Raises:
+        UserError: The name is unknown, a field is missing, unknown or out of range.
+    """
+    fields = _plain(config)
+    name = fields.pop("name", None)
+    check_choice("name", name, ("radenet", "dinorade"))
+    sections = ("image", "fusion", "query_grid") if name == "dinorade" else ()
+    _check_keys(fields, {*_own_fields(RadeNet), *sections}, "")
+    if fields["cbam"] == "off":
+        fields["cbam"] = None
+    try:
+        return DinoRade(**_with_camera(fields)) if sections else RadeNet(**fields)
+    except TypeError as error:
+        raise UserError(f"config.model has a value of a wrong type: {error}") from None
+
+
+def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
+    """Attributes of `DinoRade` from the fields of its config."""
+    image, fusion, grid = (fields.pop(k) for k in ("image", "fusion", "query_grid"))
+    fusion_fields = _own_fields(Fusion) - {"num_groups", "dtype", "remat"}
+    _check_keys(image, _IMAGE_FIELDS, "image.")
+    _check_keys(fusion, fusion_fields, "fusion.")
+    _check_keys(grid, _GRID_FIELDS, "query_grid.")
+    check_choice("image.kind", image["kind"], ("vit", "resnet50"))
+    vit = None
+    if image["kind"] == "vit":
+        activation = "silu" if image["gated_mlp"] else "gelu"
+        vit = ViT(**{name: image[name] for name in _VIT_FIELDS}, activation=activation)
+    return fields | {
+        "vit": vit,
+        "fusion": Fusion(**fusion),
+        "query_grid": LiftingAxes(**grid, num_elevation=fusion["num_elevation"]),
+        "image_size": image["size"],
+        "freeze": image["freeze"],
+        "resnet_width": image["resnet_width"],
+        "standardize_image": image["standardize"],
+    }
+
+
+def _plain(config: Any) -> Any:
+    """Dictionaries and tuples, whatever mappings and sequences a config is made of."""
+    if isinstance(config, list | tuple):
+        return tuple(map(_plain, config))
+    if isinstance(config, Mapping) or hasattr(config, "items"):
+        return {name: _plain(value) for name, value in config.items()}
+    return config
+
+
+def _own_fields(module: type[nn.Module]) -> set[str]:
+    return {f.name for f in dataclasses.fields(module)} - {"parent", "name"}
+
+
+def _check_keys(fields: Any, expected: Collection[str], section: str) -> None:
+    """Raise `UserError` naming fields that are unknown or missing."""
+    if not isinstance(fields, Mapping):
+        raise UserError(f"config.model.{section[:-1]} is {fields!r}, expected fields")
+    for text, names in (
+        ("is not a field of this model", set(fields) - set(expected)),
+        ("is missing", set(expected) - set(fields)),
+    ):
+        if names:
+            raise UserError(f"config.model.{section}{min(names)} {text}")
+
+
+def has_camera(model: nn.Module) -> bool:
+    """Whether a model takes images."""
+    return isinstance(model, DinoRade)
+
+
+def with_dtype(model: nn.Module, dtype: str) -> nn.Module:
+    """The same model computing in another dtype; parameters stay float32.
+
+    Raises:
+        UserError: Neither "float32" nor "bfloat16".
+    """
+    if dtype not in DTYPES:
+        raise UserError(f"dtype is {dtype!r}, expected one of {DTYPES}")
+    return model.clone(dtype=dtype)
+
+
+def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: AzimuthMapping) -> RadarGrid:
+    """Grid of the maps that a model makes from projections on `grid`.
+
+    Args:
+        grid: Of the sensor.
+        model: Pads to `pad_multiple` and, if `crop_output`, crops again.
+        azimuth_mapping: See `RadarGrid.padded`.
+    """
+    padded = grid.padded(model.pad_multiple, azimuth_mapping)
+    if not model.crop_output:
+        return padded
+    return dataclasses.replace(
+        padded,
+        range_m=padded.range_m[: grid.num_range],
+        azimuth_rad=padded.azimuth_rad[: grid.num_azimuth],
+    )

@@ -18,10 +18,9 @@ from jaxtyping import Float, Real
 from radejax.core.errors import UserError, require
 from radejax.core.structures import DetectionMaps
 from radejax.geometry.camera import Camera
-from radejax.models.camera_neck import CameraNeck
 from radejax.models.checks import check_size
 from radejax.models.fusion import Fusion
-from radejax.models.image import normalize
+from radejax.models.image import STRIDE, CameraNeck, ResNetNeck, ResNetTrunk, normalize
 from radejax.models.lifting import (
     MARGIN_PX,
     LiftingAxes,
@@ -29,7 +28,6 @@ from radejax.models.lifting import (
     reference_points,
 )
 from radejax.models.radenet import RadeNet
-from radejax.models.resnet import STRIDE, ResNetNeck, ResNetTrunk
 from radejax.models.vit import ViT
 
 IMAGE_BACKBONE = "image_backbone"

@@ -1,16 +1,29 @@
-"""From pictures as recorded to what an image backbone expects.
+"""From images to camera maps: normalization, ResNet-50, and the necks of both backbones.
 
-Normalisation happens here, inside the jitted model: frames travel as uint8.
+Images are normalized inside the jitted model, as frames travel as uint8. The ResNet's trunk
+(stem and the first three stages) is frozen and its last stage trained, so they are modules
+of their own; `radejax.weights.resnet_torch` reads both from torchvision's file.
+
+References:
+    DinoRADE, section 3.2; layers of the neck as in the released code. He et al., Deep
+    residual learning, arXiv:1512.03385; strides as in torchvision.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import flax.linen as nn
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import UserError
+from radejax.models.convolution import conv2d, product
+from radejax.models.layers import Conv, Dense, uniform_fan_in
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -60,3 +73,319 @@ def check_image(shape: tuple[int, ...], patch_size: int) -> tuple[int, int]:
             f"of the patch size {patch_size} (K-Radar's left front image: 720 x 1280)"
         )
     return height // patch_size, width // patch_size
+
+
+# Which of the four taps even and odd outputs see, ordered along the input.
+_PHASE_TAPS = np.array([[3, 1], [2, 0]])
+
+
+class TransposedConv(nn.Module):
+    """Transposed 4x4 convolution, stride 2, padding 1: `[B,H,W,C]` -> `[B,2H,2W,C']`.
+
+    Every output sees 2x2 inputs through one of four kernels, by its parity: one matrix
+    product of four neighbours to four times the channels, interleaved. As a convolution,
+    of a dilated input or to four times the channels, its weight gradient alone takes
+    seconds on a CPU.
+
+    Attributes:
+        features: Output channels C'.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self, x: Float[jax.Array, "B H W _"]
+    ) -> Float[jax.Array, "B 2*H 2*W {self.features}"]:
+        b, height, width, channels = x.shape
+        # torch counts the fan-in of a transposed convolution over its outputs.
+        init = uniform_fan_in(16 * self.features)
+        kernel = self.param("kernel", init, (4, 4, channels, self.features))
+        bias = self.param("bias", init, (self.features,)).astype(self.dtype)
+        kernel = kernel[_PHASE_TAPS][:, :, _PHASE_TAPS]  # phase, tap, phase, tap, C, C'
+        kernel = kernel.transpose(1, 3, 4, 0, 2, 5).reshape(4 * channels, -1)
+        x = jnp.pad(x.astype(self.dtype), ((0, 0), (1, 1), (1, 1), (0, 0)))
+        x = jnp.concatenate(
+            [
+                x[:, i : i + height + 1, j : j + width + 1]
+                for i in (0, 1)
+                for j in (0, 1)
+            ],
+            -1,
+        )
+        y = product(x, kernel.astype(self.dtype))
+        y = y.reshape(b, height + 1, width + 1, 2, 2, self.features)
+        rows = [
+            jnp.stack(
+                [y[:, i : i + height, j : j + width, i, j] for j in (0, 1)], axis=3
+            )
+            for i in (0, 1)
+        ]  # [B, H, W, 2, C'] each
+        y = jnp.stack(rows, 2)  # [B, H, 2, W, 2, C']
+        y = y.reshape(b, 2 * height, 2 * width, self.features)
+        return y + jnp.expand_dims(bias, (0, 1, 2))
+
+
+class CameraNeck(nn.Module):
+    """Image tokens `[B, h, w, C]` -> camera map `[B, 4h, 4w, features]`.
+
+    A linear layer, two doublings by transposed convolutions and a 3x3 convolution, the
+    last three with batch normalisation and ReLU.
+
+    Attributes:
+        features: Output channels.
+        dtype: Dtype of the computation and the output; statistics are float32.
+    """
+
+    features: int = 128
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self,
+        tokens: Float[jax.Array, "B h w C"],
+        has_image: Bool[jax.Array, " B"],
+        *,
+        train: bool = False,
+    ) -> Float[jax.Array, "B 4*h 4*w {self.features}"]:
+        """Runs the neck.
+
+        Args:
+            tokens: `[B, h, w, C]` patch tokens.
+            has_image: `[B]` bool; frames without image stay out of the statistics.
+            train: Normalise by the batch and update the running statistics
+                (collection "batch_stats").
+        """
+        x = Dense(self.features, dtype=self.dtype, name="proj")(tokens)
+        layers = [
+            TransposedConv(self.features, dtype=self.dtype, name="up_1"),
+            TransposedConv(self.features, dtype=self.dtype, name="up_2"),
+            Conv(self.features, dtype=self.dtype, name="refine"),
+        ]
+        for layer in layers:
+            x = layer(x)
+            x = batch_norm(f"{layer.name}_norm", self.dtype, train)(
+                x, mask=counted_frames(has_image)
+            )
+            x = nn.relu(x)
+        return x
+
+
+def counted_frames(has_image: Bool[jax.Array, " B"]) -> Bool[jax.Array, "B 1 1 1"]:
+    """Mask of the frames that enter batch statistics.
+
+    A batch without any image must not divide by zero; its map is not used.
+    """
+    return (has_image | ~has_image.any())[:, None, None, None]
+
+
+def batch_norm(name: str, dtype: Any, train: bool) -> nn.BatchNorm:
+    """Batch normalisation as torch has it by default (momentum 0.1, epsilon 1e-5).
+
+    torch's running variance is the unbiased one; over a camera map they are equal to
+    five digits.
+    """
+    return nn.BatchNorm(
+        use_running_average=not train,
+        momentum=0.9,
+        epsilon=1e-5,
+        dtype=dtype,
+        use_fast_variance=False,
+        name=name,
+    )
+
+
+STRIDE = 16
+"""Pixels per bin of the trunk's map."""
+
+
+class FrozenBatchNorm(nn.Module):
+    """Batch normalisation by fixed statistics, which are parameters here.
+
+    So a frozen backbone is all in one collection, and nothing updates it.
+
+    Attributes:
+        dtype: Dtype of the output.
+        epsilon: Added to the variance.
+    """
+
+    dtype: Any = jnp.float32
+    epsilon: float = 1e-5
+
+    @nn.compact
+    def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W C"]:
+        ones, zeros = nn.initializers.ones, nn.initializers.zeros
+        shape = (x.shape[-1],)
+        scale, var = self.param("scale", ones, shape), self.param("var", ones, shape)
+        bias, mean = self.param("bias", zeros, shape), self.param("mean", zeros, shape)
+        factor = scale * jax.lax.rsqrt(var + self.epsilon)
+        shift = jnp.expand_dims(bias - mean * factor, (0, 1, 2))
+        return x * jnp.expand_dims(factor, (0, 1, 2)).astype(self.dtype) + shift.astype(
+            self.dtype
+        )
+
+
+class StridedConv(nn.Module):
+    """Convolution without bias, padded by half its size.
+
+    Attributes:
+        features: Output channels.
+        size: Taps per axis, odd.
+        stride: Step per axis.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int
+    size: int
+    stride: int = 1
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self, x: Float[jax.Array, "B H W _"]
+    ) -> Float[jax.Array, "B h w {self.features}"]:
+        shape = (self.size, self.size, x.shape[-1], self.features)
+        kernel = self.param("kernel", uniform_fan_in(self.size**2 * shape[2]), shape)
+        if self.size == 1:  # a stride only leaves out
+            x = x[:, :: self.stride, :: self.stride]
+        x, kernel = jnp.asarray(x, self.dtype), jnp.asarray(kernel, self.dtype)
+        if self.size == 1 or self.stride == 1:
+            return conv2d(x, kernel)
+        return jax.lax.conv_general_dilated(
+            x,
+            kernel,
+            window_strides=(self.stride, self.stride),
+            padding=((self.size // 2,) * 2,) * 2,
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )
+
+
+def _normalized(
+    x: jax.Array,
+    name: str,
+    frozen: bool,
+    dtype: Any,
+    train: bool,
+    mask: jax.Array | None = None,
+) -> jax.Array:
+    if frozen:
+        return FrozenBatchNorm(dtype, name=name)(x)
+    return batch_norm(name, dtype, train)(x, mask=mask)
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 convolutions plus the input; the 3x3 one has the stride.
+
+    Attributes:
+        features: Channels inside; the output has four times as many.
+        stride: Step of the block.
+        is_first: The first block of a stage projects its input.
+        frozen: Fixed statistics, else batch normalisation.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int
+    stride: int
+    is_first: bool
+    frozen: bool
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self,
+        x: Float[jax.Array, "B H W C"],
+        train: bool,
+        mask: Bool[jax.Array, "B 1 1 1"] | None = None,
+    ) -> Float[jax.Array, "B h w {4*self.features}"]:
+        def block(x: jax.Array, features: int, size: int, stride: int, name: str):
+            x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
+            return _normalized(x, f"norm_{name}", self.frozen, self.dtype, train, mask)
+
+        y = nn.relu(block(x, self.features, 1, 1, "1"))
+        y = nn.relu(block(y, self.features, 3, self.stride, "2"))
+        y = block(y, 4 * self.features, 1, 1, "3")
+        if self.is_first:
+            x = block(x, 4 * self.features, 1, self.stride, "shortcut")
+        return nn.relu(x + y)
+
+
+class ResNetTrunk(nn.Module):
+    """Stem and first three stages: maps of a 16th of the size, rounded up.
+
+    Attributes:
+        width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
+        depths: Blocks of the three stages.
+        frozen: Fixed statistics, as in a detector; else batch normalisation, to learn
+            the weights of such a trunk (`frozen_params`).
+        dtype: Dtype of the computation; the output is float32.
+    """
+
+    width: int = 64
+    depths: tuple[int, int, int] = (3, 4, 6)
+    frozen: bool = True
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self, image: Float[jax.Array, "B H W 3"], train: bool = False
+    ) -> Float[jax.Array, "B (H+15)//16 (W+15)//16 {16*self.width}"]:
+        x = StridedConv(self.width, 7, 2, self.dtype, name="stem_conv")(image)
+        x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
+        x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
+        for stage, depth in enumerate(self.depths, 1):
+            for i in range(depth):
+                x = Bottleneck(
+                    self.width * 2 ** (stage - 1),
+                    stride=2 if stage > 1 and i == 0 else 1,
+                    is_first=i == 0,
+                    frozen=self.frozen,
+                    dtype=self.dtype,
+                    name=f"stage_{stage}_block_{i + 1}",
+                )(x, train)
+        return x.astype(jnp.float32)
+
+
+def frozen_params(variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a frozen trunk from the variables of one that is not."""
+    flat = flax.traverse_util.flatten_dict(dict(variables["params"]))
+    stats = flax.traverse_util.flatten_dict(dict(variables["batch_stats"]))
+    return flax.traverse_util.unflatten_dict(flat | stats)
+
+
+class ResNetNeck(nn.Module):
+    """Last stage and a 1x1 convolution: maps of half the size, rounded up.
+
+    Attributes:
+        features: Output channels.
+        width: Channels of the ResNet's stem, 64 in ResNet-50.
+        depth: Blocks of the stage.
+        dtype: Dtype of the computation and the output.
+    """
+
+    features: int = 128
+    width: int = 64
+    depth: int = 3
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self,
+        x: Float[jax.Array, "B h w C"],
+        has_image: Bool[jax.Array, " B"],
+        *,
+        train: bool = False,
+    ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
+        """As `CameraNeck`: frames without an image do not enter the statistics."""
+        mask = counted_frames(has_image)
+        for i in range(self.depth):
+            x = Bottleneck(
+                8 * self.width,
+                stride=2 if i == 0 else 1,
+                is_first=i == 0,
+                frozen=False,
+                dtype=self.dtype,
+                name=f"block_{i + 1}",
+            )(x, train, mask)
+        return Conv(self.features, 1, use_bias=False, dtype=self.dtype, name="proj")(x)

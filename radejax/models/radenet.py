@@ -16,8 +16,7 @@ from jaxtyping import Float
 
 from radejax.core.errors import UserError, require
 from radejax.core.structures import DetectionMaps
-from radejax.models.backbone import BACKBONES
-from radejax.models.cbam import CBAMKind
+from radejax.models.backbone import BACKBONES, CBAMKind
 from radejax.models.checks import check_choice, check_number, check_size
 from radejax.models.heads import HEADS, Heads
 from radejax.models.layers import Map
@@ -45,7 +44,7 @@ class RadeNet(nn.Module):
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage, neck and heads.
         num_groups: Groups of every normalisation; must divide every width.
-        cbam: "official", "paper" or None; see `radejax.models.cbam.CBAM`.
+        cbam: "official", "paper" or None; see `radejax.models.backbone.CBAM`.
         input_stem: Encode Doppler and elevation apart first.
         backbone, neck, heads: Of `BACKBONES`, `NECKS` and `HEADS`.
         pad_multiple: Multiple of 2 ** len(widths).

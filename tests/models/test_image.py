@@ -1,11 +1,15 @@
 """Tests of radejax.models.image."""
 
+import chex
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 
 from radejax.core.errors import UserError
 from radejax.models import image as image_lib
+from radejax.models.image import CameraNeck, TransposedConv
 
 
 def test_bytes_become_standardised_colours():
@@ -27,3 +31,179 @@ def test_grid_of_patches():
         image_lib.check_image((2, 700, 1280, 3), 16)
     with pytest.raises(UserError, match="colours last"):
         image_lib.check_image((2, 3, 720, 1280), 16)
+
+
+def convolved(x, kernel, stride):
+    """Correlation with zero padding of half the kernel's size, by scipy."""
+    out = np.zeros((*x.shape[:3], kernel.shape[-1]))
+    for b, i, o in np.ndindex(x.shape[0], *kernel.shape[2:]):
+        out[b, :, :, o] += scipy.signal.correlate2d(
+            x[b, :, :, i], kernel[:, :, i, o], mode="same"
+        )
+    return out[:, ::stride, ::stride]
+
+
+def test_strided_convolution():
+    x = np.random.default_rng(0).standard_normal((2, 7, 8, 3)).astype(np.float32)
+    for size, stride in ((1, 1), (1, 2), (3, 2), (7, 2)):
+        module = image_lib.StridedConv(4, size, stride)
+        variables = module.init(jax.random.key(0), jnp.asarray(x))
+        kernel = np.asarray(variables["params"]["kernel"])
+        np.testing.assert_allclose(
+            module.apply(variables, jnp.asarray(x)),
+            convolved(x, kernel, stride),
+            atol=1e-5,
+        )
+
+
+def test_frozen_normalisation_by_its_formula():
+    x = np.random.default_rng(0).standard_normal((1, 2, 2, 3)).astype(np.float32)
+    params = {
+        "scale": np.array([1.0, 2.0, 3.0], np.float32),
+        "bias": np.array([0.5, 0.0, -1.0], np.float32),
+        "mean": np.array([0.1, -0.2, 0.3], np.float32),
+        "var": np.array([1.0, 4.0, 0.25], np.float32),
+    }
+    expected = (x - params["mean"]) / np.sqrt(params["var"] + 1e-5)
+    expected = expected * params["scale"] + params["bias"]
+    out = image_lib.FrozenBatchNorm().apply({"params": params}, jnp.asarray(x))
+    np.testing.assert_allclose(out, expected, atol=1e-6)
+
+
+def test_bottleneck_by_its_parts():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((1, 5, 6, 4)).astype(np.float32)
+    block = image_lib.Bottleneck(3, stride=2, is_first=True, frozen=True)
+    variables = block.init(jax.random.key(0), jnp.asarray(x), False)
+    params = jax.tree.map(
+        lambda v: np.abs(v + 0.3 * rng.standard_normal(v.shape)).astype(np.float32),
+        variables["params"],
+    )
+
+    def part(x, name, stride=1):
+        norm = params[f"norm_{name}"]
+        y = convolved(x, params[f"conv_{name}"]["kernel"], stride)
+        y = (y - norm["mean"]) / np.sqrt(norm["var"] + 1e-5)
+        return y * norm["scale"] + norm["bias"]
+
+    y = np.maximum(part(x, "1"), 0)
+    y = np.maximum(part(y, "2", 2), 0)
+    expected = np.maximum(part(y, "3") + part(x, "shortcut", 2), 0)
+    out = block.apply({"params": params}, jnp.asarray(x), False)
+    chex.assert_shape(out, (1, 3, 3, 12))
+    np.testing.assert_allclose(out, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_full_size_shapes():
+    trunk, neck = image_lib.ResNetTrunk(), image_lib.ResNetNeck()
+    image = jax.ShapeDtypeStruct((1, 720, 1280, 3), jnp.float32)
+    variables = jax.eval_shape(trunk.init, jax.random.key(0), image)
+    features = jax.eval_shape(trunk.apply, variables, image)
+    assert features.shape == (1, 45, 80, 1024)
+    has_image = jax.ShapeDtypeStruct((1,), jnp.bool_)
+    neck_variables = jax.eval_shape(neck.init, jax.random.key(0), features, has_image)
+    out = jax.eval_shape(neck.apply, neck_variables, features, has_image)
+    assert out.shape == (1, 23, 40, 128)
+    # torchvision's ResNet-50 has 23,508,032 parameters without its classifier.
+    sizes = [x.size for x in jax.tree.leaves(variables["params"])]
+    sizes += [x.size for x in jax.tree.leaves(neck_variables["params"])]
+    statistics = sum(
+        x.size
+        for path, x in jax.tree_util.tree_leaves_with_path(variables["params"])
+        if path[-1].key in ("mean", "var")
+    )
+    assert sum(sizes) - statistics - 2048 * 128 == 23508032
+
+
+def test_a_trained_trunk_is_the_frozen_one_of_its_statistics():
+    trained, frozen = (
+        image_lib.ResNetTrunk(4, (1, 2, 1), frozen=f) for f in (False, True)
+    )
+    image = jax.random.normal(jax.random.key(1), (2, 32, 48, 3))
+
+    @jax.jit
+    def both(image):
+        variables = trained.init(jax.random.key(0), image)
+        _, stats = trained.apply(variables, image, True, mutable=["batch_stats"])
+        variables = {**variables, **stats}
+        params = image_lib.frozen_params(variables)
+        expected = trained.apply(variables, image)
+        return expected, frozen.apply({"params": params}, image), params
+
+    expected, found, params = both(image)
+    chex.assert_shape(found, (2, 2, 3, 64))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert float(jnp.std(found)) > 0
+    shapes = jax.eval_shape(frozen.init, jax.random.key(0), image)["params"]
+    chex.assert_trees_all_equal_shapes(params, shapes)
+    # The statistics are those of the images, not those to start with.
+    assert float(jnp.abs(params["stem_norm"]["mean"]).min()) > 0
+
+
+def scattered(x, kernel, bias):
+    """The definition: every input spreads its 4x4 kernel, two outputs apart."""
+    b, height, width, _ = x.shape
+    out = np.zeros((b, 2 * height + 2, 2 * width + 2, kernel.shape[-1]))
+    for i in range(height):
+        for j in range(width):
+            spread = np.einsum("bc,klcd->bkld", x[:, i, j], kernel)
+            out[:, 2 * i : 2 * i + 4, 2 * j : 2 * j + 4] += spread
+    return out[:, 1:-1, 1:-1] + bias  # padding 1 cuts the border
+
+
+def test_transposed_convolution_follows_its_definition():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((2, 3, 4, 5)).astype(np.float32)
+    kernel = rng.standard_normal((4, 4, 5, 6)).astype(np.float32)
+    bias = rng.standard_normal(6).astype(np.float32)
+    params = {"kernel": kernel, "bias": bias}
+    out = jax.jit(TransposedConv(6).apply)({"params": params}, x)
+    np.testing.assert_allclose(out, scattered(x, kernel, bias), atol=1e-5)
+
+
+def test_the_gradient_is_made_of_matrix_products():
+    """A convolution of this shape takes a CPU seconds by its kernel's gradient."""
+    module, x = TransposedConv(6), jnp.ones((1, 3, 4, 5))
+    variables = module.init(jax.random.key(0), x)
+    gradient = jax.grad(lambda *args: module.apply(*args).sum(), (0, 1))
+    program = jax.jit(gradient).lower(variables, x).as_text()
+    assert "dot_general" in program
+    assert "convolution" not in program
+
+
+def test_shapes_and_running_statistics():
+    neck = CameraNeck(8)
+    rng = np.random.default_rng(0)
+    tokens = rng.standard_normal((3, 2, 3, 5)).astype(np.float32)
+    all_images = jnp.ones(3, bool)
+    variables = jax.jit(neck.init)(jax.random.key(0), tokens, all_images)
+    out = jax.jit(neck.apply)(variables, tokens, all_images)
+    chex.assert_shape(out, (3, 8, 12, 8))
+    assert float(out.min()) == 0  # ReLU
+    train = jax.jit(lambda *a: neck.apply(*a, train=True, mutable="batch_stats"))
+    out, state = train(variables, tokens, all_images)
+    up = TransposedConv(8).apply(
+        {"params": variables["params"]["up_1"]},
+        tokens @ variables["params"]["proj"]["kernel"]
+        + variables["params"]["proj"]["bias"].reshape(1, 1, 1, -1),
+    )
+    mean = 0.1 * up.mean((0, 1, 2))  # a tenth of the batch's, the rest of zero
+    np.testing.assert_allclose(
+        state["batch_stats"]["up_1_norm"]["mean"], mean, atol=1e-6
+    )
+    # A frame without an image has no part in the statistics.
+    spoiled = tokens.copy()
+    spoiled[1] = 100.0
+    has_image = jnp.asarray([True, False, True])
+    _, with_gap = train(variables, spoiled, has_image)
+    _, without = train(variables, tokens[[0, 2]], jnp.ones(2, bool))
+    chex.assert_trees_all_close(with_gap, without, atol=1e-5)
+
+
+def test_a_batch_without_any_image_stays_finite():
+    neck = CameraNeck(4)
+    tokens = jnp.zeros((2, 2, 2, 3))
+    none = jnp.zeros(2, bool)
+    variables = neck.init(jax.random.key(0), tokens, none)
+    out, state = neck.apply(variables, tokens, none, train=True, mutable="batch_stats")
+    chex.assert_tree_all_finite((out, state))

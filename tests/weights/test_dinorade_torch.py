@@ -14,8 +14,8 @@ from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.camera import CameraCalibration
 from radejax.models import build
-from radejax.models.camera_neck import CameraNeck
 from radejax.models.fusion import Fusion
+from radejax.models.image import CameraNeck
 from radejax.models.lifting import (
     OFFICIAL_OFFSET_M,
     LiftingAxes,

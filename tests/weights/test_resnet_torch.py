@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.models.resnet import ResNetNeck, ResNetTrunk
+from radejax.models.image import ResNetNeck, ResNetTrunk
 from radejax.weights import resnet_torch
 from radejax.weights.convert import read_content, write_state_dict
 

@@ -1,4 +1,4 @@
-"""Tests of `radejax.models.detectors`."""
+"""Tests of `radejax.models`."""
 
 import pytest
 
