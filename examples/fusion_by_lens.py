@@ -29,7 +29,7 @@ from radejax.evaluation.files import Source, frame_keys, load
 from radejax.evaluation.results import repair_sizes
 from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_name, data_of_run
-from radejax.runs.figures import average_by_group, frame_shares, mean_share
+from radejax.runs.figures import average_shares, frame_shares, mean_share
 from radejax.simulation.camera.lens import cover_level
 
 GROUPS = {
@@ -164,7 +164,7 @@ def main(fusion, radar, out, data, split, resamples):
         config, opened = data_of_run(run, other)
         out = out or fusion / f"by_lens{name}"
         reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]
-        dataset = opened.split(None if split == "all" else split)
+        dataset = opened.split(split)
         for report in reports:
             frames = load(report, Source(), tuple(config.classes))[2]
             if frame_keys(frames) != [frame.key for frame in dataset]:
@@ -184,12 +184,7 @@ def main(fusion, radar, out, data, split, resamples):
                 place = frame.weather, level_of[frame.key]
                 yield next(n for n, rule in GROUPS.items() if rule(*place)), share
 
-        maps, counts = average_by_group(by_lens())
-        gates = {
-            name: {"mean": mean_share(share, run.grid), "frames": counts[name]}
-            for name, share in maps.items()
-        }
-        files.write_json(out / "camera_share.json", gates)
+        files.write_json(out / "camera_share.json", average_shares(by_lens(), run.grid))
         sequences = np.asarray(frames["sequence"])
         # Intervals come from resampled sequences: one alone has none.
         is_small = {

@@ -40,12 +40,12 @@ def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
         return None
     if isinstance(roi, str):
         if roi not in ROIS:
-            raise UserError(f"unknown roi {roi!r}; known: {', '.join(ROIS)}")
+            raise UserError(f"roi is {roi!r}, expected one of {', '.join(ROIS)}")
         return ROIS[roi]
     bounds = np.asarray(roi, np.float64).reshape(-1)
     if bounds.size != 6 or not np.all(bounds[::2] < bounds[1::2]):
         raise UserError(
-            f"roi must be (x0, x1, y0, y1, z0, z1) with increasing bounds, got {roi}"
+            f"roi is {roi}, expected x0, x1, y0, y1, z0, z1 with increasing bounds"
         )
     return tuple(bounds.tolist())
 

@@ -95,7 +95,10 @@ class EvaluationOptions:
         check("empty_frames", self.empty_frames in rules, f"one of {', '.join(rules)}")
         is_good = self.invalid_sizes in ("error", "false_positive")
         check("invalid_sizes", is_good, '"error" or "false_positive"')
-        roi_bounds(self.roi)
+        try:
+            roi_bounds(self.roi)
+        except UserError as error:
+            raise UserError(f"config.evaluation.{error}") from None
 
     @classmethod
     def from_config(cls, config: ConfigDict, **changes: Any) -> EvaluationOptions:
@@ -121,8 +124,9 @@ class EvaluationOptions:
             **config.evaluation.to_dict(),
             **changes,
         }
-        values["min_score"] = min(values["min_score"], values["score_threshold"])
-        return cls(**values)
+        options = cls(**values)
+        least = min(options.min_score, options.score_threshold)
+        return dataclasses.replace(options, min_score=least)
 
     @property
     def roi_bounds(self) -> tuple[float, ...] | None:

@@ -21,6 +21,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float
 
+from radejax.core.errors import require
 from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
@@ -75,6 +76,12 @@ class LiftingAxes:
     azimuth_deg: tuple[float, float]
     elevation_deg: tuple[float, float]
     num_elevation: int
+
+    def __post_init__(self) -> None:
+        for name in ("range_m", "azimuth_deg", "elevation_deg"):
+            axis = getattr(self, name)
+            is_axis = len(axis) == 2 and bool(np.isfinite(axis).all())
+            require(is_axis, f"config.model.query_grid.{name}", axis, "two numbers")
 
     @classmethod
     def of_grid(cls, grid: RadarGrid, num_elevation: int = 10) -> LiftingAxes:

@@ -95,6 +95,7 @@ class RadeNet(nn.Module):
             "input_center", self.input_center, -math.inf, math.inf, "a finite number"
         )
         stride = 2 ** len(self.widths)
+        require(stride > 1, "config.model.widths", self.widths, "one width or more")
         check_size("pad_multiple", self.pad_multiple)
         require(
             self.pad_multiple % stride == 0,

@@ -11,7 +11,6 @@ from ml_collections.config_flags import config_path
 from radejax import models
 from radejax.core.config import fields_of, load_config
 from radejax.core.errors import (
-    BELOW_ONE,
     POSITIVE,
     UserError,
     check_options,
@@ -24,10 +23,12 @@ from radejax.core.errors import (
     several,
 )
 from radejax.data.cameras import CameraOptions
+from radejax.data.dataset import data_set
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, VISIBILITY_FLAGS
 from radejax.detection.decode import DecodeOptions
 from radejax.evaluation.results import EvaluationOptions
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
 from radejax.simulation.config import SimulationConfig, default_config
 from radejax.training.step import check_train_section
@@ -36,11 +37,13 @@ _SEED = integer(0, 2**32 - 2)  # of 32 bits; a training uses the next one too
 _VERSIONS = one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
 _SEQUENCES = several(integer(1), "different sequence numbers; () for all")
 
+# What no constructor checks, or only one that reads data.
 _RUN = {
     "seed": _SEED,
     "classes": several(one_of(*LABEL_CLASSES), f"different classes of {LABEL_CLASSES}"),
 }
 _DATA = {
+    "roots": (all, "folders"),
     "label_version": _VERSIONS,
     "visibility": or_none(
         several(one_of(*VISIBILITY_FLAGS), f"different flags of {VISIBILITY_FLAGS}")
@@ -60,27 +63,6 @@ _DATA = {
     "gain_slope_db": number(0),
     "label_permutation_seed": or_none(integer(0)),
 }
-_MODEL = {
-    "widths": (
-        lambda value: len(value) > 0 and all(map(integer(1)[0], value)),
-        "one or more integers of at least 1",
-    ),
-    "decoder_width": integer(1),
-}
-_FUSION = {"dropout": BELOW_ONE}
-_AXIS = several(number(-1e6), "two finite numbers", count=2)
-_QUERY_GRID = dict.fromkeys(("range_m", "azimuth_deg", "elevation_deg"), _AXIS)
-_GRID = {f"num_{axis}": integer(1) for axis in ("doppler", "range", "elevation")}
-_GRID |= {"num_azimuth": integer(1), "max_range_m": POSITIVE}
-_EVALUATION = {
-    "roi": (
-        lambda v: (
-            v is None or (len(v) == 6 and v[0] < v[1] and v[2] < v[3] and v[4] < v[5])
-        ),
-        "x0, x1, y0, y1, z0, z1 with x0 < x1, y0 < y1, z0 < z1, or None",
-    ),
-    "min_score": number(0, 1),
-}
 _LOGGING = {
     "num_visualizations": integer(0),
     "profile_steps": (
@@ -88,9 +70,11 @@ _LOGGING = {
         "two integers of at least 0, the first not above the last",
     ),
 }
+_SIZE = integer(1)
+_GRID = dict.fromkeys(("num_doppler", "num_range", "num_elevation"), _SIZE)
+_GRID |= {"num_azimuth": _SIZE, "max_range_m": POSITIVE}
 _KINDS: dict[type, Any] = {float: int | float, tuple: tuple | list}
-_OPTIONAL = ["data.visibility", "evaluation.roi", "train.checkpoints_to_keep"]
-_OPTIONAL += ["model.cbam"]
+_OPTIONAL = ("data.visibility", "evaluation.roi", "train.checkpoints_to_keep")
 # Sections of some configs, whose names are checked by what they construct.
 _OWN_NAMES = ("model.", "loss.weights.", "data.camera", "simulation")
 
@@ -105,34 +89,51 @@ def check(config: ConfigDict) -> None:
         UserError: A field is missing, unknown, of another type or out of its range.
     """
     _check_fields(config)
-    check_options(dict(config), "config", _RUN)
-    require(len(config.classes) > 0, "config.classes", config.classes, "one or more")
-    check_options(config.evaluation, "config.evaluation", _EVALUATION)
-    _construct("config.evaluation", EvaluationOptions.from_config, config)
-    check_options(config.model, "config.model", _MODEL)
-    if "fusion" in config.model:
-        check_options(config.model.fusion, "config.model.fusion", _FUSION)
-        query_grid = config.model.query_grid
-        check_options(query_grid, "config.model.query_grid", _QUERY_GRID)
-    _construct("config.model", models.build, config.model)
-    for name, constructor in (
-        ("loss", LossOptions),
-        ("decode", DecodeOptions),
-    ):
-        options = config[name].to_dict()
-        _construct(f"config.{name}", lambda x, c=constructor: c(**x), options)
-    check_train_section(config.train)
-    check_options(config.logging, "config.logging", _LOGGING)
+    check_options(config, "config", _RUN)
     check_options(config.data, "config.data", _DATA)
-    _construct("config.data.camera", CameraOptions.from_config, config.data)
-    _check_together(config)
+    check_options(config.logging, "config.logging", _LOGGING)
+    data_set(config.data.format)
+    for section, construct in (
+        ("model", lambda: models.build(config.model)),
+        ("loss", lambda: LossOptions(**config.loss.to_dict())),
+        ("decode", lambda: DecodeOptions(**config.decode)),
+        ("train", lambda: check_train_section(config.train)),
+        ("data.camera", lambda: CameraOptions.from_config(config.data)),
+        ("evaluation", lambda: EvaluationOptions.from_config(config)),
+        ("simulation", lambda: _check_simulation(config)),
+    ):
+        try:
+            construct()
+        except (TypeError, AttributeError, KeyError) as error:
+            raise UserError(f"config.{section}: {one_line(error)}") from error
+    name, count = "config.model.num_classes", config.model.num_classes
+    classes = f"{len(config.classes)}, the number of config.classes"
+    require(count == len(config.classes), name, count, classes)
+    if config.train.evaluate_every_epochs:
+        known = [
+            f"map_{space}_iou{100 * iou:.4g}"
+            for space in ("bev", "3d")
+            for iou in config.evaluation.iou_thresholds
+        ]
+        best = config.train.best_metric
+        require(best in known, "config.train.best_metric", best, f"one of {known}")
 
 
-def check_best_metric(name: str, iou_thresholds: Any) -> None:
-    """Raises `UserError` for a metric that evaluations during training do not compute."""
-    spaces = ("bev", "3d")
-    known = [f"map_{s}_iou{100 * iou:.4g}" for s in spaces for iou in iou_thresholds]
-    require(name in known, "config.train.best_metric", name, f"one of {known}")
+def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
+    """Raises `UserError` unless `config.model` is made for a radar, that of `source`."""
+    for name in ("doppler", "elevation"):
+        bins, expected = model[f"{name}_bins"], getattr(grid, f"num_{name}")
+        text = f"{expected}, as {source} has"
+        require(bins == expected, f"config.model.{name}_bins", bins, text)
+
+
+def _check_simulation(config: ConfigDict) -> None:
+    if "simulation" not in config:
+        return
+    if isinstance(config.simulation.grid, ConfigDict):
+        check_options(config.simulation.grid, "config.simulation.grid", _GRID)
+    grid = SimulationConfig.from_mapping(config.simulation).make_grid()
+    check_bins(config.model, grid, "config.simulation.grid")
 
 
 def _check_fields(config: ConfigDict) -> None:
@@ -153,36 +154,9 @@ def _check_fields(config: ConfigDict) -> None:
             continue
         if kind is type(None):  # any value; checked by what is constructed
             continue
-        default = config_path.get_value(name, reference)
-        is_kind = isinstance(value, _KINDS.get(kind, kind))
-        is_fine = is_kind and isinstance(value, bool) == (kind is bool)
+        is_fine = isinstance(value, _KINDS.get(kind, kind))
+        is_fine = is_fine and isinstance(value, bool) == (kind is bool)
         if value is None:
+            default = config_path.get_value(name, reference)
             is_fine = default is None or name in _OPTIONAL
         require(is_fine, f"config.{name}", value, f"a value of type {kind.__name__}")
-
-
-def _construct(name: str, constructor: Any, options: Any) -> Any:
-    try:
-        return constructor(options)
-    except (TypeError, AttributeError, KeyError) as error:
-        raise UserError(f"{name}: {one_line(error)}") from error
-
-
-def _check_together(config: ConfigDict) -> None:
-    """Checks what one section requires of another."""
-    model, count = config.model, len(config.classes)
-    name = "config.model.num_classes"
-    require(model.num_classes == count, name, model.num_classes, f"{count} classes")
-    if config.train.evaluate_every_epochs:
-        check_best_metric(config.train.best_metric, config.evaluation.iou_thresholds)
-    if "simulation" in config:
-        if isinstance(config.simulation.grid, ConfigDict):
-            check_options(config.simulation.grid, "config.simulation.grid", _GRID)
-        simulation = _construct(
-            "config.simulation", SimulationConfig.from_mapping, config.simulation
-        )
-        grid = simulation.make_grid()
-        for name in ("doppler", "elevation"):
-            bins, expected = model[f"{name}_bins"], getattr(grid, f"num_{name}")
-            text = f"{expected}, as config.simulation.grid has"
-            require(bins == expected, f"config.model.{name}_bins", bins, text)

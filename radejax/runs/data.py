@@ -9,7 +9,7 @@ import hashlib
 import json
 import logging
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -20,7 +20,7 @@ from ml_collections import ConfigDict
 
 from radejax import models
 from radejax.core.config import DATA_PATHS
-from radejax.core.errors import DataError, UserError, require
+from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import (
@@ -40,16 +40,16 @@ from radejax.data.records import (
     open_projections,
     preprocess,
 )
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import SavedModel
 from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.runs.checks import check_bins
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Data:
     """Frames, records and cameras of a run, opened once.
 
@@ -60,21 +60,21 @@ class Data:
         camera: How images and calibrations are used; None for radar-only models.
         image_size: Height and width that the model takes, or None.
         features: Embedded images, or None.
-        grid: Grid that the records must have; None takes any.
     """
 
     options: ConfigDict
     frames: LabelledFrames
     classes: tuple[str, ...]
-    camera: CameraOptions | None
-    image_size: tuple[int, int] | None
-    features: Records | None
-    grid: RadarGrid | None = None
+    camera: CameraOptions | None = None
+    image_size: tuple[int, int] | None = None
+    features: Records | None = None
+    _skipped: set[str] = dataclasses.field(default_factory=set, init=False)
+    _splits: dict[str, LabelledFrames] = dataclasses.field(
+        default_factory=dict, init=False
+    )
 
     @classmethod
-    def open(
-        cls, config: ConfigDict, model: nn.Module, grid: RadarGrid | None = None
-    ) -> Data:
+    def open(cls, config: ConfigDict, model: nn.Module) -> Data:
         """Read the labels; nothing is written.
 
         Raises:
@@ -82,20 +82,17 @@ class Data:
                 has none.
             FileNotFoundError: A folder is missing.
         """
-        options, camera, features = config.data, None, None
-        _require_folders(*options.roots, options.camera_calibration)
+        options, camera, image_size, features = config.data, None, None, None
         if models.has_camera(model):
             camera = CameraOptions.from_config(options)
-            if options.embeddings is not None:
-                check_embeddable(
-                    freeze=model.freeze, mirror_probability=options.mirror_probability
-                )
-                features = open_embeddings(options.embeddings, config.model.image)
-        elif options.embeddings is not None:
-            raise UserError(
-                "embeddings are given, but config.model.name is "
-                f"{config.model.name!r}, which has no camera"
+            image_size = tuple(model.image_size)
+        if options.embeddings is not None:
+            name = config.model.name
+            require(camera is not None, "config.model.name", name, "one with a camera")
+            check_embeddable(
+                freeze=model.freeze, mirror_probability=options.mirror_probability
             )
+            features = open_embeddings(options.embeddings, config.model.image)
         frames = data_set(options.format)(
             options.roots,
             options.labels,
@@ -108,15 +105,7 @@ class Data:
             sequence_numbers=options.sequences or None,
             weather=options.weather or None,
         )
-        return cls(
-            options=options,
-            frames=frames,
-            classes=tuple(config.classes),
-            camera=camera,
-            image_size=None if camera is None else tuple(model.image_size),
-            features=features,
-            grid=grid,
-        )
+        return cls(options, frames, tuple(config.classes), camera, image_size, features)
 
     def preprocess(self) -> None:
         """Write the records that are missing, on one process while others wait.
@@ -125,7 +114,6 @@ class Data:
 
         Raises:
             UserError: No frames, records of something else, or no space left.
-            DataError: No frame could be read.
         """
         report = distributed.main_only(
             lambda: preprocess(self.frames, self.options.records)
@@ -133,44 +121,35 @@ class Data:
         if report is not None and report.skipped:
             _log.warning("%s", report.to_text())
         keys = self.records.keys()
-        self._skipped.update(f.key for f in self.frames if f.key not in keys)
-        if len(self._skipped) == len(self.frames):
-            raise DataError(
-                f"{', '.join(self.options.roots)}: none of {len(self.frames)} frames has a "
-                "radar tensor that can be read"
-            )
-        self._splits.clear()
+        self._skipped = {frame.key for frame in self.frames if frame.key not in keys}
+        self._splits = {}
 
     @functools.cached_property
     def records(self) -> Records:
-        """Projections of the frames."""
-        return open_projections(self.options.records, self.grid)
+        """Projections of the frames, on their grid."""
+        return open_projections(self.options.records, self.frames.grid)
 
-    @functools.cached_property
-    def _skipped(self) -> set[str]:
-        return set()
-
-    @functools.cached_property
-    def _splits(self) -> dict[str | None, LabelledFrames]:
-        return {}
-
-    def split(self, name: str | None) -> LabelledFrames:
-        """Frames of "train", "validation", "test" or a split file; all for None.
+    def split(self, name: str, *, may_be_empty: bool = False) -> LabelledFrames:
+        """Frames of "train", "validation", "test", "all" or a split file.
 
         Without those that `preprocess` skipped, which are counted.
         Sequences that `options.validation` holds out of "train" are "validation".
 
         Raises:
-            UserError: No such split, or sequences to hold out that are not there.
+            UserError: No such split, no frames in it unless it `may_be_empty`, or
+                sequences to hold out that are not there.
         """
         if name not in self._splits:
             if name in ("train", "validation"):
                 frames = self._part_of_train(name)
             else:
-                frames = self.frames if name is None else self.frames.of_split(name)
+                frames = self.frames if name == "all" else self.frames.of_split(name)
             if any(frame.key in self._skipped for frame in frames):
                 frames = frames.without(self._skipped, "no readable radar tensor")
             self._splits[name] = frames
+        if not len(self._splits[name]) and not may_be_empty:
+            roots = ", ".join(self.options.roots)
+            raise UserError(f"no frames of the {name} split in {roots}")
         return self._splits[name]
 
     def _part_of_train(self, name: str) -> LabelledFrames:
@@ -254,11 +233,10 @@ def located(config: ConfigDict) -> ConfigDict:
 
     Raises:
         UserError: Neither data nor a simulation is given.
+        FileNotFoundError: The folder of camera calibrations is missing.
     """
     config = config.copy_and_resolve_references()
     roots = config.data.roots
-    is_list = not isinstance(roots, str) and all(roots)
-    require(is_list, "config.data.roots", roots, "a tuple of folders")
     if "simulation" in config:
         name, one = "config.data.roots", "one folder, as the config simulates it"
         require(len(roots) <= 1, name, tuple(roots), one)
@@ -268,7 +246,7 @@ def located(config: ConfigDict) -> ConfigDict:
             "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
             "config that simulates them, such as quickstart"
         )
-    _set_paths(config.data, {**{n: config.data[n] for n in DATA_PATHS}, "roots": roots})
+    _set_paths(config.data, roots)
     return config
 
 
@@ -278,24 +256,19 @@ def _simulated_root(simulation: ConfigDict) -> str:
     return f"data/simulated-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _set_paths(options: ConfigDict, paths: Mapping[str, Any]) -> None:
-    """Set paths of `config.data`, made absolute, and where records are by default."""
-    absolute: dict[str, Any] = {
-        name: path and str(pathlib.Path(path).absolute())
-        for name, path in paths.items()
-        if name != "roots"
+def _set_paths(options: ConfigDict, roots: Iterable[str]) -> None:
+    """Make paths of `config.data` absolute; records are in the first root by default."""
+    roots = tuple(str(pathlib.Path(root).absolute()) for root in roots)
+    paths = {name: options[name] for name in DATA_PATHS if name != "roots"}
+    paths["records"] = paths["records"] or pathlib.Path(roots[0], "records")
+    absolute = {
+        k: path and str(pathlib.Path(path).absolute()) for k, path in paths.items()
     }
-    roots = tuple(str(pathlib.Path(root).absolute()) for root in paths["roots"])
-    absolute["records"] = absolute["records"] or str(pathlib.Path(roots[0], "records"))
-    with options.ignore_type():
+    with options.ignore_type():  # tuples are lists in the config of a checkpoint
         options.update(absolute, roots=roots)
-
-
-def _require_folders(*paths: str | None) -> None:
-    """Raise `FileNotFoundError` for a folder that is missing; None is not looked for."""
-    for path in filter(None, paths):
-        if not pathlib.Path(path).is_dir():
-            raise FileNotFoundError(f"no such folder: {path}")
+    folder = options.camera_calibration
+    if folder is not None and not pathlib.Path(folder).is_dir():
+        raise FileNotFoundError(f"no such folder: {folder}")
 
 
 def simulate_missing(config: ConfigDict) -> None:
@@ -315,57 +288,29 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
         model: What `config.model` describes.
 
     Raises:
-        UserError: Another backbone made the embeddings, or no space is left.
+        UserError: Another backbone made the embeddings, no frames to train on, or no
+            space is left.
         FileNotFoundError: A folder is missing.
     """
-    _require_folders(config.data.camera_calibration)  # simulating takes long
     simulate_missing(config)
     data = Data.open(config, model)
     _log.info("%s", data.frames.summary().to_text())
-    _check_bins(config.model, data)
-    if count := len(data.split("train")):  # preprocessing takes long
-        check_enough(count, config.train.batch_size)
+    # Preprocessing takes long.
+    check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
+    check_enough(len(data.split("train")), config.train.batch_size)
     data.preprocess()
     if config.data.validation:
-        _log_held_out(data)
-        if not config.train.evaluate_every_epochs:
-            _log.info(
-                "config.train.evaluate_every_epochs is 0: nothing is chosen by them; "
-                "evaluate.py --split validation evaluates on them afterwards"
-            )
+        frames = data.split("validation")
+        found = collections.Counter(cls for frame in frames for cls in frame.classes)
+        _log.info(
+            "validation: sequences %s of the train split are held out, %d frames beside "
+            "%d to train on; %s",
+            ", ".join(map(str, sorted({frame.sequence for frame in frames}))),
+            len(frames),
+            len(data.split("train")),
+            ", ".join(f"{cls} {found[cls]}" for cls in data.classes),
+        )
     return data
-
-
-def _check_bins(model: ConfigDict, data: Data) -> None:
-    """`UserError` for a model of another radar, before anything is projected."""
-    doppler, elevation = data.frames.grid.num_doppler, data.frames.grid.num_elevation
-    if (model.doppler_bins, model.elevation_bins) != (doppler, elevation):
-        raise UserError(
-            f"config.model has {model.doppler_bins} Doppler and {model.elevation_bins} "
-            f"elevation bins, the radar of {', '.join(data.options.roots)} {doppler} and "
-            f"{elevation}; give --config.model.doppler_bins={doppler} "
-            f"--config.model.elevation_bins={elevation}"
-        )
-
-
-def _log_held_out(data: Data) -> None:
-    """The sequences and their objects, with a warning for a class that they lack."""
-    frames, num_left = data.split("validation"), len(data.split("train"))
-    found = collections.Counter(cls for frame in frames for cls in frame.classes)
-    counts = {cls: found[cls] for cls in data.classes}
-    _log.info(
-        "validation: sequences %s of the train split are held out, %d frames beside %d "
-        "to train on; %s",
-        ", ".join(map(str, sorted({frame.sequence for frame in frames}))),
-        len(frames),
-        num_left,
-        ", ".join(f"{cls} {number}" for cls, number in counts.items()),
-    )
-    if absent := [cls for cls, number in counts.items() if not number]:
-        _log.warning(
-            "no %s in the validation split: it does not help to choose a checkpoint",
-            " and no ".join(absent),
-        )
 
 
 def data_of_run(
@@ -383,20 +328,19 @@ def data_of_run(
     """
     config = saved.config.copy_and_resolve_references()
     options, changes = config.data, dict(changes or {})
-    paths = {name: options[name] for name in DATA_PATHS}
-    roots = tuple(changes.get("roots") or options.roots)
-    if [str(pathlib.Path(root).absolute()) for root in roots] != list(options.roots):
-        paths = dict.fromkeys(DATA_PATHS)
-        changes = {"sequences": (), "weather": (), **changes}
+    own = list(options.roots)
+    roots = changes.pop("roots", own)
     if not roots:
         raise UserError(
             "the model was trained on frames that were never written, there is no split "
             "to evaluate on; give --data ROOT, or use `radejax detect`"
         )
+    if [str(pathlib.Path(root).absolute()) for root in roots] != own:
+        whole = {"sequences": (), "weather": (), **dict.fromkeys(DATA_PATHS)}
+        changes = whole | changes
     with options.ignore_type():
-        options.update({k: v for k, v in changes.items() if k not in DATA_PATHS})
-    given = {k: v for k, v in changes.items() if k in DATA_PATHS}
-    _set_paths(options, {**paths, **given, "roots": roots})
+        options.update(changes)
+    _set_paths(options, roots)
     has_backbone = IMAGE_BACKBONE in saved.variables["params"]
     is_blind = models.has_camera(saved.model) and not has_backbone
     if changes and is_blind and options.embeddings is None:
@@ -404,13 +348,13 @@ def data_of_run(
             "the run is without the weights of its image backbone: give "
             "--image-backbone FOLDER, or --embeddings FOLDER of these images"
         )
-    data = Data.open(config, saved.model, saved.grid)
-    if data.frames.grid != saved.grid:
-        raise UserError(
-            f"{', '.join(options.roots)}: the radar has "
-            f"{describe_grid(data.frames.grid)}, the model was trained on "
-            f"{describe_grid(saved.grid)}"
-        )
+    data = Data.open(config, saved.model)
+    grids = [describe_grid(grid) for grid in (data.frames.grid, saved.grid)]
+    is_same, text = (
+        data.frames.grid == saved.grid,
+        f"{grids[1]}, as the model was trained",
+    )
+    require(is_same, f"the radar of {options.roots[0]}", grids[0], text)
     return config, data
 
 

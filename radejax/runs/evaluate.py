@@ -3,115 +3,235 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
+import math
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import flax.linen as nn
 import jax
 import numpy as np
+from jaxtyping import UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from ml_collections import ConfigDict
 
-from radejax import models
 from radejax.core import files
-from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
-from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
+from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.projection import decode
+from radejax.evaluation.boxes import Columns
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training import distributed
+from radejax.training.metric_logger import Scores
+from radejax.training.step import TrainState
+from radejax.visualize.draw import draw_frame, draw_scenes
+from radejax.visualize.style import Scene, save_figure
 
 _log = logging.getLogger(__name__)
 
 
-def evaluate(
-    config: ConfigDict,
-    model: nn.Module,
-    variables: Mapping[str, Any],
-    data: Data,
-    workdir: pathlib.Path,
-    *,
-    out: pathlib.Path | None = None,
-    options: EvaluationOptions | None = None,
-    split: str = "test",
-    shuffle_images: int | None = None,
-    step: int | None = None,
-    run: str | None = None,
-) -> Report | None:
-    """Detect on a split, on all devices, and write the report.
+class Evaluation:
+    """Detections of a model on a split, and what they score.
+
+    Every process takes part in the predictions.
 
     Args:
-        config: Of the run.
-        model: What `config.model` describes.
-        variables: Of the model.
+        config: Of the run; `evaluation`, `decode`, `logging` and `train.best_metric` are
+            read.
         data: To evaluate on.
-        workdir: Of the run.
-        out: Folder of the results; `evaluation` in the workdir if None.
-        options: As the config says if None.
         split: "test", "validation", "train", "all" or a split file.
         shuffle_images: Seed; see `evaluate_run`.
-        step: Of the variables, for `source.json`.
-        run: Name of the run in the report; that of the workdir if None.
-
-    Returns:
-        The report that was written; None on all processes except the first.
+        mesh: All devices if None.
+        **changes: Fields of `EvaluationOptions` to replace.
 
     Raises:
         UserError: The split has no frames, or too few images to shuffle.
     """
-    options = options or EvaluationOptions.from_config(config)
-    frames, seen = _frames(data, split, shuffle_images)
-    detector = make_detector(config, data, variables, options=options)
-    predictions = predict_dataset(
-        detector, data.records, seen, options.batch_size, images=data.images(seen)
-    )
 
-    def write(folder: pathlib.Path) -> Report:
-        source = {"step": step, **source_of(data, split, shuffle_images)}
-        files.write_json(folder / "source.json", source)
-        drawer = figures.FrameDrawer(
-            data.records,
-            frames,
-            Boxes(**predictions),
-            roi=options.roi_bounds,
-            score_threshold=config.decode.score_threshold,
+    def __init__(
+        self,
+        config: ConfigDict,
+        data: Data,
+        split: str = "test",
+        *,
+        shuffle_images: int | None = None,
+        mesh: jax.sharding.Mesh | None = None,
+        **changes: Any,
+    ) -> None:
+        self._config, self._data, self._split = config, data, split
+        self._options = EvaluationOptions.from_config(config, **changes)
+        self._source = source_of(data, split, shuffle_images)
+        self._frames = data.split(split)
+        self._seen: FrameSequence = self._frames
+        if shuffle_images is not None:
+            self._seen = with_shuffled_images(data, split, shuffle_images)
+        self._images = data.images(self._seen)
+        self._truth, self._table = tables_from_frames(self._frames, split)
+        self._detector = Detector(
+            SavedModel(config, data.records.grid, {}),
+            distributed.batch_sharding(mesh or distributed.make_mesh()),
+            score_threshold=self._options.min_score,
         )
-        truth, table = tables_from_frames(frames, split)
-        report = write_report(
-            *(truth, predictions, table, folder, options),
-            run=run or workdir.name,
-            left_out=frames.summary().counts,
-            draw_frame=drawer,
-        )
-        _log.info("step %s, split %s\n%s", step, split, report.text)
-        if models.has_camera(model):
-            figures.write_camera_share(
-                folder / "camera_share.json", model, variables, data, frames
-            )
-        if drawer.draw_spread(folder / "pictures", options.num_visualizations):
-            drawer.draw_scenes(folder / "scenes.png")
-        figures.draw_curves(
-            workdir, folder / "training.png", is_simulated=frames.is_simulated
-        )
-        return report
 
-    def write_whole() -> Report:
-        place = out or workdir / "evaluation"
-        with files.swapped_in(place) as folder:
-            report = write(folder)
-        placed = [place / path.relative_to(folder) for path in report.files]
-        return dataclasses.replace(report, files=placed)
+    def predict(
+        self, variables: Mapping[str, Any], **options: Any
+    ) -> dict[str, np.ndarray]:
+        """Columns of all boxes that are stored; `options` are of `predict_dataset`."""
+        return predict_dataset(
+            self._detector.replace(variables=variables),
+            self._data.records,
+            self._seen,
+            self._options.batch_size,
+            images=self._images,
+            **options,
+        )
 
-    return distributed.main_only(write_whole)
+    def validate(
+        self,
+        state: TrainState,
+        step: int,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> Scores:
+        """Scores of a state's (averaged) parameters, during training.
+
+        Every process computes the same numbers.
+
+        Raises:
+            distributed.Stopped: `should_stop`, asked at every batch, said so.
+        """
+        predictions = self.predict(
+            state.eval_variables, progress=False, should_stop=should_stop
+        )
+        options = dataclasses.replace(self._options, bootstrap=0)
+        tables = self._truth, predictions, self._table
+        _, results = evaluate_tables(*tables, options, kinds=())
+        values, best = {}, None
+        for result in filter(lambda result: result.is_defined, results):
+            metric = result.metric
+            if result.cls != "mean":
+                values[f"validation/{metric}/{result.cls}"] = result.ap
+                continue
+            values[f"validation/m{metric}"] = result.ap
+            is_main = result.protocol == options.protocols[0]
+            name = self._config.train.best_metric
+            is_best = is_main and f"m{metric.split('/')[0]}" == name
+            if is_best and not math.isnan(result.ap):
+                best = result.ap
+        count = self._config.logging.num_visualizations
+        drawn = (
+            distributed.main_only(lambda: [*self._figures(predictions, count)]) or []
+        )
+        pictures = {f"validation/{name}": _pixels(figure) for name, figure in drawn}
+        return Scores(values, best, pictures)
+
+    def report(
+        self,
+        variables: Mapping[str, Any],
+        workdir: pathlib.Path,
+        *,
+        out: pathlib.Path | None = None,
+        step: int | None = None,
+        run: str | None = None,
+    ) -> Report | None:
+        """Detect, and write the tables and figures of an evaluation.
+
+        Args:
+            variables: Of the model.
+            workdir: Of the run.
+            out: Folder of the results; `evaluation` in the workdir if None.
+            step: Of the variables, for `source.json`.
+            run: Name of the run in the report; that of the workdir if None.
+
+        Returns:
+            The report that was written; None on all processes except the first.
+        """
+        predictions, place = self.predict(variables), out or workdir / "evaluation"
+        frames, options = self._frames, self._options
+
+        def draw(index: int, path: pathlib.Path) -> None:
+            save_figure(draw_frame(self._scene(predictions, index)), path)
+
+        def write() -> Report:
+            with files.swapped_in(place) as folder:
+                files.write_json(folder / "source.json", {"step": step, **self._source})
+                report = write_report(
+                    *(self._truth, predictions, self._table, folder, options),
+                    run=run or workdir.name,
+                    left_out=frames.summary().counts,
+                    draw_frame=draw,
+                )
+                _log.info("step %s, split %s\n%s", step, self._split, report.text)
+                if self._detector.takes_camera:
+                    model, some = self._detector.model, figures.spread(frames, 256)
+                    maps = figures.frame_shares(model, variables, self._data, some)
+                    shares = figures.average_shares(
+                        ((frame.weather, share) for frame, share in maps),
+                        self._data.records.grid,
+                    )
+                    files.write_json(folder / "camera_share.json", shares)
+                drawn = self._figures(predictions, options.num_visualizations)
+                for name, figure in drawn:
+                    save_figure(figure, folder / "pictures" / f"{name}.png")
+                if (folder / "pictures").exists():  # the layout of RADE-Net's Figure 4
+                    scenes = [
+                        self._scene(predictions, i, title=f"{name} ({frames[i].key})")
+                        for name, i in figures.fullest_of_weathers(frames).items()
+                    ]
+                    save_figure(draw_scenes(scenes), folder / "scenes.png")
+                figures.draw_curves(
+                    workdir, folder / "training.png", is_simulated=frames.is_simulated
+                )
+            placed = [place / path.relative_to(folder) for path in report.files]
+            return dataclasses.replace(report, files=placed)
+
+        return distributed.main_only(write)
+
+    def _scene(self, predictions: Columns, index: int, **fields: Any) -> Scene:
+        """The frame at a position of the split with its boxes and image.
+
+        Predictions from `decode.score_threshold` on, as in use of the detector.
+        """
+        frame, records, found = self._frames[index], self._data.records, predictions
+        threshold = self._config.decode.score_threshold
+        is_drawn = (found["frame"] == index) & (found["score"] >= threshold)
+        return figures.frame_scene(
+            frame,
+            decode(records[frame.key]),
+            records.grid,
+            predictions=Boxes(
+                **{name: column[is_drawn] for name, column in found.items()}
+            ),
+            roi=self._options.roi_bounds,
+            score_threshold=threshold,
+            **fields,
+        )
+
+    def _figures(
+        self, predictions: Columns, count: int
+    ) -> Iterator[tuple[str, Figure]]:
+        """Figures of frames with objects, always of the same, spread over the split."""
+        candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
+        for index in figures.spread(candidates, count):
+            frame = self._frames[index]
+            name = f"{frame.sequence:02d}_{frame.name}"
+            yield name, draw_frame(self._scene(predictions, index))
+
+
+def _pixels(figure: Figure) -> UInt8[np.ndarray, "H W 3"]:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())[..., :3]
 
 
 def evaluate_run(
@@ -150,14 +270,12 @@ def evaluate_run(
             data and none are given; other data do not fit the run, or `out` has results
             on others. Or a change out of its range.
     """
-    loaded = load_model(workdir, step=step, image_backbone=image_backbone)
+    saved = load_model(workdir, step=step, image_backbone=image_backbone)
     workdir = pathlib.Path(workdir).absolute()
-    if not loaded.run:
+    if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
-    options = EvaluationOptions.from_config(loaded.config, **changes)
-    config, data = data_of_run(loaded, other)
-    # Other labels may have been given.
-    options = dataclasses.replace(options, label_version=config.data.label_version)
+    EvaluationOptions.from_config(saved.config, **changes)  # reading labels takes long
+    config, data = data_of_run(saved, other)
     name = "evaluation" if other is None else f"evaluation_{data_name(other)}"
     name += "_validation" if split == "validation" else ""
     name += "" if shuffle_images is None else "_shuffled"
@@ -170,23 +288,17 @@ def evaluate_run(
             data.choosing_split,
         )
     if other is not None:
-        frames, _ = _frames(data, split, shuffle_images)
+        frames = data.split(split)
         require_images(frames, data.images(frames), split)
         if out is None:
             _check_source(workdir / name, source_of(data, split, shuffle_images))
     data.preprocess()
-    return evaluate(
-        config,
-        loaded.model,
-        loaded.variables,
-        data,
-        workdir,
-        out=pathlib.Path(out or workdir / name),
-        options=options,
-        split=split,
-        shuffle_images=shuffle_images,
-        step=loaded.step,
-        run=run,
+    evaluation = Evaluation(
+        config, data, split, shuffle_images=shuffle_images, **changes
+    )
+    place = pathlib.Path(out or workdir / name)
+    return evaluation.report(
+        saved.variables, workdir, out=place, step=saved.step, run=run
     )
 
 
@@ -197,12 +309,8 @@ def source_of(
     return {
         "split": split,
         "shuffle_images": shuffle_images,
-        "label_version": data.options.label_version,
-        "sequences": list(data.options.sequences),
-        "weather": list(data.options.weather),
         "simulated": data.frames.is_simulated,
-        **{name: data.options[name] for name in DATA_PATHS},
-        "roots": list(data.options.roots),  # as JSON has them
+        **json.loads(data.options.to_json()),
     }
 
 
@@ -210,45 +318,25 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
     """Raise `UserError` if a folder has results on other data than these."""
     if not (out / "source.json").exists():
         return
+    found = files.read_object(out / "source.json")
     names = ("roots", "labels", "label_version", "split", "sequences", "weather")
-    found, wanted = (
-        {name: values.get(name) or None for name in names}
-        for values in (files.read_object(out / "source.json"), source)
-    )
-    if lines := files.differences(found, wanted, ""):
+    there, here = ({name: of.get(name) for name in names} for of in (found, source))
+    if lines := files.differences(there, here, ""):
         raise UserError(f"{out} has other results: {'; '.join(lines)}; give --out")
 
 
-def _frames(
-    data: Data, split: str, shuffle_images: int | None
-) -> tuple[LabelledFrames, FrameSequence]:
-    """Frames of a split, and the same as the model is to see them."""
-    frames = data.split(None if split == "all" else split)
-    if not len(frames):
-        raise UserError(
-            f"no frames of split {split} in {', '.join(data.options.roots)}"
-        )
-    if shuffle_images is None:
-        return frames, frames
-    if data.camera is None:
-        raise UserError(
-            "config.model.name is 'radenet', which has no camera; expected 'dinorade', "
-            "for example --config dinorade"
-        )
-    return frames, with_shuffled_images(frames, shuffle_images)
-
-
-def with_shuffled_images(frames: FrameSequence, seed: int) -> list[LabelledFrame]:
-    """The frames, each with the image and calibration of another one.
+def with_shuffled_images(data: Data, split: str, seed: int) -> list[LabelledFrame]:
+    """The frames of a split, each with the image and calibration of another one.
 
     Raises:
-        UserError: Fewer than two frames have an image.
+        UserError: The model has no camera, or fewer than two frames have an image.
     """
+    frames = list(data.split(split))
     given = [i for i, frame in enumerate(frames) if frame.camera_path is not None]
-    if len(given) < 2:
+    if data.camera is None or len(given) < 2:
         raise UserError(
-            "shuffling images needs at least two frames with an image, found "
-            f"{len(given)}"
+            "shuffling images needs a model with a camera, such as dinorade, and at least "
+            f"two frames with an image, found {len(given)}"
         )
     order = np.random.default_rng(seed).permutation(given)
     shuffled = list(frames)
@@ -260,19 +348,3 @@ def with_shuffled_images(frames: FrameSequence, seed: int) -> list[LabelledFrame
             camera_calibration_path=frames[other].camera_calibration_path,
         )
     return shuffled
-
-
-def make_detector(
-    config: ConfigDict,
-    data: Data,
-    variables: Mapping[str, Any],
-    mesh: jax.sharding.Mesh | None = None,
-    options: EvaluationOptions | None = None,
-) -> Detector:
-    """Detector of all boxes that evaluations store, on all devices or those of a mesh."""
-    options = options or EvaluationOptions.from_config(config)
-    return Detector(
-        SavedModel(config, data.records.grid, variables),
-        distributed.batch_sharding(mesh or distributed.make_mesh()),
-        score_threshold=options.min_score,
-    )

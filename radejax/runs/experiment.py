@@ -25,7 +25,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import flax.linen as nn
 import jax
 import numpy as np
 from ml_collections import ConfigDict
@@ -35,17 +34,15 @@ import radejax
 from radejax import models
 from radejax.core import files
 from radejax.core.config import without_data_paths
-from radejax.core.errors import DataError, UserError, require
+from radejax.core.errors import require
 from radejax.core.files import PathLike
 from radejax.data.dataset import FrameSequence
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import StartingWeights, starting_weights
 from radejax.runs import checks
-from radejax.runs.data import Data, located, open_data
-from radejax.runs.evaluate import evaluate
-from radejax.runs.validation import Validation
+from radejax.runs.data import located, open_data
+from radejax.runs.evaluate import Evaluation
 from radejax.training import distributed, loop
-from radejax.training.step import TrainState
 
 _log = logging.getLogger(__name__)
 
@@ -85,65 +82,51 @@ def run(
             *(config.data.image_backbone, config.data.embeddings),
         )
         data = open_data(config, model)
-        has_test = len(data.split("test")) > 0
+        frames, grid = data.split("train"), data.records.grid
+        has_test = len(data.split("test", may_be_empty=True)) > 0
         if not has_test:
             _log.warning(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        state, is_finished = _train(model, weights, data, folder, config, str(profile))
+        loader = data.training_batches(frames, config.train, config.seed)
+        info = run_info(folder, weights.source)
+        if distributed.is_main():
+            files.write_json(folder / "run.json", info)
+        validate = None
+        if config.train.evaluate_every_epochs:
+            validate = Evaluation(config, data, data.choosing_split).validate
+        state, is_finished = loop.train(
+            config,
+            model,
+            loader,
+            models.map_grid(grid, model, config.data.azimuth_mapping),
+            folder,
+            info=checkpoint_info(config, grid, info, _invariants(frames, weights)),
+            steps_per_epoch=len(frames) // config.train.batch_size,
+            variables=weights.variables,
+            pretrained=weights.pretrained,
+            evaluate=validate,
+            profile=str(profile),
+        )
         step = int(state.step)
         if not is_finished:
             _log.info("stopped at step %d; run the same command to continue", step)
             return folder
         if has_test:
-            evaluate(config, model, state.eval_variables, data, folder, step=step)
+            evaluation = Evaluation(config, data)
+            evaluation.report(state.eval_variables, folder, step=step)
     place = files.relative(folder)
-    _log.info("Done in %s: checkpoints/, metrics.jsonl and evaluation/", place)
+    _log.info(
+        "Done in %s: checkpoints/, metrics.jsonl and evaluation/. Evaluate again: radejax "
+        "evaluate %s; boxes of frames: radejax detect --workdir %s --out boxes FOLDER",
+        *(place, place, place),
+    )
     if config.train.evaluate_every_epochs:
-        best = f"radejax evaluate --workdir {place} --checkpoint best"
+        best = f"radejax evaluate {place} --checkpoint best"
         split = data.choosing_split
         _log.info("Best checkpoint, chosen on the %s split: %s", split, best)
-    _log.info("Evaluate again: radejax evaluate --workdir %s", place)
-    _log.info("Boxes of frames: radejax detect --workdir %s --out boxes FOLDER", place)
     return folder
-
-
-def _train(
-    model: nn.Module,
-    weights: StartingWeights,
-    data: Data,
-    folder: pathlib.Path,
-    config: ConfigDict,
-    profile: str,
-) -> tuple[TrainState, bool]:
-    """Trains on the train split until the configured epochs are done."""
-    frames = data.split("train")
-    if not len(frames):
-        raise UserError(
-            f"no frames of the train split in {', '.join(data.options.roots)}"
-        )
-    loader = data.training_batches(frames, config.train, config.seed)
-    info = run_info(folder, weights.source)
-    if distributed.is_main():
-        files.write_json(folder / "run.json", info)
-    validation = None
-    if config.train.evaluate_every_epochs:
-        validation = Validation(config, data)
-    grid = data.records.grid
-    return loop.train(
-        config,
-        model,
-        loader,
-        models.map_grid(grid, model, config.data.azimuth_mapping),
-        folder,
-        info=checkpoint_info(config, grid, info, _invariants(frames, weights)),
-        steps_per_epoch=len(frames) // config.train.batch_size,
-        variables=weights.variables,
-        pretrained=weights.pretrained,
-        evaluate=validation,
-        profile=profile,
-    )
 
 
 # Workdir -----------------------------------------------------------------------------
@@ -190,24 +173,17 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     )
 
 
-def run_info(
-    workdir: pathlib.Path, init_from: PathLike | None = None
-) -> dict[str, Any]:
+def run_info(workdir: pathlib.Path, init_from: str | None = None) -> dict[str, Any]:
     """Versions, command and starting weights of a run; plain values.
 
     A run that continues keeps the weights that it started from.
     """
-    init_from = init_from and str(pathlib.Path(init_from).absolute())
     if init_from is None and (workdir / "run.json").exists():
-        saved = files.read_object(workdir / "run.json")
-        init_from = saved.get("init_from")
+        init_from = files.read_object(workdir / "run.json").get("init_from")
+    versions = {"radejax": radejax.__version__, "jax": jax.__version__}
     return {
         "init_from": init_from,
-        "versions": {
-            "radejax": radejax.__version__,
-            "jax": jax.__version__,
-            "python": sys.version.split()[0],
-        },
+        "versions": {**versions, "python": sys.version.split()[0]},
         "device": str(jax.devices()[0].device_kind),
         "command": shlex.join(sys.argv),
     }
@@ -227,13 +203,8 @@ def checkpoint_info(
         run: See `run_info`.
         same: Values by name that a run that continues must not change.
     """
-    config_json = json.loads(config.to_json())
-    return {
-        "config": config_json,
-        "grid": grid.to_dict(),
-        "run": dict(run),
-        "same": dict(same),
-    }
+    values = {"config": json.loads(config.to_json()), "grid": grid.to_dict()}
+    return {**values, "run": dict(run), "same": dict(same)}
 
 
 def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, Any]:
@@ -286,63 +257,42 @@ def run_seeds(
         UserError: Two seeds are equal; and as `run`.
     """
     require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
-    workdir = default_workdir(workdir, name)
-    tables = {}
+    workdir, tables = default_workdir(workdir, name), {}
     for seed in seeds:
         one = config.copy_and_resolve_references()
         one.seed = seed
         _log.info("seed %d of %s", seed, list(seeds))
         folder = run(one, name=name, workdir=workdir / f"seed{seed}", **options)
-        if not (folder / "evaluation" / "metrics.csv").exists():
+        metrics = folder / "evaluation" / "metrics.csv"
+        if not metrics.exists():
             _log.info("seed %d is not evaluated: it is not finished, or no data", seed)
             break
-        tables[seed] = read_aps(folder / "evaluation" / "metrics.csv")
+        tables[seed] = {
+            tuple(row[key] for key in _KEYS): float(row["ap"] or "nan")
+            for row in csv.DictReader(files.read_text(metrics).splitlines())
+            if float(row["num_gt"])
+        }
     if tables and distributed.is_main():
-        rows = _summary(tables)
-        text = _summary_text(rows)
-        files.write_json(workdir / "seeds.json", rows)
-        files.write_text(workdir / "seeds.txt", text)
-        _log.info("%s\nWritten to %s", text, workdir)
+        _write_summary(workdir, tables)
     return workdir
 
 
-def read_aps(path: pathlib.Path) -> dict[tuple[str, ...], float]:
-    """APs of a report's metrics.csv by protocol, condition, class, space and IoU."""
-    try:
-        rows = list(csv.DictReader(files.read_text(path).splitlines()))
-        return {
-            tuple(row[key] for key in _KEYS): float(row["ap"] or "nan")
-            for row in rows
-            if float(row["num_gt"])
-        }
-    except (KeyError, ValueError, TypeError, csv.Error) as error:
-        raise DataError(
-            f"{path}: not the metrics of a report ({error!r:.200})"
-        ) from None
-
-
-def _summary(tables: dict[int, dict[tuple[str, ...], float]]) -> list[dict[str, Any]]:
+def _write_summary(
+    workdir: pathlib.Path, tables: dict[int, dict[tuple[str, ...], float]]
+) -> None:
     """Mean, standard deviation (n - 1; None for one seed) and values of common APs."""
+    rows, lines = [], []
     first, *others = tables.values()
-    rows = []
     for key in (key for key in first if all(key in table for table in others)):
         values = {str(seed): table[key] for seed, table in tables.items()}
         aps = list(values.values())
         std = float(np.std(aps, ddof=1)) if others else None
-        named = dict(zip(_KEYS, key, strict=True))
-        rows.append(named | {"mean": float(np.mean(aps)), "std": std, "values": values})
-    return rows
-
-
-def _summary_text(rows: Sequence[dict[str, Any]]) -> str:
-    """A table of the rows over all frames."""
-    head = ["protocol", "class", "space", "IoU", "mean AP", "std"]
-    lines = []
-    for row in rows:
-        if row["condition"] == "all":
-            std = "-" if row["std"] is None else f"{row['std']:.2f}"
-            aps = [f"{ap:.2f}" for ap in row["values"].values()]
-            names = [row[key] for key in _KEYS if key != "condition"]
-            lines.append([*names, f"{row['mean']:.2f}", std, *aps])
-            seeds = [f"seed {seed}" for seed in row["values"]]
-    return tabulate(lines, [*head, *seeds], disable_numparse=True) if lines else ""
+        row: dict[str, Any] = dict(zip(_KEYS, key, strict=True))
+        row |= {"mean": float(np.mean(aps)), "std": std}
+        rows.append({**row, "values": values})
+        if row.pop("condition") == "all":
+            lines.append(row | {f"seed {seed}": ap for seed, ap in values.items()})
+    text = tabulate(lines, headers="keys", floatfmt=".2f", missingval="-")
+    files.write_json(workdir / "seeds.json", rows)
+    files.write_text(workdir / "seeds.txt", text)
+    _log.info("%s\nWritten to %s", text, workdir)

@@ -16,8 +16,7 @@ from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
 from radejax.runs.data import Data
-from radejax.runs.evaluate import make_detector
-from radejax.runs.validation import Validation
+from radejax.runs.evaluate import Evaluation
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import distributed
 
@@ -65,8 +64,8 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
     mesh = distributed.make_mesh(num_devices)
-    detector = make_detector(setup.config, setup.data, setup.variables, mesh)
-    return predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
+    evaluation = Evaluation(setup.config, setup.data, mesh=mesh)
+    return evaluation.predict(setup.variables, progress=False)
 
 
 def _saved(setup: SimpleNamespace) -> SavedModel:
@@ -119,7 +118,7 @@ def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
 
     state = SimpleNamespace(eval_variables=setup.variables)
     with pytest.raises(distributed.Stopped):
-        Validation(setup.config, setup.data)(state, 7, should_stop)
+        Evaluation(setup.config, setup.data).validate(state, 7, should_stop)
     assert asked == [True]
 
 
@@ -134,7 +133,7 @@ def test_images_need_the_weights_of_the_backbone() -> None:
 
 
 def test_a_detector_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
-    detector = make_detector(setup.config, setup.data, setup.variables)
+    detector = Detector(_saved(setup), batch_sizes=(8,))
     projection = np.zeros((8, *setup.records.grid.projection_shape), np.float16)
     none = np.zeros((8, 0), np.float32)
     batch = Batch(
@@ -151,7 +150,7 @@ def test_a_detector_says_that_the_backbone_is_missing(setup: SimpleNamespace) ->
 
 def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
     state = SimpleNamespace(eval_variables=setup.variables)
-    scores = Validation(setup.config, setup.data)(state, 7)
+    scores = Evaluation(setup.config, setup.data).validate(state, 7)
     name = "validation/map_3d_iou30/coco101/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
     assert all("/simulated" in key for key in scores.values)
@@ -161,14 +160,6 @@ def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> N
     (picture,) = scores.pictures.values()
     assert picture.dtype == np.uint8
     assert picture.shape[2] == 3
-    alone = Validation(setup.config, setup.data, distributed.make_mesh(1))(state, 7)
+    mesh = distributed.make_mesh(1)
+    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(state, 7)
     assert alone.values == pytest.approx(scores.values)
-
-
-def test_a_best_metric_that_is_not_measured_is_refused(setup: SimpleNamespace) -> None:
-    config = setup.config.copy_and_resolve_references()
-    config.train.best_metric = "map_3d_iou70"
-    with pytest.raises(
-        UserError, match=r"'map_3d_iou70', expected one of .*'map_3d_iou30'"
-    ):
-        Validation(config, setup.data)

@@ -69,6 +69,8 @@ WRONG = [
     ("train.checkpoint_every_steps", 0),
     ("train.checkpoints_to_keep", 0),
     ("train.parameter_sharding", "zero"),
+    ("data.roots", ("",)),
+    ("data.format", "nuscenes"),
     ("data.label_version", "v3"),
     ("data.visibility", "R"),
     ("data.visibility", ("X",)),

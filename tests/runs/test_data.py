@@ -33,14 +33,10 @@ def test_a_missing_folder_is_named(missing: str, tmp_path: pathlib.Path) -> None
     nowhere: Any = str(tmp_path / "nowhere")
     given = {"roots": (str(tmp_path),)}
     given[missing] = (nowhere,) if missing == "roots" else nowhere
-    config = _located(**given)
-    with pytest.raises(FileNotFoundError, match=r"no such folder: .*nowhere"):
-        open_data(config, models.build(config.model))
-
-
-def test_no_list_of_folders_is_an_error() -> None:
-    with pytest.raises(UserError, match=r"roots is \('',\), expected a tuple of fold"):
-        _located(roots=("",))
+    with pytest.raises(
+        FileNotFoundError, match=r"no such folder.*nowhere|nowhere: no "
+    ):
+        open_data(config := _located(**given), models.build(config.model))
 
 
 def test_paths_are_absolute_and_simulations_named_by_their_config(
@@ -79,7 +75,7 @@ def test_frames_are_projected_beside_their_data_once(
     config = base_config()
     config.data.roots = ("sim",)
     with pytest.raises(
-        UserError, match=r"64 Doppler.*doppler_bins=16 --config.model.elev"
+        UserError, match="doppler_bins is 64, expected 16, as the radar of"
     ):
         prepare()
     config.model.update(doppler_bins=16, elevation_bins=9)
@@ -141,11 +137,11 @@ def test_a_run_leaves_out_what_has_no_record_and_takes_a_part(
         data = open_data(located(config), model)
     assert "6 frames: 5 were done, 0 preprocessed, 1 skipped" in caplog.text
     assert damaged.key not in [frame.key for frame in data.split("train")]
-    assert len(data.split(None)) == len(data.records.keys()) == 5
+    assert len(data.split("all")) == len(data.records.keys()) == 5
     config.data.sequences = (1, 3)
     part = open_data(located(config), model)  # the same records
     assert {frame.sequence for frame in part.frames} == {1, 3}
-    assert len(part.split(None)) == 3
+    assert len(part.split("all")) == 3
 
     # Of a run: its own part, another one, and all of other folders.
     copy = str(shutil.copytree(root, tmp_path / "copy"))
@@ -197,9 +193,6 @@ def _check_validation(
     told = ", ".join(f"{cls} {number}" for cls, number in held.items())
     expected = f"sequences 1 of the train split are held out, 1 frames beside 2 to train on; {told}"
     assert expected in caplog.text
-    assert "evaluate_every_epochs is 0: nothing is chosen by them" in caplog.text
-    lacking = [cls for cls, number in held.items() if not number]
-    assert ("in the validation split" in caplog.text) == bool(lacking)
     config.data.validation = (0.5,)
     drawn = sequences(open_data(located(config), model))
     assert sorted({*drawn["train"], *drawn["validation"]}) == [1, 2]

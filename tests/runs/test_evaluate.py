@@ -18,40 +18,38 @@ from radejax.detection.decode import decode
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
-from radejax.runs.evaluate import with_shuffled_images
 
 
-def _frames(paths: list[str | None]) -> list[Frame]:
+def _shuffled(paths: list[str | None], seed: int) -> list[Any]:
+    """Frames 0, 1, ... with images (and calibrations) of these names, shuffled."""
     blank = {field.name: None for field in dataclasses.fields(Frame)}
-    return [
+    frames = [
         Frame(
             **blank | {"name": str(i), "camera_path": p, "camera_calibration_path": p}
         )
         for i, p in enumerate(paths)
     ]
+    data: Any = SimpleNamespace(camera=True, split=lambda _: frames)
+    return evaluate.with_shuffled_images(data, "test", seed)
 
 
 def test_every_frame_sees_another_ones_image() -> None:
     paths = ["a", "b", None, "c", "d", "e"]
-    shuffled = with_shuffled_images(_frames(paths), seed=3)
+    shuffled = _shuffled(paths, 3)
     found = [frame.camera_path for frame in shuffled]
     assert [frame.name for frame in shuffled] == list("012345")
     assert sorted(filter(None, found)) == ["a", "b", "c", "d", "e"]
     assert found[2] is None
     assert all(a != b for a, b in zip(found, paths, strict=True) if b is not None)
     assert found == [frame.camera_calibration_path for frame in shuffled]
-
-    def again(seed: int) -> list[str | None]:
-        frames = with_shuffled_images(_frames(paths), seed)
-        return [frame.camera_path for frame in frames]
-
-    assert found == again(3)
-    assert any(found != again(seed) for seed in range(4, 8))
+    again = [[f.camera_path for f in _shuffled(paths, seed)] for seed in range(3, 8)]
+    assert found == again[0]
+    assert any(found != other for other in again[1:])
 
 
 def test_images_of_fewer_than_two_frames_cannot_be_shuffled() -> None:
     with pytest.raises(UserError, match="two frames with an image, found 1"):
-        with_shuffled_images(_frames(["a", None]), seed=0)
+        _shuffled(["a", None], 0)
 
 
 def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
@@ -109,7 +107,7 @@ def test_settings_of_a_run_hold_for_all_protocols_except_all_point() -> None:
         ({"bootstrap": -1}, "bootstrap is -1"),
         ({"num_visualizations": -1}, "num_visualizations is -1"),
         ({"empty_frames": "all"}, "empty_frames is 'all', expected one of protocol"),
-        ({"roi": (0.0, 1.0)}, "roi must be"),
+        ({"roi": (0.0, 1.0)}, r"evaluation.roi is \(0.0, 1.0\), expected"),
         ({"classes": ("Tram",)}, "classes has 'Tram', expected some of the run's: Sed"),
     ],
 )
@@ -161,7 +159,8 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     loaded = _Loaded(_config())
     monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
     monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
-    monkeypatch.setattr(evaluate, "evaluate", lambda *_, **named: written.update(named))
+    evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
+    monkeypatch.setattr(evaluate, "Evaluation", lambda *_, **__: evaluation)
     evaluate.evaluate_run(tmp_path, step=step, split=split)
     assert written["out"] == tmp_path / folder
     name = f"{tmp_path.name} ({remark})" if remark else tmp_path.name

@@ -77,7 +77,7 @@ def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) ->
 
 
 def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
-    info = experiment.run_info(tmp_path, tmp_path / "model.pth")
+    info = experiment.run_info(tmp_path, str(tmp_path / "model.pth"))
     assert info["init_from"] == str(tmp_path / "model.pth")
     (tmp_path / "run.json").write_text(json.dumps(info))
     again = experiment.run_info(tmp_path)
