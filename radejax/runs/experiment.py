@@ -118,8 +118,8 @@ def run(
             evaluation.report(state.eval_variables, folder, step=step)
     place = files.relative(folder)
     _log.info(
-        "Done in %s: checkpoints/, metrics.jsonl and evaluation/. Evaluate again: radejax "
-        "evaluate %s; boxes of frames: radejax detect --workdir %s --out boxes FOLDER",
+        "Done in %s. Evaluate again: radejax evaluate %s. Boxes of frames: radejax detect "
+        "--workdir %s --out boxes FOLDER",
         *(place, place, place),
     )
     if config.train.evaluate_every_epochs:
