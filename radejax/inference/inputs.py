@@ -169,8 +169,8 @@ def check_backbone(
     is_raw = image is not None and image.shape[-1] == 3
     if is_raw and IMAGE_BACKBONE not in variables["params"]:
         raise UserError(
-            "these weights are without the image backbone: give "
-            "image_backbone=FOLDER with the weights of DINOv3, or embedded images"
+            "these weights are without the image backbone: give image_backbone=FOLDER "
+            "(--image-backbone FOLDER) with the weights of DINOv3, or embedded images"
         )
 
 

@@ -41,7 +41,6 @@ from radejax.data.records import (
     preprocess,
 )
 from radejax.inference.saved import SavedModel
-from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.runs.checks import check_bins
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
@@ -322,8 +321,8 @@ def data_of_run(
     taken whole, unless `changes` say otherwise. Nothing is preprocessed.
 
     Raises:
-        UserError: The run has no data and none are given; they are of another radar
-            grid, or without what a frozen image backbone makes of their images.
+        UserError: The run has no data and none are given, or they are of another radar
+            grid.
         FileNotFoundError: A folder is missing.
     """
     config = saved.config.copy_and_resolve_references()
@@ -341,13 +340,6 @@ def data_of_run(
     with options.ignore_type():
         options.update(changes)
     _set_paths(options, roots)
-    has_backbone = IMAGE_BACKBONE in saved.variables["params"]
-    is_blind = models.has_camera(saved.model) and not has_backbone
-    if changes and is_blind and options.embeddings is None:
-        raise UserError(
-            "the run is without the weights of its image backbone: give "
-            "--image-backbone FOLDER, or --embeddings FOLDER of these images"
-        )
     data = Data.open(config, saved.model)
     grids = [describe_grid(grid) for grid in (data.frames.grid, saved.grid)]
     is_same, text = (

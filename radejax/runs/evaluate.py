@@ -28,6 +28,7 @@ from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector
+from radejax.inference.inputs import check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import figures
@@ -118,21 +119,17 @@ class Evaluation:
         _, results = evaluate_tables(*tables, options, kinds=())
         values, best = {}, None
         for result in filter(lambda result: result.is_defined, results):
-            metric = result.metric
-            if result.cls != "mean":
-                values[f"validation/{metric}/{result.cls}"] = result.ap
-                continue
-            values[f"validation/m{metric}"] = result.ap
-            is_main = result.protocol == options.protocols[0]
-            name = self._config.train.best_metric
-            is_best = is_main and f"m{metric.split('/')[0]}" == name
-            if is_best and not math.isnan(result.ap):
-                best = result.ap
+            name = f"{result.metric}/{result.cls}"
+            if result.cls == "mean":
+                name = f"m{result.metric}"
+                is_main = result.protocol == options.protocols[0]
+                if is_main and name.split("/")[0] == self._config.train.best_metric:
+                    best = None if math.isnan(result.ap) else result.ap
+            values[f"validation/{name}"] = result.ap
         count = self._config.logging.num_visualizations
-        drawn = (
-            distributed.main_only(lambda: [*self._figures(predictions, count)]) or []
-        )
-        pictures = {f"validation/{name}": _pixels(figure) for name, figure in drawn}
+        draw = self._figures(predictions, count)
+        drawn = distributed.main_only(lambda: dict(draw)) or {}
+        pictures = {f"validation/{name}": _pixels(x) for name, x in drawn.items()}
         return Scores(values, best, pictures)
 
     def report(
@@ -289,7 +286,10 @@ def evaluate_run(
         )
     if other is not None:
         frames = data.split(split)
-        require_images(frames, data.images(frames), split)
+        images = data.images(frames)
+        require_images(frames, images, split)
+        if images is not None:
+            check_backbone(images.empty_images(1), saved.variables)
         if out is None:
             _check_source(workdir / name, source_of(data, split, shuffle_images))
     data.preprocess()
