@@ -15,7 +15,8 @@ from PIL import Image
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
-from radejax.data.dataset import DATA_SETS
+from radejax.data.dataset import DATA_SETS, data_set
+from radejax.data.kradar import KRadar
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.losses.detection import LOSSES
@@ -154,3 +155,12 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     source = json.loads((folder / "evaluation" / "source.json").read_text())
     assert source["roots"] == [str(root)]
     assert (folder / "evaluation" / "metrics.json").is_file()
+
+
+def test_a_format_may_name_a_class_of_a_module() -> None:
+    assert data_set("radejax.data.kradar:KRadar") is KRadar
+    assert data_set("kradar") is KRadar
+    with pytest.raises(UserError, match=r"'json:Reader': .* no attribute 'Reader'"):
+        data_set("json:Reader")
+    with pytest.raises(UserError, match=r"No module named 'no_module'"):
+        data_set("no_module:Reader")

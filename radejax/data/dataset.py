@@ -1,22 +1,66 @@
-"""What a run asks of a data set: its frames, their radar, images and labels.
+"""What a run needs from a dataset: its frames, their radar, images and labels.
 
-K-Radar (`radejax.data.kradar`) gives it, and so can another; docs/extending.md has a
-whole one. Nothing has to inherit from anything.
+`radejax.data.kradar` reads K-Radar; docs/extending.md has another reader. Readers satisfy
+the protocols below and need not inherit from them.
 """
 
 from __future__ import annotations
 
+import collections
+import dataclasses
+import importlib
 import pathlib
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from radejax.core.errors import UserError
-from radejax.data.kradar.dataset import KRadar, Summary
+from radejax.core.errors import UserError, require
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
+
+
+@dataclasses.dataclass
+class Summary:
+    """What reading a data set found.
+
+    Attributes:
+        counts: What was read and what was skipped, by reason.
+        problems: Everything missing or malformed: kind, and message with file and line.
+        notes: Assumptions that were made where a file is missing.
+    """
+
+    counts: collections.Counter[str] = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    problems: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def problem_counts(self) -> dict[str, int]:
+        """Number of problems of every kind."""
+        return dict(collections.Counter(kind for kind, _ in self.problems))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "counts": dict(self.counts),
+            "problem_counts": self.problem_counts(),
+            "problems": [message for _, message in self.problems],
+            "notes": list(self.notes),
+        }
+
+    def to_text(self, max_problems: int = 3) -> str:
+        """Lines for a terminal: all counts, the first problems of every kind."""
+        lines = [f"{n:>9,}  {what}" for what, n in self.counts.items() if n]
+        lines += [f"note: {note}" for note in self.notes]
+        for kind, number in self.problem_counts().items():
+            messages = [text for found, text in self.problems if found == kind]
+            lines.append(f"problem: {kind}: {number:,}")
+            lines += [f"    {message}" for message in messages[:max_problems]]
+            if number > max_problems:
+                lines.append(f"    ... and {number - max_problems:,} more")
+        return "\n".join(lines)
 
 
 @runtime_checkable
@@ -105,15 +149,31 @@ class LabelledFrames(Protocol):
 FrameSequence = LabelledFrames | Sequence[LabelledFrame]
 """Where it does not matter what else a data set can do."""
 
-DATA_SETS: dict[str, Callable[..., LabelledFrames]] = {"kradar": KRadar}
-"""What `config.data.format` may name: called with roots, labels and the options of
-`KRadar`, of which another may ignore those that it has no use for."""
+DATA_SETS: dict[str, str | Callable[..., LabelledFrames]] = {
+    "kradar": "radejax.data.kradar:KRadar"
+}
+"""Readers that `config.data.format` may name: a class, or "module:Class".
+
+They are called with roots, labels and the options of `KRadar`, of which another reader may
+ignore those that it has no use for."""
 
 
 def data_set(name: str) -> Callable[..., LabelledFrames]:
-    """What opens data sets of a format; `UserError` for one that there is not."""
-    if name not in DATA_SETS:
-        raise UserError(
-            f"config.data.format is {name!r}, expected one of {', '.join(DATA_SETS)}"
-        )
-    return DATA_SETS[name]
+    """The reader of a format.
+
+    Args:
+        name: A name of `DATA_SETS`, or "module:Class".
+
+    Raises:
+        UserError: There is no such name, or the class cannot be imported.
+    """
+    reader = DATA_SETS.get(name, name)
+    if not isinstance(reader, str):
+        return reader
+    module, _, attribute = reader.partition(":")
+    expected = f"{', '.join(DATA_SETS)} or module:Class"
+    require(bool(attribute), "config.data.format", name, expected)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"config.data.format is {name!r}: {error}") from None

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES, RARE_SHARE
+from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
     UNKNOWN_CONDITIONS,
@@ -24,7 +25,6 @@ from radejax.data.kradar.dataset import (
     Frame,
     KRadar,
     SequenceFolder,
-    Summary,
     as_paths,
     find_sequences,
     read_calibration,

@@ -30,6 +30,7 @@ from radejax.core.archives import open_zip, read_member
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, read_json, read_text
 from radejax.core.structures import CLASSES
+from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
     UNKNOWN_CONDITIONS,
@@ -153,48 +154,6 @@ class Frame:
             self.camera_calibration_path,
             radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
         )
-
-
-@dataclasses.dataclass
-class Summary:
-    """What reading a data set found.
-
-    Attributes:
-        counts: What was read and what was skipped, by reason.
-        problems: Everything missing or malformed: kind, and message with file and line.
-        notes: Assumptions that were made where a file is missing.
-    """
-
-    counts: collections.Counter[str] = dataclasses.field(
-        default_factory=collections.Counter
-    )
-    problems: list[tuple[str, str]] = dataclasses.field(default_factory=list)
-    notes: list[str] = dataclasses.field(default_factory=list)
-
-    def problem_counts(self) -> dict[str, int]:
-        """Number of problems of every kind."""
-        return dict(collections.Counter(kind for kind, _ in self.problems))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return {
-            "counts": dict(self.counts),
-            "problem_counts": self.problem_counts(),
-            "problems": [message for _, message in self.problems],
-            "notes": list(self.notes),
-        }
-
-    def to_text(self, max_problems: int = 3) -> str:
-        """Lines for a terminal: all counts, the first problems of every kind."""
-        lines = [f"{n:>9,}  {what}" for what, n in self.counts.items() if n]
-        lines += [f"note: {note}" for note in self.notes]
-        for kind, number in self.problem_counts().items():
-            messages = [text for found, text in self.problems if found == kind]
-            lines.append(f"problem: {kind}: {number:,}")
-            lines += [f"    {message}" for message in messages[:max_problems]]
-            if number > max_problems:
-                lines.append(f"    ... and {number - max_problems:,} more")
-        return "\n".join(lines)
 
 
 class KRadar(Sequence[Frame]):
