@@ -8,7 +8,6 @@ from radejax.core.errors import UserError
 from radejax.data.dataset import Summary
 from radejax.data.kradar import KRadar, write
 from radejax.data.kradar.check import HealthReport, check_dataset
-from radejax.data.kradar.dataset import 
 from radejax.geometry.radar_grid import RadarGrid
 
 
