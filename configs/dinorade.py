@@ -6,7 +6,7 @@
 
 The argument is a list of options, at most one of each group:
 
-- variant: `r` radar alone (a RADE-Net with the dual stem), `rc` with camera and without
+- variant: `r` radar-only (a RADE-Net with the dual stem), `rc` with camera and without
   elevation weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50,
   last stage fine-tuned, in place of DINOv3.
 - preset: `paper` or `official`: the released code with these values, its geometry
@@ -172,7 +172,7 @@ def _camera() -> ConfigDict:
             "calibration": "sequence",  # "common": cam_front0.yml for all, as released
             # Images of another size than model.image.size: resized, or an error.
             "resize": False,
-            # Frames without an image: radar alone, counted; False is an error.
+            # Frames without an image: radar-only, counted; False is an error.
             "allow_missing": True,
         }
     )

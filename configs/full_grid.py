@@ -4,7 +4,7 @@
 
 The quickstart's road scenes, seen by K-Radar's own sensors: the radar's projections, 64
 Doppler and 37 elevation bins of each of the 256 x 107 bins, and images of 1280 x 720
-pixels for the pictures. Widths and recipe are those of `quickstart:ablation`;
+pixels for the figures. Widths and recipe are those of `quickstart:ablation`;
 `docs/results.md` has the numbers to expect, and the time.
 
 The argument `short` makes a run of two minutes that learns next to nothing, to see

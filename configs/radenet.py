@@ -82,7 +82,7 @@ PRESETS = {
         "evaluation.empty_frames": "class",
     },
 }
-"""Where the paper and the released code differ, one field a row."""
+"""Where the paper and the released code differ, one field per row."""
 
 SIGMAS = {
     "sigma3": {"heatmap_sigma_mode": "fixed", "heatmap_sigma_bins": 3.0},

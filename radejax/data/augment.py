@@ -25,7 +25,7 @@ Sample = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Augmentation:
-    """Random changes of a frame; call it with a sample and a generator.
+    """Random augmentation of one frame: call it with a sample and a generator.
 
     Attributes:
         grid: Sensor axes of the projections.

@@ -32,12 +32,12 @@ def read_left_image(
     """Left half of a front image (a stereo pair, or left only).
 
     Args:
-        path: Of the picture file. More than twice as wide as high: a stereo pair.
+        path: Image file. An image more than twice as wide as high is a stereo pair.
         size: Height and width of the result.
         resize: Bring other sizes to `size`, averaging where they are larger.
 
     Raises:
-        DataError: The file is damaged, or of another size and not `resize`.
+        DataError: The file is corrupted, or of another size and not `resize`.
     """
     from PIL import Image
 
@@ -64,8 +64,10 @@ def read_left_image(
             return np.asarray(image)
     except DataError:
         raise
-    except Exception as error:  # Pillow's decoders raise nearly anything on damage
-        raise DataError(f"{path}: damaged image ({error})") from None
+    except (
+        Exception
+    ) as error:  # Pillow's decoders raise nearly anything on corrupted files
+        raise DataError(f"{path}: corrupted image ({error})") from None
 
 
 def front_view(
@@ -77,7 +79,7 @@ def front_view(
     none.
 
     Raises:
-        DataError: A file is damaged.
+        DataError: A file is corrupted.
     """
     if frame.camera_path is None:
         return None, None
@@ -155,7 +157,7 @@ class CameraInputs:
     """What a model sees beside the radar: an image and a camera for every frame.
 
     Attributes:
-        cameras: One a frame, NumPy float64; `is_valid` is False where there is none.
+        cameras: One per frame, NumPy float64; `is_valid` is False where there is none.
         image_size: Height and width of the images that the model sees.
         options: That they were made with.
         features: What an image backbone made of the images, in their place, or None.
@@ -177,7 +179,7 @@ class CameraInputs:
         return np.zeros((count, *self.image_size, 3), np.uint8)
 
     def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
-        """Image (or features) of a frame, black where it is missing."""
+        """Image (or features) of one frame; black if it is missing."""
         key, path = self.feature_keys[index], self.image_paths[index]
         if self.features is None and path is not None:
             return read_left_image(path, self.image_size, resize=self.options.resize)
@@ -257,7 +259,7 @@ def camera_inputs(
 def _read_camera(
     frame: LabelledFrame, image_size: tuple[int, int], options: CameraOptions
 ) -> Camera:
-    """The camera of a frame, for images of the model's size."""
+    """The camera of one frame, for images of the model's size."""
     calibration = frame.read_calibration(options.shift(frame))
     height, width = image_size
     if (calibration.height, calibration.width) != (height, width):

@@ -152,7 +152,7 @@ FrameSequence = LabelledFrames | Sequence[LabelledFrame]
 DATA_SETS: dict[str, str | Callable[..., LabelledFrames]] = {
     "kradar": "radejax.data.kradar:KRadar"
 }
-"""Readers that `config.data.format` may name: a class, or "module:Class".
+"""Readers that `config.data.format` may name, as classes or as "module:Class".
 
 They are called with roots, labels and the options of `KRadar`, of which another reader may
 ignore those that it has no use for."""

@@ -141,11 +141,11 @@ class Records:
         }
 
     def path(self, key: str) -> pathlib.Path:
-        """File of the record of a frame."""
+        """File of the record of the frame `key`."""
         return self.folder / f"{key}.npy"
 
     def __getitem__(self, key: str) -> Real[np.ndarray, "..."]:
-        """Array of a frame.
+        """Array of the frame `key`.
 
         Raises:
             FileNotFoundError: The frame has no record.
@@ -365,7 +365,7 @@ def _write_all(
 
 
 def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
-    """Writes the record of a frame; key, and why it was skipped or an empty text."""
+    """Writes the record of one frame; returns its key and why it was skipped, or ""."""
     try:
         projection = frame.read_projection(records.grid)
     except (DataError, OSError) as error:

@@ -37,7 +37,7 @@ CONDITIONS = (
 )
 
 
-_MAX_VRU_DENSITY_SCALE = 5.0  # more would leave no room for other road users
+_MAX_VRU_DENSITY_SCALE = 5.0  # more would leave no space for other road users
 
 FULL_SIZE = {
     "grid": "kradar",

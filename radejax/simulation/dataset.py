@@ -252,7 +252,7 @@ class _Scenes:
         self._sequence = functools.lru_cache(maxsize=2)(self._make)
 
     def prepare(self, number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
-        """Radar input and labels of a frame; writes its image."""
+        """Computes radar input and labels of one frame and writes its image."""
         config, camera_idx = self._config, spec.indices[2]
         simulator, renderer = self._sequence(number)
         frame = simulator.sequence.frame(spec.scene_idx)

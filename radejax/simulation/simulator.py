@@ -1,7 +1,7 @@
 """The sequences of a dataset and their frames: radar input and labels.
 
 A source lists sequences and their frames (numbers, time stamps, split) without simulating
-anything, and makes the scene of a sequence on request, procedural or from label files.
+anything, and makes the scene of one sequence on request, procedural or from label files.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class SequenceSimulator:
         radar_from_lidar_m: tuple[float, float, float],
         max_distance_m: float,
     ) -> list[Label]:
-        """Labels of a frame, in the LiDAR frame as K-Radar's files have them.
+        """Labels of one frame, in the LiDAR frame as K-Radar's files have them.
 
         Args:
             frame: Scene of the frame.
@@ -222,7 +222,7 @@ class ProceduralSource:
         self.conditions = config.conditions
 
     def frames(self, number: int) -> list[FrameSpec]:
-        """Frames of a sequence, in order."""
+        """Frames of the sequence `number`, in order."""
         config = self._config
         rng = np.random.default_rng([config.seed, number, 3])
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
@@ -242,7 +242,7 @@ class ProceduralSource:
         return number <= self._config.train_sequences
 
     def make(self, number: int) -> Sequence:
-        """The scene of a sequence."""
+        """The scene of the sequence `number`."""
         environment, time, weather = self.conditions(number)
         times = self._config.vru_density_scale if self._is_training(number) else 1.0
         return make_sequence(
@@ -277,12 +277,12 @@ class LabelSource:
         self.numbers = sorted(self._frames)
 
     def conditions(self, number: int) -> tuple[str, str, str]:
-        """Environment, time and weather of a sequence."""
+        """Environment, time and weather of the sequence `number`."""
         frame = self._frames[number][0]
         return frame.environment, frame.time, frame.weather
 
     def frames(self, number: int) -> list[FrameSpec]:
-        """Frames of a sequence, in order."""
+        """Frames of the sequence `number`, in order."""
         config, frames = self._config, self._frames[number]
         names = [f.name for f in frames]
         train = set(split_by_rule(names, "train"))
@@ -300,7 +300,7 @@ class LabelSource:
         ]
 
     def make(self, number: int) -> Sequence:
-        """The scene of a sequence."""
+        """The scene of the sequence `number`."""
         return make_real_sequence(
             self._frames[number],
             radar_from_lidar_m=self._config.radar_from_lidar_m,

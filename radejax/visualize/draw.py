@@ -332,7 +332,7 @@ def _extent_m(
 
 
 def _axes_for_extent(extent: Sequence[float]) -> Axes:
-    """Axes of a new figure that fit an extent, with room for color bar and legend."""
+    """Axes of a new figure that fit an extent, with space for color bar and legend."""
     x0, x1, y0, y1 = extent
     scale = min(5.5 / (x1 - x0), 6.0 / (y1 - y0))
     width, height = scale * (y1 - y0), scale * (x1 - x0)

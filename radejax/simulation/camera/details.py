@@ -2,7 +2,7 @@
 
 A detail (windows, wheels, lights, plates, hair) is a rectangle on a face of a block of
 `shapes.BLOCKS`, in fractions of that face; it lies within the object's box and is painted
-right after its block. Trees, poles, guard rails and house fronts are the same reflectors
+right after its block. Trees, poles, guard rails and facades are the same reflectors
 that scatter radar waves, so that an image shows what the radar map shows.
 """
 
@@ -161,7 +161,7 @@ Panels = tuple[
 def make_panels(
     frame: SceneFrame, origin: Float[np.ndarray, "3"], ground_m: float, white: float
 ) -> Panels:
-    """Upright rectangles of the surroundings of a frame.
+    """Upright rectangles of the surroundings in one frame.
 
     Args:
         frame: Its reflectors are drawn.

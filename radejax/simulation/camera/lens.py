@@ -64,7 +64,7 @@ BLOCK_FRAMES = 50
 
 
 def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
-    """State of the lens at a frame, one of `LEVELS`; constant over blocks of frames."""
+    """State of the lens in one frame, one of `LEVELS`; constant over blocks of frames."""
     rng = np.random.default_rng([seed, sequence, frame // BLOCK_FRAMES, 13])
     return LEVELS[rng.choice(4, p=COVER[weather])]
 

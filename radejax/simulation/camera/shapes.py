@@ -280,7 +280,7 @@ def _project_faces(
 def _flat(
     places: Float[np.ndarray, "F P 2"], size: Float[np.ndarray, "2"]
 ) -> list[list[float]]:
-    """Pixels of every face in a row, not too far off an image of a size."""
+    """Pixels of all faces in one array, near an image of a given size."""
     near = np.clip(places, -2.0 * size, 3.0 * size)
     return near.reshape(len(near), 2 * near.shape[1]).tolist()
 

@@ -4,7 +4,7 @@ Every object gets scattering centers on its faces once per sequence; each frame 
 them to the object's pose, keeps those on faces the radar sees, weakens those behind
 other objects, and moves wheels, legs and pedals (micro-Doppler).
 
-Cross-sections are our choice, one value and one spread a class, of the order that is
+Cross-sections are chosen, one mean and one deviation per class, of the order that is
 measured at 77 GHz; there is no single source for all five.
 
 References:
@@ -74,7 +74,7 @@ _BACK_LEAK = 0.02
 
 
 class ObjectScatterers(NamedTuple):
-    """Scattering centers of all objects of a sequence, in the frames of their boxes.
+    """Scattering centers of all objects in one sequence, in the frames of their boxes.
 
     Attributes:
         track: Which object each belongs to, ascending.
@@ -225,7 +225,7 @@ def join(parts: Iterable[FrameScattering]) -> FrameScattering:
 def scatter_objects(
     frame: SceneFrame, centers: ObjectScatterers, parameters: RadarParameters
 ) -> tuple[FrameScattering, Float[np.ndarray, " N"]]:
-    """Scatterers of the objects of a frame.
+    """Scatterers of the objects in one frame.
 
     Returns:
         The scatterers, and the fraction of each box's power that is not

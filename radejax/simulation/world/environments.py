@@ -33,7 +33,7 @@ class Environment:
         pedestrians_per_100m: People on both pavements together.
         bicycles_per_100m: Bicycles along the right edge.
         max_curvature: Largest curvature of the road in 1/m.
-        walls: Probability of a wall or house front on each side.
+        walls: Probability of a wall or facade on each side.
         wall_m: Distance of walls from the edge of the road.
         rails: Probability of a guard rail on each side.
         trees_per_100m: Trees and poles on each side.

@@ -23,7 +23,7 @@ FRAME_PERIOD_S = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Road:
-    """Centerline of a road: a circle arc that starts at the origin along x.
+    """Centerline of a road: an arc of constant curvature that starts at the origin along x.
 
     Attributes:
         curvature_per_m: Inverse radius, positive turns left; 0 is straight.

@@ -142,7 +142,7 @@ class _Traffic:
     def _add(
         self, cls: str, size: Float[np.ndarray, "3"], along, left, speed, turn: float
     ) -> None:
-        """An object whose places and speeds are one number or one a frame."""
+        """An object whose places and speeds are one number or one per frame."""
         path = (np.broadcast_to(v, self.clock.shape) for v in (along, left, speed))
         self.paths.append((cls, size, *path, turn))
 
