@@ -31,6 +31,7 @@ from radejax.data.projection import decode
 from radejax.data.records import Records, open_projections
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report
+from radejax.evaluation.results import EvaluationOptions
 from radejax.simulation.radar.tensor import RadarParameters
 
 # The gain only shifts the cross-sections, and the steps between classes with them.
@@ -80,15 +81,17 @@ def run_baseline(
         predictions,
         table,
         out,
+        EvaluationOptions(
+            classes=CLASSES,
+            protocols=tuple(protocols),
+            iou_thresholds=(0.3, 0.5),
+            roi=NARROW_ROI,
+            score_threshold=score_threshold,
+            min_score=score_threshold,
+            bootstrap=bootstrap,
+        ),
         run="CFAR",
         left_out=frames.summary().counts,
-        classes=CLASSES,
-        protocols=protocols,
-        iou_thresholds=(0.3, 0.5),
-        roi=NARROW_ROI,
-        score_threshold=score_threshold,
-        min_score=score_threshold,
-        bootstrap=bootstrap,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -134,7 +133,7 @@ def evaluate(ctx: click.Context, *, as_json: bool, **flags: Any) -> None:
     )
     assert report is not None  # as this is the only process
     # The tables have been logged to standard error.
-    echo_result(as_json, report.metrics, f"Written to {report.files[0].parent}")
+    echo_result(as_json, report.metrics, f"Written to {report.folder}")
 
 
 @click.command(
@@ -173,12 +172,11 @@ def compare(runs: tuple[str, ...], as_json: bool, **flags: Any) -> None:
 
     Example: radejax compare runs/a/evaluation runs/b/evaluation
     """
-    from radejax.evaluation.report import compare_files, plain
+    from radejax.evaluation.report import compare_files
 
     options = _options(flags, bootstrap=2000)
     text, rows = compare_files(runs, flags["out"], _source(flags), options)
-    values = plain([dataclasses.asdict(row) for row in rows])
-    echo_result(as_json, values, text.rstrip("\n"))
+    echo_result(as_json, rows, text.rstrip("\n"))
 
 
 def _source(flags: dict[str, Any]) -> Any:

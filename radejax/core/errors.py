@@ -84,12 +84,15 @@ def one_of(*choices: Any) -> Range:
     return lambda value: value in choices, f"one of {', '.join(map(repr, choices))}"
 
 
-def several(entries: Range, expected: str, count: int | None = None) -> Range:
-    """Different entries, each of a range; or so many, which may be equal."""
+def several(
+    entries: Range, expected: str, count: int | None = None, least: int = 0
+) -> Range:
+    """At least so many different entries, each of a range; or `count`, equal or not."""
 
     def holds(values: Any) -> bool:
-        is_size = len(set(values)) == len(values) if count is None else False
-        return (is_size or len(values) == count) and all(map(entries[0], values))
+        is_size = len(set(values)) == len(values) >= least
+        is_size = is_size if count is None else len(values) == count
+        return is_size and all(map(entries[0], values))
 
     return holds, expected
 

@@ -1,43 +1,32 @@
 """Where a detector is good and where it fails: subsets, box errors, worst frames.
 
 All of it uses the matches of `all_point` (every prediction, by descending score, takes
-the best free object of its class) at one IoU threshold and one space. The sanity checks
-at the end report what is wrong with predictions as a whole.
+the best free object of its class) at one IoU threshold. The sanity checks at the end
+report what is wrong with predictions as a whole.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
 from radejax.evaluation import protocols
+from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.results import condition_masks
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
+OPERATING_SCORE = 0.3
+"""Precision, recall and worst frames are of predictions above it."""
 
-@dataclasses.dataclass(frozen=True)
-class Subset:
-    """Numbers of one class in a subset of the data.
-
-    Attributes:
-        ap: Exact AP, 0 to 100, NaN without objects.
-        precision: Share of predictions above the operating score that are right.
-        recall: Share of objects they find.
-        num_gt: Objects in the subset.
-        num_det: Predictions above the operating score in the subset.
-    """
-
-    ap: float
-    precision: float
-    recall: float
-    num_gt: int
-    num_det: int
+Masks = dict[str, tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " M"]]]
+"""Objects and predictions of each subset."""
 
 
 def matched_objects(
@@ -56,102 +45,90 @@ def matched_objects(
     return match
 
 
-def by_distance(
-    data: EvaluationSet,
-    space: str,
-    iou: float,
-    *,
-    edges_m: tuple[float, ...] = DISTANCES_M,
-    operating_score: float = 0.3,
-) -> dict[tuple[str, str], Subset]:
-    """Numbers by (distance band, class); bands are of ground distance sqrt(x^2 + y^2).
+def subsets(
+    data: EvaluationSet, frames: Columns, iou: float
+) -> dict[str, list[dict[str, Any]]]:
+    """Numbers by distance and, as far as known, by weather, environment and time.
 
-    A prediction that found an object belongs to the object's band, any other to its own:
-    a detection does not become a false positive for lying just across a border.
+    Distance is that on the ground. A prediction that found an object belongs to the
+    object's distance band, any other to its own: a detection does not become a false
+    positive for lying just across a border.
 
-    Examples:
-        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
-        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
-        >>> by_distance(data, "bev", 0.5)["20-40 m", "Sedan"].num_gt
-        1
-    """
-    match = matched_objects(data, space, iou)
-    far_gt = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
-    far = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
-    if far_gt.size:
-        far = np.where(match >= 0, far_gt[match], far)
-    bands = {}
-    for low, high in itertools.pairwise(edges_m):
-        band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
-        bands[band] = [(d >= low) & (d < high) for d in (far_gt, far)]
-    return _by_subset(data, bands, match, operating_score)
-
-
-def by_condition(
-    data: EvaluationSet,
-    conditions: Mapping[str, Bool[np.ndarray, " F"]],
-    space: str,
-    iou: float,
-    *,
-    operating_score: float = 0.3,
-) -> dict[tuple[str, str], Subset]:
-    """Numbers by (condition, class); a condition is a mask of frames.
+    Returns:
+        By kind, an entry per subset and class: the kind with the name of the subset,
+        "cls", "ap" (exact, 3D, 0 to 100, NaN without objects), "precision" and "recall"
+        above the operating score, "num_gt" objects, and "num_det" predictions above it.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
         >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
-        >>> by_condition(data, {"fog": np.array([True])}, "bev", 0.5)["fog", "Sedan"].ap
+        >>> subsets(data, {"frame": [0], "weather": ["fog"]}, 0.5)["weather"][0]["ap"]
         100.0
     """
-    masks = {
-        name: (mask[data.gt.frame], mask[data.pred.frame])
-        for name, mask in conditions.items()
+    match = matched_objects(data, "3d", iou)
+    kinds = {"distance": _by_distance(data, match)}
+    for kind in ("weather", "environment", "time"):
+        kinds[kind] = {
+            name: (mask[data.gt.frame], mask[data.pred.frame])
+            for name, mask in condition_masks(frames, kind).items()
+        }
+    return {
+        kind: [
+            {kind: name, "cls": cls_name, **_numbers(data, cls, *among, match)}
+            for name, among in masks.items()
+            for cls, cls_name in enumerate(data.classes)
+        ]
+        for kind, masks in kinds.items()
+        if masks
     }
-    match = matched_objects(data, space, iou)
-    return _by_subset(data, masks, match, operating_score)
 
 
-def _by_subset(
+def _by_distance(data: EvaluationSet, match: Int[np.ndarray, " M"]) -> Masks:
+    """Bands of distance."""
+    of_gt = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
+    of_pred = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
+    is_found = match >= 0
+    of_pred[is_found] = of_gt[match[is_found]]
+    bands = {}
+    for low, high in itertools.pairwise(DISTANCES_M):
+        band = f"{low:g}-{high:g} m" if np.isfinite(high) else f"{low:g} m and more"
+        in_gt, in_pred = ((d >= low) & (d < high) for d in (of_gt, of_pred))
+        bands[band] = in_gt, in_pred
+    return bands
+
+
+def _numbers(
     data: EvaluationSet,
-    masks: Mapping[str, Sequence[Bool[np.ndarray, " _"]]],
+    cls: int,
+    in_gt: Bool[np.ndarray, " N"],
+    in_pred: Bool[np.ndarray, " M"],
     match: Int[np.ndarray, " M"],
-    operating_score: float,
-) -> dict[tuple[str, str], Subset]:
-    """Numbers by (subset, class).
-
-    Args:
-        data: The evaluation set.
-        masks: `[N]` objects and `[M]` predictions in each subset.
-        match: From `matched_objects`.
-        operating_score: Precision and recall are of predictions above this score.
-    """
-    result = {}
-    for (name, (in_gt, in_pred)), (cls, cls_name) in itertools.product(
-        masks.items(), enumerate(data.classes)
-    ):
-        order = data.by_score[cls]
-        order = order[in_pred[order]]
-        score, is_tp = data.score[order], match[order] >= 0
-        num_gt = int((in_gt & (data.gt.cls == cls)).sum())
-        curve = protocols.pooled_curve(
-            score=score,
-            is_tp=is_tp,
-            weight=np.ones_like(order),
-            num_gt=num_gt,
-            curve="all_point",
-        )
-        above = score > operating_score
-        num_det, found = int(above.sum()), int(is_tp[above].sum())
-        precision = found / num_det if num_det else math.nan
-        recall = found / num_gt if num_gt else math.nan
-        result[name, cls_name] = Subset(curve.ap, precision, recall, num_gt, num_det)
-    return result
+) -> dict[str, float]:
+    """AP, precision, recall and counts of a class in a subset."""
+    order = data.by_score[cls]
+    order = order[in_pred[order]]
+    score, is_tp = data.score[order], match[order] >= 0
+    num_gt = int((in_gt & (data.gt.cls == cls)).sum())
+    curve = protocols.pooled_curve(
+        score=score,
+        is_tp=is_tp,
+        weight=np.ones_like(order),
+        num_gt=num_gt,
+        curve="all_point",
+    )
+    above = score > OPERATING_SCORE
+    num_det, found = int(above.sum()), int(is_tp[above].sum())
+    return {
+        "ap": curve.ap,
+        "precision": found / num_det if num_det else math.nan,
+        "recall": found / num_gt if num_gt else math.nan,
+        "num_gt": num_gt,
+        "num_det": num_det,
+    }
 
 
-def box_errors(
-    data: EvaluationSet, space: str, iou: float, *, operating_score: float = 0.0
-) -> dict[str, dict[str, float]]:
-    """Errors of matched boxes per class: medians and means over the matches.
+def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
+    """Errors of boxes matched in the bird's-eye view: medians and means per class.
 
     Returns:
         Per class "count" and, as "<what>_mean" and "<what>_median": center_m (distance in
@@ -163,11 +140,11 @@ def box_errors(
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
         >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
-        >>> box_errors(data, "bev", 0.5)["Sedan"]["center_m_mean"]
+        >>> box_errors(data, 0.5)["Sedan"]["center_m_mean"]
         0.0
     """
-    match = matched_objects(data, space, iou)
-    rows = np.flatnonzero((match >= 0) & (data.score > operating_score))
+    match = matched_objects(data, "bev", iou)
+    rows = np.flatnonzero((match >= 0) & (data.score > 0))
     found, truth = data.pred.box[rows], data.gt.box[match[rows]]
     turn = np.abs(np.angle(np.exp(1j * (found[:, 6] - truth[:, 6]))))
     gap = np.abs(found - truth)
@@ -199,43 +176,40 @@ def _or_nan(
 
 
 def worst_frames(
-    data: EvaluationSet,
-    space: str,
-    iou: float,
-    *,
-    count: int = 10,
-    operating_score: float = 0.3,
-) -> list[dict[str, int]]:
-    """Frames with the most mistakes above the operating score.
+    data: EvaluationSet, frames: Columns, iou: float
+) -> list[dict[str, Any]]:
+    """Frames with the most mistakes above the operating score, in 3D.
 
     Returns:
-        Up to `count` entries, worst first: "index" in the frame table, "frame" id,
-        "missed" objects, "false" predictions, "found". Ties: more missed first, then the
-        order of the frame table. Frames without a mistake are never listed.
+        Up to 10 entries, worst first: "index" in the frame table, "frame" id, "missed"
+        objects, "false" predictions, "found" and, as far as known, "name" and "sequence".
+        Ties: more missed first, then the order of the frame table. Frames without a
+        mistake are never listed.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
         >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
-        >>> worst_frames(data, "bev", 0.5)
+        >>> worst_frames(data, {}, 0.5)
         []
     """
-    match = matched_objects(data, space, iou)
-    above = data.score > operating_score
+    match = matched_objects(data, "3d", iou)
+    above = data.score > OPERATING_SCORE
     num = data.frame.size
     found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)
     false = np.bincount(data.pred.frame[above & (match < 0)], minlength=num)
     missed = data.gt_count.sum(axis=1) - found
-    order = np.lexsort((np.arange(num), -missed, -(missed + false)))[:count]
+    order = np.lexsort((np.arange(num), -missed, -(missed + false)))[:10]
     columns = {
         "index": np.arange(num),
         "frame": data.frame,
         "missed": missed,
         "false": false,
         "found": found,
+        **{name: frames[name] for name in ("name", "sequence") if name in frames},
     }
     return [
-        {name: int(column[i]) for name, column in columns.items()}
-        for i in order
+        {name: np.asarray(column).item(i) for name, column in columns.items()}
+        for i in order.tolist()
         if missed[i] + false[i] > 0
     ]
 

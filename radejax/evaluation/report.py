@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 import itertools
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -15,9 +14,9 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
-from radejax.evaluation import analysis, bootstrap, plots, protocols, published, tables
+from radejax.evaluation import analysis, bootstrap, protocols, published, tables
 from radejax.evaluation.boxes import Columns
-from radejax.evaluation.evaluation_set import EvaluationSet, Result
+from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result
 from radejax.evaluation.files import Source, load, stored_from, write_table
 from radejax.evaluation.results import (
     EvaluationOptions,
@@ -42,13 +41,13 @@ class Report:
         text: The console text.
         metrics: The content of metrics.json.
         results: All APs.
-        files: Paths written.
+        folder: Where the files are.
     """
 
     text: str
     metrics: dict[str, Any]
     results: list[Result]
-    files: list[pathlib.Path]
+    folder: pathlib.Path
 
 
 def write_report(
@@ -56,13 +55,12 @@ def write_report(
     predictions: Columns,
     frames: Columns,
     out_dir: PathLike,
-    options: EvaluationOptions | None = None,
+    options: EvaluationOptions,
     *,
     run: str = "radejax",
     left_out: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
     draw_frame: Callable[[int, pathlib.Path], None] | None = None,
-    **changes: Any,
 ) -> Report:
     """Evaluate predictions in the given protocols and `all_point`, and write the report.
 
@@ -78,17 +76,17 @@ def write_report(
         warnings: Of loading, to be printed.
         draw_frame: Called with (frame id, path of a figure to write) for each of the
             worst frames, or None.
-        **changes: Fields of `EvaluationOptions` to replace.
 
     Raises:
-        UserError: Wrong options or missing columns.
+        UserError: Missing columns.
         DataError: A bad row; names the table, frame and row.
     """
-    options = dataclasses.replace(options or EvaluationOptions(), **changes)
     if protocols.RECOMMENDED not in options.protocols:
         names = (*options.protocols, protocols.RECOMMENDED)
         options = dataclasses.replace(options, protocols=names)
     data, results = evaluate_tables(ground_truth, predictions, frames, options)
+    iou = options.iou_thresholds[0]
+    settings = f"3d, IoU {iou:g}, score > {analysis.OPERATING_SCORE:g}"
     metrics = {
         "run": run,
         "options": dataclasses.asdict(options),
@@ -103,75 +101,50 @@ def write_report(
         "intervals": why_no_intervals(frames, options)
         or f"{options.bootstrap} resamples of sequences",
         "ap": [to_row(result) for result in results],
-        **_analysis(data, frames, options),
+        "subsets": {
+            "protocol": f"{protocols.RECOMMENDED}, {settings}",
+            **analysis.subsets(data, frames, iou),
+        },
+        "box_errors": analysis.box_errors(data, iou),
+        "worst_frames": analysis.worst_frames(data, frames, iou),
     }
+    metrics = _plain(metrics)
     text = _console_text(metrics, results, options)
     built = _tables(metrics, results, options)
     with files.swapped_in(out_dir) as folder:
         # The inputs stay with the report, so that two reports can be compared later.
         columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
-        files.write_json(folder / "metrics.json", plain(metrics))
+        files.write_json(folder / "metrics.json", metrics)
         files.write_json(folder / "frames.json", columns)
-        for name, content in (
-            ("metrics.csv", _csv_text(metrics["ap"])),
-            ("report.txt", text),
-            ("tables.md", "\n".join(table.render("markdown") for table in built)),
-            ("tables.tex", "\n".join(table.render("latex") for table in built)),
-        ):
+        files.write_text(folder / "report.txt", text)
+        for name, style in (("tables.md", "markdown"), ("tables.tex", "latex")):
+            content = "\n".join(table.render(style) for table in built)
             files.write_text(folder / name, content)
+        with open(folder / "metrics.csv", "w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, list(metrics["ap"][0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(metrics["ap"])
         keys = frames if "name" in frames else None
         # With repaired sizes, so that the stored predictions can be evaluated again.
         repaired, _ = repair_sizes(predictions, options.invalid_sizes)
         write_table(folder / "predictions.npz", repaired, keys)
         write_table(folder / "ground_truth.npz", ground_truth, keys)
         if options.plots:
-            plots.draw(data, frames, options, folder)
+            _draw_curves(data, frames, options, folder)
         if draw_frame is not None:
-            _draw_worst(metrics["worst_frames"], draw_frame, folder / "worst_frames")
-        written = [path for path in folder.rglob("*") if path.is_file()]
-        relative = [path.relative_to(folder) for path in sorted(written)]
-    paths = [pathlib.Path(out_dir) / path for path in relative]
-    return Report(text, metrics, results, paths)
+            (folder / "worst_frames").mkdir()
+            for entry in metrics["worst_frames"]:
+                name = f"frame_{entry['frame']}"
+                if {"name", "sequence"} <= set(entry):  # as other figures of frames
+                    name = f"{entry['sequence']:02d}_{entry['name']}"
+                draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")
+    return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
 def _split(frames: Columns) -> str | None:
     """The split that all frames are of; None if it is not known, or several."""
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     return str(splits[0]) if splits.size == 1 else None
-
-
-def _analysis(
-    data: EvaluationSet, frames: Columns, options: EvaluationOptions
-) -> dict[str, Any]:
-    """Subsets, box errors and worst frames, as plain values."""
-    iou, score = options.iou_thresholds[0], options.operating_score
-    subsets = {"distance": analysis.by_distance(data, "3d", iou, operating_score=score)}
-    for kind in ("weather", "environment", "time"):
-        if masks := condition_masks(frames, kind):
-            subsets[kind] = analysis.by_condition(
-                data, masks, "3d", iou, operating_score=score
-            )
-    worst = analysis.worst_frames(
-        data, "3d", iou, count=options.worst_frames, operating_score=score
-    )
-    known = [column for column in ("name", "sequence") if column in frames]
-    return {
-        "subsets": {
-            "protocol": f"{protocols.RECOMMENDED}, 3d, IoU {iou:g}, score > {score:g}",
-            **{
-                kind: [
-                    {kind: name, "cls": cls, **dataclasses.asdict(values)}
-                    for (name, cls), values in found.items()
-                ]
-                for kind, found in subsets.items()
-            },
-        },
-        "box_errors": analysis.box_errors(data, "bev", iou),
-        "worst_frames": [
-            {**entry, **{c: np.asarray(frames[c]).item(entry["index"]) for c in known}}
-            for entry in worst
-        ],
-    }
 
 
 def _tables(
@@ -187,16 +160,8 @@ def _tables(
         built.append(tables.by_protocol(table, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, ious):
         built.append(tables.class_by_weather(table, options, protocol, iou))
-    return _labelled([*built, *tables.detail_tables(metrics)], metrics)
-
-
-def _labelled(
-    built: list[tables.Table], metrics: Mapping[str, Any]
-) -> list[tables.Table]:
-    """The tables; those of simulated frames say so."""
-    if metrics["is_simulated"]:
-        return [table.of_simulated() for table in built]
-    return built
+    built += tables.detail_tables(metrics)
+    return [each.marked(metrics["is_simulated"]) for each in built]
 
 
 def _console_text(
@@ -209,9 +174,7 @@ def _console_text(
     shown = [(first, level) for level in options.iou_thresholds[:2]]
     shown += [(protocol, iou) for protocol in others]
     built = [tables.class_by_weather(table, options, *terms) for terms in shown]
-    built.append(tables.by_protocol(table, options, "3d", iou))
-    if any(result.low is not None for result in results):
-        built.append(tables.intervals(table, options, iou))
+    built += [tables.by_protocol(table, options, space, iou) for space in ("3d", "bev")]
     built.append(tables.subset_table(metrics["subsets"], "distance"))
     built.append(tables.error_table(metrics["box_errors"]))
     kind = "simulated " if metrics["is_simulated"] else ""
@@ -220,7 +183,7 @@ def _console_text(
         f"{metrics['num_ground_truth']} objects, {metrics['num_predictions']} predictions,"
         f" score above {options.min_score:g}\n",
         *(f"WARNING: {line}\n" for line in metrics["warnings"]),
-        *(built_table.render() for built_table in _labelled(built, metrics)),
+        *(each.marked(metrics["is_simulated"]).render() for each in built),
         f"Intervals: {metrics['intervals']}\n",
         "Not part of the numbers, or kept with a remark:",
         *(f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()),
@@ -228,40 +191,48 @@ def _console_text(
     return "\n".join(parts) + "\n"
 
 
-def _csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """metrics.csv: one line per AP."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return buffer.getvalue()
-
-
-def plain(value: Any) -> Any:
-    """Values that strict JSON can hold: NaN and infinities become null."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
-
-
-def _draw_worst(
-    worst: Sequence[Mapping[str, Any]],
-    draw_frame: Callable[[int, pathlib.Path], None],
+def _draw_curves(
+    data: EvaluationSet,
+    frames: Columns,
+    options: EvaluationOptions,
     folder: pathlib.Path,
 ) -> None:
-    """Figures of the worst frames, named like other figures of frames."""
-    folder.mkdir()
-    for entry in worst:
-        name = f"frame_{entry['frame']}"
-        if {"name", "sequence"} <= set(entry):
-            name = f"{entry['sequence']:02d}_{entry['name']}"
-        draw_frame(entry["frame"], folder / f"{name}.png")
+    """Draw precision over recall per class that has objects, a curve per weather."""
+    # Imported here, as matplotlib takes a second to load and may not be needed.
+    from radejax.visualize.curves import draw_precision_recall
+    from radejax.visualize.style import save_figure
+
+    protocol, iou = protocols.RECOMMENDED, options.iou_thresholds[0]
+    suffix = ", simulated data" if data.is_simulated else ""
+    masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
+    for space in SPACES:
+        panels: dict[str, dict[str, Any]] = {}
+        for name, mask in masks.items():
+            for result in data.results(
+                protocol,
+                iou_thresholds=iou,
+                spaces=space,
+                weights=mask,
+                **options.settings_of(protocol),
+            ):
+                title = f"{result.cls}, {protocol}, {space}, IoU {iou:g}{suffix}"
+                curve = (result.recall, result.precision) if result.is_defined else None
+                label = f"{name}, AP {result.ap:.1f}"
+                panels.setdefault(title, {})[label] = curve
+        seen = {title: lines for title, lines in panels.items() if any(lines.values())}
+        figure = draw_precision_recall(seen or dict([*panels.items()][:1]))
+        path = folder / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
+        save_figure(figure, path, dpi=110)
+
+
+def _plain(value: Any) -> Any:
+    """Values that strict JSON can hold: NaN becomes null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    is_number = not isinstance(value, float) or np.isfinite(value)
+    return value if is_number else None
 
 
 # Predictions in files -----------------------------------------------------------------
@@ -301,18 +272,18 @@ def compare_files(
     out_dir: PathLike | None,
     source: Source,
     options: EvaluationOptions,
-) -> tuple[str, list[bootstrap.Comparison]]:
+) -> tuple[str, list[dict[str, Any]]]:
     """Compare runs on the same frames: each with the first, and all in Table III.
 
     Args:
         paths: Predictions or report folders, at least two; the first is run A.
         out_dir: Where to write comparison.txt and comparison.json, or None.
         source: Ground truth, unless the paths bring their own.
-        options: Classes, protocols, IoU thresholds, region, score threshold, number of
-            resamples of sequences (`bootstrap`) and seed.
+        options: Classes, protocols, IoU thresholds, region, score threshold and number
+            of resamples of sequences (`bootstrap`).
 
     Returns:
-        The tables as text, and all comparisons (B is the second run first).
+        The tables as text, and the fields of all comparisons (B is the second run first).
 
     Raises:
         UserError: Fewer than two runs, or runs on different frames or ground truth.
@@ -326,44 +297,45 @@ def compare_files(
     options = dataclasses.replace(
         options, score_threshold=threshold, min_score=threshold
     )
-    first, *others = [_load_run(path, source, options) for path in paths]
     usual = (protocols.RECOMMENDED, "kradar_r40")
-    named = tuple(p for p in usual if p in options.protocols) or options.protocols[:1]
-    parts, rows = [], []
-    for path, (data, frames) in zip(paths[1:], others, strict=True):
+    names = [str(path) for path in paths]
+    (first, _), *others = loaded = [_load_run(path, source, options) for path in paths]
+    is_simulated = any(data.is_simulated for data, _ in loaded)
+    built, rows = [], []
+    for name, (data, sequence) in zip(names[1:], others, strict=True):
         found = bootstrap.compare(
-            first[0],
+            first,
             data,
-            frames["sequence"],
-            protocol_names=named,
+            sequence,
+            protocol_names=[p for p in usual if p in options.protocols]
+            or options.protocols[:1],
             iou_thresholds=options.iou_thresholds[:1],
             score_threshold=threshold,
             resamples=options.bootstrap,
-            seed=options.seed,
         )
-        table = tables.comparison(found, str(paths[0]), str(path))
-        is_simulated = data.is_simulated or first[0].is_simulated
-        parts.append((table.of_simulated() if is_simulated else table).render())
-        rows += found
+        built.append(tables.comparison(found, names[0], name))
+        rows += [_plain(dataclasses.asdict(row)) for row in found]
     if "Sedan" in options.classes:
-        runs = dict(zip(map(str, paths), [first, *others], strict=True))
-        parts.append(_ablations(runs, options).render())
-    text = "\n".join(parts)
-    if out_dir is not None:
-        content = {
-            "runs": list(map(str, paths)),
-            "options": dataclasses.asdict(options),
-            "rows": [dataclasses.asdict(row) for row in rows],
+        shown = dataclasses.replace(
+            options, protocols=(options.paper_protocol,), iou_thresholds=(0.3, 0.5)
+        )
+        results = {
+            name: tables.index(compute_results(data, shown, {}))
+            for name, (data, _) in zip(names, loaded, strict=True)
         }
+        built.append(published.table_3(results, shown, is_simulated=is_simulated))
+    text = "\n".join(table.marked(is_simulated).render() for table in built)
+    if out_dir is not None:
+        content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
         files.write_text(pathlib.Path(out_dir) / "comparison.txt", text)
-        files.write_json(pathlib.Path(out_dir) / "comparison.json", plain(content))
+        files.write_json(pathlib.Path(out_dir) / "comparison.json", content)
     return text, rows
 
 
 def _load_run(
     path: PathLike, source: Source, options: EvaluationOptions
-) -> tuple[EvaluationSet, Columns]:
-    """A run ready to be compared, and its frames."""
+) -> tuple[EvaluationSet, np.ndarray]:
+    """A run ready to be compared, and the sequence of each of its frames."""
     truth, found, frames, _ = load(path, source, options.classes)
     if "sequence" not in frames:
         raise UserError(
@@ -374,22 +346,4 @@ def _load_run(
     data = EvaluationSet(
         truth, found, classes=options.classes, frames=frames, roi=options.roi
     )
-    return data, frames
-
-
-def _ablations(
-    runs: Mapping[str, tuple[EvaluationSet, Columns]], options: EvaluationOptions
-) -> tables.Table:
-    """Several runs in the layout of Table III."""
-    options = dataclasses.replace(
-        options, protocols=(options.paper_protocol,), iou_thresholds=(0.3, 0.5)
-    )
-    results = {
-        name: tables.index(compute_results(data, frames, options, kinds=()))
-        for name, (data, frames) in runs.items()
-    }
-    is_simulated = any(data.is_simulated for data, _ in runs.values())
-    table = published.table_3(
-        results, options.paper_protocol, is_simulated=is_simulated
-    )
-    return table.of_simulated() if is_simulated else table
+    return data, np.asarray(frames["sequence"])

@@ -11,7 +11,15 @@ import numpy as np
 from jaxtyping import Bool
 from ml_collections import ConfigDict
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import (
+    BELOW_ONE,
+    UserError,
+    check_options,
+    integer,
+    number,
+    one_of,
+    several,
+)
 from radejax.core.structures import CLASSES, MIN_SIZE_M
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import bootstrap, protocols
@@ -28,6 +36,22 @@ ORDER = {
 }
 """K-Radar's conditions in the order of its papers."""
 
+_RANGES = {
+    "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
+    "protocols": several(
+        one_of(*protocols.PROTOCOLS),
+        f"different ones of {', '.join(protocols.PROTOCOLS)}",
+        least=1,
+    ),
+    "score_threshold": number(0, 1),
+    "empty_frames": one_of(*protocols.EMPTY_FRAMES),
+    "min_score": number(0, 1),
+    "bootstrap": integer(0),
+    "invalid_sizes": one_of("error", "false_positive"),
+    "batch_size": integer(1),
+    "num_visualizations": integer(0),
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationOptions:
@@ -43,11 +67,8 @@ class EvaluationOptions:
         roi: Region of interest of ground truth and predictions.
         label_version: Label revision of the ground truth.
         bootstrap: Number of resamples of sequences for intervals; 0 for none.
-        seed: Seed of the resampling.
         invalid_sizes: "error", or "false_positive": predicted boxes with a size that is
             not positive match nothing but count as predictions.
-        operating_score: Precision, recall and worst frames are of predictions above it.
-        worst_frames: Number of worst frames to list.
         plots: Whether to draw curves.
         batch_size: Frames per batch of predictions.
         num_visualizations: Number of frames to draw.
@@ -62,39 +83,13 @@ class EvaluationOptions:
     roi: Roi = "narrow"
     label_version: str | None = None
     bootstrap: int = 0
-    seed: int = 0
     invalid_sizes: str = "error"
-    operating_score: float = 0.3
-    worst_frames: int = 10
     plots: bool = True
     batch_size: int = 8
     num_visualizations: int = 8
 
     def __post_init__(self) -> None:
-        def check(name: str, holds: Any, expected: str) -> None:
-            field = f"config.evaluation.{name}"
-            require(bool(holds), field, getattr(self, name), expected)
-
-        known = protocols.PROTOCOLS
-        names = self.protocols if isinstance(self.protocols, tuple | list) else ()
-        is_known = names and all(name in known for name in names)
-        is_distinct = is_known and len(set(names)) == len(names)
-        check("protocols", is_distinct, f"different ones of {', '.join(known)}")
-        ious = (
-            self.iou_thresholds if isinstance(self.iou_thresholds, tuple | list) else ()
-        )
-        is_good = ious and all(0 <= iou < 1 for iou in ious)
-        check("iou_thresholds", is_good, "numbers in [0, 1)")
-        for name in ("score_threshold", "min_score", "operating_score"):
-            check(name, 0 <= getattr(self, name) <= 1, "a number in [0, 1]")
-        for name, least in (("bootstrap", 0), ("batch_size", 1)):
-            is_good = getattr(self, name) >= least
-            check(name, is_good, f"an integer of at least {least}")
-        check("num_visualizations", self.num_visualizations >= 0, "an integer from 0")
-        rules = protocols.EMPTY_FRAMES
-        check("empty_frames", self.empty_frames in rules, f"one of {', '.join(rules)}")
-        is_good = self.invalid_sizes in ("error", "false_positive")
-        check("invalid_sizes", is_good, '"error" or "false_positive"')
+        check_options(vars(self), "config.evaluation", _RANGES)
         try:
             roi_bounds(self.roi)
         except UserError as error:
@@ -125,13 +120,8 @@ class EvaluationOptions:
             **changes,
         }
         options = cls(**values)
-        least = min(options.min_score, options.score_threshold)
-        return dataclasses.replace(options, min_score=least)
-
-    @property
-    def roi_bounds(self) -> tuple[float, ...] | None:
-        """Bounds of the region of interest, or None."""
-        return roi_bounds(self.roi)
+        stored_from = min(options.min_score, options.score_threshold)
+        return dataclasses.replace(options, min_score=stored_from)
 
     @property
     def paper_protocol(self) -> str:
@@ -141,10 +131,11 @@ class EvaluationOptions:
 
     @property
     def main_protocols(self) -> tuple[str, ...]:
-        """Protocols shown in full on the console: the usual ones, or else the first."""
-        usual = (protocols.RECOMMENDED, "kradar_r40", "coco101")
-        chosen = tuple(name for name in usual if name in self.protocols)
-        return chosen or self.protocols[:1]
+        """Protocols shown in full on the console and with intervals per weather."""
+        usual = dict.fromkeys(
+            (protocols.RECOMMENDED, "kradar_r40", self.paper_protocol)
+        )
+        return tuple(name for name in usual if name in self.protocols)
 
     def settings_of(self, protocol: str) -> dict[str, Any]:
         """Score threshold and empty-frame rule of a protocol, for `results`."""
@@ -160,16 +151,16 @@ def evaluate_tables(
     frames: Columns,
     options: EvaluationOptions,
     *,
-    kinds: Sequence[str] = ("weather",),
+    per_weather: bool = True,
 ) -> tuple[EvaluationSet, list[Result]]:
-    """Evaluate predictions over all frames and over every condition.
+    """Evaluate predictions over all frames and over those of every weather.
 
     Args:
         ground_truth: Columns as in `evaluation.evaluate`.
         predictions: The same with scores.
         frames: Frame table.
         options: What to compute.
-        kinds: Columns of the frame table whose values are conditions.
+        per_weather: Whether to evaluate every weather of the frame table too.
 
     Returns:
         The evaluation set and the results of all protocols, with 95 % intervals where
@@ -194,7 +185,8 @@ def evaluate_tables(
         "predictions: size not positive, kept as false positives": num_invalid,
         f"predictions: size clipped to {MIN_SIZE_M} m, kept": int(is_clipped.sum()),
     }
-    results = compute_results(data, frames, options, kinds)
+    weathers = condition_masks(frames, "weather") if per_weather else {}
+    results = compute_results(data, options, weathers)
     if why_no_intervals(frames, options) is None:
         results = with_intervals(data, frames, results, options)
     return data, results
@@ -202,25 +194,21 @@ def evaluate_tables(
 
 def compute_results(
     data: EvaluationSet,
-    frames: Columns,
     options: EvaluationOptions,
-    kinds: Sequence[str] = ("weather",),
+    weathers: Mapping[str, Bool[np.ndarray, " F"]],
 ) -> list[Result]:
-    """Results of every protocol and condition, see `evaluate_tables`."""
-    conditions: list[tuple[str, str, np.ndarray | None]] = [("all", "all", None)]
-    for kind in kinds:
-        masks = condition_masks(frames, kind)
-        conditions += [(kind, name, mask) for name, mask in masks.items()]
+    """Results of every protocol over all frames and over masks of frames."""
     rows = []
-    for protocol, (kind, condition, mask) in itertools.product(
-        options.protocols, conditions
+    masks: dict[str, Any] = {"all": None, **weathers}
+    for protocol, (condition, mask) in itertools.product(
+        options.protocols, masks.items()
     ):
         results = data.results(
             protocol,
             iou_thresholds=options.iou_thresholds,
             weights=mask,
             curves=False,
-            condition=(kind, condition),
+            condition=("all" if mask is None else "weather", condition),
             **options.settings_of(protocol),
         )
         for start in range(0, len(results), len(data.classes)):
@@ -274,7 +262,6 @@ def with_intervals(
 
     Conditions are resampled within their sequences; those of one sequence get none.
     """
-    main = {protocols.RECOMMENDED, "kradar_r40", options.paper_protocol}
     sequence = np.asarray(frames["sequence"])
     conditions = {"all": np.ones(sequence.size, bool)}
     found: dict[tuple, tuple[float, float]] = {}
@@ -283,9 +270,9 @@ def with_intervals(
             continue
         part = data if mask.all() else data.of_frames(mask)
         weights = bootstrap.sequence_weights(
-            sequence[mask], resamples=options.bootstrap, seed=options.seed
+            sequence[mask], resamples=options.bootstrap, seed=0
         )
-        names = [p for p in options.protocols if condition == "all" or p in main]
+        names = options.protocols if condition == "all" else options.main_protocols
         for metric in itertools.product(names, SPACES, options.iou_thresholds):
             settings = options.settings_of(metric[0])
             samples = bootstrap.resample(part, weights, *metric, **settings)

@@ -7,7 +7,6 @@ worst frames) from the content of metrics.json.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -66,14 +65,15 @@ class Table:
         title = f"**{title}**" if style == "markdown" else title
         return f"{title}\n\n{body}\n{note and chr(10)}{note}"
 
-    def of_simulated(self) -> Table:
-        """The same with a title that says that the data are simulated."""
-        return dataclasses.replace(self, title=f"Simulated data: {self.title}")
+    def marked(self, is_simulated: bool) -> Table:
+        """The same with a title that says whether the data are simulated."""
+        prefix = "Simulated data: " if is_simulated else ""
+        return dataclasses.replace(self, title=f"{prefix}{self.title}")
 
 
 def index(results: Sequence[Result]) -> Results:
     """Results by their key."""
-    return {r.key: r for r in results if r.kind in ("all", "weather")}
+    return {result.key: result for result in results}
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
@@ -83,9 +83,9 @@ def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str
     return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
 
 
-def numbers(values: Iterable[float | None], digits: int = 2) -> list[str]:
-    """Values as entries of a table."""
-    return [number(value, digits=digits) for value in values]
+def numbers(values: Iterable[float | None], **options: Any) -> list[str]:
+    """Values as entries of a table, see `number`."""
+    return [number(value, **options) for value in values]
 
 
 def ap_of(results: Results, *key: Any) -> float | None:
@@ -96,8 +96,8 @@ def ap_of(results: Results, *key: Any) -> float | None:
 
 def settings_text(results: Results, protocol: str) -> str:
     """Score threshold, empty-frame rule, label version and region of a protocol."""
-    found = (r for r in results.values() if r.protocol == protocol)
-    return "".join(", " + ", ".join(r.metric.split("/")[2:]) for r in [next(found)])
+    found = next(r for r in results.values() if r.protocol == protocol)
+    return "".join(f", {part}" for part in found.metric.split("/")[2:])
 
 
 def class_by_weather(
@@ -124,61 +124,32 @@ def class_by_weather(
 def by_protocol(
     results: Results, options: EvaluationOptions, space: str, iou: float
 ) -> Table:
-    """Protocols by classes, all weathers."""
+    """Protocols by classes, all weathers, with intervals over sequences if there are."""
     classes = (*options.classes, "mean")
     body = []
     for name in options.protocols:
-        values = (ap_of(results, name, "all", cls, space, iou) for cls in classes)
-        body.append([name, *numbers(values)])
-    return Table(
-        f"AP {SPACE_TITLES[space]} at IoU {iou:g} in every protocol, all weathers",
-        ["Protocol", *classes],
-        body,
-    )
-
-
-def intervals(results: Results, options: EvaluationOptions, iou: float) -> Table:
-    """AP with its 95 % interval over sequences, all weathers."""
-    classes = (*options.classes, "mean")
-    body = []
-    for protocol, space in itertools.product(options.main_protocols, SPACE_TITLES):
-        keys = ((protocol, "all", cls, space, iou) for cls in classes)
-        entries = (_with_interval(results.get(key)) for key in keys)
-        body.append([protocol, SPACE_TITLES[space], *entries])
-    return Table(
-        f"AP at IoU {iou:g} with 95 % intervals ({options.bootstrap} resamples of"
-        " sequences)",
-        ["Protocol", "AP", *classes],
-        body,
-    )
+        found = (results.get((name, "all", cls, space, iou)) for cls in classes)
+        body.append([name, *map(_with_interval, found)])
+    title = f"AP {SPACE_TITLES[space]} at IoU {iou:g} in every protocol, all weathers"
+    if any(result.low is not None for result in results.values()):
+        title += f", 95 % intervals of {options.bootstrap} resamples of sequences"
+    return Table(title, ["Protocol", *classes], body)
 
 
 def _with_interval(result: Result | None) -> str:
+    """AP, and its interval if there is one, such as "61.05 [50.1, 70.2]"."""
     if result is None or result.ap_or_none is None or result.low is None:
         return number(None if result is None else result.ap_or_none)
-    ap, low, high = numbers((result.ap, result.low, result.high), digits=1)
-    return f"{ap} [{low}, {high}]"
+    low, high = numbers((result.low, result.high), digits=1)
+    return f"{number(result.ap)} [{low}, {high}]"
 
 
 def comparison(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
     """Two runs and which of their differences are significant."""
-    header = [
-        "Class",
-        "Protocol",
-        "AP",
-        "IoU",
-        "A",
-        "B",
-        "B - A",
-        "95 %",
-        "p",
-        "Difference",
-    ]
+    header = ["Class", "Protocol", "AP", "IoU", "A", "B", "B - A", "95 %", "p"]
     body = []
     for row in rows:
-        gap, low, high = (
-            number(value, signed=True) for value in (row.difference, row.low, row.high)
-        )
+        gap, low, high = numbers((row.difference, row.low, row.high), signed=True)
         entries = [row.cls, row.protocol, SPACE_TITLES[row.space], f"{row.iou:g}"]
         entries += [*numbers((row.ap_a, row.ap_b)), gap, f"[{low}, {high}]"]
         verdict = "significant" if row.is_significant else "not significant"
@@ -186,7 +157,7 @@ def comparison(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
     title = (
         f"B = {run_b} against A = {run_a}: 95 % intervals over sequences, p after Holm"
     )
-    return Table(title, header, body)
+    return Table(title, [*header, "Difference"], body)
 
 
 # Behind the APs -----------------------------------------------------------------------

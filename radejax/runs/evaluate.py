@@ -23,7 +23,7 @@ from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.projection import decode
-from radejax.evaluation.boxes import Columns
+from radejax.evaluation.boxes import Columns, roi_bounds
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
@@ -116,7 +116,7 @@ class Evaluation:
         )
         options = dataclasses.replace(self._options, bootstrap=0)
         tables = self._truth, predictions, self._table
-        _, results = evaluate_tables(*tables, options, kinds=())
+        _, results = evaluate_tables(*tables, options, per_weather=False)
         values, best = {}, None
         for result in filter(lambda result: result.is_defined, results):
             name = f"{result.metric}/{result.cls}"
@@ -189,8 +189,7 @@ class Evaluation:
                 figures.draw_curves(
                     workdir, folder / "training.png", is_simulated=frames.is_simulated
                 )
-            placed = [place / path.relative_to(folder) for path in report.files]
-            return dataclasses.replace(report, files=placed)
+            return dataclasses.replace(report, folder=place)
 
         return distributed.main_only(write)
 
@@ -209,7 +208,7 @@ class Evaluation:
             predictions=Boxes(
                 **{name: column[is_drawn] for name, column in found.items()}
             ),
-            roi=self._options.roi_bounds,
+            roi=roi_bounds(self._options.roi),
             score_threshold=threshold,
             **fields,
         )

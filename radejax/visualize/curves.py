@@ -20,41 +20,53 @@ from radejax.visualize.style import SERIES_COLORS, new_figure
 _LINE_STYLES = ("-", "--", "-.", ":")
 
 
-def draw_precision_recall(
-    curves: Mapping[str, tuple[Any, Any] | None],
-    *,
-    ax: Axes | None = None,
-    title: str = "",
-) -> Axes:
-    """Draw precision over recall, one line per class or model.
+Curve = tuple[Any, Any] | None
+"""Recall `[K]` and precision `[K]`, both in [0, 1], of one line; None draws nothing."""
 
-    Lines differ in color and in dash pattern.
+
+def draw_precision_recall(panels: Mapping[str, Mapping[str, Curve]]) -> Figure:
+    """Draw precision over recall, one line per class, condition or model.
+
+    Lines differ in color and in dash pattern; a name that has no curve in one panel
+    keeps its looks in the others.
 
     Args:
-        curves: Name to `(recall [K], precision [K])`, both in [0, 1]; None keeps the
-            looks of the others the same from panel to panel.
-        ax: Where to draw; a new figure by default.
-        title: Title of the axes.
+        panels: Title of each panel to its curves by name; at least one.
     """
-    ax = new_figure(5.2, 4.6, layout="constrained").add_subplot() if ax is None else ax
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    figure = new_figure(4.6 * columns, 4.8 * rows, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).reshape(-1)
+    for ax in axes[len(panels) :]:
+        ax.set_axis_off()
+    for ax, (title, curves) in zip(axes, panels.items(), strict=False):
+        _draw_panel(ax, curves)
+        ax.set_title(title, fontsize=9)
+    return figure
+
+
+def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
+    is_empty = True
     for i, (label, curve) in enumerate(curves.items()):
         if curve is not None:
             recall, precision = (np.asarray(values, float) for values in curve)
             order = np.argsort(recall, kind="stable")
             ax.plot(recall[order], precision[order], label=label, **_line(i))
+            is_empty = is_empty and not recall.any()
     limits = (0, 1.02)
     ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="precision")
-    ax.set_title(title, fontsize=9)
     ax.grid(alpha=0.3)
-    if curves:
-        ax.legend(  # below the axes, where it covers no curve
-            fontsize=7,
-            loc="upper center",
-            bbox_to_anchor=(0.5, -0.16),
-            ncols=1 if len(curves) < 4 else 2,
-            frameon=False,
-        )
-    return ax
+    if is_empty:
+        ax.text(0.5, 0.5, "none found", transform=ax.transAxes, ha="center")
+    if not ax.lines:
+        return
+    ax.legend(  # below the axes, where it covers no curve
+        fontsize=7,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.16),
+        ncols=1 if len(curves) < 4 else 2,
+        frameon=False,
+    )
 
 
 def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -61,7 +61,7 @@ def test_weights_of_a_condition_give_the_condition(scene):
 
 
 def intervals(scene, frames, **changes):
-    settings = {"bootstrap": 200, "seed": 1, "protocols": ("all_point",), **changes}
+    settings = {"bootstrap": 200, "protocols": ("all_point",), **changes}
     options = EvaluationOptions(
         classes=CLASSES, iou_thresholds=(0.3,), roi=None, **settings
     )

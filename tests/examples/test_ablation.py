@@ -17,6 +17,7 @@ from radejax.core import files
 from radejax.core.config import load_config, override
 from radejax.core.structures import CLASSES
 from radejax.evaluation.report import write_report
+from radejax.evaluation.results import EvaluationOptions
 from radejax.runs import checks
 
 SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "shuffled labels": 0.1}
@@ -55,8 +56,8 @@ class _Runs:
         found["score"] = np.full(is_found.sum(), 0.9)
         frames = {"frame": frame, "sequence": frame, "weather": np.full(60, "fog")}
         write_report(
-            truth, found, frames, out, protocols=("all_point",), iou_thresholds=(0.3,),
-            classes=CLASSES, plots=False,
+            truth, found, frames, out,
+            EvaluationOptions(CLASSES, (0.3,), ("all_point",), plots=False),
         )  # fmt: skip
 
 

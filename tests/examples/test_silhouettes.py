@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from radejax.core.config import load_module
 from radejax.core.structures import CLASSES
 from radejax.evaluation.report import write_report
+from radejax.evaluation.results import EvaluationOptions
 from radejax.runs import experiment
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -30,8 +31,8 @@ def _run(score_of_camera: float, seen: list[Any]) -> Any:
         found["score"] = np.where(frame % 2 == 0, 0.9, score_of_camera)[is_found]
         frames = {"frame": frame, "sequence": frame, "simulated": np.full(40, True)}
         write_report(
-            truth, found, frames, workdir / "evaluation", protocols=("all_point",),
-            iou_thresholds=(0.3,), classes=CLASSES, plots=False,
+            truth, found, frames, workdir / "evaluation",
+            EvaluationOptions(CLASSES, (0.3,), ("all_point",), plots=False),
         )  # fmt: skip
         return workdir
 

@@ -6,23 +6,35 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from radejax.core.errors import DataError
 from radejax.visualize import curves
+from radejax.visualize.style import SERIES_COLORS
 
 
 def test_precision_over_recall_in_order_of_recall():
     curve = np.array([0.5, 0.1]), np.array([0.8, 1.0])
-    ax = curves.draw_precision_recall({"Sedan": curve, "Bicycle": None}, title="AP")
-    (line,) = ax.lines
-    np.testing.assert_array_equal(line.get_xydata(), [[0.1, 1.0], [0.5, 0.8]])
-    assert line.get_label() == "Sedan"
-    assert ax.get_title() == "AP"
+    panels = {"AP": {"all": curve, "fog": None, "rain": curve}, "B": {"all": curve}}
+    figure = curves.draw_precision_recall(panels | {"C": {"all": ([0, 0], [0, 0])}})
+    one, two, three = figure.axes
+    assert [ax.get_title() for ax in figure.axes] == ["AP", "B", "C"]
+    np.testing.assert_array_equal(one.lines[0].get_xydata(), [[0.1, 1.0], [0.5, 0.8]])
+    assert [line.get_label() for line in one.lines] == ["all", "rain"]
+    # Fog has a colour of its own where it is not drawn: rain's is the third.
+    assert one.lines[1].get_color() == SERIES_COLORS[2]
+    assert not two.texts
+    assert [text.get_text() for text in three.texts] == ["none found"]
 
 
-def test_lines_differ_beyond_colour():
+def test_lines_differ_and_the_legend_covers_none():
     many = {str(i): ([0, 1], [1, 0]) for i in range(12)}
-    ax = curves.draw_precision_recall(many)
+    (ax,) = curves.draw_precision_recall({"": many}).axes
     looks = {(line.get_color(), line.get_linestyle()) for line in ax.lines}
     assert len(looks) == 12
     assert len({line.get_linestyle() for line in ax.lines[:4]}) == 4
+    canvas = FigureCanvasAgg(ax.figure)
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    legend = ax.get_legend().get_window_extent(renderer)
+    assert legend.y1 < ax.get_window_extent(renderer).y0
+    assert legend.y0 > 0  # on the picture
 
 
 def write_metrics(path, extra=""):
@@ -53,15 +65,3 @@ def test_moving_mean_by_hand():
     np.testing.assert_allclose(mean, [1.0, 2.0, 3.0, 5.0, 6.0])
     np.testing.assert_array_equal(curves.moving_mean(values[:1], 3), [1.0])
     assert values[0] == 1.0
-
-
-def test_the_legend_covers_no_curve_and_colours_differ() -> None:
-    conditions = {f"{i}, AP 50.0": ([0, 1], [1, 0]) for i in range(8)}
-    ax = curves.draw_precision_recall(conditions)
-    assert len({line.get_color() for line in ax.lines}) == 8
-    canvas = FigureCanvasAgg(ax.figure)
-    canvas.draw()
-    renderer = canvas.get_renderer()
-    legend = ax.get_legend().get_window_extent(renderer)
-    assert legend.y1 < ax.get_window_extent(renderer).y0
-    assert legend.y0 > 0  # on the picture
