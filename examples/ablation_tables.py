@@ -52,6 +52,6 @@ def tables(study: Study, rows: list[dict], claims: list[dict]) -> list[Table]:
     ]
     head = ["Claim", "A", "B", "Class", "A - B", "Seeds", "Verdict"]
     return [
-        table.of_simulated()
+        table.marked(is_simulated=True)
         for table in [*result, Table(f"{study.title}: claims", head, body)]
     ]

@@ -133,7 +133,7 @@ def main(report: pathlib.Path, within: tuple[float, ...]) -> None:
         title = f"centers within {farthest:g} m: medians of errors, boxes that overlap"
         rows = list(error_rows(data, matched(data, farthest)))
         for table in (ap_table(data, within), Table(title, head, rows)):
-            made = table.of_simulated() if data.is_simulated else table
+            made = table.marked(is_simulated=data.is_simulated)
             click.echo(made.render())
 
 

@@ -110,7 +110,7 @@ def table(config: SimulationConfig, cls: str) -> Table:
         )
     title = f"where the echo of a {cls} is, {config.make_grid().num_range} range bins"
     head = ["Distance", "Objects", "Echo - center m", "Along m", "Across m"]
-    return Table(title, [*head, "IoU > 0.3"], rows).marked(True)
+    return Table(title, [*head, "IoU > 0.3"], rows).marked(is_simulated=True)
 
 
 @click.command()

@@ -74,7 +74,7 @@ def main(workdir, words, seed, resamples):
             folders.append(experiment.run(config, name="silhouettes", workdir=folder))
         rows = compared(config, *folders, resamples)
         table = tables.comparison(rows, "radar", "radar and silhouettes")
-        click.echo(table.of_simulated().render())
+        click.echo(table.marked(is_simulated=True).render())
         click.echo(
             f"bar of +{BAR:g} in the mean: {'met' if is_met(rows) else 'missed'}"
         )

@@ -161,7 +161,7 @@ def _tables(
     for protocol, iou in itertools.product(options.protocols, ious):
         built.append(tables.class_by_weather(table, options, protocol, iou))
     built += tables.detail_tables(metrics)
-    return [each.marked(metrics["is_simulated"]) for each in built]
+    return [each.marked(is_simulated=metrics["is_simulated"]) for each in built]
 
 
 def _console_text(
@@ -183,7 +183,7 @@ def _console_text(
         f"{metrics['num_ground_truth']} objects, {metrics['num_predictions']} predictions,"
         f" score above {options.min_score:g}\n",
         *(f"WARNING: {line}\n" for line in metrics["warnings"]),
-        *(each.marked(metrics["is_simulated"]).render() for each in built),
+        *(each.marked(is_simulated=metrics["is_simulated"]).render() for each in built),
         f"Intervals: {metrics['intervals']}\n",
         "Not part of the numbers, or kept with a remark:",
         *(f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()),
@@ -324,7 +324,9 @@ def compare_files(
             for name, (data, _) in zip(names, loaded, strict=True)
         }
         built.append(published.table_3(results, shown, is_simulated=is_simulated))
-    text = "\n".join(table.marked(is_simulated).render() for table in built)
+    text = "\n".join(
+        table.marked(is_simulated=is_simulated).render() for table in built
+    )
     if out_dir is not None:
         content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
         files.write_text(pathlib.Path(out_dir) / "comparison.txt", text)

@@ -65,7 +65,7 @@ class Table:
         title = f"**{title}**" if style == "markdown" else title
         return f"{title}\n\n{body}\n{note and chr(10)}{note}"
 
-    def marked(self, is_simulated: bool) -> Table:
+    def marked(self, *, is_simulated: bool) -> Table:
         """The same with a title that says whether the data are simulated."""
         prefix = "Simulated data: " if is_simulated else ""
         return dataclasses.replace(self, title=f"{prefix}{self.title}")
