@@ -129,7 +129,7 @@ def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
     with pytest.raises(
         UserError, match=r"format is 'nuscenes', expected .*kradar, toy"
     ):
-        Data.open(config, models.build(config.model))
+        Data(config, models.build(config.model))
 
 
 @pytest.mark.slow

@@ -48,63 +48,55 @@ from radejax.training import distributed
 _log = logging.getLogger(__name__)
 
 
-@dataclasses.dataclass
 class Data:
-    """Frames, records and cameras of a run, opened once.
+    """Frames, records and cameras of a run, opened once; nothing is written.
+
+    Args:
+        config: Config of the run, see `located`.
+        model: What `config.model` describes.
 
     Attributes:
-        options: `config.data`, see `located`.
+        options: `config.data`.
         frames: All frames, with the labels that the config asks for.
         classes: Names in the order of the class indices.
         camera: How images and calibrations are used; None for radar-only models.
-        image_size: Height and width that the model takes, or None.
         features: Embedded images, or None.
+
+    Raises:
+        UserError: Embeddings are given and another backbone made them, or the model
+            has none.
+        FileNotFoundError: A folder is missing.
     """
 
-    options: ConfigDict
-    frames: LabelledFrames
-    classes: tuple[str, ...]
-    camera: CameraOptions | None = None
-    image_size: tuple[int, int] | None = None
-    features: Records | None = None
-    _skipped: set[str] = dataclasses.field(default_factory=set, init=False)
-    _splits: dict[str, LabelledFrames] = dataclasses.field(
-        default_factory=dict, init=False
-    )
-
-    @classmethod
-    def open(cls, config: ConfigDict, model: nn.Module) -> Data:
-        """Read the labels; nothing is written.
-
-        Raises:
-            UserError: Embeddings are given and another backbone made them, or the model
-                has none.
-            FileNotFoundError: A folder is missing.
-        """
-        options, camera, image_size, features = config.data, None, None, None
+    def __init__(self, config: ConfigDict, model: Any) -> None:
+        options = self.options = config.data
+        self.classes = tuple(config.classes)
+        self.camera: CameraOptions | None = None
+        self.features: Records | None = None
+        self._model, self._skipped = model, set[str]()
+        self._splits: dict[str, LabelledFrames] = {}
         if models.has_camera(model):
-            camera = CameraOptions.from_config(options)
-            image_size = tuple(model.image_size)
+            self.camera = CameraOptions.from_config(options)
         if options.embeddings is not None:
-            name = config.model.name
-            require(camera is not None, "config.model.name", name, "one with a camera")
+            name, has_camera = config.model.name, self.camera is not None
+            require(has_camera, "config.model.name", name, "a model with a camera")
             check_embeddable(
                 freeze=model.freeze, mirror_probability=options.mirror_probability
             )
-            features = open_embeddings(options.embeddings, config.model.image)
-        frames = data_set(options.format)(
+            self.features = open_embeddings(options.embeddings, config.model.image)
+        is_common = self.camera is not None and self.camera.calibration == "common"
+        self.frames = data_set(options.format)(
             options.roots,
             options.labels,
             version=options.label_version,
             visibility=options.visibility,
             classes=config.classes,
             camera_calibration=options.camera_calibration,
-            common_camera=camera is not None and camera.calibration == "common",
+            common_camera=is_common,
             include_unstarred_v11_labels=options.include_unstarred_v11_labels,
             sequence_numbers=options.sequences or None,
             weather=options.weather or None,
         )
-        return cls(options, frames, tuple(config.classes), camera, image_size, features)
 
     def preprocess(self) -> None:
         """Write the records that are missing, on one process while others wait.
@@ -162,14 +154,11 @@ class Data:
             )
         if not chosen or not len(frames):
             return frames
-        numbers = {frame.sequence for frame in frames}
+        numbers, is_train = {frame.sequence for frame in frames}, name == "train"
         held = held_out(numbers, chosen, self.options.validation_seed)
-        if name == "train":
-            other, reason = set(held), "held out for validation"
-        else:
-            other, reason = numbers.difference(held), "of sequences to train on"
-        keys = {frame.key for frame in frames if frame.sequence in other}
-        return frames.without(keys, reason)
+        others = {f.key for f in frames if (f.sequence in held) == is_train}
+        reason = "held out for validation" if is_train else "of sequences to train on"
+        return frames.without(others, reason)
 
     @property
     def choosing_split(self) -> str:
@@ -182,9 +171,10 @@ class Data:
         Raises:
             UserError: Images or calibrations are missing or of another size.
         """
-        if self.camera is None or self.image_size is None:
+        if self.camera is None:
             return None
-        return camera_inputs(frames, self.image_size, self.camera, self.features)
+        size = tuple(self._model.image_size)
+        return camera_inputs(frames, size, self.camera, self.features)
 
     def training_batches(
         self, frames: FrameSequence, train: ConfigDict, seed: int
@@ -260,9 +250,7 @@ def _set_paths(options: ConfigDict, roots: Iterable[str]) -> None:
     roots = tuple(str(pathlib.Path(root).absolute()) for root in roots)
     paths = {name: options[name] for name in DATA_PATHS if name != "roots"}
     paths["records"] = paths["records"] or pathlib.Path(roots[0], "records")
-    absolute = {
-        k: path and str(pathlib.Path(path).absolute()) for k, path in paths.items()
-    }
+    absolute = {n: x and str(pathlib.Path(x).absolute()) for n, x in paths.items()}
     with options.ignore_type():  # tuples are lists in the config of a checkpoint
         options.update(absolute, roots=roots)
     folder = options.camera_calibration
@@ -292,7 +280,7 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
         FileNotFoundError: A folder is missing.
     """
     simulate_missing(config)
-    data = Data.open(config, model)
+    data = Data(config, model)
     _log.info("%s", data.frames.summary().to_text())
     # Preprocessing takes long.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
@@ -340,7 +328,7 @@ def data_of_run(
     with options.ignore_type():
         options.update(changes)
     _set_paths(options, roots)
-    data = Data.open(config, saved.model)
+    data = Data(config, saved.model)
     grids = [describe_grid(grid) for grid in (data.frames.grid, saved.grid)]
     is_same, text = (
         data.frames.grid == saved.grid,

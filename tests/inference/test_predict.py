@@ -48,7 +48,7 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     config.logging.num_visualizations = 1
     model = models.build(config.model)
     config.data.update(roots=(str(root),), records=str(folder / "records"))
-    data = Data.open(config, model)
+    data = Data(config, model)
     preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records
     variables = drawn(model, np.zeros((1, *records.grid.projection_shape)))

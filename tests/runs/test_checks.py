@@ -19,25 +19,20 @@ CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 NAN, INF = math.nan, math.inf
 
 WRONG = [
-    ("seed", -1),
     ("seed", 2**32 - 1),
-    ("seed", 0.5),
     ("seed", True),
     ("classes", ()),
     ("classes", ("Sedan", "Sedan")),
     ("classes", ("Tank",)),
-    ("classes", "Sedan"),
     ("model.name", "yolo"),
     ("model.num_classes", 4),
     ("model.widths", ()),
     ("model.widths", (32, 0)),
-    ("model.widths", 128),
     ("model.decoder_width", 0),
     ("model.num_groups", 0),
     ("model.pad_multiple", 0),
     ("model.input_stem", "no"),
     ("model.cbam", False),
-    ("model.remat", 1),
     ("model.doppler_bins", "64"),
     ("model.heatmap_prior", 1.0),
     ("model.input_center", NAN),
@@ -45,25 +40,18 @@ WRONG = [
     ("loss.heatmap_sigma_mode", "adaptiv"),
     ("loss.heatmap_sigma_bins", 0.0),
     ("loss.gwd_tau", 0.0),
-    ("loss.gwd_tau", NAN),
     ("loss.gwd_transform", "log"),
     ("loss.weights", {"focal": 1.0, "giou": 1.0}),
     ("loss.weights", {"focal": -1.0}),
     ("loss.weights", {}),
     ("loss.z0_m", INF),
     ("decode.max_detections", 0),
-    ("decode.nms_iou", NAN),
-    ("decode.score_threshold", -0.1),
     ("train.batch_size", 0),
-    ("train.batch_size", 2.0),
     ("train.num_epochs", 0),
     ("train.learning_rate", 0.0),
     ("train.final_learning_rate", 1.0),
-    ("train.weight_decay", -1.0),
-    ("train.warmup_steps", -1),
     ("train.gradient_clip_norm", 0.0),
     ("train.ema_decay", 2.0),
-    ("train.ema_decay", "0.9"),
     ("train.gradient_accumulation_steps", 0),
     ("train.log_every_steps", 0),
     ("train.checkpoint_every_steps", 0),
@@ -72,35 +60,25 @@ WRONG = [
     ("data.roots", ("",)),
     ("data.format", "nuscenes"),
     ("data.label_version", "v3"),
-    ("data.visibility", "R"),
     ("data.visibility", ("X",)),
     ("data.validation", 0.1),
     ("data.validation", (1.0,)),
     ("data.validation", (0.1, 0.2)),
     ("data.validation", (5, 5)),
-    ("data.validation_seed", -1),
     ("data.max_objects", 0),
-    ("data.num_threads", -1),
     ("data.mirror_probability", 1.5),
-    ("data.gain_db", -1.0),
     ("evaluation.roi", (0, 1, 2)),
     ("evaluation.roi", (72.0, 0.0, -6.4, 6.4, -2.0, 6.0)),
     ("evaluation.protocols", ("nope",)),
     ("evaluation.protocols", ()),
-    ("evaluation.protocols", "kradar_r40"),
     ("evaluation.empty_frames", None),
     ("evaluation.iou_thresholds", (2.0,)),
     ("evaluation.iou_thresholds", (0.3, NAN)),
-    ("evaluation.bootstrap", -1),
     ("evaluation.batch_size", 0),
     ("logging.wandb", 1),
     ("logging.profile_steps", (5, 2)),
-    ("simulation.seed", -1),
     ("simulation.output", "video"),
     ("simulation.camera_mode", "boxes"),
-    ("simulation.vru_density_scale", "many"),
-    ("simulation.train_sequences", 2.5),
-    ("simulation.label_distance_m", NAN),
     ("simulation.radar_from_lidar_m", (0.0, 0.0)),
     ("model.image.num_heads", 0),
     ("model.image.size", (720,)),
@@ -164,37 +142,24 @@ def test_fields_that_are_missing_or_unknown() -> None:
         check(config)
 
 
-def _fields() -> list[str]:
-    return [name for name, _ in fields_of(load_config("quickstart_fusion"))]
+FIELDS = dict(fields_of(load_config("quickstart_fusion")))
+ANY_NUMBER = ("input_center", "z0_m", "radar_from_lidar_z_m", "layer_scale")
 
 
-@pytest.mark.parametrize("field", _fields())
-def test_a_value_of_a_wrong_type_is_one_line_that_names_the_field(field: str) -> None:
-    """A section is the type of no field."""
-    kind = dict(fields_of(load_config("quickstart_fusion")))[field]
-    for value in ({"a": 1}, 2.5 if kind is int else 1 if kind is str else "many"):
-        with pytest.raises(UserError, match=rf"config\.{re.escape(field)}\b") as raised:
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_value_of_a_wrong_type_or_range_is_one_line_that_names_the_field(
+    field: str,
+) -> None:
+    kind = FIELDS[field]
+    # A section is the type of no field.
+    wrong: list[Any] = [{"a": 1}, 2.5 if kind is int else 1 if kind is str else "many"]
+    if kind in (int, float) and field.rpartition(".")[2] not in ANY_NUMBER:
+        wrong += [-1] if kind is int else [-1.0, NAN, INF]
+    named = re.escape(re.sub(r"weights\..*", "weights", field))
+    for value in wrong:
+        with pytest.raises(UserError, match=rf"config\.{named}\b") as raised:
             check(_with(field, value))
         assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("field", _fields())
-def test_a_number_below_its_range_or_not_finite_is_named(field: str) -> None:
-    kind = dict(fields_of(load_config("quickstart_fusion")))[field]
-    named = field.removesuffix(".focal").removesuffix(".gwd").removesuffix(".smooth_l1")
-    anything = (
-        "num_workers",
-        "input_center",
-        "z0_m",
-        "radar_from_lidar_z_m",
-        "layer_scale",
-    )
-    if kind not in (int, float) or field.rpartition(".")[2] in anything:
-        return
-    values = (-1,) if kind is int else (-1.0, NAN, INF)
-    for value in values:
-        with pytest.raises(UserError, match=rf"config\.{re.escape(named)}\b"):
-            check(_with(field, value))
 
 
 def test_what_one_field_asks_of_another() -> None:

@@ -3,11 +3,15 @@
 import collections
 import json
 import pathlib
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import Any
 
+import click.testing
 import pytest
 
+from radejax.cli.train import train
 from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
@@ -20,18 +24,6 @@ from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
-
-
-def test_a_work_folder_in_use_is_left_alone(tmp_path: pathlib.Path) -> None:
-    folder, config = tmp_path / "run", base_config()
-    config.train.batch_size = 8  # as many as the tests have devices
-    config.data.roots = (str(tmp_path),)
-    with (
-        claimed(folder, config),
-        pytest.raises(UserError, match="another training"),
-    ):
-        experiment.run(config, name="x", workdir=folder)
-    assert sorted(path.name for path in folder.iterdir()) == ["config.json", "lock"]
 
 
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
@@ -135,15 +127,128 @@ def test_labels_are_read_once(
     assert set(parsed.values()) == {1}
 
 
-def test_a_batch_that_does_not_divide_is_told_before_anything_is_written(
+# Work folders ------------------------------------------------------------------------
+
+
+def test_a_work_folder_keeps_its_config(tmp_path: pathlib.Path) -> None:
+    config = base_config()
+    for _ in range(2):
+        with claimed(tmp_path / "run", config):
+            kept = json.loads((tmp_path / "run" / "config.json").read_text())
+            assert kept == json.loads(config.to_json())
+
+
+def test_another_config_is_refused_and_the_difference_named(
     tmp_path: pathlib.Path,
 ) -> None:
-    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
-    config.train.batch_size = 3  # of eight devices
-    config.data.roots = (str(tmp_path / "data"),)
-    with pytest.raises(
-        UserError,
-        match=r"config\.train\.batch_size is 3, expected a multiple of 8 devices",
+    config = base_config()
+    with claimed(tmp_path, config):
+        pass
+    config.train.num_epochs = 7  # nothing is trained: the folder takes it
+    with claimed(tmp_path, config):
+        kept = json.loads((tmp_path / "config.json").read_text())
+        assert kept["train"]["num_epochs"] == 7
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
+    config.train.batch_size = 3
+    config.seed = 5
+    with (
+        pytest.raises(
+            UserError,
+            match=r"config\.seed is 0 there and 5 here; "
+            r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
+        ),
+        claimed(tmp_path, config),
     ):
-        experiment.run(config, name="x", workdir=tmp_path / "run")
-    assert not list(tmp_path.iterdir())
+        pass
+
+
+def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "run"
+    with (
+        claimed(folder, base_config()),
+        pytest.raises(UserError, match=r"another training is at work in .*run: wait"),
+        claimed(folder, base_config()),
+    ):
+        pass
+    with claimed(folder, base_config()):  # let go, though the file is there
+        pass
+
+
+def test_a_killed_training_lets_go_of_its_work_folder(tmp_path: pathlib.Path) -> None:
+    code = (
+        "import sys, fcntl, time\n"
+        "file = open(sys.argv[1], 'w')\n"
+        "fcntl.flock(file, fcntl.LOCK_EX)\n"
+        "print('held', flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path / "lock")], stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(UserError), claimed(tmp_path, base_config()):
+            pass
+        other.kill()
+        other.wait()
+        with claimed(tmp_path, base_config()):
+            pass
+
+
+def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
+    info = experiment.run_info(tmp_path, str(tmp_path / "model.pth"))
+    assert info["init_from"] == str(tmp_path / "model.pth")
+    (tmp_path / "run.json").write_text(json.dumps(info))
+    again = experiment.run_info(tmp_path)
+    assert again["init_from"] == info["init_from"]
+
+
+# Several seeds -----------------------------------------------------------------------
+
+HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
+
+
+def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    aps = {0: 50.0, 1: 53.0, 2: 59.0}
+    seen = []
+
+    def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
+        seen.append((config.seed, pathlib.Path(workdir).name, options["init_from"]))
+        folder = pathlib.Path(workdir) / "evaluation"
+        folder.mkdir(parents=True)
+        (folder / "metrics.csv").write_text(
+            HEAD
+            + f"all_point,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
+            + "all_point,all,Bicycle,3d,0.3,,0\n"
+            + f"all_point,rain,Sedan,3d,0.3,{config.seed},3\n"
+        )
+        return pathlib.Path(workdir)
+
+    monkeypatch.setattr(experiment, "run", run)
+    config = base_config()
+    experiment.run_seeds(
+        config, range(3), name="x", workdir=tmp_path / "runs", init_from="w"
+    )
+    assert seen == [(i, f"seed{i}", "w") for i in range(3)]
+    rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
+    assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
+    assert rows[0]["mean"] == pytest.approx(54.0)
+    assert rows[0]["std"] == pytest.approx(21**0.5)  # (16 + 1 + 25) / 2
+    assert rows[0]["values"] == {"0": 50.0, "1": 53.0, "2": 59.0}
+    text = (tmp_path / "runs" / "seeds.txt").read_text()
+    assert "54.00" in text
+    assert "4.58" in text
+    assert "rain" not in text
+
+
+def test_train_takes_several_seeds(tmp_path: pathlib.Path) -> None:
+    arguments = ["--config=quickstart:short", "--seeds=1,2,1"]
+    done = click.testing.CliRunner().invoke(
+        train, [*arguments, f"--workdir={tmp_path / 'run'}"]
+    )
+    assert done.exit_code == 2
+    assert done.stderr.startswith(
+        "error: --seeds is (1, 2, 1), expected different seeds"
+    )
+    assert done.stderr.count("\n") == 1
