@@ -1,6 +1,7 @@
 """Untrained detectors of a few thousand parameters, with and without a camera."""
 
 import functools
+import json
 import pathlib
 from typing import Any
 
@@ -37,6 +38,24 @@ def _shrink(config: ConfigDict) -> ConfigDict:
     )
     config.decode.score_threshold = 0.3
     return config
+
+
+def shrink_run(config: ConfigDict) -> ConfigDict:
+    """Few bins and channels for a quickstart, so that a run takes seconds."""
+    config.simulation.grid.update(
+        num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
+    )
+    _shrink(config).model.doppler_bins = 4
+    return config
+
+
+def write_config(path: pathlib.Path, config: ConfigDict) -> pathlib.Path:
+    """Writes a config as a file for `--config`."""
+    path.write_text(
+        "from ml_collections import ConfigDict\n"
+        f"def get_config():\n    return ConfigDict({json.loads(config.to_json())!r})\n"
+    )
+    return path
 
 
 def radar_config() -> ConfigDict:

@@ -29,6 +29,8 @@ from radejax.runs.evaluate import evaluate_run
 from radejax.training import checkpoints, distributed
 from radejax.weights import image_backbone
 
+from . import small_models as small
+
 pytestmark = pytest.mark.slow  # several programs to compile
 
 CONFIG = pathlib.Path(__file__).parents[1] / "configs" / "quickstart_fusion.py"
@@ -44,11 +46,8 @@ def small_config():
         image_width=96,
         image_height=32,
     )
-    config.simulation.grid.update(
-        num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
-    )
-    config.model.update(doppler_bins=4, elevation_bins=3, widths=(8, 8), num_groups=4)
-    config.model.update(decoder_width=8, neck="plain", heads="default", pad_multiple=4)
+    config = small.shrink_run(config)
+    config.model.pad_multiple = 4
     config.model.image.update(
         size=(32, 96), freeze=True, hidden_size=96, num_layers=3, num_registers=4
     )
@@ -422,12 +421,7 @@ def test_example_draws_reference_points(data, from_images, tmp_path):
 
 
 def test_embed_command(data, from_images, tmp_path, monkeypatch):
-    config = tmp_path / "config.py"
-    fields = json.loads(small_config().to_json())
-    config.write_text(
-        "from ml_collections import ConfigDict\n"
-        f"def get_config():\n    return ConfigDict({fields!r})\n"
-    )
+    config = small.write_config(tmp_path / "config.py", small_config())
     command = ["embed", str(data.folder), "--config", str(config), "--json"]
     command += ["--image-backbone", str(data.backbone), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(main, command, catch_exceptions=False)

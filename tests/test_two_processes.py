@@ -11,34 +11,27 @@ import sys
 import chex
 import numpy as np
 import pytest
+from ml_collections import ConfigDict
 
+from radejax.core.config import load_config
 from radejax.inference.saved import load_model
 
+from . import small_models as small
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
-OVERRIDES = [
-    "--config=configs/quickstart.py:short",
-    "--config.simulation.train_sequences=2",
-    "--config.simulation.frames_per_sequence=5",
-    "--config.simulation.grid.num_doppler=4",
-    "--config.simulation.grid.num_range=24",
-    "--config.simulation.grid.num_elevation=3",
-    "--config.simulation.grid.num_azimuth=16",
-    "--config.model.doppler_bins=4",
-    "--config.model.elevation_bins=3",
-    "--config.model.widths=(8,8)",
-    "--config.model.decoder_width=8",
-    "--config.model.num_groups=4",
-    "--config.model.cbam=off",
-    "--config.model.neck=plain",
-    "--config.model.heads=default",
-    "--config.train.num_epochs=3",
-    "--config.train.log_every_steps=1",
-    "--config.train.checkpoint_every_steps=3",
-    "--config.train.checkpoints_to_keep=9",
-    "--config.evaluation.num_visualizations=0",
-    "--config.evaluation.batch_size=3",
-]
 MIDDLE = 3  # of six steps
+
+
+def _config() -> ConfigDict:
+    config = small.shrink_run(load_config("quickstart:short"))
+    config.simulation.update(train_sequences=2, frames_per_sequence=5)
+    config.model.cbam = "off"
+    config.train.update(num_epochs=3, log_every_steps=1)
+    config.train.update(checkpoint_every_steps=3, checkpoints_to_keep=9)
+    config.evaluation.update(num_visualizations=0, batch_size=3)
+    return config
 
 
 def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) -> None:
@@ -46,7 +39,8 @@ def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) 
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         coordinator = f"127.0.0.1:{free.getsockname()[1]}"
-    command = [sys.executable, "train.py", *OVERRIDES, *overrides]
+    config = small.write_config(folder / "config.py", _config())
+    command = [sys.executable, "train.py", f"--config={config}", *overrides]
     command += [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
     started = []
     for i in range(num_processes):
@@ -107,8 +101,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return folder
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("run", ["two", "two_then_one", "one_then_two"])
 def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
     expected, actual = _losses(runs / "one"), _losses(runs / run)
@@ -122,8 +114,6 @@ def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
     assert _aps(runs / run) == _aps(runs / "one")
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
 def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
     runs: pathlib.Path,
 ) -> None:
@@ -142,8 +132,6 @@ def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
     assert set(rows[0]["values"]) == {"0", "1"}
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
 def test_only_one_process_writes(runs: pathlib.Path) -> None:
     assert len(list((runs / "two" / "tensorboard").iterdir())) == 1
     assert not list(runs.rglob("*.tmp"))

@@ -23,6 +23,8 @@ from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 
+from .. import small_models as small
+
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 
 
@@ -98,12 +100,9 @@ def test_labels_are_read_once(
     config.simulation.update(
         train_sequences=3, frames_per_sequence=2, output="projection"
     )
-    config.simulation.grid.update(
-        num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
-    )
+    config = small.shrink_run(config)
     config.data.validation = (2,)
-    config.model.update(doppler_bins=4, elevation_bins=3, cbam="off", widths=(8,))
-    config.model.update(decoder_width=8, num_groups=4, neck="plain", heads="default")
+    config.model.update(cbam="off", widths=(8,))
     config.train.update(num_epochs=1, evaluate_every_epochs=1)
     config.evaluation.num_visualizations = 0
     evaluated = []
