@@ -15,8 +15,14 @@ from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibratio
 from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
-from radejax.visualize.labels import Label, draw_labels
-from radejax.visualize.style import COLOR_MAP, footprints, halo, new_figure
+from radejax.visualize.style import (
+    COLOR_MAP,
+    Label,
+    draw_labels,
+    footprints,
+    halo,
+    new_figure,
+)
 
 SCENES = (
     ("normal", "urban", "day", 4),

@@ -60,7 +60,7 @@ def overlay(
     import tqdm
 
     from radejax.data.kradar import KRadar
-    from radejax.visualize.animate import animate
+    from radejax.visualize.recordings import animate
     from radejax.visualize.style import save_figure
 
     sequence, _, frame_name = name.partition("/")

@@ -50,7 +50,7 @@ def view(
 
     from radejax.data.kradar import KRadar
     from radejax.inference.detector import Detector
-    from radejax.visualize.viewer import open_viewer, write_recording
+    from radejax.visualize.recordings import open_viewer, write_recording
 
     frames = KRadar(
         roots,

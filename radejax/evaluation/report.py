@@ -14,7 +14,7 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
-from radejax.evaluation import analysis, bootstrap, protocols, published, tables
+from radejax.evaluation import analysis, bootstrap, protocols, tables
 from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result
 from radejax.evaluation.files import Source, load, stored_from, write_table
@@ -155,7 +155,7 @@ def _tables(
     built = []
     if not metrics["is_simulated"]:
         names = metrics["run"], metrics["split"]
-        built = published.paper_tables(table, options, *names)
+        built = tables.paper_tables(table, options, *names)
     for space, iou in itertools.product(tables.SPACE_TITLES, ious):
         built.append(tables.by_protocol(table, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, ious):
@@ -323,7 +323,7 @@ def compare_files(
             name: tables.index(compute_results(data, shown, {}))
             for name, (data, _) in zip(names, loaded, strict=True)
         }
-        built.append(published.table_3(results, shown, is_simulated=is_simulated))
+        built.append(tables.table_3(results, shown, is_simulated=is_simulated))
     text = "\n".join(
         table.marked(is_simulated=is_simulated).render() for table in built
     )

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Shaped
 from ml_collections import ConfigDict
 
 from radejax.core.errors import (
@@ -24,7 +23,7 @@ from radejax.core.structures import CLASSES, MIN_SIZE_M
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import bootstrap, protocols
 from radejax.evaluation.boxes import AnyColumns, Columns, Roi, roi_bounds
-from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result, mean_ap
+from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 
 ENVIRONMENTS = (
     "urban highway countryside alleyway parkinglots shoulder mountain university"
@@ -186,35 +185,61 @@ def evaluate_tables(
         f"predictions: size clipped to {MIN_SIZE_M} m, kept": int(is_clipped.sum()),
     }
     weathers = condition_masks(frames, "weather") if per_weather else {}
-    results = compute_results(data, options, weathers)
-    if why_no_intervals(frames, options) is None:
-        results = with_intervals(data, frames, results, options)
-    return data, results
+    has_intervals = why_no_intervals(frames, options) is None
+    sequence = np.asarray(frames["sequence"]) if has_intervals else None
+    return data, compute_results(data, options, weathers, sequence)
 
 
 def compute_results(
     data: EvaluationSet,
     options: EvaluationOptions,
     weathers: Mapping[str, Bool[np.ndarray, " F"]],
+    sequence: Shaped[np.ndarray, " F"] | None = None,
 ) -> list[Result]:
-    """Results of every protocol over all frames and over masks of frames."""
+    """Results of every protocol over all frames and over masks of frames.
+
+    Intervals, where the sequences are given, are of all protocols over all frames and of
+    the main ones per weather. Conditions are resampled within their sequences; those of
+    one sequence get none.
+    """
     rows = []
-    masks: dict[str, Any] = {"all": None, **weathers}
-    for protocol, (condition, mask) in itertools.product(
-        options.protocols, masks.items()
-    ):
-        results = data.results(
-            protocol,
-            iou_thresholds=options.iou_thresholds,
-            weights=mask,
-            curves=False,
-            condition=("all" if mask is None else "weather", condition),
-            **options.settings_of(protocol),
-        )
-        for start in range(0, len(results), len(data.classes)):
-            group = results[start : start + len(data.classes)]
-            rows += [*group, _mean(group)]
-    return rows
+    everything = {"all": np.ones(data.frame.size, bool)}
+    for condition, mask in (everything | dict(weathers)).items():
+        is_all = condition == "all"
+        has_interval = options.protocols if is_all else options.main_protocols
+        part, weights = data, None
+        if sequence is not None and np.unique(sequence[mask]).size > 1:
+            part = data if mask.all() else data.of_frames(mask)
+            weights = bootstrap.sequence_weights(
+                sequence[mask], resamples=options.bootstrap, seed=0
+            )
+        for protocol in options.protocols:
+            settings = options.settings_of(protocol)
+            results = data.results(
+                protocol,
+                iou_thresholds=options.iou_thresholds,
+                weights=mask,
+                curves=False,
+                condition=("all" if is_all else "weather", condition),
+                **settings,
+            )
+            for start in range(0, len(results), len(data.classes)):
+                group = results[start : start + len(data.classes)]
+                group.append(_mean(group))
+                if weights is not None and protocol in has_interval:
+                    metric = protocol, group[0].space, group[0].iou
+                    samples = bootstrap.resample(part, weights, *metric, **settings)
+                    group = [*map(_with_interval, group, samples.T)]
+                rows += group
+    # By protocol, then by condition.
+    return sorted(rows, key=lambda row: options.protocols.index(row.protocol))
+
+
+def _with_interval(result: Result, samples: Float[np.ndarray, " B"]) -> Result:
+    low, high = bootstrap.interval(samples)
+    if not result.is_defined:
+        return result
+    return dataclasses.replace(result, low=low, high=high)
 
 
 def _mean(group: Sequence[Result]) -> Result:
@@ -250,41 +275,6 @@ def why_no_intervals(frames: Columns, options: EvaluationOptions) -> str | None:
     if np.unique(np.asarray(frames["sequence"])).size < 2:
         return "none: all frames are of one sequence"
     return None
-
-
-def with_intervals(
-    data: EvaluationSet,
-    frames: Columns,
-    results: list[Result],
-    options: EvaluationOptions,
-) -> list[Result]:
-    """The results with 95 % intervals: all over all frames, the main ones per weather.
-
-    Conditions are resampled within their sequences; those of one sequence get none.
-    """
-    sequence = np.asarray(frames["sequence"])
-    conditions = {"all": np.ones(sequence.size, bool)}
-    found: dict[tuple, tuple[float, float]] = {}
-    for condition, mask in (conditions | condition_masks(frames, "weather")).items():
-        if np.unique(sequence[mask]).size < 2:
-            continue
-        part = data if mask.all() else data.of_frames(mask)
-        weights = bootstrap.sequence_weights(
-            sequence[mask], resamples=options.bootstrap, seed=0
-        )
-        names = options.protocols if condition == "all" else options.main_protocols
-        for metric in itertools.product(names, SPACES, options.iou_thresholds):
-            settings = options.settings_of(metric[0])
-            samples = bootstrap.resample(part, weights, *metric, **settings)
-            for cls, column in zip((*data.classes, "mean"), samples.T, strict=True):
-                key = (metric[0], condition, cls, *metric[1:])
-                found[key] = bootstrap.interval(column)
-    return [
-        dataclasses.replace(row, low=found[row.key][0], high=found[row.key][1])
-        if row.is_defined and row.key in found
-        else row
-        for row in results
-    ]
 
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:

@@ -17,9 +17,10 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.geometry.boxes import corners
 from radejax.geometry.camera import CameraCalibration
-from radejax.visualize.labels import Label, draw_labels
 from radejax.visualize.style import (
+    Label,
     Style,
+    draw_labels,
     draw_lines,
     label_texts,
     line_scales,

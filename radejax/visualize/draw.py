@@ -26,13 +26,14 @@ from radejax.core.structures import ROIS
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.camera import draw_camera
-from radejax.visualize.labels import Label, draw_labels
 from radejax.visualize.slices import POWER_LABEL, bin_edges, range_azimuth, to_polar
 from radejax.visualize.style import (
     COLOR_MAP,
     ROI_COLOR,
+    Label,
     Scene,
     add_colorbar,
+    draw_labels,
     draw_lines,
     draw_tiles,
     footprints,

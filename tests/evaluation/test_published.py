@@ -7,10 +7,10 @@ import pytest
 
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import KRadar
-from radejax.evaluation import published, report, tables
+from radejax.evaluation import report, tables
 from radejax.evaluation.files import Source, tables_from_frames
-from radejax.evaluation.published import PUBLISHED
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
+from radejax.evaluation.tables import PUBLISHED
 
 
 def printed(source, method=None, *, iou=0.3):
@@ -41,7 +41,7 @@ def test_no_number_was_lost_on_the_way_to_the_file():
     assert (len(texts), len(values)) == (454, 385)
     assert sum(values) == pytest.approx(19256.36, abs=1e-6)
     assert all(0 <= value <= 100 for value in values)
-    assert {row.labels for row in PUBLISHED} == {"v1.1", "v2.1"}
+    assert {row.label_version for row in PUBLISHED} == {"v1.1", "v2.1"}
     assert {row.protocol for row in PUBLISHED} == {"coco101", "not stated"}
 
 
@@ -63,7 +63,7 @@ def test_rows_that_two_tables_share_agree():
     for method in ("TED-S", "MixedFusion", "RTNH", "DPFT", "EchoFusion"):
         one = printed("RADE-Net, Table I", method)
         other = printed("DinoRADE, Table 1", method)
-        for condition in published.CONDITIONS:
+        for condition in tables.CONDITIONS:
             assert one(condition=condition) == other(condition=condition)
     rade, dino = (printed("DinoRADE, Table 3", m) for m in ("RADE-Net", "DinoRADE"))
     two, weather = printed("RADE-Net, Table II"), printed("DinoRADE, Table 2")
@@ -85,7 +85,7 @@ def test_means_are_means_of_their_classes(source, method):
     """A slip in copying a number would show here."""
     value = printed(source, method)
     for space in ("3d", "bev"):
-        for condition in published.CONDITIONS:
+        for condition in tables.CONDITIONS:
             if (source, condition) == ("RADE-Net, Table II", "sleet"):
                 continue  # printed 18.52 and 21.53, its classes give 18.49 and 21.35
             values = [value(cls, space, condition) for cls in CLASSES]
@@ -122,7 +122,7 @@ def _tables(real, split="test", **changes):
     """Rows of Tables I, II, DinoRADE's 3 and III."""
     options = dataclasses.replace(AS_PAPERS, **changes)
     _, results = evaluate_tables(*real, options)
-    built = published.paper_tables(tables.index(results), options, "mine", split)
+    built = tables.paper_tables(tables.index(results), options, "mine", split)
     return [table.rows for table in built]
 
 

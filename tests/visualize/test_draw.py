@@ -11,7 +11,6 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import draw, slices
-from radejax.visualize.animate import render
 from radejax.visualize.draw import ZOOM_COLOR, draw_scenes
 from radejax.visualize.style import COLOR_MAP, Scene, footprints, save_figure
 
@@ -244,7 +243,7 @@ def test_scenes_share_a_scale_and_have_an_image_above_a_map() -> None:
     assert len({mesh.get_clim() for mesh in meshes if mesh.get_array().size > 99}) == 1
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["ground truth", "region of interest"]
-    assert not _has_color(render(figure).astype(int), ZOOM_COLOR)
+    assert not _has_color(pixels_of(figure), ZOOM_COLOR)
 
 
 def test_one_strong_echo_does_not_darken_the_maps() -> None:
@@ -258,7 +257,7 @@ def test_one_strong_echo_does_not_darken_the_maps() -> None:
 
 def test_a_magnified_view_is_framed_in_orange() -> None:
     figure = draw_scenes([_scene(0.2, zoom=(30.0, 2.0))])
-    assert _has_color(render(figure).astype(int), ZOOM_COLOR)
+    assert _has_color(pixels_of(figure), ZOOM_COLOR)
 
 
 def test_no_scenes() -> None:
