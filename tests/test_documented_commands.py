@@ -14,7 +14,6 @@ import tomllib
 
 import click
 import click.testing
-import numpy as np
 import pytest
 
 from radejax.cli import main
@@ -44,7 +43,8 @@ RUN_IN = {
     "::test_data_check_finds_simulated_folders_whole",
     "radejax preprocess": "tests/test_documented_commands.py"
     "::test_preprocess_then_nothing_is_left_to_do",
-    "radejax overlay": "tests/test_documented_commands.py::test_overlay_draws_a_frame",
+    "radejax overlay": "tests/cli/test_figures.py"
+    "::test_the_first_frame_of_a_sequence_is_drawn",
     "radejax view": "tests/test_documented_commands.py::test_view_writes_a_recording",
     "radejax demo": ".ci/run: radejax demo",
     "radejax detect": ".ci/run: radejax detect --workdir",
@@ -291,28 +291,17 @@ def test_preprocess_then_nothing_is_left_to_do(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     out = tmp_path / "records"
-    first = json.loads(_run("preprocess", root, "--out", out, "--json").stdout)
-    again = json.loads(_run("preprocess", root, "--out", out, "--json").stdout)
-    assert (first["num_written"], first["num_found"]) == (2, 0)
-    assert (again["num_written"], again["num_found"]) == (0, 2)
-
-
-def test_overlay_draws_a_frame(root: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    from PIL import Image
-
-    out = tmp_path / "overlay.png"
-    (label, *_) = sorted((root / "1" / "info_label_v2_1").glob("*.txt"))
-    _run("overlay", f"1/{label.stem}", "--data", root, "--out", out)
-    assert np.asarray(Image.open(out)).std() > 10
+    assert (
+        "0 were done, 2 preprocessed" in _run("preprocess", root, "--out", out).stdout
+    )
+    assert (
+        "2 were done, 0 preprocessed" in _run("preprocess", root, "--out", out).stdout
+    )
 
 
 def test_view_writes_a_recording(root: pathlib.Path, tmp_path: pathlib.Path) -> None:
     pytest.importorskip("rerun")
     out = tmp_path / "one.rrd"
-    result = _run("view", root, "--sequences", 1, "--out", out, "--json")
-    assert json.loads(result.stdout) == {
-        "frames": 2,
-        "without_radar": 0,
-        "recording": str(out),
-    }
+    result = _run("view", root, "--sequences", 1, "--out", out)
+    assert result.stdout == f"2 frames written to {out}\n"
     assert out.stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""`radejax data check`: a copy of K-Radar, looked at."""
+"""`radejax simulate`, `data check`, `preprocess`, `embed`: data sets before training."""
 
 from __future__ import annotations
 
@@ -7,7 +7,68 @@ from typing import Any
 
 import click
 
-from radejax.cli import entry, options
+from radejax.cli import entry
+from radejax.core.errors import UserError
+
+
+@click.command(cls=entry.Command)
+@click.option(
+    "--config", help="Config with a `simulation` section. Default: a small dataset."
+)
+@click.option(
+    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
+)
+@click.option("--seed", type=click.IntRange(0), help="Replaces the config's seed.")
+@click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
+@entry.sequences
+@click.option(
+    "--frames",
+    "frames_per_sequence",
+    type=click.IntRange(0),
+    help="Frames per sequence; 0 = all labelled frames.",
+)
+@click.option(
+    "--full-size", is_flag=True, help="K-Radar's own grid and images of 2560 x 720."
+)
+@click.option(
+    "--projections",
+    "output",
+    flag_value="projection",
+    help="Write projections only, no radar tensors (260 MB each).",
+)
+@entry.workers
+def simulate(
+    config: str | None,
+    out: pathlib.Path,
+    sequence_numbers: tuple[int, ...] | None,
+    full_size: bool,
+    num_workers: int | None,
+    **fields: Any,
+) -> None:
+    """Simulate a dataset in K-Radar's folders and file formats.
+
+    The same command resumes an interrupted simulation. The same options give the same
+    bytes for any number of processes.
+
+    Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
+    """
+    from radejax.core.config import load_config
+    from radejax.simulation.config import FULL_SIZE, default_config
+    from radejax.simulation.dataset import simulate_dataset
+
+    entry.set_up_jax()
+    simulation = default_config()
+    if config is not None:
+        section = load_config(config).get("simulation")
+        if section is None:
+            raise UserError(f"{config} has no `simulation` section")
+        simulation = dict(section)
+    if full_size:
+        simulation |= FULL_SIZE
+    fields["sequences"] = sequence_numbers
+    simulation |= {name: value for name, value in fields.items() if value is not None}
+    simulate_dataset(simulation, out, num_workers=num_workers)
+    click.echo(f"simulated dataset in {out}")
 
 
 @click.group()
@@ -15,21 +76,12 @@ def data() -> None:
     """Look at a copy of K-Radar."""
 
 
-@data.command(cls=options.Command)
-@options.roots
-@options.labels
-@options.label_version
-@options.sequences
-@options.weather
+@data.command(cls=entry.Command)
+@entry.roots
+@entry.labelled_frames
 @click.option("--deep", is_flag=True, help="Read every tesseract whole.")
-def check(
-    roots: tuple[pathlib.Path, ...],
-    labels: pathlib.Path | None,
-    label_version: str,
-    deep: bool,
-    as_json: bool,
-    **part: Any,
-) -> None:
+@entry.json_option
+def check(roots: tuple[pathlib.Path, ...], as_json: bool, **options: Any) -> None:
     """Report what is there, what is missing and what is damaged.
 
     Exit code 1 if anything is missing or damaged.
@@ -38,14 +90,124 @@ def check(
     """
     from radejax.data.kradar.check import check_dataset
 
-    report = check_dataset(
-        roots,
-        labels=labels,
-        version=label_version,
-        deep=deep,
-        progress=not as_json,
-        **part,
-    )
-    options.echo_result(as_json, report.to_dict(), report.to_text())
+    report = check_dataset(roots, progress=not as_json, **options)
+    entry.echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
         raise SystemExit(entry.FAILED)
+
+
+def _shard(text: str) -> tuple[int, int]:
+    """Part i of n, i from 0."""
+    index, _, count = text.partition("/")
+    if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
+        raise click.BadParameter(f"{text!r}, expected i/n with i from 0 to n - 1")
+    return int(index), int(count)
+
+
+@click.command(cls=entry.Command)
+@entry.roots
+@click.option("--out", required=True, type=entry.FOLDER, help="Folder of the records.")
+@entry.labelled_frames
+@click.option(
+    "--dtype",
+    type=click.Choice(["float16", "uint8", "float32"]),
+    help="Default: that of the records in the folder, else float16.",
+)
+@entry.workers
+@click.option(
+    "--shard",
+    type=_shard,
+    metavar="I/N",
+    default="0/1",
+    show_default=True,
+    help="Every N-th frame from the I-th on, for several machines.",
+)
+def preprocess(
+    roots: tuple[pathlib.Path, ...],
+    out: pathlib.Path,
+    dtype: str | None,
+    num_workers: int | None,
+    shard: tuple[int, int],
+    **part: Any,
+) -> None:
+    """Project radar tensors to records of range-azimuth maps.
+
+    Run again, it preprocesses only frames without a record. Frames whose radar tensor is
+    missing or corrupted are skipped and listed, with exit code 1.
+
+    Example: radejax preprocess /disk1/kradar --out /fast/records --shard 3/16
+    """
+    from radejax.data import records
+    from radejax.data.kradar import KRadar
+
+    frames = KRadar(roots, **part)
+    click.echo(frames.summary().to_text(), err=True)
+    report = records.preprocess(
+        frames, out, dtype=dtype, shard=shard, num_workers=num_workers
+    )
+    click.echo(report.to_text())
+    if report.skipped:
+        raise SystemExit(entry.FAILED)
+
+
+@click.command(cls=entry.Command)
+@click.argument("roots", nargs=-1, type=entry.EXISTING)
+@click.option("--config", required=True, help="As of `radejax train`, :options too.")
+@click.option(
+    "--image-backbone",
+    required=True,
+    type=entry.EXISTING,
+    help="DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.",
+)
+@click.option(
+    "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."
+)
+@entry.labels
+@entry.sequences
+@entry.weather
+@click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32")
+@click.option("--batch-size", type=entry.COUNT, default=8)
+def embed(
+    roots: tuple[pathlib.Path, ...],
+    config: str,
+    image_backbone: pathlib.Path,
+    out: pathlib.Path,
+    dtype: str,
+    batch_size: int,
+    **part: Any,
+) -> None:
+    """Run the front images through the frozen backbone once, to train from.
+
+    Resumes where it stopped. Training then takes --embeddings OUT in place of images.
+    Without ROOTS: of the data set that the config simulates, made if it is not there.
+
+    Example: radejax embed /disk1/kradar --config dinorade
+    --image-backbone dinov3-vits16 --out /fast/embeddings
+    """
+    from radejax import models
+    from radejax.core.config import load_config
+    from radejax.data.kradar import KRadar
+    from radejax.inference.embed import embed_dataset
+    from radejax.runs.data import located, simulate_missing
+    from radejax.weights.image_backbone import load_image_backbone
+
+    entry.set_up_jax()
+    settings = load_config(config)
+    model = models.build(settings.model)
+    variables = load_image_backbone(image_backbone, model)
+    assert variables is not None  # as there is a path
+    if not roots:
+        settings = located(settings)
+        simulate_missing(settings)
+        roots = settings.data.roots
+    counts = embed_dataset(
+        model,
+        variables,
+        settings.model.image,
+        KRadar(roots, version=settings.data.label_version, **part),
+        out,
+        dtype=dtype,
+        resize=settings.data.camera.resize,
+        batch_size=batch_size,
+    )
+    click.echo(", ".join(f"{number:,} {name}" for name, number in counts.items()))

@@ -1,4 +1,4 @@
-"""`radejax detect`: boxes of every frame below some folders."""
+"""`radejax detect` and `export`: a trained model at work, here and elsewhere."""
 
 from __future__ import annotations
 
@@ -7,25 +7,29 @@ from typing import Any
 
 import click
 
-from radejax.cli import entry, options
+from radejax.cli import entry
 
 
-@click.command(cls=options.Command)
-@options.roots
+@click.command(cls=entry.Command)
+@entry.roots
 @click.option(
     "--model",
     "--workdir",
     "source",
     required=True,
-    type=options.EXISTING,
+    type=entry.EXISTING,
     help="Run of train.py, or what `radejax export` takes.",
 )
-@click.option("--out", required=True, type=options.FOLDER, help="Folder of the boxes.")
+@click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
 @click.option(
-    "--step", type=options.STEP, help='Checkpoint step or "best". Default: latest.'
+    "--step",
+    type=entry.step,
+    metavar="NUMBER|best",
+    help='Checkpoint step or "best". Default: latest.',
 )
-@options.sequences
-@options.weather
+@entry.labels
+@entry.sequences
+@entry.weather
 @click.option("--score-threshold", type=float, help="Default: that of the config.")
 @click.option("--nms-iou", type=float, help="Default: that of the config.")
 @click.option(
@@ -36,15 +40,11 @@ from radejax.cli import entry, options
     show_default=True,
     help="kitti: preds/000000.txt as K-Radar's tools write them.",
 )
-@click.option("--batch-size", type=options.COUNT, default=8, show_default=True)
+@click.option("--batch-size", type=entry.COUNT, default=8, show_default=True)
 @click.option(
-    "--labels",
-    type=options.EXISTING,
-    help="Label revision used to find each frame's camera image.",
+    "--image-backbone", type=entry.EXISTING, help="Weights of the image backbone."
 )
-@click.option(
-    "--image-backbone", type=options.EXISTING, help="Weights of the image backbone."
-)
+@entry.json_option
 def detect(
     roots: tuple[pathlib.Path, ...],
     source: pathlib.Path,
@@ -71,4 +71,68 @@ def detect(
         text += f"; {count['clipped']} with a size that was clipped to be positive"
     if "radar_only" in count:
         text += f"; {count['radar_only']} without an image, from the radar only"
-    options.echo_result(as_json, {**count, "out": str(out)}, text)
+    entry.echo_result(as_json, {**count, "out": str(out)}, text)
+
+
+@click.command(cls=entry.Command)
+@click.argument("source", type=entry.EXISTING)
+@click.option("--out", required=True, type=entry.FOLDER, help="Folder to write.")
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(["stablehlo", "onnx", "huggingface"]),
+    default="stablehlo",
+    show_default=True,
+)
+@entry.several(
+    "--platforms",
+    default=["cpu,cuda,tpu"],
+    show_default=True,
+    help="Of the StableHLO program.",
+)
+@click.option(
+    "--image-backbone",
+    type=entry.EXISTING,
+    help="Weights of the image backbone, if SOURCE has none.",
+)
+@click.option(
+    "--with-backbone",
+    is_flag=True,
+    help="Keep the weights of the image transformer. DINOv3's license restricts "
+    "redistribution.",
+)
+@click.option(
+    "--batch-size",
+    type=entry.COUNT,
+    default=1,
+    show_default=True,
+    help="Batch size of the ONNX files.",
+)
+@click.option(
+    "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
+)
+def export(
+    source: pathlib.Path,
+    out: pathlib.Path,
+    image_backbone: pathlib.Path | None,
+    **settings: Any,
+) -> None:
+    """Write a model as a folder that works elsewhere.
+
+    SOURCE is the workdir of a run, its checkpoints, one of them, an exported folder or an
+    official .pth file. "stablehlo" runs with jax only, for any batch size; "onnx" is for
+    ONNX Runtime and TensorRT, for one batch size; "huggingface" is weights, config and
+    model card. Detector.from_checkpoint reads all of them.
+
+    Example: radejax export runs/quickstart --out exported
+    """
+    from radejax.inference import export as exporting
+    from radejax.inference.detector import Detector
+
+    entry.set_up_jax()
+    detector = Detector.from_checkpoint(source, image_backbone=image_backbone)
+    done = exporting.export(detector, out, **settings)
+    text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
+    if done["left_out"]:
+        text += f", without {', '.join(done['left_out'])}"
+    click.echo(text)

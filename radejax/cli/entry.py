@@ -1,20 +1,25 @@
-"""What `train.py`, `evaluate.py` and `radejax` share: errors, logging, JAX's set-up.
+"""What the commands and the examples share: options, errors, logging, JAX's set-up.
 
-JAX and absl are imported by the functions that use them: `--help` should not wait.
+JAX and absl are imported by the function that uses them: `--help` should not wait.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import gc
+import json
 import logging
 import os
 import pathlib
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
-from radejax.core.errors import UserError, one_line
+import click
+
+from radejax.core import memory
 from radejax.core.files import is_no_space
 
 FAILED = 1
@@ -27,6 +32,9 @@ _WRONG_PATH = (
     IsADirectoryError,
     PermissionError,
 )
+
+
+# Errors and set-up -------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -44,74 +52,42 @@ def exit_codes(*, debug: bool = False) -> Iterator[None]:
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for the program's life
     try:
         yield
-    except KeyboardInterrupt as error:
-        second = f" ({error})" if str(error) else ""
-        _fail(UserError(f"interrupted{second}"), INTERRUPTED, debug)
-    except ValueError as error:
-        if not hasattr(error, "exit_code"):
+    except (ValueError, OSError, KeyboardInterrupt) as error:
+        code = _exit_code(error)
+        if debug or code is None:
             raise
-        _fail(error, error.exit_code, debug)
-    except _WRONG_PATH as error:
-        _fail(error, WRONG_USE, debug)
-    except OSError as error:
-        if error.errno != errno.EROFS and not is_no_space(error):
-            raise
-        _fail(error, WRONG_USE if error.errno == errno.EROFS else FAILED, debug)
+        sys.stderr.write(f"error: {_message(error)}\n")
+        raise SystemExit(code) from None
 
 
-def _fail(error: Exception, code: int, debug: bool) -> None:
-    if debug:
-        raise error
-    message = str(error)
-    if isinstance(error, OSError) and error.filename is not None:
-        message = f"{error.strerror}: {error.filename}"
-        if isinstance(error, FileNotFoundError):
-            message = f"no such file or folder: {error.filename}"
-        if error.errno == errno.EROFS:
-            message += "; name another place (--out, --workdir, --records, --data)"
-    sys.stderr.write(f"error: {message}\n")
-    raise SystemExit(code)
+def _exit_code(error: BaseException) -> int | None:
+    """None for an error that is not the user's."""
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    if not isinstance(error, OSError):
+        return getattr(error, "exit_code", None)
+    if is_no_space(error):
+        return FAILED
+    is_users = isinstance(error, _WRONG_PATH) or error.errno == errno.EROFS
+    return WRONG_USE if is_users else None
 
 
-def join_processes(
-    coordinator: str | None = None,
-    num_processes: int | None = None,
-    process_id: int | None = None,
-) -> None:
-    """Joins the other processes of a run; to be called before anything uses JAX.
-
-    Under Slurm, Open MPI, Kubernetes and on TPU pods JAX finds the arguments itself.
-
-    Args:
-        coordinator: "host:port" of process 0, with a port that is free there.
-        num_processes: Of the run.
-        process_id: Of this process, from 0.
-
-    Raises:
-        UserError: JAX finds no cluster, or the coordinator is not reached.
-    """
-    import jax
-
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    try:
-        jax.distributed.initialize(coordinator, num_processes, process_id)
-    except (ValueError, RuntimeError) as error:
-        raise UserError(
-            f"cannot join the other processes ({one_line(error)}); without Slurm, Open "
-            "MPI or a TPU pod give --coordinator HOST:PORT, --num-processes and "
-            "--process-id"
-        ) from error
-    if jax.process_index():
-        logging.getLogger("radejax").setLevel(logging.ERROR)
-        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported
+def _message(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return f"interrupted ({error})" if str(error) else "interrupted"
+    if not isinstance(error, OSError) or error.filename is None:
+        return str(error)
+    message = f"{error.strerror}: {error.filename}"
+    if error.errno == errno.EROFS:
+        message += "; name another place (--out, --workdir, --records, --data)"
+    return message
 
 
-def set_up_jax(*, cache: bool = True) -> None:
+def set_up_jax() -> None:
     """Logging at level info without noise, and a compilation cache that persists.
 
-    Args:
-        cache: Keep compiled programs in the folder that the environment variable
-            JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
+    Compiled programs are kept in the folder that the environment variable
+    JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
     """
     import jax
     from absl import flags
@@ -127,8 +103,6 @@ def set_up_jax(*, cache: bool = True) -> None:
     # Orbax logs every step it takes; its errors are raised as well.
     absl_logging.set_verbosity(absl_logging.FATAL)
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read one of theirs
-    if not cache:
-        return
     home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
     folder = os.environ.get(
         "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(home) / "radejax" / "jax")
@@ -136,3 +110,134 @@ def set_up_jax(*, cache: bool = True) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     # Every program: the fifty small ones of a start take a second and 200 kB.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+# Commands ----------------------------------------------------------------------------
+
+
+class Program(click.Command):
+    """A command that sets up memory first when it runs as a program."""
+
+    def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
+        """Runs it with some arguments, by default those of this process."""
+        if args is None:
+            memory.restart_with_huge_pages()
+            # Tracing creates millions of objects that stay: with Python's thresholds
+            # the collector takes a sixth of a start.
+            gc.set_threshold(50_000, 20, 50)
+        return super().main(args, *others, **options)
+
+
+class Group(Program, click.Group):
+    """Commands of one program."""
+
+
+class Command(Program):
+    """A command whose errors of the user are one line and an exit code.
+
+    Every command has `--debug`, which lets their tracebacks through.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.context_settings["help_option_names"] = ["-h", "--help"]
+        text = "Show tracebacks of user errors."
+        self.params.append(click.Option(["--debug"], is_flag=True, help=text))
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with exit_codes(debug=ctx.params.pop("debug")):
+            return super().invoke(ctx)
+
+
+def echo_result(as_json: bool, values: Any, text: str) -> None:
+    """Prints the result for a machine or for a person."""
+    click.echo(json.dumps(values) if as_json else text)
+
+
+# Options -----------------------------------------------------------------------------
+
+COUNT = click.IntRange(1)
+FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
+FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
+EXISTING = click.Path(path_type=pathlib.Path, exists=True)
+
+
+def step(text: str) -> int | str:
+    """Type of `--step`: the number of a checkpoint, or "best"."""
+    if text != "best" and not text.isdecimal():
+        raise click.BadParameter(f'{text!r} is neither a number nor "best"')
+    return text if text == "best" else int(text)
+
+
+def several(
+    *names: str,
+    kind: Callable[[str], Any] = str,
+    metavar: str = "A,B,...",
+    **settings: Any,
+) -> Callable[[Any], Any]:
+    """An option that takes several: `--data A,B --data C` gives A, B and C.
+
+    Args:
+        *names: As `click.option` takes them.
+        kind: What each of them is made.
+        metavar: An example.
+        **settings: Of `click.option`.
+    """
+
+    def split(
+        _: click.Context, __: click.Parameter, values: tuple[str, ...]
+    ) -> tuple[Any, ...] | None:
+        words = (word.strip() for value in values for word in value.split(","))
+        try:
+            found = tuple(kind(word) for word in words if word)
+        except ValueError:
+            found = ()
+        if values and not found:
+            raise click.BadParameter(f"{','.join(values)!r}, expected {metavar}")
+        return found or None
+
+    return click.option(
+        *names, multiple=True, callback=split, metavar=metavar, **settings
+    )
+
+
+def together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Several options as one decorator, in the order of the help."""
+
+    def decorate(command: Any) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print the result as JSON."
+)
+roots = click.argument("roots", nargs=-1, required=True, type=EXISTING)
+labels = click.option(
+    "--labels", type=EXISTING, help="Folder or zip of a label revision."
+)
+sequences = several(
+    "--sequences",
+    "sequence_numbers",
+    kind=int,
+    metavar="1,5,58",
+    help="Only these; all by default.",
+)
+weather = several(
+    "--weather", metavar="fog,rain", help="Only sequences of these; all by default."
+)
+labelled_frames = together(
+    labels,
+    click.option("--label-version", "version", default="v2.1", show_default=True),
+    sequences,
+    weather,
+)
+workers = click.option(
+    "--workers",
+    "num_workers",
+    type=COUNT,
+    help="Number of processes. Default: one per core.",
+)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from typing import Any
 
 import click
 
-from radejax.cli import entry, options
+from radejax.cli import entry
+from radejax.core.errors import UserError, one_line
 
 _PREFIX = "--config."
 
 
-class _Command(options.Command):
+class _Command(entry.Command):
     """Also takes any field of the config: `--config.train.batch_size=4`.
 
     The last one counts where a field is given twice, and `--config.logging.wandb` alone is
@@ -20,18 +23,12 @@ class _Command(options.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Click's words; fields and their texts go to `ctx.meta["fields"]`."""
-        fields = ctx.meta["fields"] = {}
-        words, left = [], list(args)
-        while left:
-            word = left.pop(0)
-            if not word.startswith(_PREFIX):
-                words.append(word)
-                continue
-            name, is_set, text = word.removeprefix(_PREFIX).partition("=")
-            if not is_set:
-                is_value = bool(left) and not left[0].startswith("--")
-                text = left.pop(0) if is_value else "true"
-            fields[name] = text
+        words = [word for word in args if not word.startswith(_PREFIX)]
+        fields = [word.removeprefix(_PREFIX) for word in args if word not in words]
+        pairs = (field.partition("=") for field in fields)
+        ctx.meta["fields"] = {
+            n: text if is_set else "true" for n, is_set, text in pairs
+        }
         return super().parse_args(ctx, words)
 
 
@@ -45,17 +42,15 @@ class _Command(options.Command):
 @click.option(
     "--workdir", help="Folder of the run; runs/<name of the config> by default."
 )
-@click.option(
+@entry.several(
     "--data",
-    multiple=True,
-    callback=options.split_words,
-    metavar="A,B,...",
+    "roots",
     help="Roots of K-Radar. Without it, configs with a `simulation` section simulate "
     "one under data/.",
 )
 @click.option("--labels", help="Folder or zip of a label revision; the sequences' own.")
-@options.sequences
-@options.weather
+@entry.sequences
+@entry.weather
 @click.option("--records", help="Projected frames; made beside the data if missing.")
 @click.option(
     "--init-from", help="Weights to start: official .pth, or another workdir."
@@ -71,10 +66,9 @@ class _Command(options.Command):
     help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
     "repository); the roots' own by default.",
 )
-@click.option(
+@entry.several(
     "--seeds",
-    multiple=True,
-    callback=options.numbers,
+    kind=int,
     metavar="0,1,2",
     help="Train once per seed, in seed0, seed1, ..., instead of with config.seed.",
 )
@@ -87,16 +81,13 @@ class _Command(options.Command):
 @click.option("--coordinator", help="host:port of process 0, where no cluster tells.")
 @click.option("--num-processes", type=int, help="Likewise.")
 @click.option("--process-id", type=int, help="Likewise, from 0.")
-@click.option("--debug", is_flag=True, help="Show tracebacks of user errors.")
 @click.pass_context
 def train(
     ctx: click.Context,
     *,
     config: str,
     workdir: str | None,
-    data: tuple[str, ...],
     sequence_numbers: tuple[int, ...] | None,
-    weather: tuple[str, ...] | None,
     init_from: str | None,
     seeds: tuple[int, ...] | None,
     profile: str | None,
@@ -104,9 +95,7 @@ def train(
     coordinator: str | None,
     num_processes: int | None,
     process_id: int | None,
-    debug: bool,
-    as_json: bool,
-    **paths: Any,
+    **data: Any,
 ) -> None:
     """Train a detector, then evaluate it.
 
@@ -123,17 +112,52 @@ def train(
 
     settings = load_config(config)
     override(settings, ctx.meta["fields"])
-    paths |= {"roots": data, "sequences": sequence_numbers, "weather": weather}
-    settings.data.update({name: value for name, value in paths.items() if value})
+    data["sequences"] = sequence_numbers
+    settings.data.update({name: value for name, value in data.items() if value})
     entry.set_up_jax()
     place = coordinator, num_processes, process_id
     if distributed or place != (None,) * 3:
-        entry.join_processes(*place)
+        join_processes(*place)
     given: dict[str, Any] = {
         "name": config_name(config),
         "workdir": workdir,
         "init_from": init_from,
         "profile": profile or "",
     }
-    folder = run_seeds(settings, seeds, **given) if seeds else run(settings, **given)
-    options.echo_result(as_json, {"workdir": str(folder)}, "")
+    if seeds:
+        run_seeds(settings, seeds, **given)
+    else:
+        run(settings, **given)
+
+
+def join_processes(
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
+) -> None:
+    """Joins the other processes of a run; to be called before anything uses JAX.
+
+    Under Slurm, Open MPI, Kubernetes and on TPU pods JAX finds the arguments itself.
+
+    Args:
+        coordinator: "host:port" of process 0, with a port that is free there.
+        num_processes: Of the run.
+        process_id: Of this process, from 0.
+
+    Raises:
+        UserError: JAX finds no cluster, or the coordinator is not reached.
+    """
+    import jax
+
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        jax.distributed.initialize(coordinator, num_processes, process_id)
+    except (ValueError, RuntimeError) as error:
+        raise UserError(
+            f"cannot join the other processes ({one_line(error)}); without Slurm, Open "
+            "MPI or a TPU pod give --coordinator HOST:PORT, --num-processes and "
+            "--process-id"
+        ) from error
+    if jax.process_index():
+        logging.getLogger("radejax").setLevel(logging.ERROR)
+        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported

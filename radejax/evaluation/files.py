@@ -204,7 +204,7 @@ class Source:
         data: Root folders of K-Radar, or none.
         labels: Folder or zip of a label revision.
         label_version: v1.0, v1.1, v2.0 or v2.1.
-        split: "train", "test", a split file, or None for every frame.
+        split: "train", "test", a split file, or "all" for every frame.
         ground_truth: File of ground truth instead, or the folder of a report or a run.
         frames: JSON file of the frame table (columns) for `ground_truth`; by default the
             `frames.json` in the same folder.
@@ -217,7 +217,7 @@ class Source:
     data: tuple[str, ...] = ()
     labels: str | None = None
     label_version: str = "v2.1"
-    split: str | None = "test"
+    split: str = "test"
     ground_truth: str | None = None
     frames: str | None = None
     sequences: tuple[int, ...] = ()
@@ -298,11 +298,11 @@ def _load_ground_truth(
             list(source.data) or None,
             source.labels,
             version=source.label_version,
-            split=source.split,
+            split=None if source.split == "all" else source.split,
             classes=classes,
         )
         counts = {f"labels: {what}": int(n) for what, n in data.counts.items()}
-        return *tables_from_frames(data, source.split or "all"), counts
+        return *tables_from_frames(data, source.split), counts
     if _is_kitti(path):
         objects, _, frames = read_kitti(path)
         return objects, frames, {}

@@ -7,55 +7,38 @@ import jax
 import pytest
 
 from radejax.cli import entry
+from radejax.cli.train import join_processes
 from radejax.core.errors import DataError, DiskFullError, UserError
+
+READ_ONLY = OSError(errno.EROFS, "Read-only file system", "/cdrom/records")
+FULL = OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.mark.parametrize(
     ("error", "code", "text"),
     [
-        (UserError("no such field"), 2, "error: no such field\n"),
-        (DataError("a.txt:3: half a line"), 1, "error: a.txt:3: half a line\n"),
-        (
-            FileNotFoundError(errno.ENOENT, "No such file", "/nowhere"),
-            2,
-            "error: no such file or folder: /nowhere\n",
-        ),
-        (FileNotFoundError("no run in x"), 2, "error: no run in x\n"),
-        (
-            PermissionError(errno.EACCES, "Permission denied", "/root/x"),
-            2,
-            "error: Permission denied: /root/x\n",
-        ),
-        (
-            IsADirectoryError(errno.EISDIR, "Is a directory", "/tmp"),
-            2,
-            "error: Is a directory: /tmp\n",
-        ),
-        (
-            OSError(errno.EROFS, "Read-only file system", "/cdrom/records"),
-            2,
-            "error: Read-only file system: /cdrom/records; name another place (--out, "
-            "--workdir, --records, --data)\n",
-        ),
-        (KeyboardInterrupt(), 130, "error: interrupted\n"),
-        (
-            KeyboardInterrupt("second SIGINT"),
-            130,
-            "error: interrupted (second SIGINT)\n",
-        ),
-        (OSError(errno.ENOSPC, "No space left on device"), 1, None),
-        (DiskFullError("no space left"), 1, "error: no space left\n"),
+        (UserError("no such field"), 2, "no such field"),
+        (DataError("a.txt:3: half a line"), 1, "a.txt:3: half a line"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "/x"), 2, "No such file: /x"),
+        (FileNotFoundError("no run in x"), 2, "no run in x"),
+        (PermissionError(errno.EACCES, "denied", "/root"), 2, "denied: /root"),
+        (IsADirectoryError(errno.EISDIR, "a directory", "/x"), 2, "a directory: /x"),
+        (READ_ONLY, 2, "Read-only file system: /cdrom/records; name another place (--"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (KeyboardInterrupt("second SIGINT"), 130, "interrupted (second SIGINT)"),
+        (FULL, 1, "[Errno 28] No space left on device"),
+        (DiskFullError("no space left"), 1, "no space left"),
     ],
 )
 def test_user_errors_end_in_one_line(
-    error: BaseException, code: int, text: str | None, capsys: pytest.CaptureFixture
+    error: BaseException, code: int, text: str, capsys: pytest.CaptureFixture
 ) -> None:
     with pytest.raises(SystemExit) as ended, entry.exit_codes():
         raise error
     assert ended.value.code == code
     written = capsys.readouterr().err
     assert written.count("\n") == 1
-    assert text is None or written == text
+    assert written.startswith(f"error: {text}")
 
 
 def test_closed_standard_error_says_nothing_and_keeps_the_exit_code(
@@ -95,4 +78,4 @@ def test_a_coordinator_that_is_not_reached_is_one_line(
     with pytest.raises(
         UserError, match=r"cannot join the other processes \(DEADLINE.*"
     ):
-        entry.join_processes("h:1", 2, 1)
+        join_processes("h:1", 2, 1)

@@ -127,7 +127,6 @@ def test_command_line(stored):
         (("evaluate",), "radejax evaluate RUN"),
         (("compare", "a"), "at least two runs"),
         (("compare", "a", "b", "--bootstrap=0"), "a comparison needs 1 resample"),
-        (("score", "a.json", "--iou", "x"), "--iou must be numbers"),
         (("score", "a.json", "--protocols", "x"), "config.evaluation.protocols is"),
         (("score", "none.npz", "--ground-truth", "none.npz"), "none.npz"),
     ],

@@ -14,7 +14,7 @@ import safetensors.numpy
 from ml_collections import ConfigDict
 
 from radejax import Detector, UserError, models
-from radejax.cli.demo import MODEL
+from radejax.cli.figures import MODEL
 from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
 from radejax.data.records import Records

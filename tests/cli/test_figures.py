@@ -1,4 +1,4 @@
-"""One frame on radar and camera."""
+"""Frames on radar and camera, and in a recording."""
 
 import pathlib
 
@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from radejax.cli.overlay import overlay
+from radejax.cli.figures import overlay, viewer_scenes
+from radejax.data.kradar import KRadar
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.visualize import style
 
@@ -35,8 +36,8 @@ def test_the_first_frame_of_a_sequence_is_drawn(
     half = name.partition("_")[0]  # as files of `radejax detect` are named
     done = _run(f"1/{half}", root, "--out", tmp_path / "half.png")
     assert done.exit_code == 0, done.output
-    pictures = [(tmp_path / f"{of}.png").read_bytes() for of in ("first", "half")]
-    assert pictures[0] == pictures[1]
+    first = (tmp_path / "first.png").read_bytes()
+    assert first == (tmp_path / "half.png").read_bytes()
     picture = np.asarray(Image.open(tmp_path / "first.png").convert("RGB"))
     assert picture.shape[0] > 300
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
@@ -67,8 +68,8 @@ def test_slices_and_a_sequence_in_motion(
     with Image.open(slices) as picture:
         width, height = picture.size
     assert width > 2.5 * height  # three planes side by side
-    done = _run("1", root, "--out", tmp_path / "all.gif", "--max-frames", 3, "--json")
-    assert '"frames": 1' in done.output
+    done = _run("1", root, "--out", tmp_path / "all.gif", "--max-frames", 3)
+    assert done.exit_code == 0, done.output
     with Image.open(tmp_path / "all.gif") as picture:
         assert picture.format == "GIF"
 
@@ -106,3 +107,13 @@ def test_the_region_is_that_of_the_evaluation_and_named(
     assert _run("1", root, "--out", tmp_path / "a.png", *arguments).exit_code == 0
     texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert texts[1:] == ([expected] if expected else [])
+
+
+def test_frames_with_projections_alone_are_shown(tmp_path: pathlib.Path) -> None:
+    config = default_config() | {"output": "projection", "frames_per_sequence": 1}
+    config.update(train_sequences=1, test_sequences=0)
+    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    frames = KRadar([root], visibility=None)
+    (shown,) = viewer_scenes(frames, frames.grid)
+    stored = np.load(frames[0].projection_path)
+    np.testing.assert_allclose(shown.projection, np.moveaxis(stored, 0, -1))

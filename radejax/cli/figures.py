@@ -1,0 +1,225 @@
+"""`radejax overlay`, `view` and `demo`: frames, labels and detections to look at."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import tempfile
+from collections.abc import Iterator
+from typing import Any
+
+import click
+
+from radejax.cli import entry
+from radejax.core.errors import UserError
+
+ANIMATIONS = (".gif", ".mp4")
+
+MODEL = pathlib.Path(__file__).with_name("demo_model")
+"""Saved model: seed 0 of the quickstart; docs/detector.md has the commands that made it."""
+
+
+@click.command(cls=entry.Command)
+@click.argument("name", metavar="[FRAME]", default="")
+@entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
+@entry.labelled_frames
+@click.option("--out", type=entry.FILE, default="overlay.png", show_default=True)
+@click.option("--slices", is_flag=True, help="Draw slices of the projection.")
+@click.option(
+    "--roi",
+    type=click.Choice(["narrow", "wide", "none"]),
+    default="narrow",
+    show_default=True,
+    help="Region of interest to draw.",
+)
+@click.option(
+    "--max-frames", type=entry.COUNT, help="Frames of an animation. Default: all."
+)
+def overlay(
+    name: str,
+    roots: tuple[str, ...],
+    out: pathlib.Path,
+    slices: bool,
+    roi: str,
+    max_frames: int | None,
+    **part: Any,
+) -> None:
+    """Draw one frame's labels on radar and camera: the first look at new data.
+
+    FRAME is sequence/radar_lidar, sequence/radar, or a sequence, of which the first
+    frame is drawn. All frames are drawn where --out ends in .gif or .mp4.
+    --sequences and --weather select frames without a FRAME.
+
+    Example: radejax overlay 1/00033_00001 --data ROOT
+    """
+    import tqdm
+
+    from radejax.data.kradar import KRadar
+    from radejax.visualize.recordings import animate
+    from radejax.visualize.style import save_figure
+
+    sequence, _, frame_name = name.partition("/")
+    if sequence.isdecimal():
+        part["sequence_numbers"] = (int(sequence),)
+    elif name or not (part["sequence_numbers"] or part["weather"]):
+        raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
+    frames = KRadar(roots, visibility=None, **part)
+    if not len(frames):
+        raise UserError("no frames of these sequences and weathers")
+    found = [
+        frame
+        for frame in frames
+        if frame_name in ("", frame.name, frame.name.partition("_")[0])
+    ]
+    if not found:
+        raise UserError(
+            f"no frame {frame_name} in sequence {sequence}; there are "
+            f"{frames[0].name} to {frames[-1].name}"
+        )
+    if out.suffix.lower() in ANIMATIONS:
+        shown = tqdm.tqdm(found[:max_frames], "draw", unit="frame")
+        animate((_draw(frame, frames.grid, slices, roi) for frame in shown), out)
+    else:
+        save_figure(_draw(found[0], frames.grid, slices, roi), out)
+    click.echo(f"drew {out}")
+
+
+def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
+    """Figure of one frame: slices of the projection, or radar map and camera image.
+
+    Raises:
+        UserError: It has neither tensor nor projection.
+    """
+    from radejax.core.structures import ROIS
+    from radejax.runs.figures import frame_scene
+    from radejax.visualize.draw import draw_frame
+    from radejax.visualize.slices import draw_slices
+
+    projection = frame.read_projection(grid)
+    scene = frame_scene(frame, projection, grid, roi=ROIS.get(roi))
+    if not slices:
+        return draw_frame(scene)
+    figure = draw_slices(projection, grid, ground_truth=scene.ground_truth)
+    figure.suptitle(scene.title)
+    return figure
+
+
+@click.command(cls=entry.Command)
+@entry.roots
+@click.option("--out", type=entry.FILE, default="recording.rrd", show_default=True)
+@entry.labelled_frames
+@click.option("--workdir", type=entry.EXISTING, help="Run whose detections are shown.")
+@click.option("--max-frames", type=entry.COUNT, help="Frames to record. Default: all.")
+@click.option(
+    "--open", "open_it", is_flag=True, help="Open the recording in the viewer."
+)
+def view(
+    roots: tuple[pathlib.Path, ...],
+    out: pathlib.Path,
+    workdir: pathlib.Path | None,
+    max_frames: int | None,
+    open_it: bool,
+    **part: Any,
+) -> None:
+    """Record a sequence for the rerun viewer (extra "viewer").
+
+    Frames without radar tensor and projection are skipped and counted.
+
+    Example: radejax view data/kradar --sequences 5 --out five.rrd --open
+    """
+    import tqdm
+
+    from radejax.data.kradar import KRadar
+    from radejax.inference.detector import Detector
+    from radejax.visualize.recordings import open_viewer, write_recording
+
+    frames = KRadar(roots, visibility=None, **part)
+    complete = [frame for frame in frames if frame.radar_path]
+    if not complete:
+        raise UserError(
+            f"no radar tensor or projection for any of {len(frames)} labelled frames"
+        )
+    shown = complete[:max_frames]
+    detector = None if workdir is None else Detector.from_workdir(workdir)
+    bar = tqdm.tqdm(shown, desc="record", unit="frame")
+    write_recording(viewer_scenes(bar, frames.grid, detector), out)
+    if open_it:
+        open_viewer(out)
+    text = f"{len(shown)} frames written to {out}"
+    if lacking := len(frames) - len(complete):
+        text += f"; {lacking} without radar tensor or projection skipped"
+    click.echo(text)
+
+
+def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:
+    """`Scene` of each frame with radar data, read as it is needed."""
+    from radejax.core.structures import Boxes
+    from radejax.runs.figures import frame_scene
+
+    for frame in frames:
+        projection, time_s = frame.read_projection(grid), frame.header.timestamp_s
+        scene = frame_scene(frame, projection, grid, time_s=time_s)
+        if detector is not None:
+            inputs = [projection]
+            if detector.takes_camera and scene.camera is not None:
+                inputs += [frame.camera_path, scene.camera]
+            found = Boxes(**detector(*inputs).to_columns())
+            scene = dataclasses.replace(scene, predictions=found)
+        yield scene
+
+
+@click.command(cls=entry.Command)
+@click.option("--out", type=entry.FILE, default="demo.png", show_default=True)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=1000,
+    show_default=True,
+    help="Seed of the scene; the model was trained on scenes of seed 0.",
+)
+def demo(out: pathlib.Path, seed: int) -> None:
+    """Simulate a frame, detect its objects with a small trained model, draw both.
+
+    Only this package is needed. The model is that of the quickstart: it was trained on
+    simulated frames of a coarse radar, not on K-Radar's.
+
+    Example: radejax demo --out demo.png
+    """
+    from radejax.core.structures import NARROW_ROI, Boxes
+    from radejax.data.kradar import KRadar
+    from radejax.inference.detector import Detector
+    from radejax.runs.figures import frame_scene
+    from radejax.simulation.config import default_config
+    from radejax.simulation.dataset import simulate_dataset
+    from radejax.visualize.draw import draw_frame
+    from radejax.visualize.style import figure_format, save_figure
+
+    figure_format(out)  # before the frame is simulated
+    entry.set_up_jax()
+    simulation = default_config() | {
+        "seed": seed,
+        "train_sequences": 0,
+        "test_sequences": 1,
+        "frames_per_sequence": 1,
+        "image_width": 1280,
+        "image_height": 720,
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        simulate_dataset(simulation, folder)
+        frames = KRadar([folder])
+        (frame,) = frames
+        projection = frame.read_projection(frames.grid)
+        detector = Detector.from_checkpoint(MODEL)
+        found = Boxes(**detector(projection).to_columns())
+        scene = frame_scene(
+            frame,
+            projection,
+            frames.grid,
+            predictions=found,
+            score_threshold=detector.score_threshold,
+            roi=NARROW_ROI,
+            title=f"simulated frame, seed {seed}, {frame.weather}",
+        )
+    save_figure(draw_frame(scene), out)
+    num_labelled = len(frame.boxes)
+    click.echo(f"{len(found)} boxes found, {num_labelled} labelled objects: see {out}")
