@@ -23,7 +23,7 @@ _LAZY = {
     "draw_frame": "visualize.draw",
     "evaluate": "evaluation",
     "frame_scene": "runs.figures",
-    "front_view": "data.cameras",
+    "front_view": "data.dataset",
     "load_config": "core.config",
     "load_model": "inference.saved",
     "predict_dataset": "inference.predict",

@@ -14,9 +14,10 @@ from PIL import Image
 
 from radejax import models
 from radejax.core.errors import UserError
-from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import DATA_SETS, data_set
 from radejax.data.kradar import KRadar
+from radejax.data.pipeline import camera_inputs
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.losses.detection import LOSSES

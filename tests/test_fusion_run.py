@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from radejax.cli.main import main
 from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
-from radejax.data.cameras import require_images
+from radejax.data.pipeline import require_images
 from radejax.data.records import open_embeddings
 from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name

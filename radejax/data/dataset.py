@@ -14,9 +14,10 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 
 from radejax.core.errors import UserError, require
+from radejax.data.cameras import IMAGE_SIZE, read_left_image
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -177,3 +178,23 @@ def data_set(name: str) -> Callable[..., LabelledFrames]:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UserError(f"config.data.format is {name!r}: {error}") from None
+
+
+def front_view(
+    frame: LabelledFrame,
+) -> tuple[UInt8[np.ndarray, "H W 3"] | None, CameraCalibration | None]:
+    """Left front image of a frame and its calibration, to draw.
+
+    Images of another size than the calibration's are resized to it. None where there is
+    none.
+
+    Raises:
+        DataError: A file is corrupted.
+    """
+    if frame.camera_path is None:
+        return None, None
+    camera = None
+    if frame.camera_calibration_path is not None:
+        camera = frame.read_calibration()
+    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
+    return read_left_image(frame.camera_path, size, resize=True), camera

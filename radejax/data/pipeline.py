@@ -7,23 +7,179 @@ never on threads; the state of the iterator is one number.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import logging
+import pathlib
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import chex
 import grain
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 
 from radejax.core.errors import UserError, require
 from radejax.core.structures import CLASSES, Batch
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import CameraInputs, no_camera
-from radejax.data.dataset import FrameSequence
+from radejax.data.cameras import CameraOptions, no_camera, read_left_image
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.records import Records
 from radejax.geometry.boxes import boxes8_from_7
-from radejax.geometry.camera import Camera, stack_cameras
+from radejax.geometry.camera import Camera, CameraCalibration, stack_cameras
+
+_log = logging.getLogger(__name__)
+
+# Images and cameras ------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraInputs:
+    """What a model sees beside the radar: an image and a camera for every frame.
+
+    Attributes:
+        cameras: One per frame, NumPy float64; `is_valid` is False where there is none.
+        image_size: Height and width of the images that the model sees.
+        options: That they were made with.
+        features: What an image backbone made of the images, in their place, or None.
+        image_paths: Front image of every frame, None where it is missing.
+        feature_keys: Key of each frame's features, None where it has none.
+    """
+
+    cameras: tuple[Camera, ...]
+    image_size: tuple[int, int]
+    options: CameraOptions
+    features: Records | None
+    image_paths: tuple[pathlib.Path | None, ...]
+    feature_keys: tuple[str | None, ...]
+
+    def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
+        """Black images `[count, H, W, 3]` uint8, or zero features."""
+        if self.features is not None:
+            return np.zeros((count, *self.features.shape), self.features.dtype)
+        return np.zeros((count, *self.image_size, 3), np.uint8)
+
+    def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
+        """Image (or features) of one frame; black if it is missing."""
+        key, path = self.feature_keys[index], self.image_paths[index]
+        if self.features is None and path is not None:
+            return read_left_image(path, self.image_size, resize=self.options.resize)
+        if self.features is not None and key is not None:
+            return self.features[key]
+        return self.empty_images(1)[0]
+
+
+def camera_inputs(
+    frames: FrameSequence,
+    image_size: tuple[int, int],
+    options: CameraOptions,
+    features: Records | None = None,
+) -> CameraInputs:
+    """Cameras of left front images, each calibration file read once.
+
+    Args:
+        frames: Frames of a data set.
+        image_size: Height and width of the images that the model sees.
+        options: With `allow_missing`, frames without an image or a calibration get a
+            black image and a camera whose `is_valid` is False, and how many is logged.
+        features: Output of `radejax embed`, see `open_embeddings`; the image files may
+            then be gone.
+
+    Raises:
+        UserError: A frame has no image or calibration, and not `allow_missing`; the
+            calibration is of images of another size, and not `resize`; or an image is
+            not among the features.
+        DataError: A calibration file is corrupted.
+    """
+    has_image = [frame.camera_path is not None for frame in frames]
+    embedded: Collection[str] = ()
+    if features is not None:
+        embedded = features.keys()
+        files = zip(frames, has_image, strict=True)
+        has_image = [frame.key in embedded for frame in frames]
+        if absent := [f.key for f, has in files if has and f.key not in embedded]:
+            raise UserError(
+                f"{features.folder}: {len(absent)} of {len(frames)} frames have an image "
+                f"that is not embedded, the first is {absent[0]}; embed all of the data: "
+                "`radejax embed`"
+            )
+    cameras: list[Camera] = []
+    missing: list[str] = []
+    known: dict[Any, Camera] = {}
+    for frame, has in zip(frames, has_image, strict=True):
+        if not has or frame.camera_calibration_path is None:
+            missing.append(frame.key)
+            cameras.append(no_camera(image_size))
+            continue
+        shift = options.shift(frame.radar_from_lidar_m, frame.radar_from_lidar_z_m)
+        source = frame.camera_calibration_path, shift
+        if source not in known:
+            calibration = frame.read_calibration(shift)
+            known[source] = _camera(frame, calibration, image_size, options)
+        cameras.append(known[source])
+    if missing and not options.allow_missing:
+        raise UserError(
+            f"{len(missing)} of {len(frames)} frames have no front image or no camera "
+            f"calibration, the first is {missing[0]}; "
+            "config.data.camera.allow_missing=True uses only the radar there"
+        )
+    if missing:
+        _log.warning(
+            "%d of %d frames have no front image or no camera calibration: radar only",
+            len(missing),
+            len(frames),
+        )
+    return CameraInputs(
+        tuple(cameras),
+        (*image_size,),
+        options,
+        features,
+        tuple(frame.camera_path for frame in frames),
+        tuple(frame.key if frame.key in embedded else None for frame in frames),
+    )
+
+
+def _camera(
+    frame: LabelledFrame,
+    calibration: CameraCalibration,
+    image_size: tuple[int, int],
+    options: CameraOptions,
+) -> Camera:
+    """The camera of one frame, for images of the model's size."""
+    height, width = image_size
+    if (calibration.height, calibration.width) != (height, width):
+        if not options.resize:
+            raise UserError(
+                f"{frame.camera_calibration_path}: calibration of {calibration.width} x "
+                f"{calibration.height} images, the model sees {width} x {height} "
+                "(config.model.image.size); config.data.camera.resize=True resizes"
+            )
+        calibration = calibration.resized(width, height)
+    return calibration.camera(options.projection)
+
+
+def require_images(
+    frames: FrameSequence, inputs: CameraInputs | None, split: str = "train"
+) -> None:
+    """`UserError` if no frame has both an image and a calibration.
+
+    Args:
+        frames: Frames of the split.
+        inputs: Inputs of these frames; None for models without a camera.
+        split: Its name, for the message.
+    """
+    if inputs is None or any(camera.is_valid for camera in inputs.cameras):
+        return
+    images = sum(frame.camera_path is None for frame in frames)
+    calibrations = sum(frame.camera_calibration_path is None for frame in frames)
+    raise UserError(
+        f"no frame of the {split} split ({len(frames)}) can use the camera: {images} have "
+        f"no front image (cam-front/cam-front_*.png), {calibrations} no camera calibration "
+        "(calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of K-Radar's repository: "
+        "--camera-calibration FOLDER)"
+    )
+
+
+# Batches -----------------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)

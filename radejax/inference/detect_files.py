@@ -19,9 +19,9 @@ import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Detections
-from radejax.data.cameras import camera_inputs
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
+from radejax.data.pipeline import camera_inputs
 from radejax.data.tesseract import read_frame
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera

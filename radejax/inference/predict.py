@@ -11,9 +11,13 @@ from jaxtyping import Shaped
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
-from radejax.data.cameras import CameraInputs
 from radejax.data.dataset import FrameSequence
-from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.pipeline import (
+    CameraInputs,
+    LoaderOptions,
+    make_loader,
+    make_table,
+)
 from radejax.data.records import Records
 from radejax.inference.detector import Detector
 from radejax.training import distributed
@@ -36,7 +40,7 @@ def predict_dataset(
         records: Projections of the frames.
         frames: Which frames, in which order.
         batch_size: Frames at once; rounded up to a multiple of the devices.
-        images: Images of these frames, for a radar-camera model, see `data.cameras`.
+        images: Images of these frames, for a radar-camera model, see `camera_inputs`.
         progress: Show a progress bar.
         should_stop: Asked before every batch.
 

@@ -23,16 +23,18 @@ from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import (
-    CameraInputs,
-    CameraOptions,
-    camera_inputs,
-    check_embeddable,
-    require_images,
-)
+from radejax.data.cameras import CameraOptions, check_embeddable
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.kradar.dataset import held_out
-from radejax.data.pipeline import LoaderOptions, check_enough, make_loader, make_table
+from radejax.data.pipeline import (
+    CameraInputs,
+    LoaderOptions,
+    camera_inputs,
+    check_enough,
+    make_loader,
+    make_table,
+    require_images,
+)
 from radejax.data.records import (
     Records,
     describe_grid,

@@ -20,8 +20,8 @@ from ml_collections import ConfigDict
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
-from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.pipeline import require_images
 from radejax.data.projection import decode
 from radejax.evaluation.boxes import Columns, roi_bounds
 from radejax.evaluation.files import tables_from_frames

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from radejax.core.structures import Boxes
-from radejax.data.cameras import front_view
-from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.dataset import FrameSequence, LabelledFrame, front_view
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.projection import decode
 from radejax.geometry.radar_grid import RadarGrid

@@ -13,9 +13,14 @@ from PIL import Image
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import IMAGE_SIZE, CameraOptions, camera_inputs
+from radejax.data.cameras import IMAGE_SIZE, CameraOptions
 from radejax.data.kradar import KRadar
-from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.pipeline import (
+    LoaderOptions,
+    camera_inputs,
+    make_loader,
+    make_table,
+)
 from radejax.data.records import Records, open_projections, preprocess
 from radejax.geometry.camera import CameraCalibration
 

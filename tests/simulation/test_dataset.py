@@ -14,8 +14,9 @@ import pytest
 from PIL import Image
 
 from radejax.core.errors import UserError
-from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.cameras import CameraOptions
 from radejax.data.kradar import KRadar, read_labels
+from radejax.data.pipeline import camera_inputs
 from radejax.simulation import dataset
 from radejax.simulation.camera.renderer import stereo_calibration
 from radejax.simulation.dataset import default_config, simulate_dataset
