@@ -119,34 +119,56 @@ def _add_camera_model(model: ConfigDict) -> None:
     model.name = "dinorade"
     model.image = ConfigDict(
         {
-            "kind": "vit",  # "resnet50"
-            "size": (720, 1280),  # height, width
+            # vit or resnet50.
+            "kind": "vit",
+            # Height and width of the images in pixels, multiples of the patch size.
+            "size": (720, 1280),
+            # Keep the image backbone fixed.
             "freeze": True,
+            # Normalize by ImageNet's statistics; otherwise scale to [0, 1].
             "standardize": True,
-            # DINOv3 ViT-S/16.
+            # Channels of the transformer (the defaults are DINOv3 ViT-S/16).
             "hidden_size": 384,
+            # Layers of the transformer.
             "num_layers": 12,
+            # Attention heads of the transformer.
             "num_heads": 6,
+            # Hidden channels of its MLPs.
             "mlp_dim": 1536,
+            # Pixels per patch and axis.
             "patch_size": 16,
+            # Register tokens.
             "num_registers": 4,
+            # Gated MLPs with SiLU instead of GELU.
             "gated_mlp": False,
-            "layer_scale": 1.0,  # initial value; DINOv3's come with the weights
+            # Initial value of the layer scale; DINOv3's come with the weights.
+            "layer_scale": 1.0,
+            # Implementation of the attention: auto, or one of `radejax.models.vit`.
             "attention": "auto",
+            # Channels of the ResNet's stem; 64 in ResNet-50.
             "resnet_width": 64,
         }
     )
     model.fusion = ConfigDict(
         {
+            # Heads of the deformable attention; must divide `decoder_width`.
             "num_heads": 4,
+            # Sampling points per head and query.
             "num_points": 4,
+            # Queries per bin, at different elevations.
             "num_elevation": 10,
-            "weighting": "mlp",  # "cnn", "off"
-            "gate": "channel",  # "bin"
-            "out_of_view": "drop",  # "official"
+            # Elevation weights: mlp (paper), cnn (released), off.
+            "weighting": "mlp",
+            # Gate: channel (paper) or bin (released).
+            "gate": "channel",
+            # Queries outside the image: drop, or official (zeroed, but counted).
+            "out_of_view": "drop",
+            # A dilated neck on each map before the attention.
             "necks": True,
+            # Dropout rate on the fused map, from 0 to below 1.
             "dropout": 0.1,
-            "chunk_size": 0,  # chosen by platform
+            # Bins that are attended at a time; 0: chosen by platform.
+            "chunk_size": 0,
         }
     )
     model.query_grid = _axes(LiftingAxes.of_grid(RadarGrid.kradar()))
@@ -154,25 +176,32 @@ def _add_camera_model(model: ConfigDict) -> None:
 
 def _axes(axes: LiftingAxes) -> ConfigDict:
     """Centers of the radar queries: first and step, for elevation from and to."""
-    names = ("range_m", "azimuth_deg", "elevation_deg")
-    return ConfigDict({name: getattr(axes, name) for name in names})
+    return ConfigDict(
+        {
+            # Center of the first query in range and the step, in meters.
+            "range_m": axes.range_m,
+            # Center of the first query in azimuth and the step, in degrees.
+            "azimuth_deg": axes.azimuth_deg,
+            # Elevation span in degrees, which `fusion.num_elevation` segments divide.
+            "elevation_deg": axes.elevation_deg,
+        }
+    )
 
 
 def _camera() -> ConfigDict:
     return ConfigDict(
         {
-            # "raw": the image as recorded, with lens distortion; "pinhole": without
-            # distortion, as released.
+            # raw (with lens distortion) or pinhole (without, as released).
             "projection": "raw",
-            # Shift from LiDAR to radar; None: each sequence's own.
+            # Shift from LiDAR to radar in meters; None: each sequence's own.
             "radar_from_lidar_m": placeholder(tuple),
-            # Its z, which boxes are not moved by. None: as the sensors stand, K-Radar's
-            # 0.7 or what a simulation says.
+            # Its z, which does not move boxes; None: K-Radar's 0.7, or the simulation's.
             "radar_from_lidar_z_m": placeholder(float),
-            "calibration": "sequence",  # "common": cam_front0.yml for all, as released
-            # Images of another size than model.image.size: resized, or an error.
+            # sequence (each sequence's own) or common (cam_front0.yml, as released).
+            "calibration": "sequence",
+            # Resize images of another size than `model.image.size`; otherwise an error.
             "resize": False,
-            # Frames without an image: radar-only, counted; False is an error.
+            # Predict frames without an image from the radar only; otherwise an error.
             "allow_missing": True,
         }
     )

@@ -10,16 +10,12 @@ The second command lists the public names that a built site lacks, and fails if 
 """
 
 import ast
-import io
 import pathlib
 import re
 import sys
-import tokenize
 from collections.abc import Iterator
-from typing import Any
 
 import click
-from ml_collections import ConfigDict
 from ml_collections.config_flags import config_path
 
 from radejax.cli.main import main
@@ -90,64 +86,49 @@ def config_page() -> str:
     """All fields of the bundled configs: type, values of the presets, meaning."""
     parts = [
         "# Config fields",
-        "",
         "Every field can be set on the command line, for example "
         "`--config.train.batch_size=4`. [Differences](../deviations.md) explains where the "
         "paper and the released code disagree.",
     ]
-    comments = field_comments(
-        (ROOT / "radejax/core/config.py").read_text(encoding="utf-8")
-    )
-    for name in ("radenet", "dinorade"):
+    comments: dict[str, str] = {}
+    for path in ("radejax/core/config.py", "configs/dinorade.py"):
+        comments |= field_comments((ROOT / path).read_text(encoding="utf-8"))
+    known: dict[str, str] = {}
+    for name, title in (
+        ("radenet", "RADE-Net"),
+        ("dinorade", "DinoRADE: further fields, and those with other values"),
+    ):
         path = str(ROOT / "configs" / f"{name}.py")
         configs = [load_config(path + end) for end in ("", ":paper", ":official")]
-        if name == "dinorade":
-            source = (ROOT / "configs" / "dinorade.py").read_text(encoding="utf-8")
-            comments |= field_comments(source)
-        parts += [
-            "",
-            f"## {name}",
-            "",
-            "| field | type | default | paper | official | meaning |",
-        ]
-        parts.append("|---|---|---|---|---|---|")
+        rows = ["| field | type | default | paper | official | meaning |"]
+        rows.append("|---|---|---|---|---|---|")
         for field, kind in fields_of(configs[0]):
-            values = [_text(config_path.get_value(field, config)) for config in configs]
-            kind_name = getattr(kind, "__name__", str(kind))
-            meaning = comments.get(field.split(".")[-1], "")
-            cells = [
-                f"`{field}`",
-                kind_name,
-                *(f"`{value}`" for value in values),
-                meaning,
-            ]
-            parts.append(f"| {' | '.join(cells)} |")
-    return "\n".join(parts) + "\n"
-
-
-def _text(value: Any) -> str:
-    return repr(value.to_dict() if isinstance(value, ConfigDict) else value)
+            values = [config_path.get_value(field, config) for config in configs]
+            cells = [f"`{field}`", kind.__name__, *(f"`{value!r}`" for value in values)]
+            cells.append(comments[re.sub(r"weights\..*", "weights", field)])
+            row = f"| {' | '.join(cells)} |"
+            if known.get(field) != row:
+                rows.append(row)
+            known[field] = row
+        parts += [f"## {title}", "\n".join(rows)]
+    return "\n\n".join(parts) + "\n"
 
 
 def field_comments(source: str) -> dict[str, str]:
-    """The comment above and behind every key of the dictionaries of a config module."""
-    found, above = {}, []
-    lines = source.splitlines()
-    comments = {
-        token.start[0]: (token.start[1], token.string.lstrip("# ").rstrip())
-        for token in tokenize.generate_tokens(io.StringIO(source).readline)
-        if token.type == tokenize.COMMENT
-    }
-    for number, line in enumerate(lines, 1):
-        key = re.match(r'\s*"(\w+)":', line)
-        column, text = comments.get(number, (0, ""))
-        if text and not line[:column].strip():
-            above.append(text)
+    """The comment above every field of a config module, by the field's dotted name."""
+    found, above, section = {}, [], ""
+    for line in source.splitlines():
+        if match := re.match(r"def _(\w+)\(", line):
+            sections = {"camera": "data.camera", "axes": "model.query_grid"}
+            section = f"{sections.get(match[1], match[1])}."
+        if match := re.match(r"    (model\.\w+) = ConfigDict", line):
+            section = f"{match[1]}."
+        if line.lstrip().startswith("# "):
+            above.append(line.strip("# "))
             continue
-        if key:
-            found[key[1]] = " ".join([*above, *([text] if text else [])]).replace(
-                "|", "\\|"
-            )
+        if match := re.match(r'\s+(?:"(\w+)":|config\.(\w+) = (?!_))', line):
+            name = f"{section}{match[1]}" if match[1] else match[2]
+            found[name] = " ".join(above).replace("|", "\\|")
         above = []
     return found
 
