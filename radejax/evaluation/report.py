@@ -154,8 +154,8 @@ def _tables(
     table, ious = tables.index(results), options.iou_thresholds
     built = []
     if not metrics["is_simulated"]:
-        names = metrics["run"], metrics["split"]
-        built = tables.paper_tables(table, options, *names)
+        runs = {metrics["run"]: table}
+        built = tables.paper_tables(runs, options, metrics["split"])
     for space, iou in itertools.product(tables.SPACE_TITLES, ious):
         built.append(tables.by_protocol(table, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, ious):
@@ -323,7 +323,7 @@ def compare_files(
             name: tables.index(compute_results(data, shown, {}))
             for name, (data, _) in zip(names, loaded, strict=True)
         }
-        built.append(tables.table_3(results, shown, is_simulated=is_simulated))
+        built.append(tables.ablations(results, shown, is_simulated=is_simulated))
     text = "\n".join(
         table.marked(is_simulated=is_simulated).render() for table in built
     )

@@ -21,6 +21,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import importlib.resources
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -109,10 +110,10 @@ def ap_of(results: Results, *key: Any) -> float | None:
     return None if result is None else result.ap_or_none
 
 
-def settings_text(results: Results, protocol: str) -> str:
-    """Score threshold, empty-frame rule, label version and region of a protocol."""
+def terms_of(results: Results, protocol: str) -> str:
+    """Protocol with its score threshold, empty-frame rule, label version and region."""
     found = next(r for r in results.values() if r.protocol == protocol)
-    return "".join(f", {part}" for part in found.metric.split("/")[2:])
+    return ", ".join(found.metric.split("/")[1:])
 
 
 def class_by_weather(
@@ -130,7 +131,7 @@ def class_by_weather(
         )
         body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
     return Table(
-        f"AP 3D / BEV at IoU {iou:g}, {protocol}{settings_text(results, protocol)}",
+        f"AP 3D / BEV at IoU {iou:g}, {terms_of(results, protocol)}",
         ["Class", *(TITLES.get(name, name) for name in conditions)],
         body,
     )
@@ -326,78 +327,67 @@ PUBLISHED = _read()
 
 
 def paper_tables(
-    results: Results, options: EvaluationOptions, run: str, split: str | None
+    runs: Mapping[str, Results], options: EvaluationOptions, split: str | None
 ) -> list[Table]:
     """All tables that the results allow, in the order of the papers.
 
     Args:
-        results: By key, of frames that are not simulated.
+        runs: Results by the name of the run, of frames that are not simulated.
         options: Of the evaluation.
-        run: Name of the run.
         split: Split of the frames, None if it is not known.
     """
     if 0.3 not in options.iou_thresholds:
         return []
-    protocol = options.paper_protocol
-    settings = settings_text(results, protocol)
-    ours = [(run, protocol, results)]
     classes = [{"cls": cls} for cls in (*options.classes, "mean")]
     conditions = [{"condition": name} for name in CONDITIONS]
-    tables = [
-        _layout(
-            f"Classes by weather at IoU 0.3 (layout of Table II), {protocol}{settings}",
+    layouts: list[tuple[str, Sequence[str], list[Place], list[Place]]] = [
+        (
+            "Classes by weather at IoU 0.3 (layout of Table II)",
             ["RADE-Net, Table II", "DinoRADE, Table 2"],
             classes,
             _crossed(conditions, SPACES),
-            ours,
-            options,
-            split,
         ),
-        _layout(
-            "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3), "
-            f"{protocol}{settings}",
+        (
+            "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
             ["DinoRADE, Table 3"],
             [{"condition": "all"}],
             _crossed(classes, SPACES),
-            ours,
-            options,
-            split,
         ),
     ]
+    built = [_layout(*layout, runs, options, split) for layout in layouts]
     if "Sedan" not in options.classes:
-        return tables
+        return built
     one = _layout(
-        f"Sedan by weather at IoU 0.3 (layout of Table I){settings}",
+        "Sedan by weather at IoU 0.3 (layout of Table I)",
         ["RADE-Net, Table I", "DinoRADE, Table 1"],
         SPACES,
         conditions,
-        [(run, name, results) for name in options.main_protocols],
+        runs,
         options,
         split,
     )
-    return [one, *tables, table_3({run: results}, options)]
+    return [one, *built, ablations(runs, options)]
 
 
-def table_3(
+def ablations(
     runs: Mapping[str, Results],
     options: EvaluationOptions,
     *,
     is_simulated: bool = False,
 ) -> Table:
-    """Sedan AP of several runs at IoU 0.3 and 0.5 with the papers' ablations.
+    """Sedan AP at IoU 0.3 and 0.5 with the ablations of the papers, no differences.
 
     Args:
         runs: Results by the name of the run.
         options: Of the evaluations.
         is_simulated: Omit the published rows.
     """
-    protocol = options.paper_protocol
     return _layout(
-        f"Ablations, Sedan (layout of Table III), {protocol}",
+        "Ablations, Sedan (layout of Table III)",
         [] if is_simulated else ["RADE-Net, Table III", "DinoRADE, Table 4"],
         [{"cls": "Sedan"}],
         _crossed([{"iou": 0.3}, {"iou": 0.5}], SPACES),
-        [(name, protocol, results) for name, results in runs.items()],
+        runs,
         options,
         split=None,
     )
@@ -412,7 +402,7 @@ def _layout(
     sources: Sequence[str],
     groups: Sequence[Place],
     columns: Sequence[Place],
-    ours: Sequence[tuple[str, str, Results]],
+    runs: Mapping[str, Results],
     options: EvaluationOptions,
     split: str | None,
 ) -> Table:
@@ -423,36 +413,36 @@ def _layout(
         sources: Papers and tables whose rows to print.
         groups: What the rows of each group are of.
         columns: What the columns are of.
-        ours: Name, protocol and results of our rows.
+        runs: Results by the name of the run; differences are those of the first.
         options: Of the evaluation.
         split: Split of the frames; None for no differences.
     """
     body: list[list[str]] = []
-    listed = [row for row in PUBLISHED if row.source in sources]
     for group in groups:
         places = [{**_USUAL, **group, **column} for column in columns]
         cells = [(p["condition"], p["cls"], p["space"], p["iou"]) for p in places]
-        of, printed = _name(group), set()
-        _, _, results = ours[0]
-        compared = [ap_of(results, options.paper_protocol, *cell) for cell in cells]
-        for row in listed:
+        of, printed = _name(group), []
+        first, protocol = next(iter(runs.values())), options.paper_protocol
+        compared = [ap_of(first, protocol, *cell) for cell in cells]
+        for row in PUBLISHED:
             values = [row.values.get(cell, "-") for cell in cells]
-            is_repeated = (
-                row.method,
-                *values,
-            ) in printed  # copied from the other paper
-            if set(values) == {"-"} or is_repeated:
+            # Both papers copy the same rows.
+            is_repeated = [row.method, *values] in printed
+            if row.source not in sources or set(values) == {"-"} or is_repeated:
                 continue
-            printed.add((row.method, *values))
-            terms = [row.source, row.protocol, row.label_version]
-            body.append([f"{row.method} ({row.modality})", of, *terms, *values])
+            printed.append([row.method, *values])
+            terms = f"{row.protocol}, labels={row.label_version}"
+            name = f"{row.method} ({row.modality})"
+            body.append([name, of, row.source, terms, *values])
             gaps = row.differences(cells, compared, options, split)
             if set(gaps) != {"-"}:
-                body.append(["difference", of, row.source, "", "", *gaps])
-        for name, protocol, results in ours:
+                body.append(["difference", of, row.source, "", *gaps])
+        for (name, results), protocol in itertools.product(
+            runs.items(), options.main_protocols
+        ):
             aps = [ap_of(results, protocol, *cell) for cell in cells]
-            body.append([name, of, "", protocol, "", *numbers(aps)])
-    header = ["Method", "Of", "Source", "Protocol", "Labels", *map(_name, columns)]
+            body.append([name, of, "", terms_of(results, protocol), *numbers(aps)])
+    header = ["Method", "Of", "Source", "Terms", *map(_name, columns)]
     return Table(title, header, body, NOTE if split else "")
 
 
