@@ -21,12 +21,7 @@ from radejax.cli import entry
     help="Run of train.py, or what `radejax export` takes.",
 )
 @click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
-@click.option(
-    "--step",
-    type=entry.step,
-    metavar="NUMBER|best",
-    help='Checkpoint step or "best". Default: latest.',
-)
+@entry.step
 @entry.labels
 @entry.sequences
 @entry.weather
@@ -41,9 +36,7 @@ from radejax.cli import entry
     help="kitti: preds/000000.txt as K-Radar's tools write them.",
 )
 @click.option("--batch-size", type=entry.COUNT, default=8, show_default=True)
-@click.option(
-    "--image-backbone", type=entry.EXISTING, help="Weights of the image backbone."
-)
+@entry.image_backbone
 @entry.json_option
 def detect(
     roots: tuple[pathlib.Path, ...],
@@ -90,11 +83,7 @@ def detect(
     show_default=True,
     help="Of the StableHLO program.",
 )
-@click.option(
-    "--image-backbone",
-    type=entry.EXISTING,
-    help="Weights of the image backbone, if SOURCE has none.",
-)
+@entry.image_backbone
 @click.option(
     "--with-backbone",
     is_flag=True,

@@ -162,8 +162,7 @@ FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(path_type=pathlib.Path, exists=True)
 
 
-def step(text: str) -> int | str:
-    """Type of `--step`: the number of a checkpoint, or "best"."""
+def _step(text: str) -> int | str:
     if text != "best" and not text.isdecimal():
         raise click.BadParameter(f'{text!r} is neither a number nor "best"')
     return text if text == "best" else int(text)
@@ -234,6 +233,22 @@ labelled_frames = together(
     click.option("--label-version", "version", default="v2.1", show_default=True),
     sequences,
     weather,
+)
+step = click.option(
+    "--checkpoint",
+    "--step",
+    "step",
+    type=_step,
+    metavar="NUMBER|best",
+    help='Checkpoint step or "best". Default: latest.',
+)
+image_backbone = click.option(
+    "--image-backbone",
+    type=EXISTING,
+    help="Weights of the image backbone, if the model has none.",
+)
+max_frames = click.option(
+    "--max-frames", type=COUNT, help="Frames of an animation or recording, if not all."
 )
 workers = click.option(
     "--workers",

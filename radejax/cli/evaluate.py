@@ -8,15 +8,8 @@ from typing import Any
 
 import click
 
-from radejax.cli.entry import (
-    Command,
-    echo_result,
-    json_option,
-    set_up_jax,
-    several,
-    together,
-)
-from radejax.cli.entry import step as to_step
+from radejax.cli import entry
+from radejax.cli.entry import several, together
 from radejax.core.errors import UserError
 
 
@@ -78,7 +71,7 @@ _SETTINGS = together(
         help="Resamples of sequences for 95 % intervals; 0: none. Default: 200 (score), "
         "2000 (compare), or the run's.",
     ),
-    json_option,
+    entry.json_option,
 )
 _FILES = together(
     _DATA,
@@ -106,24 +99,17 @@ _OTHER_DATA = (
 )
 
 
-@click.command(cls=Command)
+@click.command(cls=entry.Command)
 @click.argument("run_folder", metavar="[RUN]", required=False)
 @click.option("--workdir", help="The same as RUN.")
-@click.option(
-    "--checkpoint",
-    "--step",
-    "step",
-    type=to_step,
-    metavar="NUMBER|best",
-    help='Checkpoint step or "best". Default: latest.',
-)
+@entry.step
 @click.option("--out", help="Output folder. Default: in the workdir.")
 @click.option("--name", "run", help="Name of the run in tables.")
 @_DATA
 @click.option("--records", help="Preprocessed frames of --data; made if missing.")
 @click.option("--camera-calibration", help="Folder of camera calibrations of --data.")
 @click.option("--embeddings", help="Folder of `radejax embed` of the images of --data.")
-@click.option("--image-backbone", help="Weights of the image backbone, if moved.")
+@entry.image_backbone
 @click.option(
     "--shuffle-images",
     type=int,
@@ -151,14 +137,14 @@ def evaluate(
     other = {name: given.pop(name) for name in _OTHER_DATA if name in given}
     if "data" in other:
         other["roots"] = other.pop("data")
-    set_up_jax()
+    entry.set_up_jax()
     report = evaluate_run(workdir, other=other or None, **given)
     assert report is not None  # as this is the only process
     # The tables have been logged to standard error.
-    echo_result(as_json, report.metrics, f"Written to {report.folder}")
+    entry.echo_result(as_json, report.metrics, f"Written to {report.folder}")
 
 
-@click.command(cls=Command)
+@click.command(cls=entry.Command)
 @click.argument("predictions")
 @click.option("--out", help="Output folder. Default: next to the predictions.")
 @click.option("--name", help="Name of the run in tables.")
@@ -180,10 +166,10 @@ def score(
     folder = out or path.with_name(f"{path.stem}_evaluation")
     source, settings = _source_and_settings(options, bootstrap=200)
     report = evaluate_files(path, folder, source, settings, run=name or path.stem)
-    echo_result(as_json, report.metrics, f"{report.text}\nWritten to {folder}")
+    entry.echo_result(as_json, report.metrics, f"{report.text}\nWritten to {folder}")
 
 
-@click.command(cls=Command)
+@click.command(cls=entry.Command)
 @click.argument("runs", nargs=-1, metavar="A B [C ...]")
 @click.option("--out", help="Folder to write the comparison to. Default: none.")
 @_FILES
@@ -200,7 +186,7 @@ def compare(
 
     source, settings = _source_and_settings(options, bootstrap=2000)
     text, rows = compare_files(runs, out, source, settings)
-    echo_result(as_json, rows, text.rstrip("\n"))
+    entry.echo_result(as_json, rows, text.rstrip("\n"))
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:

@@ -32,9 +32,7 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
     show_default=True,
     help="Region of interest to draw.",
 )
-@click.option(
-    "--max-frames", type=entry.COUNT, help="Frames of an animation. Default: all."
-)
+@entry.max_frames
 def overlay(
     name: str,
     roots: tuple[str, ...],
@@ -109,7 +107,7 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
 @click.option("--out", type=entry.FILE, default="recording.rrd", show_default=True)
 @entry.labelled_frames
 @click.option("--workdir", type=entry.EXISTING, help="Run whose detections are shown.")
-@click.option("--max-frames", type=entry.COUNT, help="Frames to record. Default: all.")
+@entry.max_frames
 @click.option(
     "--open", "open_it", is_flag=True, help="Open the recording in the viewer."
 )

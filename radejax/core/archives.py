@@ -37,9 +37,9 @@ def wrap_read_errors(where: PathLike, what: str) -> Iterator[None]:
 @contextlib.contextmanager
 def open_zip(path: PathLike, what: str = "a zip file") -> Iterator[zipfile.ZipFile]:
     """A zip archive for reading; `DataError` that it is not `what`, where corrupted."""
-    with contextlib.ExitStack() as stack:
-        with wrap_read_errors(path, what):
-            archive = stack.enter_context(zipfile.ZipFile(path))
+    with wrap_read_errors(path, what):
+        archive = zipfile.ZipFile(path)
+    with archive:
         yield archive
 
 

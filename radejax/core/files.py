@@ -11,7 +11,6 @@ import os
 import pathlib
 import shutil
 import socket
-import stat
 from collections.abc import Collection, Iterator, Mapping
 from typing import IO, Any
 
@@ -31,9 +30,7 @@ _MAX_VALUE_CHARS = 80
 def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
     """Yields a temporary path to write to, which becomes `path` at the end of the block.
 
-    Missing parent folders are created. After an error or a kill `path` is unchanged. Its
-    permissions are those of a new file in that folder, also where a library writes files
-    that only the owner can read.
+    Missing parent folders are created. After an error or a kill `path` is unchanged.
 
     Raises:
         DiskFullError: No space is left on the disk.
@@ -43,12 +40,8 @@ def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
     temporary = _temporary_path(path)
     try:
         with disk_full(path):
-            temporary.touch()
-            mode = stat.S_IMODE(temporary.stat().st_mode)
             yield temporary
             with open(temporary, "rb+") as file:
-                if stat.S_IMODE(os.fstat(file.fileno()).st_mode) != mode:
-                    os.fchmod(file.fileno(), mode)
                 os.fsync(file.fileno())
             os.replace(temporary, path)
     except BaseException:
