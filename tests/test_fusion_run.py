@@ -232,7 +232,7 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
     config = small_config()
     config.data.update(paths)
     config.model.image.freeze = False
-    with pytest.raises(UserError, match="freeze is False"):
+    with pytest.raises(UserError, match="freeze=True"):
         Data(config, build(config.model))
     with pytest.raises(FileNotFoundError, match="radejax embed"):
         open_embeddings(tmp_path)

@@ -84,7 +84,7 @@ def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
         rows = list(csv.DictReader(file))
     assert {row["space"] for row in rows} == {"bev", "3d"}
     assert {float(row["iou"]) for row in rows} == {0.3, 0.5}
-    assert list((run / "evaluation" / "pictures").glob("*.png"))
+    assert list((run / "evaluation" / "figures").glob("*.png"))
     assert all(row["name"].endswith("/simulated") for row in rows)
     tables = (run / "evaluation" / "tables.md").read_text()
     titles = [line for line in tables.splitlines() if line.startswith("**")]

@@ -126,17 +126,6 @@ class CameraOptions:
         return tuple(map(float, (*own_m[:2], own_z_m if z is None else z)))
 
 
-def check_embeddable(*, freeze: bool, mirror_probability: float) -> None:
-    """`UserError` where embeddings cannot replace the images."""
-    require(freeze, "config.model.image.freeze", freeze, "True with embeddings")
-    require(
-        not mirror_probability,
-        "config.data.mirror_probability",
-        mirror_probability,
-        "0 with embeddings, which cannot be mirrored",
-    )
-
-
 def no_camera(image_size: tuple[int, int]) -> Camera:
     """Stands for the camera of a frame that has none: finite numbers, not valid."""
     height, width = image_size

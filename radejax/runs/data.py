@@ -23,7 +23,7 @@ from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import CameraOptions, check_embeddable
+from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.kradar.dataset import held_out
 from radejax.data.pipeline import (
@@ -80,11 +80,13 @@ class Data:
         if models.has_camera(model):
             self.camera = CameraOptions.from_config(options)
         if options.embeddings is not None:
-            name, has_camera = config.model.name, self.camera is not None
-            require(has_camera, "config.model.name", name, "a model with a camera")
-            check_embeddable(
-                freeze=model.freeze, mirror_probability=options.mirror_probability
-            )
+            is_frozen = self.camera is not None and model.freeze
+            if not is_frozen or options.mirror_probability:
+                raise UserError(
+                    "embeddings are given: they need a model whose image backbone is frozen "
+                    "(config.model.image.freeze=True) and, as they cannot be mirrored, "
+                    "config.data.mirror_probability=0"
+                )
             self.features = open_embeddings(options.embeddings, config.model.image)
         is_common = self.camera is not None and self.camera.calibration == "common"
         self.frames = data_set(options.format)(

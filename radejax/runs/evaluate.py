@@ -129,8 +129,8 @@ class Evaluation:
         count = self._config.logging.num_visualizations
         draw = self._figures(predictions, count)
         drawn = distributed.main_only(lambda: dict(draw)) or {}
-        pictures = {f"validation/{name}": _pixels(x) for name, x in drawn.items()}
-        return Scores(values, best, pictures)
+        images = {f"validation/{name}": _pixels(x) for name, x in drawn.items()}
+        return Scores(values, best, images)
 
     def report(
         self,
@@ -179,8 +179,8 @@ class Evaluation:
                     files.write_json(folder / "camera_share.json", shares)
                 drawn = self._figures(predictions, options.num_visualizations)
                 for name, figure in drawn:
-                    save_figure(figure, folder / "pictures" / f"{name}.png")
-                if (folder / "pictures").exists():  # the layout of RADE-Net's Figure 4
+                    save_figure(figure, folder / "figures" / f"{name}.png")
+                if (folder / "figures").exists():  # the layout of RADE-Net's Figure 4
                     scenes = [
                         self._scene(predictions, i, title=f"{name} ({frames[i].key})")
                         for name, i in figures.fullest_of_weathers(frames).items()

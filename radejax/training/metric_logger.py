@@ -33,12 +33,12 @@ class Scores:
     Attributes:
         values: Metrics by name.
         best: The metric that decides which checkpoint is best; None where undefined.
-        pictures: Images `[H, W, 3]` by name, on the main process.
+        figures: Images `[H, W, 3]` by name, on the main process.
     """
 
     values: Values
     best: float | None = None
-    pictures: Figures = dataclasses.field(default_factory=dict)
+    figures: Figures = dataclasses.field(default_factory=dict)
 
 
 class MetricLogger:
@@ -129,7 +129,7 @@ class MetricLogger:
 
     def log_scores(self, step: int, scores: Scores) -> None:
         """Writes the result of an evaluation, whose time is left out of the rate."""
-        self._write(step, scores.values, scores.pictures)
+        self._write(step, scores.values, scores.figures)
         self._restart_timer(step)
 
     def _write(self, step: int, values: Values, figures: Figures) -> None:

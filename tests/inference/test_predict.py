@@ -157,7 +157,7 @@ def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> N
     assert any(key.endswith("/Sedan") for key in scores.values)
     means = [v for k, v in scores.values.items() if k.startswith(name)]
     assert means == [scores.best]
-    (picture,) = scores.pictures.values()
+    (picture,) = scores.figures.values()
     assert picture.dtype == np.uint8
     assert picture.shape[2] == 3
     mesh = distributed.make_mesh(1)
