@@ -9,7 +9,16 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import (
+    POSITIVE,
+    UserError,
+    check_options,
+    integer,
+    number,
+    one_of,
+    require,
+    several,
+)
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
 
@@ -37,7 +46,20 @@ CONDITIONS = (
 )
 
 
-_MAX_VRU_DENSITY_SCALE = 5.0  # more would leave no space for other road users
+_RANGES = {
+    "seed": integer(0),
+    "train_sequences": integer(0),
+    "test_sequences": integer(0),
+    "frames_per_sequence": integer(0),
+    "frame_stride": integer(1),
+    "image_width": integer(0),
+    "image_height": integer(0),
+    "vru_density_scale": number(0, 5),  # more would leave no space for other road users
+    "output": one_of("tesseract", "projection"),
+    "camera_mode": one_of("scene", "oracle"),
+    "label_distance_m": POSITIVE,
+    "radar_from_lidar_m": several(number(-math.inf), "three numbers", 3),
+}
 
 FULL_SIZE = {
     "grid": "kradar",
@@ -128,50 +150,19 @@ class SimulationConfig:
         return cls(**values)
 
     def __post_init__(self) -> None:
-        is_procedural = self.scenes == "procedural"
-        for name, least in (
-            ("seed", 0),
-            ("train_sequences", 0),
-            ("test_sequences", 0),
-            ("frames_per_sequence", 1 if is_procedural else 0),
-            ("frame_stride", 1),
-            ("image_width", 0),
-            ("image_height", 0),
-        ):
-            value = getattr(self, name)
-            is_fine = isinstance(value, int) and value >= least
-            self._require(is_fine, name, f"an integer of at least {least}")
-        density, shift = self.vru_density_scale, self.radar_from_lidar_m
-        rules = {
-            "output": (
-                self.output in ("tesseract", "projection"),
-                "'tesseract' or 'projection'",
-            ),
-            "camera_mode": (
-                self.camera_mode in ("scene", "oracle"),
-                "'scene' or 'oracle'",
-            ),
-            "label_distance_m": (0 < self.label_distance_m < math.inf, "above 0"),
-            "radar_from_lidar_m": (
-                len(shift) == 3 and all(map(math.isfinite, shift)),
-                "three numbers",
-            ),
-            "vru_density_scale": (
-                0 <= density <= _MAX_VRU_DENSITY_SCALE
-                and (is_procedural or density == 1),
-                f"0 to {_MAX_VRU_DENSITY_SCALE:g}, and 1 for scenes of real labels",
-            ),
-            "train_sequences": (
-                not is_procedural or self.train_sequences + self.test_sequences > 0,
-                "a sequence to train or to test on",
-            ),
-            "sequences": (
-                not is_procedural or self.sequences is None,
-                "None: it selects sequences of real labels",
-            ),
-        }
-        for name, (holds, expected) in rules.items():
-            self._require(holds, name, expected)
+        check_options(vars(self), "config.simulation", _RANGES)
+        if self.scenes == "procedural":
+            is_any = self.train_sequences + self.test_sequences > 0
+            self._require(
+                is_any, "train_sequences", "a sequence to train or to test on"
+            )
+            frames = "an integer of at least 1"
+            self._require(self.frames_per_sequence > 0, "frames_per_sequence", frames)
+            selects = "None: it selects sequences of real labels"
+            self._require(self.sequences is None, "sequences", selects)
+        else:
+            is_one = self.vru_density_scale == 1
+            self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
         self.make_grid()
         self.make_parameters()
 

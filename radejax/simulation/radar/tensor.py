@@ -21,7 +21,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Float, UInt32
 
-from radejax.core.errors import require
+from radejax.core.errors import check_options, integer, number
 from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
@@ -32,16 +32,16 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
 
 
-_PARAMETER_RANGES = {
-    "gain_db": (-1e3, 1e3),
-    "noise_db": (-1e3, 1e3),
-    "wavelength_m": (1e-4, 1.0),
-    "azimuth_elements": (1.0, 512.0),
-    "elevation_elements": (1.0, 512.0),
-    "array_pedestal": (0.0, 1.0),
-    "range_resolution_m": (0.0, 100.0),
-    "pattern_exponent": (0.0, 100.0),
-    "max_scatterers_per_row": (1, 4096),
+_RANGES = {
+    "gain_db": number(-1e3, 1e3),
+    "noise_db": number(-1e3, 1e3),
+    "wavelength_m": number(1e-4, 1),
+    "azimuth_elements": number(1, 512),
+    "elevation_elements": number(1, 512),
+    "array_pedestal": number(0, 1),
+    "range_resolution_m": number(0, 100),
+    "pattern_exponent": number(0, 100),
+    "max_scatterers_per_row": integer(1, 4096),
 }
 
 
@@ -79,18 +79,7 @@ class RadarParameters:
     max_scatterers_per_row: int = 96
 
     def __post_init__(self) -> None:
-        for name, (least, most) in _PARAMETER_RANGES.items():
-            value, kind = (
-                getattr(self, name),
-                int if type(least) is int else float | int,
-            )
-            is_number = isinstance(value, kind) and not isinstance(value, bool)
-            require(
-                is_number and least <= value <= most,
-                f"config.simulation.radar.{name}",
-                value,
-                f"{least:g} to {most:g}",
-            )
+        check_options(vars(self), "config.simulation.radar", _RANGES)
 
 
 class Scatterers(struct.PyTreeNode):
