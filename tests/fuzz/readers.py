@@ -46,8 +46,7 @@ def _labels(folder: Folder, version: str) -> None:
 
 def _read_labels(folder: Folder, version: str) -> None:
     for path in folder.glob("*.txt"):
-        content, problems = path.read_bytes(), []
-        found = labels.parse_label_file(content, version, problems=problems).labels
+        found = labels.read_label_file(path, version).labels
         assert np.isfinite([label.box for label in found]).all()
         assert all(min(label.box[3:6]) > 0 for label in found)
         labels.read_labels(path, version)

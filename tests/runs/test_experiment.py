@@ -87,13 +87,13 @@ def test_labels_are_read_once(
 ) -> None:
     """And the sequences that are held out choose the best checkpoint."""
     parsed: collections.Counter = collections.Counter()
-    parse = dataset.parse_label_file
+    read = dataset.read_label_file
 
-    def count(*args: Any, where: str, **options: Any) -> Any:
-        parsed[where] += 1
-        return parse(*args, where=where, **options)
+    def count(path: pathlib.Path, version: str, **options: Any) -> Any:
+        parsed[path] += 1
+        return read(path, version, **options)
 
-    monkeypatch.setattr(dataset, "parse_label_file", count)
+    monkeypatch.setattr(dataset, "read_label_file", count)
     mesh = distributed.make_mesh(1)
     monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     config = load_config(f"{CONFIGS / 'quickstart.py'}:short")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
+import itertools
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from tabulate import tabulate
@@ -19,24 +21,22 @@ from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
     UNKNOWN_CONDITIONS,
     Conditions,
-    read_description,
 )
 from radejax.data.kradar.dataset import (
     Frame,
     KRadar,
     SequenceFolder,
     as_paths,
+    find_own_labels,
     find_sequences,
     read_calibration,
     read_grid,
-    read_split_entries,
 )
 from radejax.data.kradar.labels import normalize_version
 from radejax.data.tesseract import check_tesseract
 from radejax.geometry.radar_grid import RadarGrid
 
-ClassCounts = dict[tuple[str, str, str], int]
-"""Objects by split, weather and class."""
+Rows = list[dict[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,14 +48,15 @@ class HealthReport:
         version: Version of the labels.
         sequences: One row per sequence: its conditions, numbers of files, and of labels
             without them.
-        class_counts: Objects visible to the radar and in its field of view.
+        objects: One row per split and weather: objects of every class that are visible
+            to the radar and in its field of view.
         summary: Counts, problems with file and line, notes.
     """
 
     roots: list[str]
     version: str
-    sequences: list[dict[str, Any]]
-    class_counts: ClassCounts
+    sequences: Rows
+    objects: Rows
     summary: Summary
 
     @property
@@ -65,61 +66,38 @@ class HealthReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        names = ("split", "weather", "class")
-        return {
-            "roots": self.roots,
-            "version": self.version,
-            "num_problems": self.num_problems,
-            "sequences": self.sequences,
-            "class_counts": [
-                {**dict(zip(names, key, strict=True)), "objects": number}
-                for key, number in sorted(self.class_counts.items())
-            ],
-            **self.summary.to_dict(),
-        }
+        summary = {"num_problems": self.num_problems, **self.summary.to_dict()}
+        return {**vars(self), "summary": summary}
 
     def to_text(self) -> str:
         """Tables for a terminal."""
-        header = {
+        names = {
             name: name.replace("_", "\n") for row in self.sequences for name in row
         }
+        objects = [_with_shares(row) for row in self.objects]
         parts = [
             f"{len(self.sequences)} sequences in {', '.join(self.roots)}; labels "
             f"{self.version}",
-            tabulate(self.sequences, headers=header),
+            tabulate(self.sequences, headers=names),
             "Objects that are visible to the radar and in its field of view, and their "
             f"share of the row; *: under {RARE_SHARE:.0%} of the training objects of a "
             "weather.",
-            _class_table(self.class_counts),
+            tabulate(objects, "keys", disable_numparse=True, stralign="right"),
             self.summary.to_text(),
             f"{self.num_problems:,} problems" if self.num_problems else "no problems",
         ]
         return "\n\n".join(part for part in parts if part)
 
 
-def _class_table(class_counts: ClassCounts) -> str:
-    """Rows split and weather, columns classes."""
-    rows: dict[tuple[str, str], collections.Counter[str]] = {}
-    for (split, weather, cls), number in class_counts.items():
-        for name in (weather, "all"):
-            rows.setdefault((split, name), collections.Counter())[cls] += number
-    table = []
-    for (split, weather), counts in sorted(
-        rows.items(), key=lambda row: (row[0][0], row[0][1] == "all", row[0][1])
-    ):
-        shares = {cls: counts[cls] / max(counts.total(), 1) for cls in CLASSES}
-        cells = [
-            ("*" if split == "train" and shares[cls] < RARE_SHARE else "")
-            + f"{counts[cls]:,} ({100 * shares[cls]:4.1f} %)"
-            for cls in CLASSES
-        ]
-        table.append([split, weather, *cells])
-    return tabulate(
-        table,
-        headers=["split", "weather", *CLASSES],
-        disable_numparse=True,
-        colalign=["left", "left", *["right"] * len(CLASSES)],
-    )
+def _with_shares(row: Mapping[str, Any]) -> dict[str, str]:
+    """A row of `objects` as text, with the share of every class."""
+    total = max(sum(row[cls] for cls in CLASSES), 1)
+    cells = {}
+    for cls in CLASSES:
+        share = row[cls] / total
+        mark = "*" if row["split"] == "train" and share < RARE_SHARE else ""
+        cells[cls] = f"{mark}{row[cls]:,} ({100 * share:4.1f} %)"
+    return {**row, **cells}
 
 
 def check_dataset(
@@ -152,12 +130,13 @@ def check_dataset(
         UserError: There are neither sequence folders nor labels, none of the sequences
             and weathers asked for, or the labels have another version.
     """
-    paths, frames, summary = as_paths(roots), [], Summary()
-    folders, splits = find_sequences(paths), {}
-    is_whole = sequence_numbers is None and weather is None
-    own_labels = folders and labels is None and is_whole
-    if own_labels and not any(_has_labels(folder) for folder in folders.values()):
-        summary.problems.append(("labels missing", "labels: no info_label/*.txt"))
+    paths, version = as_paths(roots), normalize_version(version)
+    folders, grid = find_sequences(paths), read_grid(paths)
+    frames: list[Frame] = []
+    splits: dict[str, str] = {}
+    if folders and labels is None and not find_own_labels(folders, version):
+        summary = Summary()
+        summary.problems.append(("labels missing", f"no {version} info_label/*.txt"))
     else:
         data = KRadar(
             paths,
@@ -167,130 +146,97 @@ def check_dataset(
             weather=weather,
         )
         frames, summary = list(data), data.summary()
-        splits = _splits(data, summary)
-    by_sequence: dict[int, list[Frame]] = {}
-    for frame in frames:
-        by_sequence.setdefault(frame.sequence, []).append(frame)
-    if not is_whole:
+        splits = _find_splits(data, summary)
+    groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
+    by_sequence = {number: list(group) for number, group in groups}
+    if sequence_numbers is not None or weather is not None:
         if not frames:
             raise UserError("no frames of these sequences and weathers")
-        folders = {n: folder for n, folder in folders.items() if n in by_sequence}
-    grid = read_grid(paths)
-    total = sum(len(f.listing("radar_tesseract")) for f in folders.values())
+        folders = {number: folders[number] for number in by_sequence}
+    is_kradar = grid.shape_drea == RadarGrid.kradar().shape_drea
+    total = sum(len(_tensors(folder)) for folder in folders.values())
     rows = []
     with tqdm(total=total, unit="file", desc="check", disable=not progress) as bar:
-        for number in sorted({*folders, *by_sequence}):
-            folder = folders.get(number, SequenceFolder([]))
-            tensors = folder.listing("radar_tesseract")
-            corrupted = _check_tensors(tensors.values(), grid, deep, summary, bar)
-            row = _row(number, folder, by_sequence.get(number, []), splits)
-            rows.append(row | {"tesseracts_damaged": corrupted})
-            _check_conditions(number, folder, grid, summary)
-            _check_calibration(folder, by_sequence.get(number, []), summary)
-    class_counts = collections.Counter(
-        (splits.get(frame.key, "none"), frame.weather, str(cls))
-        for frame in frames
-        for cls in frame.classes
-    )
+        for number, folder in folders.items():
+            own = by_sequence.get(number, [])
+            damaged = 0
+            for path in _tensors(folder):
+                try:
+                    check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
+                except (DataError, OSError) as error:
+                    summary.problems.append(("tesseract damaged", str(error)))
+                    damaged += 1
+                bar.update()
+            published = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
+            conditions = published
+            if own:
+                conditions = Conditions(own[0].environment, own[0].time, own[0].weather)
+            if (
+                conditions != published
+                and published != UNKNOWN_CONDITIONS
+                and is_kradar
+            ):
+                summary.notes.append(
+                    f"sequence {number}: description.txt has {','.join(conditions)}; "
+                    f"K-Radar published {','.join(published)}"
+                )
+            _check_calibration(folder, own, summary)
+            in_split = collections.Counter(splits.get(frame.key) for frame in own)
+            rows.append(
+                {
+                    "sequence": number,
+                    **conditions._asdict(),
+                    "labels": len(own),
+                    "train": in_split["train"],
+                    "test": in_split["test"],
+                    "tesseracts": len(_tensors(folder)),
+                    "tesseracts_missing": sum(f.tesseract_path is None for f in own),
+                    "tesseracts_damaged": damaged,
+                    "projections": len(folder.listing("DERA_tesseract")),
+                    "images": len(folder.listing("cam-front")),
+                    "images_missing": sum(frame.camera_path is None for frame in own),
+                    "calibration": "{:g}, {:g}".format(*own[0].radar_from_lidar_m)
+                    if own
+                    else "unknown",
+                }
+            )
     names = [str(path) for path in paths]
-    return HealthReport(names, normalize_version(version), rows, class_counts, summary)
+    return HealthReport(names, version, rows, _count_objects(frames, splits), summary)
 
 
-def _has_labels(folder: SequenceFolder) -> bool:
-    """Whether a sequence has a folder of labels, of any version."""
-    subfolders = folder.listing(".")
-    return any(name.startswith("info_label") for name in subfolders)
+def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:
+    files = folder.listing("radar_tesseract").values()
+    return [path for path in files if path.suffix == ".mat"]
 
 
-def _splits(data: KRadar, summary: Summary) -> dict[str, str]:
-    """Split of every frame key; frames in both splits or in none are reported."""
-    keys = [(frame.sequence, frame.name) for frame in data]
-    found: dict[str, str] = {}
-    for split in ("train", "test"):
-        entries = read_split_entries(split, data.split_folders, keys, summary)
-        for sequence, name in sorted(entries):
-            key = f"{sequence}/{name}"
-            if key in found:
-                message = f"{key}: in both {found[key]} and {split}"
-                summary.problems.append(("split", message))
-            found[key] = split
-    present, sequences = {frame.key for frame in data}, {f.sequence for f in data}
-    for frame in data:
-        if frame.key not in found:
-            message = f"{frame.key}: labelled, but in neither train nor test"
-            summary.problems.append(("split", message))
-    for key in sorted(found.keys() - present):
-        if int(key.split("/")[0]) in sequences:
-            message = f"{key}: in split {found[key]} without a label file"
-            summary.problems.append(("label file missing", message))
-    return found
+def _find_splits(data: KRadar, summary: Summary) -> dict[str, str]:
+    """Split of every frame; what is wrong with the splits is added to the summary."""
+    splits: dict[str, str] = {}
+    for name in ("train", "test"):
+        part = data.of_split(name)
+        splits |= {frame.key: name for frame in part}
+        found = part.summary()
+        summary.problems[:] = dict.fromkeys(summary.problems + found.problems)
+        summary.notes[:] = dict.fromkeys(summary.notes + found.notes)
+    summary.problems += [
+        ("split", f"{frame.key}: labelled, but in neither train nor test")
+        for frame in data
+        if frame.key not in splits
+    ]
+    return splits
 
 
-def _row(
-    number: int,
-    folder: SequenceFolder,
-    frames: Sequence[Frame],
-    splits: dict[str, str],
-) -> dict[str, Any]:
-    """Row of a sequence: its conditions and numbers of files."""
-    conditions, offset = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS), "unknown"
-    if frames:
-        one = frames[0]
-        conditions = Conditions(one.environment, one.time, one.weather)
-        offset = "{:g}, {:g}".format(*one.radar_from_lidar_m)
-    split_counts = collections.Counter(splits.get(frame.key) for frame in frames)
-    return {
-        "sequence": number,
-        **conditions._asdict(),
-        "labels": len(frames),
-        "train": split_counts["train"],
-        "test": split_counts["test"],
-        "tesseracts": len(folder.listing("radar_tesseract")),
-        "tesseracts_missing": sum(frame.tesseract_path is None for frame in frames),
-        "projections": len(folder.listing("DERA_tesseract")),
-        "images": len(folder.listing("cam-front")),
-        "images_missing": sum(frame.camera_path is None for frame in frames),
-        "calibration": offset,
-    }
-
-
-def _check_tensors(
-    paths: Iterable[pathlib.Path],
-    grid: RadarGrid,
-    deep: bool,
-    summary: Summary,
-    bar: tqdm,
-) -> int:
-    """Number of corrupted radar tensors."""
-    before = len(summary.problems)
-    for path in paths:
-        try:
-            if path.suffix == ".mat":
-                check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
-        except (DataError, OSError) as error:
-            summary.problems.append(("tesseract damaged", str(error)))
-        bar.update()
-    return len(summary.problems) - before
-
-
-def _check_conditions(
-    number: int, folder: SequenceFolder, grid: RadarGrid, summary: Summary
-) -> None:
-    """Note conditions of a K-Radar sequence that contradict the published ones."""
-    path = folder.find(".", "description.txt")
-    published = KRADAR_CONDITIONS.get(number)
-    is_kradar = grid.shape_drea == RadarGrid.kradar().shape_drea
-    if path is None or published is None or not is_kradar:
-        return
-    try:
-        found = read_description(path)
-    except DataError:  # KRadar has reported it
-        return
-    if found != published:
-        summary.notes.append(
-            f"{path}: {','.join(found)}; K-Radar published {','.join(published)} for "
-            f"sequence {number}"
-        )
+def _count_objects(frames: Iterable[Frame], splits: Mapping[str, str]) -> Rows:
+    counts: dict[tuple[str, str], collections.Counter[str]] = {}
+    for frame in frames:
+        for weather in (frame.weather, "all"):
+            row = splits.get(frame.key, "none"), weather
+            counts.setdefault(row, collections.Counter()).update(frame.classes.tolist())
+    return [
+        {"split": split, "weather": weather}
+        | {cls: counts[split, weather][cls] for cls in CLASSES}
+        for split, weather in sorted(counts)
+    ]
 
 
 def _check_calibration(
@@ -298,16 +244,11 @@ def _check_calibration(
 ) -> None:
     """Report frame numbers that contradict the calibration file."""
     path = folder.find("info_calib", "calib_radar_lidar.txt")
-    if path is None:
-        return
-    try:
-        expected = read_calibration(path)[0]
-    except DataError:  # KRadar has reported it
-        return
     differences = {frame.header.radar - frame.header.lidar for frame in frames}
-    if differences - {expected}:
-        message = (
-            f"{path}: frame difference {expected}, but radar minus LiDAR frame numbers in "
-            f"the labels are {sorted(differences)}"
-        )
-        summary.problems.append(("calibration", message))
+    with contextlib.suppress(DataError):  # KRadar has reported it
+        if path and differences - {expected := read_calibration(path)[0]}:
+            message = (
+                f"{path}: frame difference {expected}, but radar minus LiDAR frame "
+                f"numbers in the labels are {sorted(differences)}"
+            )
+            summary.problems.append(("calibration", message))

@@ -20,14 +20,14 @@ import os
 import pathlib
 import re
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from radejax.core.archives import open_zip, read_member
-from radejax.core.errors import DataError, UserError
+from radejax.core.archives import wrap_read_errors
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, read_json, read_text
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import Summary
@@ -35,20 +35,18 @@ from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
     UNKNOWN_CONDITIONS,
     WEATHERS,
-    Conditions,
     check_weather,
     read_description,
 )
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
-    MAX_LABEL_BYTES,
     VISIBILITY_FLAGS,
     Label,
     LabelFile,
     LabelHeader,
+    LabelPath,
     normalize_version,
-    parse_label_file,
-    read_label_bytes,
+    read_label_file,
 )
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import (
@@ -59,6 +57,8 @@ from radejax.geometry.camera import (
 from radejax.geometry.radar_grid import RadarGrid
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 SIMULATION_MARKER = "simulation.json"
 """File that marks a data set as simulated and has the settings of the simulator."""
@@ -78,6 +78,7 @@ _LABELLED_SEQUENCE = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
 _LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
 _SPLIT_LINE = re.compile(r"\s*([0-9]{1,6})\s*,\s*([0-9]{1,9}_[0-9]{1,9})(?:\.txt)?\s*")
 _CAMERA_FOLDERS = ("calib", "cam_calib", "resources/cam_calib")
+_SPLITS = ("train", "test")
 _MAX_OFFSET_M = 100.0
 
 
@@ -217,34 +218,53 @@ class KRadar(Sequence[Frame]):
     ) -> None:
         self.version = normalize_version(version)
         self.classes = tuple(classes)
-        self.roots = as_paths(root)
-        if not self.roots and labels is None:
-            raise UserError("give a K-Radar root, or labels, or both")
-        if isinstance(visibility, str):
-            raise UserError(f"visibility is {visibility!r}, expected a tuple of flags")
-        if not self.classes or not set(self.classes) <= set(LABEL_CLASSES):
-            expected = ", ".join(LABEL_CLASSES)
-            raise UserError(f"classes are {self.classes}, expected some of {expected}")
+        flags = VISIBILITY_FLAGS if visibility is None else visibility
+        known = f"some of {VISIBILITY_FLAGS}, or None"
+        require(set(flags) <= set(VISIBILITY_FLAGS), "visibility", visibility, known)
+        are_known = bool(classes) and set(classes) <= set(LABEL_CLASSES)
+        require(are_known, "classes", self.classes, f"some of {LABEL_CLASSES}")
+        self._visibility, self._field_of_view = visibility, field_of_view
         self._weather = None if weather is None else check_weather(weather)
+        numbers = sequence_numbers
+        self._sequence_numbers = None if numbers is None else set(numbers)
+
+        self.roots = as_paths(root)
         self.folders = find_sequences(self.roots)
         self.grid = read_grid(self.roots)
-        self._label_files = self._find_labels(labels)
+        names = ", ".join(map(str, self.roots))
+        if not self.folders and (self.roots or labels is None):
+            raise UserError(f"no sequence folders (1, 2, ...) in the roots: {names}")
         self.split_folders = list(self.roots)
-        if labels is not None:
+        if labels is None:
+            self._label_source = "the sequences' own folders"
+            self._label_paths = find_own_labels(self.folders, self.version)
+            if not self._label_paths:
+                raise UserError(
+                    f"no {self.version} labels in the sequence folders of {names} "
+                    "(info_label/*.txt); name the folder or zip of a label revision as "
+                    "labels"
+                )
+        else:
+            self._label_source = str(labels)
+            self._label_paths = find_labels(pathlib.Path(labels))
             self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
-        self.is_simulated = are_simulated(self.split_folders)
-        self._radar_from_lidar_z_m = read_radar_from_lidar_z(self.split_folders)
-        self._sequence_numbers = (
-            None if sequence_numbers is None else set(sequence_numbers)
+        self.is_simulated = any(
+            (folder / SIMULATION_MARKER).is_file() for folder in self.split_folders
         )
+        self._radar_from_lidar_z_m = read_radar_from_lidar_z(self.split_folders)
         self._camera_folders = as_paths(camera_calibration)
         self._camera_folders += [
             r / name for r in self.roots for name in _CAMERA_FOLDERS
         ]
         self._common_camera = common_camera
-        self._visibility, self._field_of_view = visibility, field_of_view
-        self._include_unstarred = include_unstarred_v11_labels
-        self._parsed: dict[Key, tuple[LabelFile | None, list[str]]] = {}
+        # Shared by the splits of a data set: no label file is read twice.
+        self._read_label_file = functools.cache(
+            functools.partial(
+                read_label_file,
+                version=self.version,
+                include_unstarred=include_unstarred_v11_labels,
+            )
+        )
         self._read(split)
 
     def of_split(self, split: PathLike | None) -> KRadar:
@@ -287,32 +307,19 @@ class KRadar(Sequence[Frame]):
         counts = collections.Counter(cls for f in self._frames for cls in f.classes)
         return {cls: counts[cls] for cls in self.classes}
 
-    def _find_labels(self, labels: PathLike | None) -> LabelFiles:
-        """The label files; `UserError` when there is nothing to read."""
-        roots = ", ".join(map(str, self.roots))
-        if not self.folders and self.roots:
-            raise UserError(f"no sequence folders (1, 2, ...) in {roots}")
-        if labels is not None:
-            return find_labels(pathlib.Path(labels))
-        found = find_own_labels(self.folders, self.version)
-        if not found.paths:
-            raise UserError(
-                f"no {self.version} labels in the sequence folders of {roots} "
-                "(info_label/*.txt); name the folder or zip of a label revision as labels"
-            )
-        return found
-
     def _read(self, split: PathLike | None) -> None:
         """Read the label files of a split and make its frames."""
         self._summary = Summary()
         keys = self._select(split)
-        self._info = {
-            number: self._read_sequence_info(number)
+        self._sequences = {
+            number: self._read_sequence(number)
             for number in sorted({number for number, _ in keys})
         }
         if self._weather is not None:
             kept = [
-                key for key in keys if self._info[key[0]][0].weather in self._weather
+                key
+                for key in keys
+                if self._sequences[key[0]]["weather"] in self._weather
             ]
             self.counts["frames left out by weather"] = len(keys) - len(kept)
             keys = kept
@@ -320,68 +327,71 @@ class KRadar(Sequence[Frame]):
 
     def _select(self, split: PathLike | None) -> list[Key]:
         """Keys of the label files to read, sorted; the others are counted."""
-        all_keys, numbers = self._label_files.paths, self._sequence_numbers
-        present = {number for number, _ in all_keys}
-        absent = present - set(self.folders) if self.folders else set()
+        numbers = self._sequence_numbers
+        labelled = {number for number, _ in self._label_paths}
+        here = labelled & set(self.folders) if self.folders else labelled
+        wanted = here if numbers is None else numbers
+        if wanted - here:
+            raise UserError(
+                f"no labels in {self._label_source}, or no folders in the roots, of "
+                f"sequences {sorted(wanted - here)}; there are {sorted(here)}"
+            )
+        keys = [key for key in self._label_paths if key[0] in wanted]
         if numbers is None:
-            wanted = present - absent
-            self.counts["sequences with labels that are not in the roots"] = len(absent)
-            self.counts["frames of sequences that are not in the roots"] = sum(
-                number in absent for number, _ in all_keys
-            )
-        else:
-            wanted = numbers
-        if wanted & absent:
-            raise UserError(
-                f"no folders of sequences {sorted(wanted & absent)} in the roots; there "
-                f"are {sorted(self.folders)}"
-            )
-        if wanted - present:
-            raise UserError(
-                f"no labels of sequences {sorted(wanted - present)} in "
-                f"{self._label_files.description}; there are {sorted(present)}"
-            )
-        keys = [key for key in all_keys if key[0] in wanted]
+            absent = len(labelled - here)
+            self.counts["sequences with labels that are not in the roots"] = absent
+            self.counts["frames of sequences that are not in the roots"] = len(
+                self._label_paths
+            ) - len(keys)
         if split is None:
             return keys
-        self._report_overlap()
-        entries = read_split_entries(split, self.split_folders, keys, self._summary)
-        for number, name in sorted(entries - set(keys)):
+        entries = self._read_split_entries(str(split), keys)
+        for number, name in sorted(entries.difference(keys)):
             if number in wanted:
                 self._report(
                     "label file missing",
                     f"{number}/{name}: in split {split} but not among the labels of "
-                    f"{self._label_files.description}",
+                    f"{self._label_source}",
                 )
             elif numbers is None:
                 self.counts["split entries of sequences that are not here"] += 1
         return [key for key in keys if key in entries]
 
-    def _report(self, kind: str, message: str) -> None:
-        self._summary.problems.append((kind, message))
-
-    def _report_overlap(self) -> None:
-        """Report, and warn of, frames that the files of both splits name."""
-        paths = [
-            find_split_file(name, self.split_folders) for name in ("train", "test")
-        ]
-        if None in paths:
-            return
-        train, test = (set(read_split(path)) for path in paths if path)
-        if both := sorted(train & test):
+    def _read_split_entries(self, split: str, keys: Sequence[Key]) -> set[Key]:
+        """Frames of a split, from its file or by rule; reports an overlap of splits."""
+        if split not in ("train", "test"):
+            if not os.path.isfile(split):
+                raise UserError(
+                    f"split {split!r} is neither 'train', 'test', None nor a split file"
+                )
+            return set(read_split(split))
+        paths = {name: find_split_file(name, self.split_folders) for name in _SPLITS}
+        entries = {name: set(read_split(path)) for name, path in paths.items() if path}
+        if len(entries) == 2 and (both := sorted(entries["train"] & entries["test"])):
             message = (
                 f"{both[0][0]}/{both[0][1]}: the first of {len(both)} frames that are in "
-                f"both {paths[0]} and {paths[1]}; a model is evaluated on frames that it "
-                "was trained on"
+                f"both {paths['train']} and {paths['test']}; a model is evaluated on "
+                "frames that it was trained on"
             )
             self._report("split", message)
             _log.warning(message)
+        if split in entries:
+            return entries[split]
+        self._summary.notes.append(
+            f"no split/{split}.txt found: split by K-Radar's rule, alternating quarters"
+        )
+        return {
+            (number, name)
+            for number, group in itertools.groupby(keys, key=lambda key: key[0])
+            for name in split_by_rule([name for _, name in group], split)
+        }
 
-    def _read_sequence_info(
-        self, number: int
-    ) -> tuple[Conditions, tuple[float, float, float], pathlib.Path | None]:
-        """Conditions, LiDAR offset and camera calibration of a sequence."""
-        folder = self.folders.get(number)
+    def _report(self, kind: str, message: str) -> None:
+        self._summary.problems.append((kind, message))
+
+    def _read_sequence(self, number: int) -> dict[str, Any]:
+        """Fields that the frames of a sequence share, from its files or by default."""
+        folder = self.folders.get(number, SequenceFolder([]))
         camera, is_own = find_camera_calibration(
             self._camera_folders, number, common_only=self._common_camera
         )
@@ -389,178 +399,142 @@ class KRadar(Sequence[Frame]):
             self.counts["sequences without camera calibration"] += 1
         elif not is_own:
             self.counts["sequences with the common camera calibration"] += 1
-        offset = self._read_offset(number, folder)
-        return self._read_conditions(number, folder), (*offset, 0.0), camera
-
-    def _read_offset(
-        self, number: int, folder: SequenceFolder | None
-    ) -> tuple[float, float]:
-        """Metres to add to LiDAR x and y of a sequence."""
-        path = folder.find("info_calib", "calib_radar_lidar.txt") if folder else None
-        default = RADAR_FROM_LIDAR_M[:2]
-        if path is not None:
-            try:
-                return read_calibration(path)[1:]
-            except DataError as error:
-                self._report("calibration", f"{error}; using K-Radar's {default}")
-        elif folder is not None:
+        path = folder.find("info_calib", "calib_radar_lidar.txt")
+        if path is None and folder.folders:
             self._report(
                 "calibration missing",
                 f"sequence {number}: no info_calib/calib_radar_lidar.txt, using K-Radar's "
-                f"{default}",
+                f"{RADAR_FROM_LIDAR_M[:2]}",
             )
-        self.counts["sequences with the default calibration"] += 1
-        return default
+        calibration = self._read_or_report(read_calibration, path, "calibration")
+        if calibration is None:
+            self.counts["sequences with the default calibration"] += 1
+            calibration = (0, *RADAR_FROM_LIDAR_M[:2])
+        path = folder.find(".", "description.txt")
+        conditions = self._read_or_report(read_description, path, "description")
+        if conditions is None:
+            self.counts["sequences with built-in conditions"] += 1
+            conditions = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
+        elif conditions.weather not in (*WEATHERS, "unknown"):
+            self._summary.notes.append(
+                f"{path}: weather {conditions.weather!r} is none of K-Radar's: "
+                f"{', '.join(WEATHERS)}"
+            )
+        return {
+            **conditions._asdict(),
+            "radar_from_lidar_m": (*calibration[1:], 0.0),
+            "camera_calibration_path": camera,
+        }
 
-    def _read_conditions(
-        self, number: int, folder: SequenceFolder | None
-    ) -> Conditions:
-        """Conditions of a sequence: its own description, else the built-in table."""
-        path = folder.find(".", "description.txt") if folder else None
-        if path is not None:
-            try:
-                conditions = read_description(path)
-            except DataError as error:
-                self._report("description", str(error))
-            else:
-                if conditions.weather not in (*WEATHERS, "unknown"):
-                    self._summary.notes.append(
-                        f"{path}: weather {conditions.weather!r} is none of K-Radar's: "
-                        f"{', '.join(WEATHERS)}"
-                    )
-                return conditions
-        self.counts["sequences with built-in conditions"] += 1
-        return KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
+    def _read_or_report(
+        self, read: Callable[[pathlib.Path], T], path: pathlib.Path | None, kind: str
+    ) -> T | None:
+        """Content of a file, None for none; a malformed one is reported."""
+        try:
+            return None if path is None else read(path)
+        except DataError as error:
+            self._report(kind, str(error))
+            return None
 
     def _read_label_files(self, keys: list[Key]) -> dict[Key, LabelFile]:
-        """Parsed label files; corrupted ones are reported."""
+        """Label files; damaged ones are reported."""
         files: dict[Key, LabelFile] = {}
-        for key, (file, problems) in self._parse(keys):
-            has_labels = any(file.labels for file in files.values())
-            if problems and not has_labels and "has the layout of" in problems[0]:
-                raise UserError(
-                    f"{problems[0]}; give the version of the labels in "
-                    f"{self._label_files.description}: --label-version VERSION, in "
-                    "training --config.data.label_version=VERSION, such as v1.0"
-                )
-            kind = "label file" if file is None else "label line"
-            self._summary.problems += [(kind, message) for message in problems]
-            if file is None:
+        for key in keys:
+            try:
+                file = self._read_label_file(self._label_paths[key])
+            except DataError as error:
+                self._report("label file", str(error))
                 continue
             files[key] = file
+            self._summary.problems += [("label line", text) for text in file.problems]
             odd = [x for x in file.labels if x.visibility not in VISIBILITY_FLAGS]
             expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
             self.counts["objects in the label files"] += len(file.labels)
             self.counts["disabled objects (no leading *)"] += file.num_unstarred
             self.counts["objects with an odd availability flag"] += len(odd)
             self.counts["files named unlike their header"] += key[1] != expected
+        lines = [text for file in files.values() for text in file.problems]
+        if lines and not self.counts["objects in the label files"]:
+            raise UserError(
+                f"no object could be read from {self._label_source}: {lines[0]}; give the "
+                "version of these labels: --label-version VERSION, in training "
+                "--config.data.label_version=VERSION, such as v1.0"
+            )
         return files
-
-    def _parse(
-        self, keys: list[Key]
-    ) -> Iterator[tuple[Key, tuple[LabelFile | None, list[str]]]]:
-        """Every file with its problems, parsed unless that was done before.
-
-        None stands for a file of which nothing can be used.
-        """
-        with self._label_files.reader() as read:
-            for key in keys:
-                if key not in self._parsed:
-                    problems: list[str] = []
-                    file = None
-                    try:
-                        file = parse_label_file(
-                            read(self._label_files.paths[key]),
-                            self.version,
-                            where=self._label_files.where(key),
-                            problems=problems,
-                            include_unstarred=self._include_unstarred,
-                        )
-                    except DataError as error:
-                        problems = [str(error)]
-                    self._parsed[key] = file, problems
-                yield key, self._parsed[key]
 
     def _make_frames(self, files: dict[Key, LabelFile]) -> list[Frame]:
         """Frames with filtered boxes; all boxes of the data set are filtered at once."""
         labels = [label for file in files.values() for label in file.labels]
         sizes = np.array([len(file.labels) for file in files.values()], int)
-        offsets = [self._info[number][1] for number, _ in files]
+        shifts = [self._sequences[number]["radar_from_lidar_m"] for number, _ in files]
         boxes = np.array([label.box for label in labels], np.float64).reshape(-1, 7)
-        boxes[:, :3] += np.repeat(np.reshape(offsets, (-1, 3)), sizes, axis=0)
-        names = np.array([label.cls for label in labels], dtype=np.str_)
+        boxes[:, :3] += np.repeat(np.reshape(shifts, (-1, 3)), sizes, axis=0)
+        classes = np.array([label.cls for label in labels], dtype=np.str_)
         flags = np.array([label.visibility for label in labels], dtype=np.str_)
-        kept = np.flatnonzero(self._filter(boxes, names, flags))
+        kept = np.flatnonzero(self._filter(boxes, classes, flags))
         ends = np.searchsorted(kept, np.append(0, np.cumsum(sizes)))
         self.counts["frames"] = len(files)
         self.counts["frames without objects"] = int((np.diff(ends) == 0).sum())
-        rows_of_files = [kept[a:b] for a, b in itertools.pairwise(ends)]
-        return [
-            self._frame(key, file, boxes[rows], names[rows], flags[rows])
-            for (key, file), rows in zip(files.items(), rows_of_files, strict=True)
-        ]
+        frames = []
+        for (key, file), (start, end) in zip(
+            files.items(), itertools.pairwise(ends), strict=True
+        ):
+            rows = kept[start:end]
+            frames.append(
+                Frame(
+                    key[0],
+                    key[1],
+                    file.header,
+                    labels=tuple(file.labels),
+                    boxes=boxes[rows],
+                    classes=classes[rows],
+                    visibility=flags[rows],
+                    is_simulated=self.is_simulated,
+                    radar_from_lidar_z_m=self._radar_from_lidar_z_m,
+                    **self._sequences[key[0]],
+                    **self._find_files(key, file.header),
+                )
+            )
+        return frames
 
     def _filter(
-        self, boxes: np.ndarray, names: np.ndarray, flags: np.ndarray
+        self, boxes: np.ndarray, classes: np.ndarray, flags: np.ndarray
     ) -> np.ndarray:
         """`[M]` True for the objects to keep; the others are counted by reason."""
-        rules = {"class": np.isin(names, np.array(self.classes, np.str_))}
+        rules = {"class": np.isin(classes, self.classes)}
         if self._visibility is not None:
-            wanted = np.array(list(self._visibility), np.str_)
-            rules["visibility"] = np.isin(flags, wanted)
+            rules["visibility"] = np.isin(flags, list(self._visibility))
         if self._field_of_view:
             rules["field of view"] = self.grid.in_field_of_view(
                 boxes[:, 0], boxes[:, 1]
             )
-        is_kept = np.ones(len(names), bool)
+        is_kept = np.ones(len(classes), bool)
         for rule, passes in rules.items():
             self.counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
             is_kept &= passes
         self.counts["objects kept"] = int(is_kept.sum())
         return is_kept
 
-    def _frame(
-        self,
-        key: Key,
-        file: LabelFile,
-        boxes: np.ndarray,
-        classes: np.ndarray,
-        visibility: np.ndarray,
-    ) -> Frame:
-        """One frame with the paths of its files; missing ones are reported."""
-        header, folder = file.header, self.folders.get(key[0])
-        conditions, offset, camera_calibration = self._info[key[0]]
-        tesseract = projection = camera = None
-        if folder is not None:
-            stem = f"tesseract_{header.radar:05d}"
-            tesseract = folder.find("radar_tesseract", f"{stem}.mat")
-            projection = folder.find("DERA_tesseract", f"DERA_{stem}.npy")
-            if header.camera_front is not None:
-                name = f"cam-front_{header.camera_front:05d}.png"
-                camera = folder.find("cam-front", name)
-            if tesseract is None and projection is None:
+    def _find_files(self, key: Key, header: LabelHeader) -> dict[str, Any]:
+        """Paths of a frame's files, None where they are missing, which is reported."""
+        folder = self.folders.get(key[0], SequenceFolder([]))
+        stem = f"tesseract_{header.radar:05d}"
+        paths = {
+            "tesseract_path": folder.find("radar_tesseract", f"{stem}.mat"),
+            "projection_path": folder.find("DERA_tesseract", f"DERA_{stem}.npy"),
+            "camera_path": folder.find(
+                "cam-front", f"cam-front_{header.camera_front:05d}.png"
+            ),
+        }
+        if folder.folders:
+            if not (paths["tesseract_path"] or paths["projection_path"]):
                 self._report(
                     "tesseract missing",
                     f"{key[0]}/{key[1]}: no radar_tesseract/{stem}.mat in "
                     + ", ".join(map(str, folder.folders)),
                 )
-            self.counts["frames without front image"] += camera is None
-        return Frame(
-            *key,
-            header,
-            *conditions,
-            tuple(file.labels),
-            boxes,
-            classes,
-            visibility,
-            offset,
-            tesseract,
-            projection,
-            camera,
-            camera_calibration,
-            self.is_simulated,
-            self._radar_from_lidar_z_m,
-        )
+            self.counts["frames without front image"] += paths["camera_path"] is None
+        return paths
 
 
 # Folders -----------------------------------------------------------------------------
@@ -607,8 +581,6 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
     """
     found: dict[int, list[pathlib.Path]] = {}
     for root in roots:
-        if not root.is_dir():
-            raise FileNotFoundError(f"{root}: no such folder, expected a K-Radar root")
         for folder in sorted(root.iterdir()):
             if _SEQUENCE.fullmatch(folder.name) and folder.is_dir():
                 same = found.setdefault(int(folder.name), [])
@@ -638,10 +610,9 @@ def find_camera_calibration(
     of_sequence = (f"calib_seq_v2/{own}", own)
     common = ("common/cam_front0.yml", "cam_front0.yml")
     for names, is_own in ((of_sequence, True), (common, False))[common_only:]:
-        for folder in folders:
-            for name in names:
-                if (folder / name).is_file():
-                    return folder / name, is_own
+        for folder, name in itertools.product(folders, names):
+            if (folder / name).is_file():
+                return folder / name, is_own
     return None, False
 
 
@@ -655,28 +626,16 @@ def read_calibration(path: PathLike) -> tuple[int, float, float]:
     Raises:
         DataError: The file is malformed; the message names file and line.
     """
-    lines = read_text(path).splitlines()
-    line = lines[1] if len(lines) > 1 else ""
+    line = "".join(read_text(path).splitlines()[1:2])
     with contextlib.suppress(ValueError):
         difference, dx_m, dy_m = map(float, line.split(","))
         is_near = abs(dx_m) <= _MAX_OFFSET_M and abs(dy_m) <= _MAX_OFFSET_M
-        if (
-            is_near
-            and abs(difference) < 1e6
-            and difference % 1 == 0
-            and "_" not in line
-        ):
+        if is_near and difference.is_integer():
             return int(difference), dx_m, dy_m
     raise DataError(
         f"{path}:2: {line[:80]!r}, expected three numbers: frame difference (whole), x, y "
         f"up to {_MAX_OFFSET_M:g} m, such as 32,-2.54,0.3"
     )
-
-
-def are_simulated(folders: Sequence[pathlib.Path]) -> bool:
-    """Whether the simulator has written one of the folders."""
-    # os.path, as pathlib raises for names that no file can have.
-    return any(os.path.isfile(folder / SIMULATION_MARKER) for folder in folders)
 
 
 def read_radar_from_lidar_z(folders: Sequence[pathlib.Path]) -> float:
@@ -688,19 +647,12 @@ def read_radar_from_lidar_z(folders: Sequence[pathlib.Path]) -> float:
     Raises:
         DataError: A simulation's file is malformed, or two of them differ.
     """
-    found: dict[pathlib.Path, float] = {}
-    for path in (folder / SIMULATION_MARKER for folder in folders):
-        if path.is_file():
-            try:
-                shift = read_json(path).get("config", {}).get("radar_from_lidar_m")
-                found[path] = float(
-                    KRADAR_RADAR_FROM_LIDAR_Z_M if shift is None else shift[2]
-                )
-            except (AttributeError, IndexError, TypeError, KeyError, ValueError):
-                raise DataError(
-                    f"{path}: config.radar_from_lidar_m is not three numbers"
-                ) from None
-    return _the_same(found, "heights of the sensors", KRADAR_RADAR_FROM_LIDAR_Z_M)
+    return _read_common(
+        folders,
+        SIMULATION_MARKER,
+        lambda content: float(content["config"]["radar_from_lidar_m"][2]),
+        KRADAR_RADAR_FROM_LIDAR_Z_M,
+    )
 
 
 def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
@@ -709,25 +661,24 @@ def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
     Raises:
         DataError: The file is malformed, or two roots have different axes.
     """
-    paths = [root / "radar_grid.json" for root in roots]
-    found: dict[pathlib.Path, RadarGrid] = {}
-    for path in filter(pathlib.Path.is_file, paths):
-        try:
-            found[path] = RadarGrid.from_dict(read_json(path))
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: not the axes of a sensor ({error})") from None
-    return _the_same(found, "sensor axes", RadarGrid.kradar())
+    return _read_common(
+        roots, "radar_grid.json", RadarGrid.from_dict, RadarGrid.kradar()
+    )
 
 
-T = TypeVar("T")
-
-
-def _the_same(found: Mapping[pathlib.Path, T], what: str, default: T) -> T:
-    """The one value of all files; `DataError` where they differ."""
+def _read_common(
+    folders: Sequence[pathlib.Path], name: str, read: Callable[[Any], T], default: T
+) -> T:
+    """What the JSON files of a name in these folders say in common."""
+    found: dict[pathlib.Path, T] = {}
+    for path in (folder / name for folder in folders):
+        if path.is_file():
+            with wrap_read_errors(path, "the description of a sensor"):
+                found[path] = read(read_json(path))
     if len(set(found.values())) > 1:
         raise DataError(
-            f"different {what} in {', '.join(map(str, found))}; data sets of different "
-            "sensors cannot be read as one"
+            f"{' and '.join(map(str, found))} differ; data sets of different sensors "
+            "cannot be read as one"
         )
     return next(iter(found.values()), default)
 
@@ -735,95 +686,61 @@ def _the_same(found: Mapping[pathlib.Path, T], what: str, default: T) -> T:
 # Label files -------------------------------------------------------------------------
 
 
-class LabelFiles(NamedTuple):
-    """Label files by key, sorted.
-
-    Attributes:
-        paths: Path of each label file, or its name in `archive`.
-        archive: Zip file that they are in, None for plain files.
-        description: Where they are from, for messages.
-    """
-
-    paths: dict[Key, pathlib.Path | str]
-    archive: pathlib.Path | None
-    description: str
-
-    def where(self, key: Key) -> str:
-        """Name of a label file, for messages."""
-        path = self.paths[key]
-        return str(path) if self.archive is None else f"{self.archive}/{path}"
-
-    @contextlib.contextmanager
-    def reader(self) -> Iterator[Callable[[Any], bytes]]:
-        """A function that reads one of the paths; an archive is opened once."""
-        if self.archive is None:
-            yield read_label_bytes
-        else:
-            with open_zip(self.archive) as archive:
-                yield functools.partial(read_member, archive, max_bytes=MAX_LABEL_BYTES)
-
-
-def find_own_labels(sequences: dict[int, SequenceFolder], version: str) -> LabelFiles:
+def find_own_labels(
+    sequences: dict[int, SequenceFolder], version: str
+) -> dict[Key, LabelPath]:
     """Label files in the sequences' own folders, as the data set is delivered."""
-    paths: dict[Key, pathlib.Path | str] = {}
+    found: dict[Key, LabelPath] = {}
     for number, folder in sequences.items():
         for subfolder in _LABEL_FOLDERS[version]:
             listing = folder.listing(subfolder)
             names = sorted(name for name in listing if _LABEL_NAME.fullmatch(name))
-            paths |= {(number, n.removesuffix(".txt")): listing[n] for n in names}
+            found |= {(number, n.removesuffix(".txt")): listing[n] for n in names}
             if names:
                 break
-    return LabelFiles(paths, None, "the sequences' own folders")
+    return found
 
 
-def find_labels(path: pathlib.Path) -> LabelFiles:
+def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
     """Label files of a revision, a folder or zip with `<sequence>/<radar>_<lidar>.txt`.
+
+    The sequence is the nearest folder above that is named like one: `1/...`,
+    `1/info_label/...` or `1_info_label_revised/...`.
 
     Raises:
         FileNotFoundError: There is no such folder or file.
-        UserError: It is neither a folder nor a zip, or holds no label files.
+        UserError: It holds no label files.
         DataError: A frame is in it twice, or the zip is corrupted.
     """
-    names: list[tuple[pathlib.PurePath, Any]]
+    files: list[tuple[pathlib.PurePath, LabelPath]]
     if path.is_dir():
-        names = [(file.relative_to(path), file) for file in sorted(path.rglob("*.txt"))]
-    elif not path.exists():
-        raise FileNotFoundError(f"{path}: no such labels, expected a folder or a zip")
-    elif path.suffix == ".zip" or zipfile.is_zipfile(path):
-        with open_zip(path) as file:
-            names = [(pathlib.PurePosixPath(name), name) for name in file.namelist()]
+        files = [(file.relative_to(path), file) for file in sorted(path.rglob("*.txt"))]
     else:
-        raise UserError(f"{path}: labels must be a folder or a zip file")
-    found: dict[Key, pathlib.Path | str] = {}
-    for name, member in names:
-        key = _label_key(name)
-        if key is not None and key in found:
+        with wrap_read_errors(path, "a folder or a zip file of labels"):
+            archive = zipfile.ZipFile(path)  # open for as long as its members are used
+        files = [
+            (pathlib.PurePosixPath(name), zipfile.Path(archive, name))
+            for name in archive.namelist()
+        ]
+    found: dict[Key, LabelPath] = {}
+    for name, file in files:
+        folders = map(_LABELLED_SEQUENCE.fullmatch, reversed(name.parts[:-1]))
+        sequence = next(filter(None, folders), None)
+        if sequence is None or not _LABEL_NAME.fullmatch(name.name):
+            continue
+        key = int(sequence[1]), name.stem
+        if key in found:
             raise DataError(
                 f"{path}: frame {key[0]}/{key[1]} is there twice, as {found[key]} and "
-                f"{member}: one revision of every label, delete or move the other"
+                f"{file}: one revision of every label, delete or move the other"
             )
-        if key is not None:
-            found[key] = member
+        found[key] = file
     if not found:
         raise UserError(
             f"{path}: no label files in it, expected <sequence>/<radar>_<lidar>.txt "
             "such as 1/00033_00001.txt"
         )
-    archive = None if path.is_dir() else path
-    return LabelFiles(dict(sorted(found.items())), archive, str(path))
-
-
-def _label_key(path: pathlib.PurePath) -> Key | None:
-    """Sequence and frame name of a label file, None for any other file.
-
-    The sequence is the nearest folder above that is named like one: `1/...`,
-    `1/info_label/...` or `1_info_label_revised/...`.
-    """
-    if _LABEL_NAME.fullmatch(path.name):
-        for folder in reversed(path.parts[:-1]):
-            if match := _LABELLED_SEQUENCE.fullmatch(folder):
-                return int(match[1]), path.stem
-    return None
+    return dict(sorted(found.items()))
 
 
 # Splits ------------------------------------------------------------------------------
@@ -831,12 +748,9 @@ def _label_key(path: pathlib.PurePath) -> Key | None:
 
 def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | None:
     """`split/<name>.txt` in or next to the given folders, None where there is none."""
-    for folder in near:
-        for candidate in ("split", "resources/split", "."):
-            path = folder / candidate / f"{split}.txt"
-            if path.is_file():
-                return path
-    return None
+    places = itertools.product(near, ("split", "resources/split", "."))
+    paths = (folder / place / f"{split}.txt" for folder, place in places)
+    return next(filter(pathlib.Path.is_file, paths), None)
 
 
 def read_split(path: PathLike) -> list[Key]:
@@ -871,46 +785,9 @@ def split_by_rule(names: Iterable[str], split: str) -> list[str]:
     names = sorted(names)
     cuts = [int(len(names) * quarter / 4) for quarter in range(5)]
     first = 0 if split == "train" else 1
-    return [
-        name
-        for quarter in (first, first + 2)
-        for name in names[cuts[quarter] : cuts[quarter + 1]]
-    ]
-
-
-def read_split_entries(
-    split: PathLike,
-    near: Sequence[pathlib.Path],
-    keys: Collection[Key],
-    summary: Summary,
-) -> set[Key]:
-    """Frames of a split, from its file or by rule.
-
-    Args:
-        split: "train", "test" or a split file.
-        near: Folders in which split files are looked for.
-        keys: All labelled frames, which the rule divides.
-        summary: The use of the rule is noted in it.
-    """
-    if pathlib.Path(split).is_file():
-        return set(read_split(split))
-    if str(split) not in ("train", "test"):
-        raise UserError(
-            f"split {str(split)!r} is neither 'train', 'test', None nor a split file"
-        )
-    if path := find_split_file(str(split), near):
-        return set(read_split(path))
-    summary.notes.append(
-        f"no split/{split}.txt found: split by K-Radar's rule, alternating quarters"
+    return (
+        names[cuts[first] : cuts[first + 1]] + names[cuts[first + 2] : cuts[first + 3]]
     )
-    names = collections.defaultdict(list)
-    for sequence, name in keys:
-        names[sequence].append(name)
-    return {
-        (sequence, name)
-        for sequence in names
-        for name in split_by_rule(names[sequence], str(split))
-    }
 
 
 def held_out(

@@ -17,10 +17,15 @@ import dataclasses
 import math
 import pathlib
 import re
+import zipfile
 
 from radejax.core import files
+from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
+
+LabelPath = pathlib.Path | zipfile.Path
+"""A label file, or one in a zip archive."""
 
 LABEL_CLASSES = (
     "Sedan",
@@ -36,36 +41,38 @@ LABEL_CLASSES = (
 VERSIONS = ("v1.0", "v1.1", "v2.0", "v2.1")
 VISIBILITY_FLAGS = ("R", "L", "L1")
 
-MAX_LABEL_BYTES = 1 << 18
-"""Size limit of a label file; K-Radar's largest have 3 kB."""
-
-_MAX_LINE = 1000  # characters; K-Radar's longest lines have 150
+_MAX_BYTES = 1 << 18  # K-Radar's largest label files have 3 kB
 _MAX_NUMBER = 1e4  # metres or degrees
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+# Every pattern takes linear time.
+_NUMBER = r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)"
 _SEPARATOR = r"\s*,\s*"
-_FLAG, _ID, _CLASS = r"([A-Za-z]\w*)", r"(-?\d{1,9})", r"([A-Za-z][^,*]*?)"
+_FLAG, _ID = r"(?P<visibility>[A-Za-z]\w*)", r"(?P<track_id>-?\d{1,9})"
+_PREVIOUS_ID = r"-?\d{1,9}"  # identity in the frame before, which nothing needs
+_CLASS = f"(?P<cls>{'|'.join(LABEL_CLASSES)})"
 _FIELDS = {
-    "v1.0": (_ID + rf"(?:{_SEPARATOR}{_ID})?", _CLASS),  # with one or two ids
-    "v1.1": (_FLAG, _ID, _ID, _CLASS),
+    "v1.0": (_ID + rf"(?:{_SEPARATOR}{_PREVIOUS_ID})?", _CLASS),  # with one or two ids
+    "v1.1": (_FLAG, _ID, _PREVIOUS_ID, _CLASS),
     "v2.0": (_ID, _CLASS),
     "v2.1": (_FLAG, _ID, _CLASS),
 }
 _OBJECT = {
     version: re.compile(
-        _SEPARATOR.join((r"\s*\*", *fields, *[f"({_NUMBER})"] * 7)) + r"\s*", re.ASCII
+        _SEPARATOR.join((r"\s*\*", *fields, *[_NUMBER] * 7)) + r"\s*", re.ASCII
     )
     for version, fields in _FIELDS.items()
 }
-_HEADER = re.compile(
-    r"\*\s*idx\([^)]*\)=(\d{1,9})_(\d{1,9})_(\d{1,9})_(\d{1,9})_(\d{1,9}),"
-    r"\s*timestamp=(\d{1,12}(?:\.\d*)?)\s*",
-    re.ASCII,
-)
-_TOOL_HEADER = re.compile(  # of the early annotation tool
-    r"\*\s*radar idx: (\d{1,9}), lidar idx: (\d{1,9}), camera idx: (\d{1,9}), "
-    r"time: (\d{1,12}(?:\.\d*)?)(?:,.*)?",
-    re.DOTALL | re.ASCII,
+_HEADERS = (
+    re.compile(
+        r"\*\s*idx\([^)]*\)=(\d{1,9})_(\d{1,9})_(\d{1,9})_(\d{1,9})_(\d{1,9}),"
+        r"\s*timestamp=(\d{1,12}(?:\.\d*)?)\s*",
+        re.ASCII,
+    ),
+    re.compile(  # of the early annotation tool
+        r"\*\s*radar idx: (\d{1,9}), lidar idx: (\d{1,9}), camera idx: (\d{1,9}), "
+        r"time: (\d{1,12}(?:\.\d*)?)(?:,.*)?",
+        re.DOTALL | re.ASCII,
+    ),
 )
 _LINE_END = re.compile(r"\r\n|\n|\r")
 
@@ -81,14 +88,12 @@ class Label:
         visibility: `R` is visible to the radar, `L` to the LiDAR only, `L1` not judged.
             Versions without the flag (v1.0, v2.0) read `R`: every object counts.
         track_id: Identity within the sequence; -1 where the file has none.
-        previous_track_id: Identity in the frame before (v1.x), -1 or None: none.
     """
 
     cls: str
     box: tuple[float, float, float, float, float, float, float]
     visibility: str = "R"
     track_id: int = -1
-    previous_track_id: int | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -96,20 +101,20 @@ class LabelHeader:
     """First line of a label file: which frames of the sensors belong together.
 
     Attributes:
+        timestamp_s: Unix time of the OS2-64 scan.
         radar: Frame number of the radar tensor.
         lidar: Frame number of the OS2-64 LiDAR.
         camera_front: Frame number of the front camera.
         lidar_long: Frame number of the OS1-128 LiDAR, None where unknown.
         camera_lrr: Frame number of the left, right and rear cameras, None: unknown.
-        timestamp_s: Unix time of the OS2-64 scan.
     """
 
+    timestamp_s: float
     radar: int
     lidar: int
-    camera_front: int | None
-    lidar_long: int | None
-    camera_lrr: int | None
-    timestamp_s: float
+    camera_front: int
+    lidar_long: int | None = None
+    camera_lrr: int | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -119,11 +124,13 @@ class LabelFile:
     Attributes:
         header: Its first line.
         labels: Its objects.
+        problems: Malformed lines, with file and line.
         num_unstarred: Lines of v1.x without a `*` that are not among the objects.
     """
 
     header: LabelHeader
     labels: list[Label]
+    problems: list[str]
     num_unstarred: int
 
 
@@ -156,57 +163,40 @@ def read_labels(path: PathLike, version: str = "v2.1") -> list[Label]:
         FileNotFoundError: There is no such file.
         UserError: There is no such version.
     """
-    version, path = normalize_version(version), pathlib.Path(path)
-    return parse_label_file(read_label_bytes(path), version, where=str(path)).labels
+    file = read_label_file(pathlib.Path(path), normalize_version(version))
+    if file.problems:
+        raise DataError(file.problems[0])
+    return file.labels
 
 
-def read_label_bytes(path: pathlib.Path) -> bytes:
-    """Read the content of a label file; errors as `read_labels`."""
-    try:
-        with open(path, "rb") as file:
-            content = file.read(MAX_LABEL_BYTES + 1)
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such label file") from None
-    except IsADirectoryError:
-        raise DataError(f"{path}: is a folder, expected a label file") from None
-    if len(content) > MAX_LABEL_BYTES:
-        raise DataError(f"{path}: more than {MAX_LABEL_BYTES} bytes, not a label file")
-    return content
-
-
-def parse_label_file(
-    content: bytes,
-    version: str = "v2.1",
-    *,
-    where: str = "<labels>",
-    problems: list[str] | None = None,
-    include_unstarred: bool = False,
+def read_label_file(
+    path: LabelPath, version: str, *, include_unstarred: bool = False
 ) -> LabelFile:
-    """Parse the content of a label file.
+    """Read a label file; malformed lines are skipped and described.
 
     Args:
-        content: Bytes of the file.
+        path: Label file.
         version: Label version, such as "v2.1".
-        where: Name of the file in messages.
-        problems: Without it the first malformed line raises. With it malformed lines
-            are skipped and described in this list.
         include_unstarred: Lines of v1.x without a `*` are objects too where they have
             the fields of one, as the reference implementation reads them.
 
     Raises:
-        DataError: The header is malformed or the file is not text, also with
-            `problems`; or a line is malformed, without.
+        DataError: The header is malformed, or the file is not text.
+        FileNotFoundError: There is no such file.
     """
-    if not content.strip():
-        raise DataError(f"{where}:1: the file is empty, expected a header line")
-    first, *lines = _LINE_END.split(files.decoded(content, where))
+    with wrap_read_errors(str(path), "a label file"), path.open("rb") as file:
+        content = file.read(_MAX_BYTES + 1)
+    if len(content) > _MAX_BYTES:
+        raise DataError(f"{path}: more than {_MAX_BYTES} bytes, not a label file")
+    first, *lines = _LINE_END.split(files.decoded(content, str(path)))
     # Some files of v2.0 have their first object on the line of the header.
     second = first.find("*", first.find("*") + 1)
-    header = _parse_header(first if second < 0 else first[:second], f"{where}:1")
-    numbered = [(1, first[second:])] if second >= 0 else []
+    header = _parse_header(first if second < 0 else first[:second], f"{path}:1")
+    lines.insert(0, "" if second < 0 else first[second:])
     labels: list[Label] = []
+    problems: list[str] = []
     num_unstarred = 0
-    for number, line in [*numbered, *enumerate(lines, start=2)]:
+    for number, line in enumerate(lines, start=1):
         if not line or line.isspace():
             continue
         if version.startswith("v1") and not line.lstrip().startswith("*"):
@@ -215,69 +205,42 @@ def parse_label_file(
                 num_unstarred += 1
                 continue
         try:
-            labels.append(_parse_object(line, version, f"{where}:{number}"))
+            labels.append(_parse_object(line, version))
         except DataError as error:
-            if problems is None:
-                raise
-            problems.append(str(error))
-    return LabelFile(header, labels, num_unstarred)
+            problems.append(f"{path}:{number}: {error}")
+    return LabelFile(header, labels, problems, num_unstarred)
 
 
 def _parse_header(line: str, where: str) -> LabelHeader:
-    """Parse both forms of headers."""
-    if match := _HEADER.fullmatch(line):
-        radar, lidar, camera, long_lidar, cameras = map(int, match.groups()[:5])
-        return LabelHeader(radar, lidar, camera, long_lidar, cameras, float(match[6]))
-    if match := _TOOL_HEADER.fullmatch(line):
-        radar, lidar, camera = map(int, match.groups()[:3])
-        return LabelHeader(radar, lidar, camera, None, None, float(match[4]))
+    for pattern in _HEADERS:
+        if match := pattern.fullmatch(line):
+            *numbers, timestamp = match.groups()
+            return LabelHeader(float(timestamp), *map(int, numbers))
     raise DataError(
-        f"{where}: {_short(line)} is not a header, expected "
+        f"{where}: {line[:80]!r} is not a header, expected "
         "'* idx(...)=00033_00001_00002_00001_00004, timestamp=...'"
     )
 
 
-def _parse_object(line: str, version: str, where: str) -> Label:
-    """Parse one object line."""
-    if len(line) > _MAX_LINE:
-        raise DataError(f"{where}: {len(line)} characters, not an object line")
-    match = _OBJECT[version].fullmatch(line)
+def _parse_object(line: str, version: str) -> Label:
+    pattern = _OBJECT[version]
+    match = pattern.fullmatch(line)
     if match is None:
-        others = [name for name in VERSIONS if _OBJECT[name].fullmatch(line)]
-        if others:
-            raise DataError(
-                f"{where}: {_short(line)} has the layout of {others[0]} labels, not of "
-                f"{version}"
-            )
-        num_fields = line.count(",") + 1
         raise DataError(
-            f"{where}: {num_fields} fields in {_short(line)}, which is not an object "
-            f"line of {version} labels"
+            f"{line[:80]!r} is not an object of {version} labels, expected "
+            f"*, {', '.join(pattern.groupindex)}, x, y, z, yaw, l/2, w/2, h/2"
         )
-    *leading, cls = match.groups()[:-7]
     numbers = x, y, z, yaw_deg, *half_extents = list(map(float, match.groups()[-7:]))
-    if cls not in LABEL_CLASSES:
-        expected = ", ".join(LABEL_CLASSES)
-        raise DataError(
-            f"{where}: class {cls!r} is unknown, expected one of {expected}"
-        )
     if min(half_extents) <= 0 or max(map(abs, numbers)) > _MAX_NUMBER:
         raise DataError(
-            f"{where}: box {numbers}, expected x, y, z, yaw in degrees and positive half "
-            f"extents, all up to {_MAX_NUMBER:g}"
+            f"box {numbers}, expected x, y, z, yaw in degrees and positive half extents, "
+            f"all up to {_MAX_NUMBER:g}"
         )
     length, width, height = (2.0 * half for half in half_extents)
-    visibility = leading.pop(0) if version in ("v1.1", "v2.1") else "R"
-    has_previous = version.startswith("v1") and leading[1] is not None
+    fields = match.groupdict()
     return Label(
-        cls,
+        fields["cls"],
         (x, y, z, length, width, height, math.radians(yaw_deg)),
-        visibility,
-        int(leading[0]),
-        int(leading[1]) if has_previous else None,
+        fields.get("visibility", "R"),
+        int(fields["track_id"]),
     )
-
-
-def _short(text: str) -> str:
-    """A quotation that fits in a message."""
-    return repr(text if len(text) <= 80 else text[:77] + "...")

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Real
 
-from radejax.core.errors import UserError
 from radejax.core.files import atomic_write, write_text
 from radejax.data.kradar.labels import Label, normalize_version
 from radejax.geometry.radar_grid import RadarGrid
@@ -27,7 +26,7 @@ _MAT_TEXT = b"MATLAB 5.0 MAT-file, written by radejax"
 def write_labels(
     path: str | os.PathLike,
     indices: Sequence[int],
-    timestamp_s: float | str,
+    timestamp_s: float,
     labels: Iterable[Label],
     version: str = "v2.1",
 ) -> None:
@@ -42,15 +41,11 @@ def write_labels(
         version: Label version; v1.0 and v2.0 cannot keep the visibility.
 
     Raises:
-        UserError: There are not five indices, or no such version.
+        UserError: There is no such version.
     """
     version = normalize_version(version)
-    if len(indices) != 5:
-        raise UserError(f"a label header has five frame numbers, got {list(indices)}")
-    if not isinstance(timestamp_s, str):
-        timestamp_s = f"{timestamp_s:.9f}"
     numbers = "_".join(f"{int(index):05d}" for index in indices)
-    lines = [f"* idx({_SENSORS})={numbers}, timestamp={timestamp_s}"]
+    lines = [f"* idx({_SENSORS})={numbers}, timestamp={timestamp_s:.9f}"]
     lines += [_object_line(label, version) for label in labels]
     write_text(path, "\n".join(lines) + "\n")
 
@@ -106,9 +101,6 @@ def write_tesseract(
     """
     import scipy.io  # loads slowly, and label writers do not need it
 
-    tesseract = np.asarray(tesseract)
-    if tesseract.ndim != 4:
-        raise UserError(f"a tesseract has 4 axes, got shape {tesseract.shape}")
     with atomic_write(path) as file:
         scipy.io.savemat(file, {"arrDREA": tesseract}, do_compression=compress)
         file.seek(0)
@@ -122,10 +114,9 @@ def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
 
 def _object_line(label: Label, version: str) -> str:
     x, y, z, length, width, height, yaw = map(float, label.box)
-    previous = -1 if label.previous_track_id is None else label.previous_track_id
     leading = {
-        "v1.0": (label.track_id, previous),
-        "v1.1": (label.visibility, label.track_id, previous),
+        "v1.0": (label.track_id, -1),
+        "v1.1": (label.visibility, label.track_id, -1),
         "v2.0": (label.track_id,),
         "v2.1": (label.visibility, label.track_id),
     }[version]

@@ -1,3 +1,4 @@
+import csv
 import dataclasses
 import pathlib
 import zipfile
@@ -6,6 +7,13 @@ import pytest
 
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar import KRadar, dataset, write
+from radejax.data.kradar.conditions import (
+    KRADAR_CONDITIONS,
+    WEATHERS,
+    Conditions,
+    read_description,
+)
+from radejax.data.kradar.dataset import read_calibration, read_split
 from radejax.geometry.radar_grid import RadarGrid
 
 LABEL = "00004_00001"
@@ -21,6 +29,9 @@ def touch(path: pathlib.Path, text: str = "x") -> pathlib.Path:
     return path
 
 
+# Sequences and their labels ---------------------------------------------------------
+
+
 def test_sequence_spread_over_roots(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     first = touch(a / "7/radar_tesseract/tesseract_00001.mat")
@@ -34,8 +45,6 @@ def test_sequence_spread_over_roots(tmp_path):
     assert seven.find("radar_tesseract", "tesseract_00001.mat") == first
     assert seven.find("cam-front", "cam-front_00001.png") == second
     assert seven.find("cam-front", "cam-front_00002.png") is None
-    with pytest.raises(FileNotFoundError, match=r"c: no such folder"):
-        dataset.find_sequences([tmp_path / "c"])
 
 
 @pytest.mark.parametrize(
@@ -46,8 +55,8 @@ def test_own_labels_by_version(tmp_path, version, folder):
     touch(tmp_path / f"3/info_label/{LABEL}.txt")
     touch(tmp_path / f"3/info_label_v2/{LABEL}.txt")
     touch(tmp_path / "3/info_label/readme.txt")
-    source = dataset.find_own_labels(dataset.find_sequences([tmp_path]), version)
-    assert source.paths == {(3, LABEL): tmp_path / f"3/{folder}/{LABEL}.txt"}
+    found = dataset.find_own_labels(dataset.find_sequences([tmp_path]), version)
+    assert found == {(3, LABEL): tmp_path / f"3/{folder}/{LABEL}.txt"}
 
 
 @pytest.mark.parametrize(
@@ -62,26 +71,24 @@ def test_own_labels_by_version(tmp_path, version, folder):
 @pytest.mark.parametrize("zipped", [False, True])
 def test_label_revisions_in_their_layouts(tmp_path, layout, zipped):
     names = [layout.format(12, LABEL), layout.format(3, LABEL), "readme.txt"]
+    path = tmp_path / ("labels.zip" if zipped else "labels")
     if zipped:
-        path = tmp_path / "labels.zip"
         with zipfile.ZipFile(path, "w") as archive:
             for name in names:
                 archive.writestr(name, name)
     else:
-        path = tmp_path / "labels"
         for name in names:
             touch(path / name, name)
-    source = dataset.find_labels(path)
-    assert list(source.paths) == [(3, LABEL), (12, LABEL)]
-    with source.reader() as read:
-        assert read(source.paths[12, LABEL]) == names[0].encode()
-    assert source.where((3, LABEL)).endswith(names[1])
+    found = dataset.find_labels(path)
+    assert list(found) == [(3, LABEL), (12, LABEL)]
+    assert found[12, LABEL].read_text() == names[0]
+    assert str(found[3, LABEL]) == f"{path}/{names[1]}"
 
 
 def test_bad_label_sources(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such labels"):
+    with pytest.raises(FileNotFoundError, match="none"):
         dataset.find_labels(tmp_path / "none")
-    with pytest.raises(UserError, match="must be a folder or a zip"):
+    with pytest.raises(DataError, match="not a folder or a zip file of labels"):
         dataset.find_labels(touch(tmp_path / "labels.txt"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="no label files in it"):
@@ -99,7 +106,9 @@ def test_a_frame_twice_names_both(tmp_path):
         archive.writestr(f"1/{LABEL}.txt", "x")
         with pytest.warns(UserWarning, match="Duplicate name"):
             archive.writestr(f"1/{LABEL}.txt", "y")
-    with pytest.raises(DataError, match=f"as 1/{LABEL}.txt and 1/{LABEL}.txt"):
+    with pytest.raises(
+        DataError, match=rf"as .*zip/1/{LABEL}.txt and .*/1/{LABEL}.txt"
+    ):
         dataset.find_labels(path)
     for name in ("1", "01"):
         touch(tmp_path / f"root/{name}/description.txt")
@@ -109,33 +118,34 @@ def test_a_frame_twice_names_both(tmp_path):
 
 def test_one_bad_member_leaves_the_others(tmp_path):
     path = tmp_path / "labels.zip"
-    content = HEADER.encode()
-    bomb = bytes(2 << 20)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(f"1/{LABEL}.txt", content)
-        archive.writestr("1/00005_00002.txt", bomb)
+        archive.writestr(f"1/{LABEL}.txt", HEADER)
+        archive.writestr("1/00005_00002.txt", bytes(2 << 20))
+        archive.writestr("1/00006_00003.txt", HEADER + "\n")
+    content = bytearray(path.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + 8] |= 1  # encrypted
+    path.write_bytes(content)
     data = KRadar(labels=path)
     assert [frame.name for frame in data] == [LABEL]
-    ((_, bombed),) = data.summary().problems
-    assert "2097152 bytes, expected at most" in bombed
+    (_, bomb), (_, encrypted) = data.summary().problems
+    assert "labels.zip/1/00005_00002.txt: more than 262144 bytes" in bomb
+    assert "labels.zip/1/00006_00003.txt: corrupted" in encrypted
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(DataError, match=r"labels\.zip: corrupted, not a zip file"):
+    with pytest.raises(
+        DataError, match=r"labels\.zip: corrupted, not a folder or a zip"
+    ):
         KRadar(labels=path)
 
 
-def test_a_label_that_is_a_folder_is_reported(tmp_path):
-    touch(tmp_path / f"1/{LABEL}.txt", HEADER)
-    (tmp_path / "1/00005_00002.txt").mkdir()
-    data = KRadar(labels=tmp_path)
-    assert len(data) == 1
-    assert "is a folder, expected a label file" in str(data.summary().problems[0])
+def test_a_root_of_symbolic_links(kradar_root, tmp_path):
+    (tmp_path / "radar_grid.json").symlink_to(kradar_root / "radar_grid.json")
+    for sequence in "12":
+        (tmp_path / sequence).symlink_to(kradar_root / sequence)
+    assert [f.key for f in KRadar(tmp_path)] == [f.key for f in KRadar(kradar_root)]
+    assert KRadar(tmp_path)[0].tesseract_path is not None
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, '{"range_m": 1e400}', "1"])
-def test_damaged_grids_are_named(tmp_path, text):
-    touch(tmp_path / "radar_grid.json", text)
-    with pytest.raises(DataError, match=r"radar_grid\.json"):
-        dataset.read_grid([tmp_path])
+# Files of a whole data set ----------------------------------------------------------
 
 
 def test_split_files_and_camera_calibration_are_found(tmp_path):
@@ -154,18 +164,15 @@ def test_split_files_and_camera_calibration_are_found(tmp_path):
 
 def test_height_of_the_radar_is_kradars_or_the_simulations(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
-    touch(a / "1/x")
+    text = '{"config": {"radar_from_lidar_m": [-2.54, 0.3, %s]}}'
     assert dataset.read_radar_from_lidar_z([a]) == 0.7
-    touch(
-        b / "simulation.json", '{"config": {"radar_from_lidar_m": [-2.54, 0.3, 0.2]}}'
-    )
+    touch(b / "simulation.json", text % 0.2)
     assert dataset.read_radar_from_lidar_z([a, b]) == 0.2
-    touch(a / "simulation.json", "{}")
-    assert dataset.read_radar_from_lidar_z([a]) == 0.7
-    with pytest.raises(DataError, match="different heights of the sensors in"):
+    touch(a / "simulation.json", text % 0.7)
+    with pytest.raises(DataError, match=r"a/simulation.json and .* differ"):
         dataset.read_radar_from_lidar_z([a, b])
     touch(b / "simulation.json", '{"config": {"radar_from_lidar_m": [1]}}')
-    with pytest.raises(DataError, match=r"radar_from_lidar_m is not three numbers"):
+    with pytest.raises(DataError, match=r"simulation\.json: corrupted"):
         dataset.read_radar_from_lidar_z([b])
 
 
@@ -176,10 +183,95 @@ def test_grid_of_the_roots(tmp_path):
     write.write_grid(a, grid)
     assert dataset.read_grid([a, b]) == grid
     write.write_grid(b, dataclasses.replace(grid, fov_range_m=50.0))
-    with pytest.raises(DataError, match="different sensor axes"):
+    with pytest.raises(DataError, match="data sets of different sensors"):
         dataset.read_grid([a, b])
-    touch(b / "radar_grid.json", '{"range_m": 3}')
-    with pytest.raises(
-        DataError, match=r"radar_grid\.json: not the axes of a sensor \('azimuth_rad"
+    for text in (
+        '{"range_m": 3}',
+        "[" * 100_000,
+        "9" * 5000,
+        '{"range_m": 1e400}',
+        "1",
     ):
-        dataset.read_grid([b])
+        touch(b / "radar_grid.json", text)
+        with pytest.raises(DataError, match=r"radar_grid\.json"):
+            dataset.read_grid([b])
+
+
+# Files of a sequence ----------------------------------------------------------------
+
+
+def test_conditions_of_the_published_sequences(shared):
+    with open(shared / "data/kradar/sequences.csv") as file:
+        rows = {int(row["seq"]): row for row in csv.DictReader(file)}
+    names = ("environment", "time", "weather")
+    assert {
+        number: Conditions(*[row[name] for name in names])
+        for number, row in rows.items()
+    } == KRADAR_CONDITIONS
+    assert {row["weather"] for row in rows.values()} == set(WEATHERS)
+
+
+@pytest.mark.parametrize(
+    ("read", "text", "message"),
+    [
+        (read_calibration, "frame difference,x,y\n", ":2: '', expected three"),
+        (read_calibration, "", ":2: '', expected three"),
+        (read_calibration, "h\n1,2", ":2: '1,2', expected three numbers"),
+        (read_calibration, "h\n1.5,2,3", r":2: .* \(whole\)"),
+        (read_calibration, "h\n1,nan,3", ":2: '1,nan,3'"),
+        (read_calibration, "h\n1,2,nan", ":2: '1,2,nan'"),
+        (read_description, "", ":1: '', expected 'environment"),
+        (read_description, "urban,night", ":1: 'urban,night'"),
+        (read_description, "urban,,fog", ":1: 'urban,,fog'"),
+        (read_split, "1,00033_00001.txt\n1;x", ":2: '1;x', expected"),
+    ],
+)
+def test_malformed_files_name_file_and_line(tmp_path, read, text, message):
+    with pytest.raises(DataError, match=r"f\.txt" + message):
+        read(touch(tmp_path / "f.txt", text))
+    (tmp_path / "f.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DataError, match=r"f\.txt:1: byte 0xff is not UTF-8"):
+        read(tmp_path / "f.txt")
+
+
+def test_readers_accept_what_is_on_the_disks(tmp_path):
+    path = tmp_path / "f.txt"
+    path.write_bytes(b"frame difference,x,y\r\n 32, -2.54, 0.3\r\n")
+    assert read_calibration(path) == (32, -2.54, 0.3)
+    path.write_text("Urban, Day ,Normal")
+    assert read_description(path).environment == "urban"
+    path.write_text("1,00033_00001.txt\n2,00034_00002.txt")
+    assert read_split(path) == [(1, "00033_00001"), (2, "00034_00002")]
+
+
+def open_sequence(root, number=1):
+    """A data set of one frame of a sequence."""
+    touch(root / f"{number}/info_label/{LABEL}.txt", HEADER)
+    return KRadar(root)
+
+
+def test_own_files_come_first(tmp_path):
+    write.write_calibration(tmp_path / "1/info_calib/calib_radar_lidar.txt", 3, -2, 0.5)
+    camera = touch(tmp_path / "calib/seq_01/cam_1.yml")
+    for weather, count in (("fog", 0), ("fogg", 1)):
+        write.write_description(tmp_path / "1/description.txt", "a", "b", weather)
+        data = open_sequence(tmp_path)
+        assert data[0].radar_from_lidar_m == (-2.0, 0.5, 0.0)
+        assert data[0].weather == weather
+        assert data[0].camera_calibration_path == camera
+        assert len(data.summary().notes) == count
+    assert "weather 'fogg' is none of K-Radar's: normal, " in data.summary().notes[0]
+
+
+def test_missing_files_have_defaults_and_are_counted(tmp_path):
+    data = open_sequence(tmp_path, 38)
+    assert data[0].radar_from_lidar_m == (-2.54, 0.3, 0.0)
+    assert data[0].weather == "fog"
+    assert data[0].camera_calibration_path is None
+    assert data.counts["sequences with the default calibration"] == 1
+    assert data.counts["sequences with built-in conditions"] == 1
+    assert data.summary().problem_counts()["calibration missing"] == 1
+    # Without folders there is no file to miss.
+    data = KRadar(labels=tmp_path)
+    assert not data.summary().problems
+    assert data.counts["sequences with the default calibration"] == 1

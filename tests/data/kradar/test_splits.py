@@ -1,8 +1,12 @@
+import collections
+
+import numpy as np
 import pytest
 
-from radejax.core.errors import DataError, UserError
-from radejax.data.kradar import KRadar, write
-from radejax.data.kradar.dataset import held_out
+from radejax.core.errors import UserError
+from radejax.data.kradar import KRadar, dataset, write
+from radejax.data.kradar.dataset import held_out, read_split, split_by_rule
+from radejax.data.kradar.labels import read_label_file
 
 KEYS = [(1, f"{i:05d}_{i:05d}") for i in range(8)] + [(2, "00000_00000")]
 
@@ -24,7 +28,7 @@ def test_everything_sorted(tmp_path):
 def test_rule_and_file(tmp_path):
     keys, data = select(tmp_path, split="train")
     assert keys == [KEYS[i] for i in (0, 1, 4, 5)]
-    assert len(data.summary().notes) == 1
+    assert "K-Radar's rule" in data.summary().to_text()
     # A file in `split/` takes precedence over the rule.
     write.write_splits(tmp_path / "split", [KEYS[7], KEYS[3]], [])
     keys, data = select(tmp_path, split="train")
@@ -44,26 +48,65 @@ def test_a_frame_in_both_splits_is_told(tmp_path, caplog):
     keys, data = select(tmp_path, split="train")
     assert keys == KEYS[:4]
     assert data.summary().problem_counts() == {"split": 1}
-    assert "the first of 1 frames that are in both" in caplog.text
-    assert "1/00003_00003: the first" in caplog.text
-    assert select(tmp_path)[0] == KEYS  # all frames, as `data check` reads them
+    assert "1/00003_00003: the first of 1 frames that are in both" in caplog.text
 
 
-def test_errors(tmp_path):
-    with pytest.raises(UserError, match="'val' is neither"):
-        select(tmp_path, split="val")
-    with pytest.raises(UserError, match=r"no labels of sequences \[3\] in"):
-        select(tmp_path, sequence_numbers=[1, 3])
-    (tmp_path / "train.txt").write_text("1 2\n")
-    with pytest.raises(
-        DataError, match=r"train\.txt:1: '1 2', expected 'sequence,label"
-    ):
-        select(tmp_path, split="train")
+def test_entries_without_labels_are_reported(tmp_path):
     (tmp_path / "train.txt").write_text("1,00099_00099.txt\n9,00099_00099.txt\n")
     keys, data = select(tmp_path, split="train")
     assert keys == []
     assert data.summary().problem_counts() == {"label file missing": 1}
+    assert "1/00099_00099: in split train but" in data.summary().to_text()
     assert data.counts["split entries of sequences that are not here"] == 1
+
+
+def test_rule_gives_alternating_quarters():
+    names = [f"{i:05d}_00000" for i in range(10)]  # cuts at 2, 5, 7
+    assert split_by_rule(names, "train") == names[:2] + names[5:7]
+    assert split_by_rule(reversed(names), "test") == names[2:5] + names[7:]
+
+
+def test_rule_equals_the_official_split(shared):
+    folder = shared / "data/kradar/split"
+    splits = {s: read_split(folder / f"{s}.txt") for s in ("train", "test")}
+    names = collections.defaultdict(list)
+    for sequence, name in splits["train"] + splits["test"]:
+        names[sequence].append(name)
+    for split, frames in splits.items():
+        ruled = [(s, n) for s in sorted(names) for n in split_by_rule(names[s], split)]
+        assert ruled == sorted(frames)
+
+
+def test_splits_of_an_opened_data_set_read_no_label_again(
+    tmp_path, kradar_writer, monkeypatch
+):
+    kradar_writer(tmp_path)
+    path = tmp_path / "1/info_label/00004_00001.txt"
+    path.write_text(path.read_text() + "*, R, 1, Tree, 1, 2, 3, 4, 5, 6, 7\n")
+    (tmp_path / "mine.txt").write_text("1,00004_00001.txt\n2,00009_00006.txt\n")
+    (tmp_path / "none.txt").write_text("7,00004_00001.txt\n")
+    read = collections.Counter()
+
+    def count(path, version, **options):
+        read[path] += 1
+        return read_label_file(path, version, **options)
+
+    splits = (None, "train", "test", tmp_path / "mine.txt", tmp_path / "none.txt")
+    wanted = [KRadar(tmp_path, split=split) for split in splits]
+    monkeypatch.setattr(dataset, "read_label_file", count)
+    for first in (None, "test"):
+        read.clear()
+        data = KRadar(tmp_path, split=first)
+        before = data.summary()
+        for split, other in zip(splits, wanted, strict=True):
+            found = data.of_split(split)
+            assert found.summary() == other.summary()
+            assert [frame.key for frame in found] == [frame.key for frame in other]
+            for a, b in zip(found, other, strict=True):
+                np.testing.assert_array_equal(a.boxes, b.boxes)
+        assert data.summary() == before
+        assert set(read.values()) == {1}
+        assert len(read) == 12
 
 
 def test_whole_sequences_are_held_out_by_number_or_by_a_drawn_share():
