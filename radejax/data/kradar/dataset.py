@@ -316,13 +316,9 @@ class KRadar(Sequence[Frame]):
             for number in sorted({number for number, _ in keys})
         }
         if self._weather is not None:
-            kept = [
-                key
-                for key in keys
-                if self._sequences[key[0]]["weather"] in self._weather
-            ]
-            self.counts["frames left out by weather"] = len(keys) - len(kept)
-            keys = kept
+            number_before, chosen = len(keys), self._weather
+            keys = [k for k in keys if self._sequences[k[0]]["weather"] in chosen]
+            self.counts["frames left out by weather"] = number_before - len(keys)
         self._frames = self._make_frames(self._read_label_files(keys))
 
     def _select(self, split: PathLike | None) -> list[Key]:
@@ -338,11 +334,9 @@ class KRadar(Sequence[Frame]):
             )
         keys = [key for key in self._label_paths if key[0] in wanted]
         if numbers is None:
-            absent = len(labelled - here)
-            self.counts["sequences with labels that are not in the roots"] = absent
-            self.counts["frames of sequences that are not in the roots"] = len(
-                self._label_paths
-            ) - len(keys)
+            absent, rest = labelled - here, len(self._label_paths) - len(keys)
+            self.counts["sequences with labels that are not in the roots"] = len(absent)
+            self.counts["frames of sequences that are not in the roots"] = rest
         if split is None:
             return keys
         entries = self._read_split_entries(str(split), keys)

@@ -12,12 +12,11 @@ from radejax.data.kradar import KRadar, write
 from radejax.data.kradar.labels import LABEL_CLASSES, Label
 
 NAME = "00004_00001"
-INDICES = (4, 1, 2, 1, 3)
 
 
-def write_frame(root, labels, version="v2.1", sequence=1, name=NAME):
-    path = root / f"{sequence}/info_label/{name}.txt"
-    write.write_labels(path, INDICES, 0.5, labels, version)
+def write_frame(root, labels, version="v2.1"):
+    path = root / f"1/info_label/{NAME}.txt"
+    write.write_labels(path, (4, 1, 2, 1, 3), 0.5, labels, version)
 
 
 def sedan(x, y, visibility="R", cls="Sedan"):
@@ -54,19 +53,15 @@ def test_offset_and_filters(tmp_path):
     assert frame.classes.tolist() == ["Sedan", "Bicycle"]
     assert frame.radar_from_lidar_m == (-2.5, 0.25, 0.0)
     assert len(frame.labels) == 8
-    counts = data.counts
-    assert counts["objects left out by class"] == 1
-    assert counts["objects left out by visibility"] == 2
-    assert counts["objects left out by field of view"] == 3
-    assert counts["objects with an odd availability flag"] == 1
-    assert counts["objects kept"] == 2
-    assert data.class_counts() == {
-        "Sedan": 1,
-        "Bus or Truck": 0,
-        "Pedestrian": 0,
-        "Motorcycle": 0,
-        "Bicycle": 1,
+    counts = {
+        "objects left out by class": 1,
+        "objects left out by visibility": 2,
+        "objects left out by field of view": 3,
+        "objects with an odd availability flag": 1,
+        "objects kept": 2,
     }
+    assert data.counts.items() >= counts.items()
+    assert data.class_counts() == dict(zip(CLASSES, [1, 0, 0, 0, 1], strict=True))
 
 
 def test_filters_can_be_changed(tmp_path):
@@ -112,11 +107,10 @@ def test_frame_knows_its_files(kradar_root):
 def test_camera_frame_number_comes_from_the_header(tmp_path):
     write_frame(tmp_path, [])
     image = tmp_path / "1/cam-front/cam-front_00002.png"
-    image.parent.mkdir()
-    image.write_bytes(b"")
     npy = tmp_path / "1/DERA_tesseract/DERA_tesseract_00004.npy"
-    npy.parent.mkdir()
-    npy.write_bytes(b"")
+    for path in (image, npy):
+        path.parent.mkdir()
+        path.touch()
     (frame,) = KRadar(tmp_path)
     assert frame.camera_path == image
     assert frame.projection_path == npy
@@ -125,8 +119,7 @@ def test_camera_frame_number_comes_from_the_header(tmp_path):
 # What is missing or malformed -------------------------------------------------------
 
 
-@pytest.fixture
-def damaged(tmp_path, kradar_writer):
+def test_problems_are_counted_and_named(tmp_path, kradar_writer):
     kradar_writer(tmp_path, sequences=(1,), num_frames=6)
     labels = tmp_path / "1/info_label"
     (labels / "00005_00002.txt").write_text("")
@@ -135,11 +128,7 @@ def damaged(tmp_path, kradar_writer):
     (tmp_path / "1/radar_tesseract/tesseract_00007.mat").unlink()
     (tmp_path / "1/info_calib/calib_radar_lidar.txt").write_text("x\n1\n")
     (tmp_path / "1/description.txt").write_text("fog")
-    return tmp_path
-
-
-def test_problems_are_counted_and_named(damaged):
-    data = KRadar(damaged)
+    data = KRadar(tmp_path)
     summary = data.summary()
     assert len(data) == 5
     assert summary.problem_counts() == {
@@ -155,10 +144,7 @@ def test_problems_are_counted_and_named(damaged):
     assert "calib_radar_lidar.txt:2: '1', expected three numbers" in text
     assert "no radar_tesseract/tesseract_00007.mat in" in text
     assert data[0].radar_from_lidar_m == (-2.54, 0.3, 0.0)
-    assert (data[0].time, data[0].weather) == (
-        "night",
-        "normal",
-    )  # K-Radar's sequence 1
+    assert (data[0].time, data[0].weather) == ("night", "normal")  # of sequence 1
     assert json.loads(json.dumps(summary.to_dict()))["counts"]["frames"] == 5
     assert data[3].tesseract_path is not None
     assert data[2].tesseract_path is None
@@ -169,7 +155,7 @@ def test_labels_of_another_version_are_one_error(tmp_path):
     with pytest.raises(
         UserError, match=r"not an object of v2\.1 .*--config\.data\.label_version"
     ):
-        KRadar(tmp_path, version="v2.1")
+        KRadar(tmp_path)
     assert len(KRadar(tmp_path, version="v2.0")[0].boxes) == 2
 
 
@@ -182,6 +168,8 @@ def test_labels_of_another_version_are_one_error(tmp_path):
         ({"visibility": "L1"}, "visibility is 'L1', expected some"),
         ({"classes": ("Car",)}, r"classes is \('Car',\), expected some of"),
         ({"classes": ()}, r"classes is \(\), expected"),
+        ({"weather": ("mist",)}, r"unknown weather \('mist',\)"),
+        ({"weather": ()}, "unknown weather"),
         ({"sequence_numbers": [9]}, r"no labels .*sequences \[9\]; .*\[1, 2\]"),
     ],
 )
@@ -293,12 +281,6 @@ def test_a_part_is_chosen_by_weather(kradar_root, tmp_path):
     assert {frame.sequence for frame in data} == {2}
     assert data.counts["frames left out by weather"] == 6
     assert len(KRadar(root, weather=("fog", "rain"))) == 12
-    for wrong, message in (
-        (("mist",), r"unknown weather \('mist',\)"),
-        ((), "unknown weath"),
-    ):
-        with pytest.raises(UserError, match=message):
-            KRadar(root, weather=wrong)
 
 
 def test_frames_that_are_taken_away_are_counted(kradar_root):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.labels import (
     VERSIONS,
+    LabelHeader,
     normalize_version,
     read_label_file,
     read_labels,
@@ -51,33 +52,24 @@ def test_one_object_of_every_version(parse, version):
     assert label.track_id == 4
 
 
-def test_header_of_the_data_set(parse):
+def test_headers_of_the_data_set_and_of_the_annotation_tool(parse):
     header = parse(HEADER).header
-    numbers = (header.radar, header.lidar, header.camera_front)
-    assert numbers == (33, 1, 2)
-    assert (header.lidar_long, header.camera_lrr) == (3, 4)
-    assert header.timestamp_s == pytest.approx(1643292946.710046, abs=1e-6)
-
-
-def test_header_of_the_annotation_tool(parse):
+    assert header == LabelHeader(
+        pytest.approx(1643292946.710046, abs=1e-6), 33, 1, 2, 3, 4
+    )
     text = (
         "* radar idx: 00857, lidar idx: 00834, camera idx: 02499, time: 1643184534.69,"
         f" prev lidar idx: -1, sequence: 9\r\n*, 0, -1, Sedan, {BOX}"
     )
     file = parse(text, "v1.0")
-    assert (file.header.radar, file.header.lidar) == (857, 834)
-    assert file.header.lidar_long is None
+    assert file.header == LabelHeader(1643184534.69, 857, 834, 2499)
     assert len(file.labels) == 1
 
 
-def test_object_on_the_header_line(parse):
+def test_object_on_the_header_line_and_single_id_of_version_1_0(parse):
     text = f"{HEADER}{LINES['v2.0']}\n{LINES['v2.0'].replace('4,', '5,', 1)}"
-    assert [label.track_id for label in parse(text, "v2.0").labels] == [4, 5]
-
-
-def test_single_id_of_version_1_0(parse):
-    (label,) = parse(f"{HEADER}\n*, 7, Sedan, {BOX}", "v1.0").labels
-    assert label.track_id == 7
+    for version in ("v1.0", "v2.0"):
+        assert [label.track_id for label in parse(text, version).labels] == [4, 5]
 
 
 @pytest.mark.parametrize("version", ["v1.0", "v1.1"])
@@ -135,14 +127,14 @@ def test_files_that_are_no_label_files_are_errors(parse, text, message):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (LINES["v2.0"], r"expected \*, visibility, track_id, cls, x, y, z"),
-        (f"L, 4, Sedan, {BOX}", "is not an object of v2.1 labels"),
-        ("*, L, 4, Sedan, 1, 2, 3", "is not an object"),
+        (LINES["v2.0"], r".* expected \*, visibility, track_id, cls, x, y, z"),
+        (f"L, 4, Sedan, {BOX}", ".* is not an object of v2.1 labels"),
+        ("*, L, 4, Sedan, 1, 2, 3", ".* is not an object"),
         (f"*, L, 4, Sedam, {BOX}", "'.*Sedam.*' is not an object"),
-        (f"*, L, 4, Sedan, {BOX[:-4]}nan", "is not an object"),
-        (f"*, L, 4, Sedan, {BOX[:-4]}1_0", "is not an object"),
-        (f"*, L, {'9' * 500}, Sedan, {BOX}", "is not an object"),
-        (f"*, L, x, Sedan, {BOX}", "is not an object"),
+        (f"*, L, 4, Sedan, {BOX[:-4]}nan", ".* is not an object"),
+        (f"*, L, 4, Sedan, {BOX[:-4]}1_0", ".* is not an object"),
+        (f"*, L, {'9' * 500}, Sedan, {BOX}", ".* is not an object"),
+        (f"*, L, x, Sedan, {BOX}", ".* is not an object"),
         (f"*, L, 4, Sedan, {BOX[:-4]}1e999", "box .* positive"),
         (f"*, L, 4, Sedan, {BOX[:-4]}-1.0", "box .* positive"),
         (f"*, L, 4, Sedan, 1e308{BOX[4:]}", "box .* up to 10000"),
@@ -152,11 +144,9 @@ def test_files_that_are_no_label_files_are_errors(parse, text, message):
 def test_malformed_lines_are_skipped_and_described(parse, line, message):
     file = parse(f"{HEADER}\n{line}\n\n{LINES['v2.1']}\n{line}")
     assert len(file.labels) == 1
-    assert [re.match(r".*/f\.txt:(\d): ", text)[1] for text in file.problems] == [
-        "2",
-        "5",
-    ]
-    assert re.search(message, file.problems[0])
+    assert len(file.problems) == 2
+    assert re.search(rf"/f\.txt:2: {message}", file.problems[0])
+    assert "/f.txt:5: " in file.problems[1]
 
 
 def test_numbers_of_64_kb_take_no_time(parse):
@@ -180,24 +170,18 @@ def test_missing_and_malformed_files_and_versions(tmp_path):
 
 # Properties -------------------------------------------------------------------------
 
-PIECES = st.sampled_from(
-    [
-        *(
-            HEADER,
-            *LINES.values(),
-            "\n",
-            "\r\n",
-            ",",
-            ", ",
-            "*",
-            "#",
-            "Sedan",
-            "R",
-            "1",
-        ),
-        *("1e5", "nan", "\ufeff", "\x00", "é", " ", "\t", "\x1c", "\u2028", "٣", "-"),
-    ]
-)
+TEXTS = [
+    HEADER,
+    *LINES.values(),
+    "\r\n",
+    ", ",
+    "Sedan",
+    "1e5",
+    "nan",
+    "\ufeff",
+    "\u2028",
+]
+PIECES = st.lists(st.sampled_from([*TEXTS, *"\n,*#R1\x00é \t\x1c٣-"]), max_size=12)
 
 
 @settings(deadline=None, max_examples=300)
@@ -205,10 +189,8 @@ PIECES = st.sampled_from(
     content=st.one_of(
         st.binary(max_size=200),
         st.text(max_size=200).map(str.encode),
-        st.lists(PIECES, max_size=12).map("".join).map(str.encode),
-        st.lists(PIECES, max_size=8).map(
-            lambda x: (HEADER + "\n" + "".join(x)).encode()
-        ),
+        PIECES.map("".join).map(str.encode),
+        PIECES.map(lambda pieces: "\n".join([HEADER, "".join(pieces)]).encode()),
         st.text(max_size=80).map(lambda x: x.encode("utf-16")),
     ),
     version=st.sampled_from(VERSIONS),

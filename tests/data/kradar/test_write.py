@@ -1,6 +1,3 @@
-import json
-import math
-
 import numpy as np
 import pytest
 import scipy.io
@@ -13,9 +10,7 @@ from radejax.data.kradar.labels import (
     VERSIONS,
     Label,
     read_label_file,
-    read_labels,
 )
-from radejax.geometry.radar_grid import RadarGrid
 
 position = st.floats(-200, 200)
 extent = st.floats(1e-3, 40)
@@ -72,19 +67,3 @@ def test_tesseract_is_what_matlab_writes(tmp_path, compress):
     first = path.read_bytes()
     write.write_tesseract(path, tesseract, compress=compress)
     assert path.read_bytes() == first  # no date in it
-
-
-def test_grid_survives(tmp_path):
-    grid = RadarGrid.reduced(
-        num_doppler=4, num_range=8, num_elevation=3, num_azimuth=7, max_azimuth_deg=41.3
-    )
-    write.write_grid(tmp_path, grid)
-    fields = json.loads((tmp_path / "radar_grid.json").read_text())
-    assert RadarGrid.from_dict(fields) == grid
-
-
-def test_unusual_yaw_is_kept(tmp_path):
-    label = Label("Sedan", (1.0, 2.0, 3.0, 4.0, 5.0, 6.0, math.radians(457.4)))
-    write.write_labels(tmp_path / "a.txt", range(5), 1.5, [label])
-    (found,) = read_labels(tmp_path / "a.txt")
-    assert found.box[6] == pytest.approx(label.box[6], rel=1e-15)
