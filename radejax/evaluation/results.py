@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Shaped
 from ml_collections import ConfigDict
 
 from radejax.core.errors import (
@@ -229,17 +229,16 @@ def compute_results(
                 if weights is not None and protocol in has_interval:
                     metric = protocol, group[0].space, group[0].iou
                     samples = bootstrap.resample(part, weights, *metric, **settings)
-                    group = [*map(_with_interval, group, samples.T)]
+                    pairs = zip(group, map(bootstrap.interval, samples.T), strict=True)
+                    group = [
+                        dataclasses.replace(row, low=low, high=high)
+                        if row.is_defined
+                        else row
+                        for row, (low, high) in pairs
+                    ]
                 rows += group
     # By protocol, then by condition.
     return sorted(rows, key=lambda row: options.protocols.index(row.protocol))
-
-
-def _with_interval(result: Result, samples: Float[np.ndarray, " B"]) -> Result:
-    low, high = bootstrap.interval(samples)
-    if not result.is_defined:
-        return result
-    return dataclasses.replace(result, low=low, high=high)
 
 
 def _mean(group: Sequence[Result]) -> Result:
@@ -259,11 +258,9 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
     if kind not in frames:
         return {}
     column = np.asarray(frames[kind]).astype(str)
-    present = set(np.unique(column).tolist())
-    known = [name for name in ORDER.get(kind, ()) if name in present]
-    return {
-        name: column == name for name in [*known, *sorted(present.difference(known))]
-    }
+    present = np.unique(column).tolist()
+    ordered = dict.fromkeys((*ORDER[kind], *present))
+    return {name: column == name for name in ordered if name in present}
 
 
 def why_no_intervals(frames: Columns, options: EvaluationOptions) -> str | None:
@@ -281,22 +278,19 @@ def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[st
     """Counts of what is not part of the numbers, by reason."""
     fixed = [p for p in options.protocols if protocols.PROTOCOLS[p].is_fixed]
     threshold = max(options.score_threshold, options.min_score)
-    is_low = data.score <= threshold
+    is_kept = data.score > threshold
     but = f" (counted by {', '.join(fixed)})" if threshold > options.min_score else ""
-    empty = data.gt_count.sum(axis=1) == 0
+    is_empty = data.gt_count.sum(axis=1) == 0
     is_other = data.gt_count[data.pred.frame, data.pred.cls] == 0
-    in_empty = empty[data.pred.frame] & ~is_low
-    return {
-        **data.left_out,
-        f"predictions: score not above {threshold:g}{but}": int(is_low.sum()),
-        "frames: without ground truth (ignored by skip=frame)": int(empty.sum()),
-        "predictions: in frames without ground truth (ignored by skip=frame)": int(
-            in_empty.sum()
-        ),
-        "predictions: in frames without their class (ignored by skip=class)": int(
-            (is_other & ~is_low).sum()
-        ),
+    in_empty = is_empty[data.pred.frame] & is_kept
+    in_other = is_other & is_kept
+    masks = {
+        f"predictions: score not above {threshold:g}{but}": ~is_kept,
+        "frames: without ground truth (ignored by skip=frame)": is_empty,
+        "predictions: in frames without ground truth (ignored by skip=frame)": in_empty,
+        "predictions: in frames without their class (ignored by skip=class)": in_other,
     }
+    return data.left_out | {what: int(mask.sum()) for what, mask in masks.items()}
 
 
 def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:

@@ -120,9 +120,7 @@ def class_by_weather(
     results: Results, options: EvaluationOptions, protocol: str, iou: float
 ) -> Table:
     """Classes by total and weathers in one protocol, "3D / BEV" in each entry."""
-    present = dict.fromkeys(key[1] for key in results)
-    conditions = [name for name in TITLES if name in present]
-    conditions += [name for name in present if name not in TITLES]
+    conditions = dict.fromkeys(key[1] for key in results)
     body = []
     for cls in (*options.classes, "mean"):
         pairs = (

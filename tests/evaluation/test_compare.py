@@ -85,17 +85,14 @@ def test_predictions_that_were_stored_cut_say_so(stored, scene):
     assert new.metrics["warnings"] == []
     runs = [folder / "old", folder / "new"]
     _, rows = report.compare_files(runs, None, Source(), OPTIONS)
-    assert {row["difference"] for row in rows} == {
-        0.0
-    }  # both above what one has stored
+    # Both above what one has stored.
+    assert {row["difference"] for row in rows} == {0.0}
 
 
 def test_frames_without_sequences_cannot_be_compared(scene, tmp_path):
-    kitti.write_kitti(tmp_path / "kitti", *scene)
+    kitti.write_kitti(tmp_path, *scene)
     with pytest.raises(UserError, match="has no column sequence"):
-        report.compare_files(
-            [tmp_path / "kitti", tmp_path / "kitti"], None, Source(), OPTIONS
-        )
+        report.compare_files([tmp_path, tmp_path], None, Source(), OPTIONS)
 
 
 def run(*arguments):
