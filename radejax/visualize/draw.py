@@ -19,7 +19,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
 from radejax.core.errors import UserError
 from radejax.core.structures import ROIS
@@ -46,7 +45,6 @@ from radejax.visualize.style import (
 Extent = Literal["roi", "fov"] | Sequence[float]
 Limits = tuple[float, float] | None
 
-ZOOM_COLOR = "#E69F00"
 _OUTSIDE_COLOR = "0.90"
 _BEHIND_M = 2.0  # shown behind the sensor, so that its mark is whole
 _POINTS_PER_EDGE = 8  # straight edges bend in the polar view
@@ -153,26 +151,22 @@ def draw_polar(
     scene: Scene,
     *,
     ax: Axes | None = None,
-    color_limits: Limits = None,
     show_labels: bool = True,
-    show_legend: bool = True,
-    show_colorbar: bool = True,
 ) -> Axes:
     """Draw one frame as the network sees it: range over azimuth, one tile per bin.
 
-    Straight box edges bend here; they are drawn bent. Arguments as in `draw_bev`.
+    Straight box edges bend here; they are drawn bent. Arguments as in `draw_bev`, which
+    has the legend and the color bar.
     """
     ax = new_figure(6.0, 5.0).add_axes((0.11, 0.1, 0.74, 0.82)) if ax is None else ax
     power = range_azimuth(scene.projection, scene.grid)
     horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
     vertical = bin_edges(scene.grid.range_m)
-    mesh = draw_tiles(ax, horizontal, vertical, power, color_limits)
+    draw_tiles(ax, horizontal, vertical, power)
     ax.set_xlim(horizontal[0], horizontal[-1])
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
-    if show_colorbar:
-        add_colorbar(mesh, ax, POWER_LABEL)
-    _draw_over(ax, scene, to_polar, show_labels, show_legend)
+    _draw_over(ax, scene, to_polar, show_labels, show_legend=False)
     return ax
 
 
@@ -192,8 +186,6 @@ def draw_frame(scene: Scene) -> Figure:
         untitled,
         ax=figure.add_axes((0.57, 0.085, 0.41, height)),
         show_labels=not has_image,
-        show_legend=False,
-        show_colorbar=False,
     )
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
@@ -210,22 +202,18 @@ def draw_frame(scene: Scene) -> Figure:
     return figure
 
 
-def draw_scenes(
-    scenes: Sequence[Scene], *, columns: int = 4, zoom_m: float = 10.0
-) -> Figure:
-    """Figure of scenes side by side, each with its camera image above its map.
+def draw_scenes(scenes: Sequence[Scene]) -> Figure:
+    """Figure of scenes, four in a row, each with its camera image above its map.
 
     Args:
         scenes: At least one; the legend is that of the first.
-        columns: Scenes per row.
-        zoom_m: Width and height in meters of what `Scene.zoom` magnifies.
 
     Raises:
         UserError: There are no scenes.
     """
     if not scenes:
         raise UserError("no scenes to draw")
-    columns = min(columns, len(scenes))
+    columns = min(4, len(scenes))
     width = _COLUMN_IN * columns
     height = _ROW_IN * -(-len(scenes) // columns) + _FOOT_IN
     figure = new_figure(width, height)
@@ -244,12 +232,16 @@ def draw_scenes(
             # Labels are readable on the map; here they would hide the image.
             _draw_view(above, scene, show_labels=False)
         below = figure.add_axes((left, (base + 0.55) / height, across, 4.9 / height))
-        _draw_plain(below, dataclasses.replace(scene, title=""), limits)
+        draw_bev(
+            dataclasses.replace(scene, title=""),
+            ax=below,
+            color_limits=limits,
+            show_legend=False,
+            show_colorbar=False,
+        )
         if column:
             below.set_ylabel("")
         (above or below).set_title(scene.title, fontsize=11)
-        if scene.zoom is not None:
-            _magnify(below, scene, zoom_m, limits)
     place = (1 - 3.3 / width, 0.42 / height, 2.7 / width, 0.11 / height)
     bar = figure.colorbar(
         ScalarMappable(Normalize(*limits), COLOR_MAP),
@@ -267,35 +259,6 @@ def draw_scenes(
         frameon=False,
     )
     return figure
-
-
-def _draw_plain(ax: Axes, scene: Scene, limits: Limits, **options: Any) -> None:
-    """Bird's-eye view without legend and color bar."""
-    draw_bev(
-        scene,
-        ax=ax,
-        color_limits=limits,
-        show_legend=False,
-        show_colorbar=False,
-        **options,
-    )
-
-
-def _magnify(ax: Axes, scene: Scene, size_m: float, limits: Limits) -> None:
-    """Mark a square on the map and show it larger in a corner."""
-    assert scene.zoom is not None
-    x, y = scene.zoom
-    half = size_m / 2
-    corner = (y - half, x - half)  # the axes show y to the left and x up
-    ax.add_patch(Rectangle(corner, size_m, size_m, fill=False, ec=ZOOM_COLOR, lw=1.5))
-    box = ax.get_window_extent()
-    inset = ax.inset_axes((0.60, 0.02, 0.38, 0.38 * box.width / box.height))
-    extent = (x - half, x + half, y - half, y + half)
-    untitled = dataclasses.replace(scene, title="", roi=None)
-    _draw_plain(inset, untitled, limits, extent=extent, show_labels=False)
-    inset.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    for spine in inset.spines.values():
-        spine.set(color=ZOOM_COLOR, lw=1.5)
 
 
 def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:

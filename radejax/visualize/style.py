@@ -80,7 +80,6 @@ class Scene:
         camera: Calibration of the image, which draws the boxes on it; or None.
         title: Title, such as sequence, frame and weather.
         score_threshold: Threshold of the predictions shown, for the legend, or None.
-        zoom: x and y in meters of the place that `draw_scenes` magnifies, or None.
         time_s: Seconds since the Unix epoch, for recordings; or None.
 
     Raises:
@@ -96,7 +95,6 @@ class Scene:
     camera: CameraCalibration | None = None
     title: str = ""
     score_threshold: float | None = None
-    zoom: tuple[float, float] | None = None
     time_s: float | None = None
 
     def __post_init__(self) -> None:
