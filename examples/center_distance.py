@@ -21,8 +21,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
-from radejax.evaluation.matching import Pairs, match_free
-from radejax.evaluation.overlap import ranges
+from radejax.evaluation.matching import Pairs, match_free, ranges
 from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.tables import Table, number
 from radejax.geometry.rotated_iou import bev_iou

@@ -10,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import UserError
 from radejax.evaluation import protocols
-from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
+from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, mean_ap
 
 LEVEL = 0.95
 
@@ -50,38 +51,28 @@ def resample(
     protocol: str,
     space: str,
     iou: float,
-    *,
-    empty_frames: str = "protocol",
-    score_threshold: float = 0.0,
+    **settings: Any,
 ) -> Float[np.ndarray, "B _"]:
     """`[B, C + 1]` AP of every class, then their mean, in every resample.
 
     NaN where a resample has no object of a class; the mean is over classes that occur.
+    The settings are those of `EvaluationSet.results`.
     """
-    chosen = protocols.get_protocol(protocol)
-    empty_frames = chosen.resolve_empty_frames(empty_frames)
-    ap = np.full((len(weights), len(data.classes) + 1), np.nan)
-    for row, weight in enumerate(weights):
-        by_class = data.frame_weights(empty_frames, weight)
-        for cls in range(len(data.classes)):
-            curve = data.curve(
-                chosen, space, iou, float(score_threshold), cls, by_class[:, cls]
-            )
-            if curve.num_gt:
-                ap[row, cls] = curve.ap
-        present = ap[row, ~np.isnan(ap[row])]
-        ap[row, -1] = present.mean() if present.size else np.nan
-    return ap
+    settings |= {"spaces": space, "iou_thresholds": iou, "curves": False}
+    rows = []
+    for weight in weights:
+        results = data.results(protocol, weights=weight, **settings)
+        aps = [result.ap if result.is_defined else np.nan for result in results]
+        rows.append([*aps, mean_ap(results)])
+    return np.array(rows)
 
 
-def interval(
-    samples: Float[np.ndarray, " B"], level: float = LEVEL
-) -> tuple[float, float]:
-    """Percentile interval of the samples that are defined; NaN if none is."""
+def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:
+    """95 % percentile interval of the samples that are defined; NaN if none is."""
     samples = samples[~np.isnan(samples)]
-    if samples.size < 1:
+    if not samples.size:
         return float("nan"), float("nan")
-    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 
 
@@ -146,7 +137,7 @@ def compare(
     Raises:
         UserError: The runs differ in classes, frames or ground truth.
     """
-    check_same_truth(data_a, data_b)
+    _check_same_truth(data_a, data_b)
     weights = sequence_weights(sequence, resamples=resamples, seed=seed)
     # The first row weights every frame once: the APs themselves.
     weights = np.concatenate([np.ones_like(weights[:1]), weights])
@@ -187,33 +178,27 @@ def _compare_class(
 
 def _holm(rows: list[Comparison]) -> list[Comparison]:
     """Adjusts p-values for the number of rows (Holm's step-down)."""
-    order = np.argsort([row.p_value for row in rows], kind="stable")
-    adjusted = 0.0
-    result = list(rows)
-    for rank, position in enumerate(order.tolist()):
-        row = rows[position]
-        adjusted = max(adjusted, min(1.0, (len(rows) - rank) * row.p_value))
-        result[position] = dataclasses.replace(
-            row, p_adjusted=adjusted, is_significant=adjusted < 1 - LEVEL
-        )
-    return result
+    p_values = np.array([row.p_value for row in rows])
+    order = np.argsort(p_values, kind="stable")
+    scaled = np.minimum(1, np.arange(len(rows), 0, -1) * p_values[order])
+    adjusted = np.empty(len(rows))
+    adjusted[order] = np.maximum.accumulate(scaled)
+    return [
+        dataclasses.replace(row, p_adjusted=p, is_significant=p < 1 - LEVEL)
+        for row, p in zip(rows, adjusted.tolist(), strict=True)
+    ]
 
 
-def check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
+def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
     """Raises unless two sets have the same classes, frames and ground truth."""
-    if data_a.classes != data_b.classes:
-        raise UserError(
-            f"the runs are of different classes: {data_a.classes} and {data_b.classes}"
-        )
     for name, one, other in (
+        ("classes", data_a.classes, data_b.classes),
         ("frames", data_a.frame, data_b.frame),
         ("objects", data_a.gt.box, data_b.gt.box),
         ("classes of objects", data_a.gt.cls, data_b.gt.cls),
     ):
-        if one.shape != other.shape:
-            raise UserError(
-                f"the runs have different {name}: {len(one)} and {len(other)}"
-            )
         if not np.array_equal(one, other):
-            row = int(np.flatnonzero((one != other).reshape(len(one), -1).any(1))[0])
-            raise DataError(f"the runs have different {name}, first in row {row}")
+            counts = f"{len(one)} and {len(other)}"
+            raise UserError(
+                f"the runs have different {name} ({counts}), expected equal"
+            )

@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES, Boxes
-from radejax.evaluation import boxes, matching, overlap, protocols
+from radejax.evaluation import boxes, matching, protocols
 from radejax.evaluation.boxes import AnyColumns, Roi
 from radejax.evaluation.protocols import Curve, Protocol
+from radejax.geometry.rotated_iou import bev_iou, iou_3d
 
 SPACES = ("bev", "3d")
 
@@ -22,13 +23,6 @@ MAX_PAIRS = 1_000_000
 """Of predictions and ground truths of a class in a frame; 100 and 20 are many."""
 
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
-
-# Scores, descending; their frames; the true positives or matches that each adds.
-Ranked = tuple[
-    Float[np.ndarray, " K"],
-    Int[np.ndarray, " K"],
-    Int[np.ndarray, " K"] | Bool[np.ndarray, " K"],
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,45 +142,54 @@ class EvaluationSet:
         label_version: str | None = None,
     ) -> None:
         """See `evaluate` for the arguments."""
-        self.classes = _check_classes(classes)
+        self.classes = tuple(classes)
+        is_repeated = len(set(self.classes)) < len(self.classes)
+        if isinstance(classes, str) or not self.classes or is_repeated:
+            raise UserError(f"classes is {classes!r}, expected different class names")
         self.roi = boxes.roi_name(roi)
         self.label_version = label_version
-        self.is_simulated = boxes.are_simulated(frames)
         truth = boxes.read_boxes(ground_truth, "ground truth", scored=False)
         found = boxes.read_boxes(predictions, "predictions", scored=True)
         if frames is None:
-            self.frame = np.unique(np.concatenate([truth.frame, found.frame]))
-        else:
-            self.frame = boxes.frame_ids(frames)
+            frames = {"frame": np.union1d(truth.frame, found.frame)}
+        self.frame = boxes.frame_ids(frames)
+        self.is_simulated = bool(np.any(frames.get("simulated", False)))
         self._roi, self._tables = roi, (truth, found)
         self.left_out: dict[str, int] = {}
-        self.gt, _ = self._select(truth, "ground truth", roi)
-        self.pred, self._pred_row = self._select(found, "predictions", roi)
+        self.gt, _ = self._select(truth, "ground truth")
+        self.pred, self._pred_row = self._select(found, "predictions")
         assert self.pred.score is not None  # read_boxes requires it
         self.score = self.pred.score
-        num_classes = len(self.classes)
-        self.gt_group = self.gt.frame * num_classes + self.gt.cls
-        self.pred_group = self.pred.frame * num_classes + self.pred.cls
+        self.gt_group = self.gt.frame * len(self.classes) + self.gt.cls
+        self.pred_group = self.pred.frame * len(self.classes) + self.pred.cls
         self.gt_count = self._count(self.gt_group)
-        self._check_number()
-        self.pair_pred, self.pair_gt = overlap.candidate_pairs(
+        pairs = self.gt_count * self._count(self.pred_group)
+        if pairs.max(initial=0) > MAX_PAIRS:
+            frame, cls = np.unravel_index(pairs.argmax(), pairs.shape)
+            raise DataError(
+                f"frame {self.frame[frame]}: predictions and ground truths of "
+                f"{self.classes[cls]} are {pairs[frame, cls]:,} pairs, expected at most "
+                f"{MAX_PAIRS:,}: keep those with the highest scores"
+            )
+        self.pair_pred, self.pair_gt = matching.candidate_pairs(
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
-        self._overlaps: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        self._matches: dict[tuple, Matches] = {}
-        self._ranked: dict[tuple, list[Ranked]] = {}
+        # Shared by the results of all protocols, thresholds and frames.
+        self.overlap = functools.cache(self._overlap)
+        self._cached_match = functools.cache(self._match)
+        self._cached_ranking = functools.cache(self._ranking)
 
-    def _select(
-        self, table: Boxes, name: str, roi: Roi
-    ) -> tuple[Boxes, Int[np.ndarray, " N"]]:
+    def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
         """Sorted boxes of the classes in the region, and their rows; counts the others."""
         position = boxes.frame_positions(table.frame, self.frame, name)
         cls = boxes.class_indices(table, self.classes, name)
-        is_class, is_inside = cls >= 0, boxes.in_roi(table.box, roi)
-        self.left_out[f"{name}: class not evaluated"] = int((~is_class).sum())
-        self.left_out[f"{name}: center outside the region of interest"] = int(
-            (is_class & ~is_inside).sum()
-        )
+        is_class, is_inside = cls >= 0, boxes.in_roi(table.box, self._roi)
+        self.left_out |= {
+            f"{name}: class not evaluated": int((~is_class).sum()),
+            f"{name}: center outside the region of interest": int(
+                (is_class & ~is_inside).sum()
+            ),
+        }
         row = np.flatnonzero(is_class & is_inside)
         row = row[np.lexsort((row, cls[row], position[row]))]
         score = None if table.score is None else table.score[row]
@@ -197,19 +200,6 @@ class EvaluationSet:
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
-    def _check_number(self) -> None:
-        """Raise `DataError` for more boxes of a class in a frame than can be compared."""
-        pred_count = self._count(self.pred_group)
-        pairs = self.gt_count * pred_count
-        if pairs.max(initial=0) > MAX_PAIRS:
-            frame, cls = np.unravel_index(pairs.argmax(), pairs.shape)
-            raise DataError(
-                f"frame {self.frame[frame]}: {pred_count[frame, cls]} predictions and "
-                f"{self.gt_count[frame, cls]} ground truths of {self.classes[cls]} are "
-                f"{pairs[frame, cls]:,} pairs, expected at most {MAX_PAIRS:,}: keep those "
-                "with the highest scores"
-            )
-
     @property
     def predictions(self) -> Boxes:
         """The predictions as given."""
@@ -218,66 +208,54 @@ class EvaluationSet:
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """The set of some frames, for many evaluations of a condition."""
         ids = self.frame[is_chosen]
-        truth, found = (t.take(np.isin(t.frame, ids)) for t in self._tables)
-        frames = {"frame": ids, "simulated": np.full(ids.size, self.is_simulated)}
         return EvaluationSet(
-            truth,
-            found,
+            *(table.take(np.isin(table.frame, ids)) for table in self._tables),
             classes=self.classes,
-            frames=frames,
+            frames={"frame": ids, "simulated": np.full(ids.size, self.is_simulated)},
             roi=self._roi,
             label_version=self.label_version,
         )
 
     # Shared work ---------------------------------------------------------------------
 
-    def overlaps(
-        self, geometry: str
-    ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
-        """BEV and 3D IoU of the candidate pairs under a protocol's geometry."""
-        if geometry not in self._overlaps:
-            self._overlaps[geometry] = self._overlap(geometry)
-        return self._overlaps[geometry]
-
-    def _overlap(
-        self, geometry: str
-    ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    def _overlap(self, geometry: str, space: str) -> Float[np.ndarray, " P"]:
+        """IoU of the candidate pairs under a protocol's geometry."""
         truth, found = self.gt.box, self.pred.box
-        if geometry == "plain":
-            return overlap.pair_iou(found[self.pair_pred], truth[self.pair_gt])
-        truth = np.round(truth, 2)
+        if geometry != "plain":
+            truth = np.round(truth, 2)
         if geometry.startswith("swapped_lw"):
             swap = [0, 1, 2, 4, 3, 5, 6]
             truth, found = truth[:, swap], found[:, swap]
-        bev, iou_3d = overlap.pair_iou(
-            found[self.pair_pred],
-            truth[self.pair_gt],
-            z_center=1.0 if geometry == "swapped_lw_z_top" else 0.5,
-        )
+        z_center = 1.0 if geometry == "swapped_lw_z_top" else 0.5
+        parts = []
+        # A pair has about 32 temporary arrays.
+        for rows in matching.chunks(np.full(self.pair_gt.size, 32)):
+            pair = found[self.pair_pred[rows], None], truth[self.pair_gt[rows], None]
+            iou = bev_iou(*pair) if space == "bev" else iou_3d(*pair, z_center)
+            parts.append(iou[:, 0, 0])
+        values = np.concatenate(parts)
+        if geometry == "plain":
+            return values
         # The original stores overlaps in single and compares them in double precision.
-        bev, iou_3d = (i.astype(np.float32).astype(np.float64) for i in (bev, iou_3d))
-        return bev, iou_3d
+        return values.astype(np.float32).astype(np.float64)
 
     def match(self, protocol: Protocol, space: str, iou: float) -> Matches:
         """Matches of all frames and classes: `KradarMatches` or each one's object or -1."""
-        geometry = protocol.geometry
+        geometry: str = protocol.geometry
         if geometry == "swapped_lw_z_top" and space == "bev":
             geometry = "swapped_lw"  # z plays no part
-        key = (geometry, protocol.matching, space, iou)
-        if key not in self._matches:
-            values = self.overlaps(geometry)[SPACES.index(space)]
-            pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
-            match: Matches
-            if protocol.matching == "kradar":
-                match = matching.match_kradar(pairs, self.score, self.gt_group, iou)
-            elif protocol.matching == "best":
-                match = matching.match_best(pairs, self.score, iou)
-            else:
-                match = matching.match_free(
-                    pairs, self.score, self.pred_group, len(self.gt), iou
-                )
-            self._matches[key] = match
-        return self._matches[key]
+        return self._cached_match(geometry, protocol.matching, space, iou)
+
+    def _match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
+        values = self.overlap(geometry, space)
+        pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
+        if rule == "kradar":
+            return matching.match_kradar(pairs, self.score, self.gt_group, iou)
+        if rule == "best":
+            return matching.match_best(pairs, self.score, iou)
+        return matching.match_free(
+            pairs, self.score, self.pred_group, len(self.gt), iou
+        )
 
     @functools.cached_property
     def by_score(self) -> list[Int[np.ndarray, " _"]]:
@@ -286,19 +264,6 @@ class EvaluationSet:
         return [order[self.pred.cls[order] == c] for c in range(len(self.classes))]
 
     # Results -------------------------------------------------------------------------
-
-    def frame_weights(
-        self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None = None
-    ) -> Int[np.ndarray, "F C"]:
-        """Weights of the frames for every class, 0 for frames that are ignored."""
-        if weights is None:
-            weights = np.ones(self.frame.size, np.int64)
-        weights = np.asarray(weights).astype(np.int64)[:, None]
-        if empty_frames == "class":
-            return weights * (self.gt_count > 0)
-        if empty_frames == "frame":
-            weights = weights * (self.gt_count.sum(axis=1, keepdims=True) > 0)
-        return np.broadcast_to(weights, self.gt_count.shape)
 
     def results(
         self,
@@ -328,22 +293,28 @@ class EvaluationSet:
         empty_frames = chosen.resolve_empty_frames(empty_frames)
         spaces = (spaces,) if isinstance(spaces, str) else tuple(spaces)
         if not set(spaces) <= set(SPACES):
-            raise UserError(f"spaces must be among {SPACES}, got {spaces}")
-        frame_weights = self.frame_weights(empty_frames, weights)
+            raise UserError(f"spaces is {spaces}, expected some of {SPACES}")
+        ious = np.atleast_1d(np.asarray(iou_thresholds, np.float64)).tolist()
+        if not ious or not all(0 <= iou < 1 for iou in ious):
+            raise UserError(
+                f"iou_thresholds is {iou_thresholds}, expected numbers in [0, 1)"
+            )
+        frame_weights = self._frame_weights(empty_frames, weights)
         points = () if curves else ("precision", "recall", "score")
         dropped = dict.fromkeys(points, np.zeros(0))
+        num_frames = (frame_weights > 0).sum(axis=0).tolist()
         score_threshold, results = float(score_threshold), []
         for space, iou, (index, name) in itertools.product(
-            spaces, _check_ious(iou_thresholds), enumerate(self.classes)
+            spaces, ious, enumerate(self.classes)
         ):
             weight = frame_weights[:, index]
-            curve = self.curve(chosen, space, iou, score_threshold, index, weight)
+            curve = self._curve(chosen, space, iou, score_threshold, index, weight)
             result = Result(
                 cls=name,
                 space=space,
                 iou=iou,
                 protocol=chosen.name,
-                num_frames=int((weight > 0).sum()),
+                num_frames=num_frames[index],
                 score_threshold=score_threshold,
                 empty_frames=empty_frames,
                 roi=self.roi,
@@ -356,7 +327,19 @@ class EvaluationSet:
             results.append(result)
         return results
 
-    def curve(
+    def _frame_weights(
+        self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None
+    ) -> Int[np.ndarray, "F C"]:
+        """Weights of the frames for every class, 0 for frames that are ignored."""
+        counts = np.ones(self.frame.size) if weights is None else np.asarray(weights)
+        counts = counts.astype(np.int64)[:, None]
+        if empty_frames == "class":
+            return counts * (self.gt_count > 0)
+        if empty_frames == "frame":
+            counts = counts * (self.gt_count.sum(axis=1, keepdims=True) > 0)
+        return np.broadcast_to(counts, self.gt_count.shape)
+
+    def _curve(
         self,
         protocol: Protocol,
         space: str,
@@ -366,65 +349,48 @@ class EvaluationSet:
         weight: Int[np.ndarray, " F"],
     ) -> Curve:
         """Curve and AP of one class over weighted frames."""
-        key = (protocol.geometry, protocol.matching, space, iou, score_threshold, cls)
-        if key not in self._ranked:
-            self._ranked[key] = self._rank(protocol, space, iou, score_threshold, cls)
-        (score, frame, is_tp), *steps = self._ranked[key]
-        num_gt, det_weight = int(weight @ self.gt_count[:, cls]), weight[frame]
+        ranked = self._cached_ranking(protocol, space, iou, score_threshold, cls)
+        num_gt = int(weight @ self.gt_count[:, cls])
         if protocol.matching == "kradar":
-            matched, events = ((s, count * weight[f]) for s, f, count in steps)
-            detections = (score, det_weight)
+            matched, events, detections = (
+                (score, count * weight[frame]) for score, frame, count in ranked
+            )
             return protocols.kradar_curve(
                 matched, events, detections, num_gt, protocol.curve
             )
+        ((score, frame, is_tp),) = ranked
         return protocols.pooled_curve(
             score=score,
             is_tp=is_tp,
-            weight=det_weight,
+            weight=weight[frame],
             num_gt=num_gt,
             curve=protocol.curve,
         )
 
-    def _rank(
+    def _ranking(
         self, protocol: Protocol, space: str, iou: float, threshold: float, cls: int
-    ) -> list[Ranked]:
-        """What a curve of one class needs, by descending score, for any weights.
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """What a curve of one class needs for any weights of the frames.
 
-        Predictions and whether they match; in K-Radar's protocols then the matches of
-        the first pass and the steps of the second.
+        Scores, descending, their frames, and whether the predictions match. In K-Radar's
+        protocols the counts that they add instead: to the matches of the first pass, to
+        the true positives of the second, and to the predictions.
         """
         match, mine = self.match(protocol, space, iou), self.by_score[cls]
-        if not isinstance(match, matching.KradarMatches):
-            counts = [(mine, match[mine] >= 0)]
-            threshold = threshold or -1.0  # a threshold of 0 keeps scores of 0 too
+        if isinstance(match, matching.KradarMatches):
+            counted = [
+                (match.first_pred, np.ones_like(match.first_pred)),
+                (match.event_pred, match.event_delta),
+                (mine, np.ones_like(mine)),
+            ]
         else:
-            first = match.first_pred
-            counts = [(pred, np.ones_like(pred)) for pred in (mine, first)]
-            counts.append((match.event_pred, match.event_delta))
+            counted = [(mine, match[mine] >= 0)]
+            threshold = threshold or -1.0  # a threshold of 0 keeps scores of 0 too
         ranked = []
-        for pred, count in counts:
+        for pred, count in counted:
             keep = (self.pred.cls[pred] == cls) & (self.score[pred] > threshold)
             pred, count = pred[keep], count[keep]
-            if np.any(np.diff(self.score[pred]) > 0):
-                order = np.argsort(-self.score[pred], kind="stable")
-                pred, count = pred[order], count[order]
+            order = np.argsort(-self.score[pred], kind="stable")
+            pred, count = pred[order], count[order]
             ranked.append((self.score[pred], self.pred.frame[pred], count))
         return ranked
-
-
-def _check_classes(classes: Sequence[str]) -> tuple[str, ...]:
-    """Class names as a tuple; raises for none, one twice or a plain string."""
-    if isinstance(classes, str) or not len(classes):
-        raise UserError(f"classes must be a sequence of class names, got {classes!r}")
-    names = tuple(str(name) for name in classes)
-    if len(set(names)) != len(names):
-        raise UserError(f"a class is named twice in {names}")
-    return names
-
-
-def _check_ious(iou_thresholds: Sequence[float] | float) -> tuple[float, ...]:
-    """IoU thresholds as a tuple of floats in [0, 1)."""
-    values = tuple(float(v) for v in np.atleast_1d(np.asarray(iou_thresholds, float)))
-    if not values or not all(0 <= value < 1 for value in values):
-        raise UserError(f"iou_thresholds must lie in [0, 1), got {iou_thresholds}")
-    return values

@@ -1,4 +1,4 @@
-"""Assigning predictions to ground truth: every frame and class at the same time.
+"""Pairing predictions with ground truth: every frame and class at the same time.
 
 Boxes of different groups (a group is one class in one frame) never meet in a pair, so one
 round serves the r-th box of every group at once, and the number of rounds is the largest
@@ -15,9 +15,68 @@ import chex
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real, Shaped
 
-from radejax.evaluation.overlap import ranges
+PAIRS_PER_CHUNK = 2_000_000
+"""Pairs compared at once, about, which bounds the memory."""
 
-VIRTUAL_PAIRS_PER_CHUNK = 2_000_000
+
+def candidate_pairs(
+    group_a: Real[np.ndarray, " N"],
+    group_b: Real[np.ndarray, " M"],
+    box_a: Float[np.ndarray, "N 7"],
+    box_b: Float[np.ndarray, "M 7"],
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
+    """Pairs (a, b) of one group whose rectangles can possibly touch.
+
+    Args:
+        group_a: `[N]` group of every box a, for instance frame and class in one number.
+        group_b: `[M]` groups of the boxes b, sorted.
+        box_a: `[N, 7]` boxes.
+        box_b: `[M, 7]` boxes.
+
+    Returns:
+        Two `[P]` index arrays, ordered by a, then b.
+
+    Examples:
+        >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [60.0, 0, 0, 4, 2, 1.5, 0]])
+        >>> a, b = candidate_pairs(np.zeros(2), np.zeros(2), cars, cars)
+        >>> a.tolist(), b.tolist()
+        ([0, 1], [0, 1])
+    """
+    chex.assert_shape([box_a, box_b], (None, 7))
+    first = np.searchsorted(group_b, group_a)
+    count = np.searchsorted(group_b, group_a, side="right") - first
+    # Half diagonals; 3 cm of slack for boxes that a protocol rounds to centimetres.
+    reach_a = 0.5 * np.hypot(box_a[:, 3], box_a[:, 4]) + 0.03
+    reach_b = 0.5 * np.hypot(box_b[:, 3], box_b[:, 4])
+    parts = []
+    for rows in chunks(count):
+        owner, b = ranges(first[rows], count[rows])
+        a = rows[owner]
+        gap = box_a[a, :2] - box_b[b, :2]
+        near = np.hypot(gap[:, 0], gap[:, 1]) <= reach_a[a] + reach_b[b]
+        parts.append((a[near], b[near]))
+    return np.concatenate([a for a, _ in parts]), np.concatenate([b for _, b in parts])
+
+
+def chunks(count: Int[np.ndarray, " R"]) -> list[Int[np.ndarray, " _"]]:
+    """Rows in chunks, of about so many pairs in all as are compared at once."""
+    num_chunks = 1 + int(count.sum()) // PAIRS_PER_CHUNK
+    return np.array_split(np.arange(count.size), num_chunks)
+
+
+def ranges(
+    first: Int[np.ndarray, " R"], count: Int[np.ndarray, " R"]
+) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Which range, and index, of everything in the ranges [first, first + count).
+
+    Examples:
+        >>> owner, index = ranges(np.array([5, 0]), np.array([2, 3]))
+        >>> owner.tolist(), index.tolist()
+        ([0, 0, 1, 1, 1], [5, 6, 0, 1, 2])
+    """
+    owner = np.repeat(np.arange(count.size), count)
+    before = np.cumsum(count) - count
+    return owner, np.arange(owner.size) + (first - before)[owner]
 
 
 class Pairs(NamedTuple):
@@ -166,27 +225,23 @@ def _steps(
 
     The matching is computed once per level, which is a distinct score of a group.
     """
-    if group.size == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     order = np.argsort(group, kind="stable")
     (pred, gt, iou), group = pairs.take(order), group[order]
     # Levels: distinct (group, score), by descending score.
-    rows = np.lexsort((pred, -score[pred], group))
-    rows = rows[_is_new(group[rows], score[pred[rows]])]
-    level_pred, level_group = pred[rows], group[rows]
-    first = np.searchsorted(group, level_group, side="left")
+    start = np.lexsort((pred, -score[pred], group))
+    start = start[_is_new(group[start], score[pred[start]])]
+    level_pred, level_group = pred[start], group[start]
+    first = np.searchsorted(group, level_group)
     count = np.searchsorted(group, level_group, side="right") - first
     true_positives = np.zeros(level_pred.size, np.int64)
-    chunk = np.cumsum(count) // VIRTUAL_PAIRS_PER_CHUNK
-    bounds = np.flatnonzero(np.diff(chunk, prepend=-1, append=chunk[-1] + 1))
-    for low, high in itertools.pairwise(bounds):
-        level, pair = ranges(first[low:high], count[low:high])
-        enters = score[pred[pair]] >= score[level_pred[low:high]][level]
+    for rows in chunks(count):
+        level, pair = ranges(first[rows], count[rows])
+        enters = score[pred[pair]] >= score[level_pred[rows]][level]
         level, pair = level[enters], pair[enters]
         # Levels are independent: renumber the predictions of each.
         target = np.unique(level * score.size + pred[pair], return_inverse=True)[1]
-        won = greedy(gt[pair], target, iou[pair], level, int(target.max()) + 1)
-        true_positives[low:high] = np.bincount(level[won], minlength=high - low)
+        won = greedy(gt[pair], target, iou[pair], level, target.size)
+        true_positives[rows] = np.bincount(level[won], minlength=rows.size)
     before = np.where(_is_new(level_group), 0, np.roll(true_positives, 1))
     return level_pred, true_positives - before
 

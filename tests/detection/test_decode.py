@@ -12,9 +12,9 @@ from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
-from radejax.evaluation.overlap import pair_iou
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.rotated_iou import bev_iou, iou_3d
 
 KRADAR = RadarGrid.kradar()
 OFFICIAL = {112: KRADAR.padded(8, "stretched"), 107: KRADAR.padded(1, "stretched")}
@@ -366,9 +366,9 @@ def test_our_evaluator_takes_the_raw_footprint_as_the_released_one(shared):
         np.asarray(boxes7_from_8(D._with_raw_footprint(jnp.asarray(pairs[key][mine]))))
         for key in ("box_a", "box_b")
     )
-    bev, volume = pair_iou(a.astype(float), b.astype(float))
-    np.testing.assert_allclose(bev, pairs["iou_bev"][mine], atol=5e-4)
-    np.testing.assert_allclose(volume, pairs["iou_3d"][mine], atol=5e-4)
+    for iou, key in ((bev_iou, "iou_bev"), (iou_3d, "iou_3d")):
+        found = iou(a[:, None].astype(float), b[:, None].astype(float))[:, 0, 0]
+        np.testing.assert_allclose(found, pairs[key][mine], atol=5e-4)
 
 
 def test_thresholds_and_region_are_traced_values():

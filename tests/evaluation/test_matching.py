@@ -2,6 +2,55 @@ import numpy as np
 import pytest
 
 from radejax.evaluation import matching
+from radejax.geometry.rotated_iou import bev_iou, iou_3d
+
+
+def boxes(rng, num):
+    return np.column_stack(
+        [
+            rng.normal(0, 3, (num, 2)),
+            rng.normal(0, 0.5, num),
+            rng.uniform(0.3, 6, (num, 3)),
+            rng.uniform(-7, 7, num),
+        ]
+    )
+
+
+@pytest.mark.parametrize("chunk", [64, 10**6])
+def test_candidates_are_all_overlapping_pairs_of_a_group(monkeypatch, chunk):
+    monkeypatch.setattr(matching, "PAIRS_PER_CHUNK", chunk)
+    rng = np.random.default_rng(3)
+    a, b = boxes(rng, 80), boxes(rng, 90)
+    group_a, group_b = rng.integers(0, 6, 80), np.sort(rng.integers(0, 6, 90))
+    first, second = matching.candidate_pairs(group_a, group_b, a, b)
+    order = np.lexsort((second, first))
+    np.testing.assert_array_equal(order, np.arange(first.size))
+    found = set(zip(first.tolist(), second.tolist(), strict=True))
+    is_same = group_a[:, None] == group_b
+    touching = set(zip(*np.nonzero((bev_iou(a, b) > 0) & is_same), strict=True))
+    assert len(found) == first.size
+    assert touching <= found < set(zip(*np.nonzero(is_same), strict=True))
+
+
+@pytest.mark.parametrize("counts", [(0, 0), (0, 1), (1, 0)])
+def test_no_candidates(counts):
+    group, box = zip(*((np.zeros(n), np.ones((n, 7))) for n in counts), strict=True)
+    assert [x.size for x in matching.candidate_pairs(*group, *box)] == [0, 0]
+
+
+def test_kradar_pair_fixture(shared):
+    folder = shared / "fixtures" / "kradar_eval"
+    pairs = np.load(folder / "pair_iou.npz")
+    truth = np.load(folder / "ground_truth.npz")["box_rounded"][pairs["gt_index"]]
+    found = np.load(folder / "predictions.npz")["box"][pairs["pred_index"]]
+    exchange = [0, 1, 2, 4, 3, 5, 6]
+    for columns, kind in ((slice(None), "geometric"), (exchange, "official")):
+        both = found[:, None, columns], truth[:, None, columns]
+        for iou, name in ((bev_iou, "bev"), (iou_3d, "iou3d")):
+            expected = pairs[f"{name}_{kind}"]
+            np.testing.assert_allclose(iou(*both)[:, 0, 0], expected, atol=1e-12)
+    legacy = iou_3d(*both, z_center=1.0)[:, 0, 0]
+    np.testing.assert_allclose(legacy, pairs["iou3d_official_legacy"], atol=1e-12)
 
 
 def pairs(*triples):
@@ -112,7 +161,7 @@ def second_pass_loop(pred, gt, iou, score, threshold):
 @pytest.mark.parametrize("chunk", [1, 7, 10**6])
 @pytest.mark.parametrize("seed", range(6))
 def test_second_pass_equals_a_loop_at_every_threshold(monkeypatch, seed, chunk):
-    monkeypatch.setattr(matching, "VIRTUAL_PAIRS_PER_CHUNK", chunk)
+    monkeypatch.setattr(matching, "PAIRS_PER_CHUNK", chunk)
     rng = np.random.default_rng(seed)
     num_pred, num_gt = 25, 18
     grid = np.stack(np.meshgrid(np.arange(num_pred), np.arange(num_gt), indexing="ij"))
