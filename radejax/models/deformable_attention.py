@@ -19,56 +19,46 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+Arrays = tuple[jax.Array, ...]
+
 _CHUNK_SIZES = {"cpu": 448, "default": 8192}
 """Bins at a time: a CPU wants the sampled rows in cache, an accelerator few large steps."""
 
 
 class Linear(nn.Module):
-    """Linear layer whose product and bias can be had apart.
+    """Linear layer, `[..., C]` -> its product `[..., C']` and its bias `[C']` apart.
 
     Attributes:
-        features_in: Input channels.
-        features: Output channels.
+        features: Output channels C'.
         kernel_init: Initialiser of the kernel.
         bias_init: Initialiser of the bias.
-        dtype: Dtype of the computation and the output.
+        dtype: Dtype of the product.
         precision: Of the product, as in `jax.lax.dot`.
     """
 
-    features_in: int
     features: int
     kernel_init: Any = nn.initializers.xavier_uniform()
     bias_init: Any = nn.initializers.zeros
     dtype: Any = jnp.float32
     precision: str | None = None
 
-    def setup(self) -> None:
-        shape = (self.features_in, self.features)
-        self.kernel = self.param("kernel", self.kernel_init, shape)
-        self.bias = self.param("bias", self.bias_init, (self.features,))
-
-    def product(
-        self, x: Float[jax.Array, "*batch {self.features_in}"]
-    ) -> Float[jax.Array, "*batch {self.features}"]:
-        """The layer without its bias."""
-        x, kernel = x.astype(self.dtype), self.kernel.astype(self.dtype)
-        return jnp.matmul(x, kernel, precision=self.precision)
-
+    @nn.compact
     def __call__(
-        self, x: Float[jax.Array, "*batch {self.features_in}"]
-    ) -> Float[jax.Array, "*batch {self.features}"]:
-        bias = jnp.expand_dims(self.bias.astype(self.dtype), range(x.ndim - 1))
-        return self.product(x) + bias
+        self, x: Float[jax.Array, "*batch _"]
+    ) -> tuple[Float[jax.Array, "*batch C"], Float[jax.Array, " C"]]:
+        kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
+        bias = self.param("bias", self.bias_init, (self.features,))
+        x, kernel = x.astype(self.dtype), kernel.astype(self.dtype)
+        return jnp.matmul(x, kernel, precision=self.precision), bias
 
 
 class DeformableAttention(nn.Module):
@@ -88,21 +78,7 @@ class DeformableAttention(nn.Module):
     chunk_size: int = 0
     dtype: Any = jnp.float32
 
-    def setup(self) -> None:
-        features, init = self.features, nn.initializers
-        samples = self.num_heads * self.num_points
-        # Where to look needs all its digits, whatever the dtype of the features.
-        place = functools.partial(
-            Linear,
-            precision="highest",
-            kernel_init=init.zeros,
-            dtype=wide_dtype(self.dtype),
-        )
-        self.sampling_offsets = place(features, 2 * samples, bias_init=self._ring)
-        self.attention_weights = place(features, samples)
-        self.value_proj = Linear(features, features, dtype=self.dtype)
-        self.output_proj = Linear(features, features, dtype=self.dtype)
-
+    @nn.compact
     def __call__(
         self,
         feature: Float[jax.Array, "B N C"],
@@ -123,27 +99,39 @@ class DeformableAttention(nn.Module):
         Returns:
             `[B, N, C]`: the weighted sum of the attention of the queries.
         """
-        b, n = feature.shape[:2]
         heads, points = self.num_heads, self.num_points
-        values = self.value_proj(value).reshape(*value.shape[:3], heads, -1)
+        # Where to look needs all its digits, whatever the dtype of the features.
+        place = functools.partial(
+            Linear,
+            precision="highest",
+            kernel_init=nn.initializers.zeros,
+            dtype=wide_dtype(self.dtype),
+        )
+        offset_layer = place(
+            2 * heads * points, bias_init=self._ring, name="sampling_offsets"
+        )
+        offsets, offset_bias = offset_layer(feature)
+        logits, logit_bias = place(heads * points, name="attention_weights")(feature)
+        linear = functools.partial(Linear, self.features, dtype=self.dtype)
+        value, value_bias = linear(name="value_proj")(value)
+        value += jnp.expand_dims(value_bias.astype(self.dtype), (0, 1, 2))
 
-        offsets, logits = self.sampling_offsets, self.attention_weights
+        batch = feature.shape[:2]
         out = lifted_attention(
-            values,
-            offsets.product(feature).reshape(b, n, heads, points, 2),
-            logits.product(feature).reshape(b, n, heads, points),
+            value.reshape(*value.shape[:3], heads, -1),
+            offsets.reshape(*batch, heads, points, 2),
+            logits.reshape(*batch, heads, points),
             scale,
             reference,
             query_weights,
-            offsets.bias.reshape(heads, points, 2),
-            logits.bias.reshape(heads, points),
+            offset_bias.reshape(heads, points, 2),
+            logit_bias.reshape(heads, points),
             chunk_size=self.chunk_size,
         )  # [B, N, heads, D]
         # The projection is linear: once per bin, its bias as often as the mean counts.
-        out = self.output_proj.product(out.reshape(b, n, -1))
+        out, bias = linear(name="output_proj")(out.reshape(*batch, -1))
         total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
-        bias = jnp.expand_dims(self.output_proj.bias, (0, 1))
-        return out + (total * bias).astype(self.dtype)
+        return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
     def _ring(self, key: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> Any:
         """Heads look in different directions, point i at distance i + 1."""
@@ -190,39 +178,20 @@ def lifted_attention(
 
     Returns:
         `[B, N, heads, D]`.
-
-    Raises:
-        AssertionError: Arrays do not fit together.
     """
-    b, bins, heads, points = logits.shape
-    chex.assert_shape(value, (b, None, None, heads, None))
-    chex.assert_shape(offsets, (*logits.shape, 2))
-    chex.assert_shape(scale, (b, bins, None))
-    chex.assert_shape(reference, (None, *scale.shape[1:], 2))
-    chex.assert_shape(query_weights, (None, *scale.shape[1:]))
-    chex.assert_shape(offset_bias, (heads, points, 2))
-    chex.assert_shape(logit_bias, (heads, points))
+    b = len(value)
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
     by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
 
     def sample(arrays: tuple[jax.Array, ...]) -> jax.Array:
         value, offsets, logits, scale, *own = arrays
         # Geometry is per sample, or one for the whole batch.
-        points, weights = own or (reference[0], query_weights[0])
+        geometry = own or (reference[0], query_weights[0])
 
         def head(arrays: tuple[jax.Array, ...]) -> jax.Array:
-            value, offsets, logits, offset_bias, logit_bias = arrays
-            return _lifted_head(
-                chunk_size,
-                value,
-                offsets,
-                logits,
-                scale,
-                points,
-                weights,
-                offset_bias,
-                logit_bias,
-            )
+            value, offsets, logits, *biases = arrays
+            per_bin = (offsets, logits, scale, *geometry)
+            return _lifted_head(chunk_size, value, per_bin, tuple(biases))
 
         return jax.lax.map(head, (value, offsets, logits, offset_bias, logit_bias))
 
@@ -242,12 +211,12 @@ def lifted_attention(
 # place; transposing the loop would allocate and add a whole map per chunk.
 
 
-# The chunk is chosen in there too, where nothing is differentiated: a program lowered for
-# another platform than the tracing machine's gets that platform's.
-
-
 def _by_chunk(function: Callable[..., Any], chunk_size: int, *arrays: Any) -> Any:
-    """`function(chunk_size, *arrays)`; a chunk size of 0 is the platform's."""
+    """`function(chunk_size, *arrays)`; a chunk size of 0 is the platform's.
+
+    Chosen where nothing is differentiated: a program lowered for another platform than
+    the tracing machine's gets that platform's.
+    """
     if chunk_size:
         return function(chunk_size, *arrays)
     by_platform = {
@@ -258,24 +227,33 @@ def _by_chunk(function: Callable[..., Any], chunk_size: int, *arrays: Any) -> An
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _lifted_head(chunk_size: int, value: jax.Array, *arrays: jax.Array) -> jax.Array:
-    """`[N, D]` of one head: value `[H, W, D]`, the rest as in `lifted_attention`."""
-    return _by_chunk(_head_forward, chunk_size, value, *arrays)
+def _lifted_head(
+    chunk_size: int, value: jax.Array, per_bin: Arrays, biases: Arrays
+) -> jax.Array:
+    """`[N, D]` of one head: value `[H, W, D]`; offsets, logits, scale, reference and
+    weights of the queries, and the two biases as in `lifted_attention`."""
+    return _by_chunk(_head_forward, chunk_size, value, per_bin, biases)
 
 
-def _head_forward(chunk_size: int, value: jax.Array, *arrays: jax.Array) -> jax.Array:
-    *per_bin, offset_bias, logit_bias = arrays
+def _head_forward(
+    chunk_size: int, value: jax.Array, per_bin: Arrays, biases: Arrays
+) -> jax.Array:
     pixels = value.reshape(-1, value.shape[-1])
 
-    def chunk(parts: Sequence[jax.Array]) -> jax.Array:
-        index, share = _lifted_samples(value.shape[:2], parts, offset_bias, logit_bias)
-        return _weighted_rows(pixels, index, share)
+    def chunk(parts: Arrays) -> jax.Array:
+        share, index = _lifted_samples(value.shape[:2], parts, biases)
+        return jnp.einsum(
+            "nk,nkd->nd",
+            share.reshape(len(share), -1).astype(pixels.dtype),
+            _rows(pixels, index),
+            preferred_element_type=wide_dtype(pixels.dtype),
+        ).astype(pixels.dtype)
 
     out = jax.lax.map(chunk, _to_chunks(per_bin, chunk_size))
-    return out.reshape(-1, out.shape[-1])[: per_bin[0].shape[0]]
+    return out.reshape(-1, out.shape[-1])[: len(per_bin[0])]
 
 
-def _lifted_head_forward(chunk_size: int, *arrays: jax.Array) -> tuple[jax.Array, Any]:
+def _lifted_head_forward(chunk_size: int, *arrays: Any) -> tuple[jax.Array, Any]:
     return _lifted_head(chunk_size, *arrays), arrays
 
 
@@ -283,63 +261,51 @@ def _lifted_head_backward(chunk_size: int, saved: Any, grad: jax.Array) -> tuple
     return _by_chunk(_head_backward, chunk_size, grad, *saved)
 
 
-def _head_backward(chunk_size: int, grad: jax.Array, *saved: jax.Array) -> tuple:
-    value, *per_bin, offset_bias, logit_bias = saved
-    size, bins = value.shape[:2], per_bin[0].shape[0]
+def _head_backward(
+    chunk_size: int, grad: jax.Array, value: jax.Array, per_bin: Arrays, biases: Arrays
+) -> tuple:
     pixels = value.reshape(-1, value.shape[-1])
+    samples = functools.partial(_lifted_samples, value.shape[:2])
 
-    def chunk(sums: tuple, arrays: tuple) -> tuple[tuple, list[jax.Array]]:
-        grad_pixels, grad_offset_bias, grad_logit_bias = sums
+    def chunk(sums: tuple, arrays: tuple) -> tuple[tuple, Arrays]:
+        grad_pixels, grad_biases = sums
         parts, grad = arrays  # grad [n, D]
-
-        def samples(*arrays: Any) -> tuple[jax.Array, jax.Array]:
-            index, share = _lifted_samples(size, *arrays)
-            return share, index
-
-        share, pull, index = jax.vjp(
-            samples, parts, offset_bias, logit_bias, has_aux=True
-        )
-        n = index.shape[0]
-        rows = _rows(pixels, index).reshape(n, -1, pixels.shape[-1])  # [n, E P 4, D]
+        share, pull, index = jax.vjp(samples, parts, biases, has_aux=True)
         grad_share = jnp.einsum(
-            "nd,nkd->nk", grad, rows, preferred_element_type=wide_dtype(pixels.dtype)
+            "nd,nkd->nk",
+            grad,
+            _rows(pixels, index),
+            preferred_element_type=wide_dtype(pixels.dtype),
         )
         wide = grad.astype(wide_dtype(grad.dtype))[:, None]
-        grad_rows = share.reshape(n, -1, 1) * wide  # [n, E P 4, D]
+        grad_rows = share.reshape(len(share), -1, 1) * wide  # [n, E P 4, D]
         grad_pixels = grad_pixels.at[index.reshape(-1)].add(
             grad_rows.reshape(-1, pixels.shape[-1]), mode="promise_in_bounds"
         )
-        grad_parts, *grad_biases = pull(grad_share.reshape(share.shape))
-        sums = (
-            grad_pixels,
-            grad_offset_bias + grad_biases[0],
-            grad_logit_bias + grad_biases[1],
-        )
-        return sums, grad_parts
+        grad_parts, own_biases = pull(grad_share.reshape(share.shape))
+        grad_biases = jax.tree.map(jnp.add, grad_biases, own_biases)
+        return (grad_pixels, grad_biases), grad_parts
 
-    zeros = (
-        jnp.zeros(pixels.shape, wide_dtype(pixels.dtype)),
-        jnp.zeros_like(offset_bias),
-        jnp.zeros_like(logit_bias),
+    grad_pixels = jnp.zeros(pixels.shape, wide_dtype(pixels.dtype))
+    zeros = grad_pixels, jax.tree.map(jnp.zeros_like, biases)
+    chunks = _to_chunks((per_bin, grad), chunk_size)
+    (grad_pixels, grad_biases), grad_parts = jax.lax.scan(chunk, zeros, chunks)
+    own_grads = jax.tree.map(
+        lambda x: x.reshape(-1, *x.shape[2:])[: len(grad)], grad_parts
     )
-    chunks = (_to_chunks(per_bin, chunk_size), _to_chunks([grad], chunk_size)[0])
-    (grad_pixels, *grad_biases), grad_parts = jax.lax.scan(chunk, zeros, chunks)
-    own_grads = [x.reshape(-1, *x.shape[2:])[:bins] for x in grad_parts]
     grad_value = grad_pixels.reshape(value.shape).astype(value.dtype)
-    return (grad_value, *own_grads, *grad_biases)
+    return grad_value, own_grads, grad_biases
 
 
 _lifted_head.defvjp(_lifted_head_forward, _lifted_head_backward)
 
 
 def _lifted_samples(
-    size: tuple[int, ...],
-    parts: Sequence[jax.Array],
-    offset_bias: Float[jax.Array, "P 2"],
-    logit_bias: Float[jax.Array, " P"],
-) -> tuple[Int[jax.Array, "n E P 4"], Float[jax.Array, "n E P 4"]]:
-    """Pixel indices and shares of a chunk of n bins."""
-    offsets, logits, scale, reference, query_weights = parts
+    size: tuple[int, ...], per_bin: Arrays, biases: Arrays
+) -> tuple[Float[jax.Array, "n E P 4"], Int[jax.Array, "n E P 4"]]:
+    """Shares and pixel indices of a chunk of n bins."""
+    offsets, logits, scale, reference, query_weights = per_bin
+    offset_bias, logit_bias = biases
     height, width = size
     shift = scale[:, :, None, None] * offsets[:, None] + offset_bias[None, None]
     x = reference[..., None, 0] * width - 0.5 + shift[..., 0]  # [n, E, P]
@@ -348,7 +314,7 @@ def _lifted_samples(
         scale[..., None] * logits[:, None] + logit_bias[None, None], -1
     )
     index, share = _corners(x, y, height, width)
-    return index, share * (weights * query_weights[..., None])[..., None]
+    return share * (weights * query_weights[..., None])[..., None], index
 
 
 # Sampling ----------------------------------------------------------------------------
@@ -392,31 +358,21 @@ def wide_dtype(dtype: Any) -> Any:
 
 
 def _rows(
-    pixels: Float[jax.Array, "pixels D"], index: Int[jax.Array, "..."]
-) -> Float[jax.Array, "rows D"]:
+    pixels: Float[jax.Array, "pixels D"], index: Int[jax.Array, "n ..."]
+) -> Float[jax.Array, "n _ D"]:
+    """Pixels by indices, `[n, E P 4, D]`."""
     # Indices are in the map by construction; not checking them again is faster.
-    return pixels.at[index.reshape(-1)].get(mode="promise_in_bounds")
+    rows = pixels.at[index.reshape(-1)].get(mode="promise_in_bounds")
+    return rows.reshape(len(index), -1, pixels.shape[-1])
 
 
-def _weighted_rows(
-    pixels: Float[jax.Array, "pixels D"],
-    index: Int[jax.Array, "n ..."],
-    share: Float[jax.Array, "n ..."],
-) -> Float[jax.Array, "n D"]:
-    """Sums of rows by indices and shares."""
-    n = index.shape[0]
-    rows = _rows(pixels, index).reshape(n, -1, pixels.shape[-1])
-    return jnp.einsum(
-        "nk,nkd->nd",
-        share.reshape(n, -1).astype(pixels.dtype),
-        rows,
-        preferred_element_type=wide_dtype(pixels.dtype),
-    ).astype(pixels.dtype)
-
-
-def _to_chunks(arrays: Sequence[jax.Array], size: int) -> list[jax.Array]:
+def _to_chunks(arrays: Any, size: int) -> Any:
     """`[N, ...]` -> `[chunks, size, ...]`, padded with zeros; one chunk if N is less."""
-    size = min(size, len(arrays[0]))
-    fill = -len(arrays[0]) % size
-    padded = (jnp.pad(x, [(0, fill)] + [(0, 0)] * (x.ndim - 1)) for x in arrays)
-    return [x.reshape(-1, size, *x.shape[1:]) for x in padded]
+    bins = len(jax.tree.leaves(arrays)[0])
+    size = min(size, bins)
+
+    def split(x: jax.Array) -> jax.Array:
+        padded = jnp.pad(x, [(0, -bins % size)] + [(0, 0)] * (x.ndim - 1))
+        return padded.reshape(-1, size, *x.shape[1:])
+
+    return jax.tree.map(split, arrays)
