@@ -23,7 +23,7 @@ from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.projection import project_plain
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.deformable_attention import DeformableAttention
-from radejax.models.lifting import ReferencePoints, static_reference_points
+from radejax.models.lifting import ReferencePoints, reference_points
 from radejax.models.vit import rotary_angles
 from radejax.training.step import create_state, make_optimizer, make_train_step
 from radejax.weights import convert, radenet_torch
@@ -92,7 +92,7 @@ def torch_state(model, variables):
         state[name.replace("running_var", "num_batches_tracked")] = np.array(0)
     rows, columns, channels = model.feature_shape
     vit = model.vit
-    angles = rotary_angles(rows, columns, channels // vit.num_heads, vit.rope_theta)
+    angles = rotary_angles(rows, columns, channels // vit.num_heads)
     names = ("image_backbone.cos", "image_backbone.sin")
     return state | dict(zip(names, map(np.asarray, angles), strict=True))
 
@@ -238,8 +238,8 @@ def dinorade(machine, task="forward"):
         config, model, precision = network("dinorade.py", dtype)
         rng = np.random.default_rng(0)
         image = rng.integers(0, 256, (size, *model.image_size, 3), np.uint8)
-        places = static_reference_points(
-            inputs.CALIBRATION, model.query_grid, 256, 112
+        places = reference_points(
+            inputs.CALIBRATION.camera(), model.query_grid, 256, 112
         ).points
         places = np.asarray(places, np.float32)
         # All in the image, as torch's has it.
@@ -300,8 +300,8 @@ def attention(machine):
     state = {f"{k}.weight": v["kernel"].T for k, v in params.items()}
     state |= {f"{k}.bias": v["bias"] for k, v in params.items()}
     _, model, _ = network("dinorade.py", "float32")
-    places = static_reference_points(
-        inputs.CALIBRATION, model.query_grid, 256, 112
+    places = reference_points(
+        inputs.CALIBRATION.camera(), model.query_grid, 256, 112
     ).points
     scale = np.exp(normal((1, bins, elevation)))
     given = (

@@ -19,7 +19,7 @@ from radejax.data.cameras import read_left_image
 from radejax.data.kradar import read_labels
 from radejax.geometry.camera import RADAR_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.lifting import LiftingAxes, static_reference_points
+from radejax.models.lifting import LiftingAxes, reference_points
 from radejax.visualize.camera import draw_camera
 from radejax.visualize.style import save_figure
 
@@ -78,8 +78,8 @@ def main(image, calibration, label, version, out):
         camera = CameraCalibration.from_kradar(calibration)
         pixels = read_left_image(image, (camera.height, camera.width))
         grid = RadarGrid.kradar()
-        reference = static_reference_points(
-            camera, LiftingAxes.of_grid(grid), grid.num_range, grid.num_azimuth
+        reference = reference_points(
+            camera.camera(), LiftingAxes.of_grid(grid), grid.num_range, grid.num_azimuth
         )
         ground_truth = None
         if label is not None:

@@ -22,8 +22,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.losses.detection import LOSSES
 from radejax.models.backbone import BACKBONES
-from radejax.models.heads import HEADS
-from radejax.models.neck import NECKS
+from radejax.models.heads import HEADS, NECKS
 from radejax.runs import checks, experiment
 from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run

@@ -103,6 +103,9 @@ def or_none(values: Range) -> Range:
     return lambda value: value is None or holds(value), f"{expected}, or None"
 
 
+SIZE = integer(1, 1 << 16)
+"""Numbers of channels, classes, heads, ..."""
+
 POSITIVE: Range = lambda x: _is_number(x, 0) and x > 0, "a number above 0"
 BELOW_ONE: Range = (
     lambda x: _is_number(x, 0, 1) and x < 1,

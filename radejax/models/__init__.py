@@ -8,13 +8,12 @@ from typing import Any
 
 import flax.linen as nn
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, check_options, one_of
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
-from radejax.models.checks import check_choice
 from radejax.models.dinorade import DinoRade
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import LiftingAxes
-from radejax.models.radenet import DTYPES, RadeNet
+from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
 
 _VIT_FIELDS = (
@@ -47,14 +46,15 @@ def build(config: Mapping[str, Any]) -> nn.Module:
         UserError: The name is unknown, a field is missing, unknown or out of range.
     """
     fields = _plain(config)
-    name = fields.pop("name", None)
-    check_choice("name", name, ("radenet", "dinorade"))
-    sections = ("image", "fusion", "query_grid") if name == "dinorade" else ()
+    fields.setdefault("name", None)
+    check_options(fields, "config.model", {"name": one_of("radenet", "dinorade")})
+    is_camera = fields.pop("name") == "dinorade"
+    sections = ("image", "fusion", "query_grid") if is_camera else ()
     _check_keys(fields, {*_own_fields(RadeNet), *sections}, "")
     if fields["cbam"] == "off":
         fields["cbam"] = None
     try:
-        return DinoRade(**_with_camera(fields)) if sections else RadeNet(**fields)
+        return DinoRade(**_with_camera(fields)) if is_camera else RadeNet(**fields)
     except TypeError as error:
         raise UserError(f"config.model has a value of a wrong type: {error}") from None
 
@@ -66,11 +66,11 @@ def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
     _check_keys(image, _IMAGE_FIELDS, "image.")
     _check_keys(fusion, fusion_fields, "fusion.")
     _check_keys(grid, _GRID_FIELDS, "query_grid.")
-    check_choice("image.kind", image["kind"], ("vit", "resnet50"))
+    kinds = {"kind": one_of("vit", "resnet50")}
+    check_options(image, "config.model.image", kinds)
     vit = None
     if image["kind"] == "vit":
-        activation = "silu" if image["gated_mlp"] else "gelu"
-        vit = ViT(**{name: image[name] for name in _VIT_FIELDS}, activation=activation)
+        vit = ViT(**{name: image[name] for name in _VIT_FIELDS})
     return fields | {
         "vit": vit,
         "fusion": Fusion(**fusion),
@@ -110,17 +110,6 @@ def _check_keys(fields: Any, expected: Collection[str], section: str) -> None:
 def has_camera(model: nn.Module) -> bool:
     """Whether a model takes images."""
     return isinstance(model, DinoRade)
-
-
-def with_dtype(model: nn.Module, dtype: str) -> nn.Module:
-    """The same model computing in another dtype; parameters stay float32.
-
-    Raises:
-        UserError: Neither "float32" nor "bfloat16".
-    """
-    if dtype not in DTYPES:
-        raise UserError(f"dtype is {dtype!r}, expected one of {DTYPES}")
-    return model.clone(dtype=dtype)
 
 
 def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: AzimuthMapping) -> RadarGrid:

@@ -6,19 +6,14 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float, Real
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import SIZE, UserError, check_options, require
 from radejax.core.structures import DetectionMaps
 from radejax.geometry.camera import Camera
-from radejax.models.checks import check_size
 from radejax.models.fusion import Fusion
 from radejax.models.image import STRIDE, CameraNeck, ResNetNeck, ResNetTrunk, normalize
 from radejax.models.lifting import (
@@ -60,7 +55,7 @@ class DinoRade(RadeNet, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_size("image.resnet_width", self.resnet_width)
+        check_options(vars(self), "config.model.image", {"resnet_width": SIZE})
         require(
             self.freeze or self.vit is not None,
             "config.model.image.freeze",
@@ -209,12 +204,3 @@ class DinoRade(RadeNet, kw_only=True):
         if has_image is None:
             has_image = jnp.ones(b, bool)
         return self.image_neck(features, jnp.asarray(has_image), train=train)
-
-
-def num_parameters(variables: Mapping[str, Any]) -> tuple[int, int]:
-    """Numbers of parameters outside and inside the image backbone."""
-    sizes = [0, 0]
-    for name, tree in variables["params"].items():
-        leaves = jax.tree.leaves(tree)
-        sizes[name == IMAGE_BACKBONE] += sum(int(np.prod(x.shape)) for x in leaves)
-    return sizes[0], sizes[1]

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Real
 
-from radejax.core.errors import require
+from radejax.core.errors import BELOW_ONE, SIZE, check_options, integer, one_of
 from radejax.core.structures import Array
-from radejax.models.checks import check_choice, check_size
 from radejax.models.deformable_attention import DeformableAttention
+from radejax.models.heads import DilatedNeck
 from radejax.models.layers import Dense, Map
 from radejax.models.lifting import (
     OutOfViewRule,
@@ -26,7 +26,6 @@ from radejax.models.lifting import (
     WeightingNetwork,
     query_weights,
 )
-from radejax.models.neck import DilatedNeck
 
 GateKind = Literal["channel", "bin"]
 
@@ -68,21 +67,17 @@ class Fusion(nn.Module):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("num_heads", "num_points", "num_elevation"):
-            check_size(f"fusion.{name}", getattr(self, name))
-        check_size("fusion.chunk_size", self.chunk_size, least=0)
-        for name, kind in (
-            ("weighting", WeightingKind),
-            ("gate", GateKind),
-            ("out_of_view", OutOfViewRule),
-        ):
-            check_choice(f"fusion.{name}", getattr(self, name), get_args(kind))
-        require(
-            0 <= self.dropout < 1,
-            "config.model.fusion.dropout",
-            self.dropout,
-            "a number from 0 to below 1",
-        )
+        ranges = {
+            "num_heads": SIZE,
+            "num_points": SIZE,
+            "num_elevation": SIZE,
+            "chunk_size": integer(0, 1 << 16),
+            "weighting": one_of(*get_args(WeightingKind)),
+            "gate": one_of(*get_args(GateKind)),
+            "out_of_view": one_of(*get_args(OutOfViewRule)),
+            "dropout": BELOW_ONE,
+        }
+        check_options(vars(self), "config.model.fusion", ranges)
 
     @nn.compact
     def __call__(

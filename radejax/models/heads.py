@@ -1,9 +1,12 @@
-"""Decoupled heads: a class heatmap and eight box parameters per bin.
+"""Necks, which widen the receptive field, and heads, which predict.
+
+Heads are decoupled: a class heatmap and eight box parameters per bin.
 
 References:
-    RADE-Net, section III-E. "Sigmoid after each convolution" there is a slip: the
-    released code has GroupNorm and SiLU between convolutions and one sigmoid at the
-    end of the heatmap head, which lives in losses and decoding here.
+    RADE-Net, sections III-D and III-E, and equation (12). "Sigmoid after each
+    convolution" there is a slip: the released code has GroupNorm and SiLU between
+    convolutions and one sigmoid at the end of the heatmap head, which lives in losses
+    and decoding here.
 """
 
 from __future__ import annotations
@@ -16,7 +19,76 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from radejax.core.structures import DetectionMaps
-from radejax.models.layers import Conv, ConvGNSiLU, Features, Map
+from radejax.models.layers import Conv, ConvGNSiLU, Features, GroupNorm, Map
+
+
+class DilatedResidual(nn.Module):
+    """Dilated `ConvGNSiLU`, convolution, normalisation, plus the input, SiLU.
+
+    Attributes:
+        dilation: Distance of the first convolution's taps in bins.
+        num_groups: Groups of the normalisations.
+        dtype: Dtype of the computation and the output.
+    """
+
+    dilation: int
+    num_groups: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Map) -> Map:
+        features = x.shape[-1]
+        y = ConvGNSiLU(
+            features,
+            self.num_groups,
+            dilation=self.dilation,
+            dtype=self.dtype,
+            name="conv_1",
+        )(x)
+        y = Conv(features, dtype=self.dtype, name="conv_2")(y)
+        y = GroupNorm(self.num_groups, dtype=self.dtype, name="norm")(y)
+        return nn.silu(x + y)
+
+
+class Neck(nn.Module):
+    """What every neck has; it keeps shape and width.
+
+    Attributes:
+        num_groups: Groups of the normalisations.
+        dtype: Dtype of the computation and the output.
+        remat: Recompute blocks in the backward pass instead of storing them.
+    """
+
+    num_groups: int = 32
+    dtype: Any = jnp.float32
+    remat: bool = False
+
+
+class DilatedNeck(Neck):
+    """Three `DilatedResidual`, of dilation 1, 2 and 3."""
+
+    @nn.compact
+    def __call__(self, x: Map) -> Map:
+        block = nn.remat(DilatedResidual) if self.remat else DilatedResidual
+        for i in (1, 2, 3):
+            x = block(i, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
+        return x
+
+
+class PlainNeck(Neck):
+    """Three `ConvGNSiLU`."""
+
+    @nn.compact
+    def __call__(self, x: Map) -> Map:
+        block, width = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU, x.shape[-1]
+        for i in (1, 2, 3):
+            x = block(width, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
+        return x
+
+
+NECKS: dict[str, type[Neck]] = {"dilated": DilatedNeck, "plain": PlainNeck}
+"""What `config.model.neck` may name."""
+
 
 NUM_BOX_PARAMS = 8
 

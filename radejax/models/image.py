@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from radejax.core.errors import UserError
 from radejax.models.convolution import conv2d, product
 from radejax.models.layers import Conv, Dense, uniform_fan_in
 
@@ -53,26 +52,6 @@ def normalize(
         for v in (IMAGENET_MEAN, IMAGENET_STD)
     )
     return (scaled - mean) / std
-
-
-def check_image(shape: tuple[int, ...], patch_size: int) -> tuple[int, int]:
-    """Rows and columns of patches in images of a shape.
-
-    Raises:
-        UserError: It is no batch of colour images, or height or width is not a
-            multiple of the patch size.
-    """
-    if len(shape) != 4 or shape[-1] != 3:
-        raise UserError(
-            f"images must be [B, H, W, 3] with colours last, got shape {tuple(shape)}"
-        )
-    height, width = shape[1:3]
-    if height % patch_size or width % patch_size or 0 in (height, width):
-        raise UserError(
-            f"image is {height} x {width} pixels; height and width must be multiples "
-            f"of the patch size {patch_size} (K-Radar's left front image: 720 x 1280)"
-        )
-    return height // patch_size, width // patch_size
 
 
 # Which of the four taps even and odd outputs see, ordered along the input.

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from radejax.core.structures import Array
 from radejax.models.convolution import conv2d, product
 
 Initializer = Callable[..., jax.Array]
@@ -141,56 +140,37 @@ def max_pool(x: Map) -> Float[jax.Array, "B R//2 A//2 C"]:
 class GroupNorm(nn.Module):
     """Group normalisation over bins and the channels of a group, then scale and bias.
 
+    Sums run per channel first and are joined into groups after, so that the map is
+    read with channels innermost.
+
     Attributes:
         num_groups: Groups of channels; must divide the channels.
-        epsilon: Added to the variance, 1e-5 as in torch.
         dtype: Dtype of the output; statistics are float32.
     """
 
     num_groups: int
-    epsilon: float = 1e-5
     dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
-        channels = x.shape[-1]
-        if channels % self.num_groups:
-            raise ValueError(
-                f"num_groups={self.num_groups} does not divide {channels} channels"
-            )
-        scale = self.param("scale", nn.initializers.ones, (channels,))
-        bias = self.param("bias", nn.initializers.zeros, (channels,))
-        return group_norm(x, scale, bias, self.num_groups, self.epsilon).astype(
-            self.dtype
-        )
+        b, r, a, c = x.shape
+        scale = self.param("scale", nn.initializers.ones, (c,))
+        bias = self.param("bias", nn.initializers.zeros, (c,))
+        x = x.astype(jnp.float32)
+        group_size = c // self.num_groups
 
+        def over_group(
+            per_channel: Float[jax.Array, "B C"],
+        ) -> Float[jax.Array, "B 1 1 C"]:
+            per_group = per_channel.reshape(b, self.num_groups, -1).sum(-1)
+            per_group = per_group / (r * a * group_size)
+            return jnp.repeat(per_group, group_size, -1)[:, None, None]
 
-def group_norm(
-    x: Map,
-    scale: Float[Array, " C"],
-    bias: Float[Array, " C"],
-    num_groups: int,
-    epsilon: float,
-) -> Map:
-    """Group normalisation with scale and bias, in float32.
-
-    Sums run per channel first and are joined into groups after, so that the map is
-    read with channels innermost.
-    """
-    b, r, a, c = x.shape
-    x = x.astype(jnp.float32)
-    count = r * a * (c // num_groups)
-
-    def over_group(
-        per_channel: Float[jax.Array, "B C"],
-    ) -> Float[jax.Array, "B 1 1 C"]:
-        per_group = per_channel.reshape(b, num_groups, -1).sum(-1) / count
-        return jnp.repeat(per_group, c // num_groups, -1)[:, None, None]
-
-    centered = x - over_group(x.sum((1, 2)))
-    variance = over_group(jnp.square(centered).sum((1, 2)))
-    factor = jax.lax.rsqrt(variance + epsilon) * jnp.expand_dims(scale, (0, 1, 2))
-    return centered * factor + jnp.expand_dims(bias, (0, 1, 2))
+        centered = x - over_group(x.sum((1, 2)))
+        variance = over_group(jnp.square(centered).sum((1, 2)))
+        factor = jax.lax.rsqrt(variance + 1e-5) * jnp.expand_dims(scale, (0, 1, 2))
+        y = centered * factor + jnp.expand_dims(bias, (0, 1, 2))
+        return y.astype(self.dtype)
 
 
 class ConvGNSiLU(nn.Module):

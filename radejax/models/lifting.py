@@ -11,7 +11,6 @@ References:
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -22,7 +21,7 @@ from flax import struct
 from jaxtyping import Bool, Float
 
 from radejax.core.errors import require
-from radejax.geometry.camera import Camera, CameraCalibration, ImageKind, project
+from radejax.geometry.camera import Camera, project
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.layers import Conv, Dense, GroupNorm
 
@@ -150,10 +149,9 @@ def reference_points(
     is_batch = np.ndim(camera.max_radius) > 0
     on_host = isinstance(camera.intrinsics, np.ndarray)
     xp = np if on_host else jnp
-    centers = axes.centers_ego(num_range, num_azimuth)
-    if not on_host:
-        # Small products in the program, no constant of millions of numbers.
-        centers = _centers_in_program(axes, num_range, num_azimuth)
+    # Small products in the program, no constant of millions of numbers.
+    make_centers = LiftingAxes.centers_ego if on_host else _centers_in_program
+    centers: Any = make_centers(axes, num_range, num_azimuth)
     centers = xp.broadcast_to(
         centers[None], (np.shape(camera.max_radius) or (1,)) + centers.shape
     )
@@ -174,25 +172,6 @@ def reference_points(
         is_valid=is_valid,
         has_image=camera.is_valid if is_batch else None,
     )
-
-
-@functools.lru_cache(maxsize=64)
-def static_reference_points(
-    calibration: CameraCalibration,
-    axes: LiftingAxes,
-    num_range: int,
-    num_azimuth: int,
-    *,
-    image: ImageKind = "raw",
-    out_of_view: OutOfViewRule = "drop",
-) -> ReferencePoints:
-    """`reference_points` of one calibration, computed once on the host and kept.
-
-    Returns:
-        NumPy arrays with a leading axis of 1, for batches that share the calibration.
-    """
-    camera = calibration.camera(image)
-    return reference_points(camera, axes, num_range, num_azimuth, out_of_view)
 
 
 def query_weights(

@@ -14,17 +14,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import (
+    POSITIVE,
+    SIZE,
+    UserError,
+    check_options,
+    one_of,
+    require,
+)
 from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import BACKBONES, CBAMKind
-from radejax.models.checks import check_choice, check_number, check_size
-from radejax.models.heads import HEADS, Heads
+from radejax.models.heads import HEADS, NECKS, Heads
 from radejax.models.layers import Map
-from radejax.models.neck import NECKS
 
 Projection = Float[jax.Array, "B R A DE"]
-
-DTYPES = ("float32", "bfloat16")
 
 REMAT = ("none", "blocks", "full")
 """What the backward pass computes again instead of keeping: nothing, the inside of each
@@ -78,25 +81,26 @@ class RadeNet(nn.Module):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in (
-            ("cbam", ("official", "paper", None)),
-            ("backbone", BACKBONES),
-            ("neck", NECKS),
-            ("heads", HEADS),
-            ("dtype", DTYPES),
-            ("remat", REMAT),
-        ):
-            check_choice(name, getattr(self, name), choices)
-        for name in ("num_classes", "doppler_bins", "elevation_bins", "num_groups"):
-            check_size(name, getattr(self, name))
-        check_number("heatmap_prior", self.heatmap_prior, 0, 1, "a number in (0, 1)")
-        check_number("input_scale", self.input_scale, 0, math.inf, "a number above 0")
-        check_number(
-            "input_center", self.input_center, -math.inf, math.inf, "a finite number"
-        )
+        sizes = ["num_classes", "doppler_bins", "elevation_bins", "decoder_width"]
+        sizes += ["num_groups", "pad_multiple"]
+        ranges = {
+            **dict.fromkeys(sizes, SIZE),
+            "widths": (
+                lambda widths: len(widths) > 0 and all(map(SIZE[0], widths)),
+                "one or several integers of at least 1",
+            ),
+            "cbam": one_of("official", "paper", None),
+            "backbone": one_of(*BACKBONES),
+            "neck": one_of(*NECKS),
+            "heads": one_of(*HEADS),
+            "dtype": one_of("float32", "bfloat16"),
+            "remat": one_of(*REMAT),
+            "heatmap_prior": (lambda prior: 0 < prior < 1, "a number in (0, 1)"),
+            "input_center": (math.isfinite, "a finite number"),
+            "input_scale": POSITIVE,
+        }
+        check_options(vars(self), "config.model", ranges)
         stride = 2 ** len(self.widths)
-        require(stride > 1, "config.model.widths", self.widths, "one width or more")
-        check_size("pad_multiple", self.pad_multiple)
         require(
             self.pad_multiple % stride == 0,
             "config.model.pad_multiple",
@@ -105,8 +109,6 @@ class RadeNet(nn.Module):
         )
         widths = {f"widths[{i}]": width for i, width in enumerate(self.widths)}
         widths["decoder_width"] = self.decoder_width
-        for name, width in widths.items():
-            check_size(name, width)
         if self.heads == "default":
             half = min(64, self.decoder_width // 2)
             widths["decoder_width / 2 (default heads)"] = half
@@ -152,7 +154,14 @@ class RadeNet(nn.Module):
             # Before the cast: bfloat16 has steps of 0.7 dB at the noise's 0.545.
             projection = projection.astype(jnp.float32) - self.input_center
             projection = projection * self.input_scale
-        return pad_to_multiple(projection.astype(self.dtype), self.pad_multiple)
+        _, r, a, _ = projection.shape
+        padding = (
+            (0, 0),
+            (0, -r % self.pad_multiple),
+            (0, -a % self.pad_multiple),
+            (0, 0),
+        )
+        return jnp.pad(projection.astype(self.dtype), padding)
 
     def _features(self, padded: Projection) -> Map:
         """Features of the backbone."""
@@ -193,9 +202,3 @@ class RadeNet(nn.Module):
             "dtype": jnp.dtype(self.dtype),
             "remat": self.remat != "none",
         }
-
-
-def pad_to_multiple(x: Map, multiple: int) -> Float[jax.Array, "B Rp Ap C"]:
-    """Zero-pads range and azimuth at their ends to a multiple."""
-    pad_range, pad_azimuth = (-x.shape[1] % multiple, -x.shape[2] % multiple)
-    return jnp.pad(x, ((0, 0), (0, pad_range), (0, pad_azimuth), (0, 0)))

@@ -11,18 +11,16 @@ References:
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, Literal, get_args
 
+import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from radejax.core.errors import require
-from radejax.models.checks import check_choice, check_size
-from radejax.models.image import check_image
+from radejax.core.errors import SIZE, check_options, integer, one_of, require
 
 AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
 
@@ -46,13 +44,8 @@ class ViT(nn.Module):
         mlp_dim: Hidden channels of each block's MLP.
         patch_size: Pixels of a patch's side.
         num_registers: Learned tokens beside the class token.
-        rope_theta: Base of the rotary wavelengths.
-        epsilon: Of the layer normalisations.
-        gated_mlp: SwiGLU, as in the larger DINOv3 models, instead of a plain MLP.
-        activation: "gelu" (exact) or "silu".
+        gated_mlp: SwiGLU, as in the larger DINOv3 models, instead of a GELU MLP.
         qkv_bias: Whether query, key and value projections have a bias.
-        proj_bias: Whether the attention's output projection has a bias.
-        mlp_bias: Whether the MLP's layers have biases.
         layer_scale: Initial value of the learned scales of the residual branches.
         attention: "auto" picks by platform; see `attend`.
         dtype: Dtype of the computation; statistics and tokens are float32.
@@ -65,13 +58,8 @@ class ViT(nn.Module):
     mlp_dim: int = 1536
     patch_size: int = 16
     num_registers: int = 4
-    rope_theta: float = 100.0
-    epsilon: float = 1e-5
     gated_mlp: bool = False
-    activation: str = "gelu"
     qkv_bias: tuple[bool, bool, bool] = (True, False, True)
-    proj_bias: bool = True
-    mlp_bias: bool = True
     layer_scale: float = 1.0
     attention: AttentionKind = "auto"
     dtype: Any = jnp.float32
@@ -79,11 +67,12 @@ class ViT(nn.Module):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        names = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
-        for name in names:
-            check_size(f"image.{name}", getattr(self, name))
-        check_size("image.num_registers", self.num_registers, least=0)
-        check_choice("image.attention", self.attention, get_args(AttentionKind))
+        sizes = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
+        ranges = dict.fromkeys(sizes, SIZE) | {
+            "num_registers": integer(0, 1 << 16),
+            "attention": one_of(*get_args(AttentionKind)),
+        }
+        check_options(vars(self), "config.model.image", ranges)
         require(
             self.hidden_size % (4 * self.num_heads) == 0,
             "config.model.image.hidden_size",
@@ -101,10 +90,12 @@ class ViT(nn.Module):
         self, image: Float[jax.Array, "B H W 3"]
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
         """Tokens of normalised float images `[B, H, W, 3]`, float32."""
-        rows, columns = check_image(image.shape, self.patch_size)
+        rows, columns = (n // self.patch_size for n in image.shape[1:3])
+        height, width = rows * self.patch_size, columns * self.patch_size
+        chex.assert_shape(image, (None, height, width, 3))
         tokens = self._embed(image, rows, columns)
         head_dim = self.hidden_size // self.num_heads
-        rope = rotary_angles(rows, columns, head_dim, self.rope_theta)
+        rope = rotary_angles(rows, columns, head_dim)
         block = nn.remat(Block, prevent_cse=False) if self.remat else Block
         # One traced block for all layers: parameters carry a leading layer axis.
         layers = nn.scan(
@@ -114,12 +105,18 @@ class ViT(nn.Module):
             in_axes=nn.broadcast,
             length=self.num_layers,
         )
-        fields = ["num_heads", "mlp_dim", "num_prefix", "epsilon", "gated_mlp"]
-        fields += ["activation", "qkv_bias", "proj_bias", "mlp_bias", "layer_scale"]
-        fields += ["attention", "dtype"]
-        settings = {name: getattr(self, name) for name in fields}
-        tokens, _ = layers(**settings, name="layers")(tokens, rope)
-        return _layer_norm(self.epsilon, jnp.float32, "norm")(tokens)
+        tokens, _ = layers(
+            self.num_heads,
+            self.mlp_dim,
+            self.num_prefix,
+            self.gated_mlp,
+            self.qkv_bias,
+            self.layer_scale,
+            self.attention,
+            self.dtype,
+            name="layers",
+        )(tokens, rope)
+        return _layer_norm(jnp.float32, "norm")(tokens)
 
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
@@ -144,12 +141,8 @@ class Block(nn.Module):
     num_heads: int
     mlp_dim: int
     num_prefix: int
-    epsilon: float
     gated_mlp: bool
-    activation: str
     qkv_bias: tuple[bool, bool, bool]
-    proj_bias: bool
-    mlp_bias: bool
     layer_scale: float
     attention: AttentionKind
     dtype: Any
@@ -158,9 +151,9 @@ class Block(nn.Module):
     def __call__(
         self, x: Float[jax.Array, "B T C"], rope: Rope
     ) -> tuple[Float[jax.Array, "B T C"], None]:
-        y = _layer_norm(self.epsilon, self.dtype, "norm_1")(x)
+        y = _layer_norm(self.dtype, "norm_1")(x)
         x = x + self._scale("scale_1", x) * self._attend(y, rope)
-        y = _layer_norm(self.epsilon, self.dtype, "norm_2")(x)
+        y = _layer_norm(self.dtype, "norm_2")(x)
         x = x + self._scale("scale_2", x) * self._mlp(y)
         return x, None
 
@@ -169,26 +162,23 @@ class Block(nn.Module):
     ) -> Float[jax.Array, "B T C"]:
         b, t, c = x.shape
         query, key, value = (
-            self._dense(c, name, bias)(x).reshape(b, t, self.num_heads, -1)
+            self._dense(c, name, use_bias=bias)(x).reshape(b, t, self.num_heads, -1)
             for name, bias in zip(("query", "key", "value"), self.qkv_bias, strict=True)
         )  # [B, T, heads, C / heads]
         query = rotate(query, rope, self.num_prefix)
         key = rotate(key, rope, self.num_prefix)
         y = attend(query, key, value, self.attention).reshape(b, t, c)
-        return self._dense(c, "out", self.proj_bias)(y)
+        return self._dense(c, "out")(y)
 
     def _mlp(self, x: Float[jax.Array, "B T C"]) -> Float[jax.Array, "B T C"]:
-        gelu: Callable = functools.partial(nn.gelu, approximate=False)
-        act = {"gelu": gelu, "silu": nn.silu}[self.activation]
-        y = self._dense(self.mlp_dim, "up", self.mlp_bias)(x)
+        y = self._dense(self.mlp_dim, "up")(x)
         if self.gated_mlp:
-            gate = self._dense(self.mlp_dim, "gate", self.mlp_bias)(x)
-            y = act(gate) * y
+            y = nn.silu(self._dense(self.mlp_dim, "gate")(x)) * y
         else:
-            y = act(y)
-        return self._dense(x.shape[-1], "down", self.mlp_bias)(y)
+            y = nn.gelu(y, approximate=False)
+        return self._dense(x.shape[-1], "down")(y)
 
-    def _dense(self, features: int, name: str, use_bias: bool) -> nn.Dense:
+    def _dense(self, features: int, name: str, *, use_bias: bool = True) -> nn.Dense:
         return nn.Dense(
             features,
             use_bias=use_bias,
@@ -205,9 +195,9 @@ class Block(nn.Module):
         return scale[None, None]
 
 
-def _layer_norm(epsilon: float, dtype: Any, name: str) -> nn.LayerNorm:
+def _layer_norm(dtype: Any, name: str) -> nn.LayerNorm:
     # The fast variance E[x^2] - E[x]^2 loses digits where the mean is large.
-    return nn.LayerNorm(epsilon, dtype=dtype, use_fast_variance=False, name=name)
+    return nn.LayerNorm(1e-5, dtype=dtype, use_fast_variance=False, name=name)
 
 
 # Rotary embedding --------------------------------------------------------------------

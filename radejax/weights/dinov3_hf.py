@@ -33,15 +33,22 @@ _FIELDS = {
     "intermediate_size": "mlp_dim",
     "patch_size": "patch_size",
     "num_register_tokens": "num_registers",
-    "rope_theta": "rope_theta",
-    "layer_norm_eps": "epsilon",
     "use_gated_mlp": "gated_mlp",
-    "hidden_act": "activation",
-    "proj_bias": "proj_bias",
-    "mlp_bias": "mlp_bias",
     "layerscale_value": "layer_scale",
 }
 """Our name of each field of Hugging Face's config."""
+
+
+def _constants(gated_mlp: bool) -> dict[str, Any]:
+    """Fields that are the same in all published models, or follow from the MLP."""
+    return {
+        "rope_theta": 100.0,
+        "layer_norm_eps": 1e-5,
+        "proj_bias": True,
+        "mlp_bias": True,
+        "hidden_act": "silu" if gated_mlp else "gelu",
+    }
+
 
 _LAYER_NAMES = {
     "norm_1": "norm1",
@@ -104,6 +111,7 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
     config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
     biases = zip(("query", "key", "value"), model.qkv_bias, strict=True)
     config |= {f"{name}_bias": bias for name, bias in biases}
+    config |= _constants(model.gated_mlp)
     config |= {"model_type": "dinov3_vit", "architectures": ["DINOv3ViTModel"]}
     files.write_json(folder / CONFIG_FILE, config)
     content = safetensors.numpy.save(to_tensors(model, params), {"format": "pt"})
@@ -120,7 +128,8 @@ def model_from_config(config: Mapping[str, Any]) -> ViT:
     """
     kind = config.get("model_type")
     require(kind == "dinov3_vit", "model_type", kind, "'dinov3_vit'")
-    if missing := sorted(set(_FIELDS) - set(config)):
+    constants = _constants(config.get("use_gated_mlp") is True)
+    if missing := sorted({*_FIELDS, *constants} - set(config)):
         raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
     defaults = {field.name: field.default for field in dataclasses.fields(ViT)}
     fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
@@ -130,10 +139,8 @@ def model_from_config(config: Mapping[str, Any]) -> ViT:
         if kind is float:
             fits = type(value) in (int, float) and 0 < value < float("inf")
         require(fits, theirs, value, f"{kind.__name__}, such as {defaults[ours]}")
-    activation = fields["activation"]
-    require(
-        activation in ("gelu", "silu"), "hidden_act", activation, "'gelu' or 'silu'"
-    )
+    for name, value in constants.items():
+        require(config[name] == value, name, config[name], f"{value!r}")
     fields["qkv_bias"] = tuple(
         bool(config.get(f"{name}_bias", default))
         for name, default in (("query", True), ("key", False), ("value", True))

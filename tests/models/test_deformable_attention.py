@@ -14,53 +14,21 @@ from radejax.models.deformable_attention import DeformableAttention, lifted_atte
 
 from .plain_attention import plain_attention, plain_samples
 
-CORES = ("core_single_level", "core_two_levels", "core_inside")
-MODULES = ("module_single_level", "module_two_levels", "module_box_reference")
-
-
-def load_make(golden):
-    """The recipes beside the golden files."""
-    return load_module(golden / "dinorade_make.py")
+MODULES = ("module_two_levels", "module_box_reference")
 
 
 @pytest.fixture(scope="module")
-def excerpt(golden):
-    """Arrays and settings of the reference cases that travel with the tests."""
+def case_of(golden):
+    """Function from a reference case's name to its settings and arrays."""
     file = np.load(golden / "dinorade_deform_attn.npz")
-    return json.loads(str(file["info"])), file
+    info = json.loads(str(file["info"]))
 
+    def case(name):
+        prefix = f"{name}__"
+        keys = [k for k in file.files if k.startswith(prefix)]
+        return info[name], {k.removeprefix(prefix): file[k] for k in keys}
 
-@pytest.fixture(scope="module")
-def whole(shared):
-    """The same of all cases."""
-    folder = shared / "fixtures" / "deform_attn"
-    info = json.loads((folder / "deform_attn.json").read_text())
-    return info, np.load(folder / "deform_attn.npz")
-
-
-@pytest.fixture(scope="module")
-def reference(request, excerpt):
-    """All cases where they are at hand."""
-    try:
-        return request.getfixturevalue("whole")
-    except pytest.skip.Exception:
-        return excerpt
-
-
-def test_the_stored_excerpt_is_of_the_reference(excerpt, whole):
-    assert len(excerpt[0]) == 3
-    assert {name: whole[0][name] for name in excerpt[0]} == excerpt[0]
-    for name in set(excerpt[1].files) - {"info"}:
-        np.testing.assert_array_equal(excerpt[1][name], whole[1][name])
-
-
-def case_of(reference, name):
-    info, file = reference
-    if name not in info:
-        pytest.skip("not in the stored excerpt")
-    prefix = f"{name}__"
-    keys = [k for k in file.files if k.startswith(prefix)]
-    return info[name], {k.removeprefix(prefix): file[k] for k in keys}
+    return case
 
 
 def close_to_maximum(actual, desired, tolerance):
@@ -97,9 +65,8 @@ def test_samples_by_hand():
     np.testing.assert_allclose(out.reshape(n), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", CORES)
-def test_reference_sampling_and_gradients(reference, name):
-    info, case = case_of(reference, name)
+def test_reference_sampling_and_gradients(case_of):
+    info, case = case_of("core_two_levels")
     sizes = [tuple(s) for s in info["shapes_hw"]]
 
     @jax.jit
@@ -130,12 +97,13 @@ def test_reference_sampling_and_gradients(reference, name):
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_reference_module_and_gradients(reference, name, golden):
-    info, case = case_of(reference, name)
+def test_reference_module_and_gradients(case_of, name, golden):
+    info, case = case_of(name)
     sizes = [tuple(s) for s in info["shapes_hw"]]
     counts = info["n_heads"], info["n_points"]
+    make = load_module(golden / "dinorade_make.py")
     params = {}
-    for key, tensor in load_make(golden).seeded_state_dict(info["tensors"]).items():
+    for key, tensor in make.seeded_state_dict(info["tensors"]).items():
         layer, kind = key.split(".")
         entry = {"kernel": tensor.T} if kind == "weight" else {"bias": tensor}
         params.setdefault(layer, {}).update(entry)

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.errors import UserError
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import ReferencePoints
 
@@ -159,8 +158,3 @@ def test_dropout_drops_in_training_only():
     assert 0.3 < share < 0.7
     kept = np.asarray(dropped) != 0
     np.testing.assert_allclose(dropped[kept], 2 * np.asarray(plain)[kept], rtol=1e-5)
-
-
-def test_unknown_gate():
-    with pytest.raises(UserError, match=r"fusion.gate is 'pixel', expected one of"):
-        Fusion(**SMALL, gate="pixel")

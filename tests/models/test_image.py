@@ -4,10 +4,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import scipy.signal
 
-from radejax.core.errors import UserError
 from radejax.models import image as image_lib
 from radejax.models.image import CameraNeck, TransposedConv
 
@@ -23,14 +21,6 @@ def test_bytes_become_standardised_colours():
 def test_floats_are_normalised_already():
     image = jnp.full((1, 2, 2, 3), 0.3)
     assert image_lib.normalize(image) is image
-
-
-def test_grid_of_patches():
-    assert image_lib.check_image((2, 720, 1280, 3), 16) == (45, 80)
-    with pytest.raises(UserError, match="700 x 1280 pixels"):
-        image_lib.check_image((2, 700, 1280, 3), 16)
-    with pytest.raises(UserError, match="colours last"):
-        image_lib.check_image((2, 3, 720, 1280), 16)
 
 
 def convolved(x, kernel, stride):

@@ -11,6 +11,8 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
 from radejax.models.lifting import LiftingAxes, WeightingNetwork
 
+from .. import small_models as small
+
 AXES = LiftingAxes((1.0, 4.0), (-40.0, 20.0), (-10.0, 10.0), 2)
 
 
@@ -29,17 +31,9 @@ def official_calibration(golden) -> CameraCalibration:
 
 def ahead(**fields) -> CameraCalibration:
     """A camera of 100 x 80 pixels in the radar's place, looking along x."""
-    settings = {
-        "intrinsics": (50.0, 50.0, 50.0, 40.0),
-        "yaw_deg": 90.0,
-        "pitch_deg": 0.0,
-        "roll_deg": 90.0,
-        "translation_m": (0.0, 0.0, 0.0),
-        "radar_from_lidar_m": (0.0, 0.0, 0.0),
-        "width": 100,
-        "height": 80,
-    }
-    return CameraCalibration.from_angles(**(settings | fields))
+    settings = {"intrinsics": (50.0, 50.0, 50.0, 40.0), "width": 100, "height": 80}
+    settings["radar_from_lidar_m"] = (0.0, 0.0, 0.0)
+    return small.calibration(**(settings | fields))
 
 
 def test_centers_by_hand():
@@ -80,21 +74,18 @@ def test_released_reference_points(golden):
     file = np.load(golden / "dinorade_geometry.npz")
     calibration = official_calibration(golden)
     axes = LiftingAxes.official()
-    settings = {"image": "pinhole", "out_of_view": "official"}
-    on_host = lifting.static_reference_points(calibration, axes, 256, 112, **settings)
+    camera = calibration.camera("pinhole")
+    on_host = lifting.reference_points(camera, axes, 256, 112, "official")
     chex.assert_shape(on_host.points, (1, 256, 112, 10, 2))
     assert on_host.points.dtype == np.float32
     check_official(on_host, file["index"], file["reference_points_f64"], file["valid"])
     # In the program, in float32, for two cameras.
-    cameras = stack_cameras([calibration.camera("pinhole")] * 2)
+    cameras = stack_cameras([camera] * 2)
     in_program = jax.jit(
         lambda c: lifting.reference_points(c, axes, 256, 112, "official")
     )(jax.tree.map(jnp.asarray, cameras))
     second = jax.tree.map(lambda x: x[1], in_program)
     check_official(second, file["index"], file["reference_points_f64"], file["valid"])
-    # Computed once.
-    again = lifting.static_reference_points(calibration, axes, 256, 112, **settings)
-    assert again is on_host
 
 
 def test_released_mask_of_all_queries(shared):
@@ -104,10 +95,8 @@ def test_released_mask_of_all_queries(shared):
         shared / "data/kradar/calib/common/cam_front0.yml",
         radar_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
     )
-    axes = LiftingAxes.official()
-    reference = lifting.static_reference_points(
-        calibration, axes, 256, 112, image="pinhole", out_of_view="official"
-    )
+    camera, axes = calibration.camera("pinhole"), LiftingAxes.official()
+    reference = lifting.reference_points(camera, axes, 256, 112, "official")
     check_official(
         reference, file["index"], file["reference_points_f64"], file["valid"]
     )
@@ -116,9 +105,7 @@ def test_released_mask_of_all_queries(shared):
     is_valid = reference.is_valid.ravel()
     np.testing.assert_array_equal(is_valid[is_clear], expected[is_clear])
     # Without the released crop 95.3 % of the queries lie in the image.
-    whole = lifting.static_reference_points(
-        calibration, axes, 256, 112, image="pinhole"
-    )
+    whole = lifting.reference_points(camera, axes, 256, 112)
     assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
 
 

@@ -10,7 +10,6 @@ from ml_collections import ConfigDict
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.models.radenet import pad_to_multiple
 
 from ..small_models import drawn
 
@@ -59,19 +58,12 @@ def test_parameters_of_released_variants(changes, expected):
     assert sum(num_parameters(models.build(config)).values()) == expected
 
 
-def test_pads_at_the_far_and_right_end():
-    padded = pad_to_multiple(jnp.ones((1, 5, 7, 2)), 4)
-    assert padded.shape == (1, 8, 8, 2)
-    np.testing.assert_array_equal(padded[:, :5, :7], 1.0)
-    assert padded.sum() == 5 * 7 * 2
-
-
 def test_padding_inside_equals_padding_outside(variables, apply):
     x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
     maps = apply(variables, x)
     assert maps.heatmap_logits.shape == (1, 24, 16, 3)
     assert maps.box_params.shape == (1, 24, 16, 8)
-    outside = apply(variables, pad_to_multiple(x, 8))
+    outside = apply(variables, jnp.pad(x, ((0, 0), (0, 3), (0, 2), (0, 0))))
     chex.assert_trees_all_close(maps, outside, atol=1e-5)
 
 
@@ -175,21 +167,11 @@ def test_every_field_is_required(small):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"name": "radarnet"}, r"'radarnet', expected one of \('radenet', 'dinorade'"),
-        ({"cbam": "on"}, r"cbam is 'on', expected one of"),
-        ({"neck": "flat"}, r"neck is 'flat'"),
-        ({"heads": "small"}, r"heads is 'small'"),
-        ({"dtype": "float16"}, r"dtype is 'float16'"),
         ({"pad_multiple": 4}, r"pad_multiple is 4, expected a multiple of 8 for 3 l"),
         ({"num_groups": 32}, r"widths\[0\] is 16, expected a multiple of num_groups"),
         ({"num_groups": 16, "heads": "default"}, r"decoder_width / 2 .* is 8"),
         ({"num_groups": 16, "input_stem": True}, r"widths\[0\] / 2 .* is 8"),
-        ({"heatmap_prior": 1.0}, r"heatmap_prior is 1.0"),
-        ({"input_center": float("nan")}, r"input_center is nan, expected a finite"),
-        ({"input_scale": 0.0}, r"input_scale is 0.0, expected a number above 0"),
-        ({"widths": 16}, r"wrong type"),
-        ({"widths": (16, "a", 64)}, r"widths\[1\] is 'a', expected an integer"),
-        ({"num_classes": 0}, r"num_classes is 0, expected an integer from 1"),
+        ({"widths": (16, "a", 64)}, r"widths is \(16, 'a', 64\), .* integers"),
     ],
 )
 def test_impossible_values_are_named(small, changes, message):

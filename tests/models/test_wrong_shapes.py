@@ -11,7 +11,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.geometry.rotated_iou import bev_iou, iou_3d
 from radejax.losses.focal import focal_loss, gaussian_heatmap
 from radejax.models.convolution import conv2d
-from radejax.models.deformable_attention import lifted_attention
 
 pytestmark = pytest.mark.wrong_types
 
@@ -52,20 +51,6 @@ def zeros(*shape: int) -> jax.Array:
         (lambda: conv2d(zeros(1, 8, 8, 3), zeros(3, 3, 4, 2)), r"\(3, 3, 4, 2\)"),
         (lambda: project(zeros(2, 6, 2), CAMERA), r"\(2, 6, 2\)"),
         (lambda: project(zeros(3, 6, 3), CAMERA), r"\(3, 6, 3\)"),
-        (
-            lambda: lifted_attention(
-                zeros(1, 2, 3, 2, 4),
-                zeros(1, 5, 2, 4, 2),
-                zeros(1, 5, 2, 3),
-                zeros(1, 5, 6),
-                zeros(1, 5, 6, 2),
-                zeros(1, 5, 6),
-                zeros(2, 3, 2),
-                zeros(2, 3),
-                chunk_size=4,
-            ),
-            r"\(1, 5, 2, 4, 2\)",
-        ),
     ],
 )
 def test_wrong_shapes_are_named(call, message):

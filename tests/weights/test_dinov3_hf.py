@@ -40,7 +40,7 @@ def test_tokens_of_the_tiny_model(folder, golden, make):
     np.testing.assert_allclose(tokens[0], expected, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("changes", [{}, {"use_gated_mlp": True, "mlp_bias": False}])
+@pytest.mark.parametrize("changes", [{}, {"use_gated_mlp": True, "hidden_act": "silu"}])
 def test_a_folder_that_is_written_is_the_one_that_was_read(
     folder, tensors, changes, make, tmp_path
 ):
@@ -174,15 +174,15 @@ def test_incomplete_or_damaged_folders(folder, tmp_path):
     ("change", "message"),
     [
         ({"model_type": "dinov2"}, "'dinov2', expected 'dinov3_vit'"),
-        ({"hidden_act": "relu"}, "expected 'gelu' or 'silu'"),
+        ({"hidden_act": "relu"}, "is 'relu', expected 'gelu'"),
         ({"rope_theta": None}, "lacks rope_theta"),
-        ({"num_hidden_layers": 10**9}, "is 1000000000, expected .* 1 to 65536"),
+        ({"num_hidden_layers": 10**9}, "is 1000000000, expected .* at most 65536"),
         ({"num_hidden_layers": "8"}, "is '8', expected int, such as 12"),
         ({"num_hidden_layers": True}, "is True, expected int"),
-        ({"num_attention_heads": 0}, "expected .* 1 to 65536"),
-        ({"num_register_tokens": -1}, "expected .* 0 to 65536"),
-        ({"layer_norm_eps": float("nan")}, "is nan, expected float, such as 1e-05"),
-        ({"rope_theta": float("inf")}, "is inf, expected float"),
+        ({"num_attention_heads": 0}, "expected an integer of at least 1"),
+        ({"num_register_tokens": -1}, "expected an integer of at least 0"),
+        ({"layer_norm_eps": float("nan")}, "is nan, expected 1e-05"),
+        ({"rope_theta": 10.0}, "is 10.0, expected 100.0"),
         ({"use_gated_mlp": "no"}, "is 'no', expected bool"),
         ({"num_attention_heads": 7}, "hidden_size is 96, expected a multiple of 4"),
     ],
