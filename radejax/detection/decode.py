@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import chex
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Int, Num, Real
 
-from radejax.core.errors import require
+from radejax.core.errors import check_options, integer, number, one_of
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -47,18 +47,18 @@ class DecodeOptions:
     clip_sizes: bool = True
 
     def __post_init__(self) -> None:
-        def check(name: str, holds: bool, expected: str) -> None:
-            require(holds, f"config.decode.{name}", getattr(self, name), expected)
+        ranges = {
+            "max_detections": integer(1),
+            "score_threshold": number(0, 1),
+            "nms_iou": number(0, 1),
+            "roi": (_is_roi, "six numbers x0, x1, y0, y1, z0, z1, or None"),
+            "raw_yaw": one_of(*get_args(RawYaw)),
+        }
+        check_options(vars(self), "config.decode", ranges)
 
-        check("max_detections", self.max_detections >= 1, "an integer of at least 1")
-        for name in ("score_threshold", "nms_iou"):
-            check(name, 0 <= getattr(self, name) <= 1, "a number from 0 to 1")
-        is_roi = self.roi is None or (
-            len(self.roi) == 6 and np.isfinite(self.roi).all()
-        )
-        check("roi", bool(is_roi), "six numbers x0, x1, y0, y1, z0, z1, or None")
-        kinds = get_args(RawYaw)
-        check("raw_yaw", self.raw_yaw in kinds, f"one of {kinds}")
+
+def _is_roi(roi: Any) -> bool:
+    return roi is None or (len(roi) == 6 and bool(np.isfinite(roi).all()))
 
 
 class Peaks(struct.PyTreeNode):
@@ -139,11 +139,8 @@ def decode(
         >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
         ([[1, -1, -1, -1]], 0.8808)
     """
-    if max_detections < 1 or raw_yaw not in get_args(RawYaw):
-        raise ValueError(
-            f"max_detections must be at least 1, got {max_detections}, and raw_yaw one "
-            f"of {get_args(RawYaw)}, got {raw_yaw!r}"
-        )
+    if raw_yaw not in get_args(RawYaw):
+        raise ValueError(f"raw_yaw must be one of {get_args(RawYaw)}, got {raw_yaw!r}")
     peaks = find_peaks(
         maps,
         grid,

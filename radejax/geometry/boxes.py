@@ -36,6 +36,21 @@ def array_module(*values: Any) -> Any:
     return np if on_host else jnp
 
 
+def as_floats(*values: Any) -> tuple[Any, ...]:
+    """The array module, then the values: float64 on the host, at least float32 in JAX.
+
+    Examples:
+        >>> as_floats(1)[1].dtype, as_floats(jnp.ones(3, jnp.bfloat16))[1].dtype
+        (dtype('float64'), dtype('float32'))
+    """
+    xp = array_module(*values)
+    if xp is np:
+        return (np, *(np.asarray(v, np.float64) for v in values))
+    arrays = [jnp.asarray(v) for v in values]
+    dtype = jnp.promote_types(jnp.result_type(*arrays), jnp.float32)
+    return (xp, *(v.astype(dtype) for v in arrays))
+
+
 def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
     """Boxes with sin and cos of yaw: `[..., 7]` -> `[..., 8]`.
 

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import DataError, require
 from radejax.geometry.boxes import array_module, corners
-from radejax.geometry.values import ArrayValues
+from radejax.geometry.radar_grid import ArrayValues
 
 ImageKind = Literal["raw", "pinhole"]
 """The recorded image with lens distortion, or the same matrix without distortion."""
@@ -106,9 +106,6 @@ def project(
     """
     batch = np.shape(camera.max_radius)
     chex.assert_shape(points_ego, (*batch, ..., 3))
-    chex.assert_shape(camera.cam_from_ego, (*batch, 3, 4))
-    chex.assert_shape(camera.intrinsics, (*batch, 4))
-    chex.assert_shape(camera.distortion, (*batch, 5))
     points_cam = to_camera(points_ego, camera)
     return to_pixels(points_cam, camera, depth_offset_m), points_cam[..., 2]
 

@@ -13,8 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
-from radejax.geometry.boxes import array_module
-from radejax.geometry.values import ArrayValues
+from radejax.geometry.boxes import as_floats
 
 _AXES = ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps")
 _MAX_VALUE = 10_000.0  # far beyond the axes of any radar
@@ -22,6 +21,31 @@ _MAX_VALUE = 10_000.0  # far beyond the axes of any radar
 AzimuthMapping = Literal["true", "stretched"]
 Positions = float | Real[Any, "*#bins"]
 """One number or an array of them, which broadcast against each other: `[...]`."""
+
+
+class ArrayValues:
+    """Base of frozen dataclasses (`eq=False`) whose fields are arrays and numbers.
+
+    Instances can be static arguments of jitted functions and fields of flax modules.
+    """
+
+    def freeze(self, name: str) -> np.ndarray:
+        """Makes a field a read-only float64 array of its own and returns it."""
+        value = np.array(getattr(self, name), np.float64)
+        value.setflags(write=False)
+        object.__setattr__(self, name, value)
+        return value
+
+    def _key(self) -> tuple[object, ...]:
+        fields: Any = dataclasses.fields(self)  # type: ignore[arg-type]
+        values = (getattr(self, field.name) for field in fields)
+        return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for v in values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,12 +149,7 @@ class RadarGrid(ArrayValues):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain lists and floats, exact through JSON."""
-        return {
-            f.name: getattr(self, f.name).tolist()
-            if isinstance(getattr(self, f.name), np.ndarray)
-            else float(getattr(self, f.name))
-            for f in dataclasses.fields(self)
-        }
+        return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
     def padded(
         self, multiple: int = 8, azimuth_mapping: AzimuthMapping = "true"
@@ -218,7 +237,7 @@ class RadarGrid(ArrayValues):
             `[..., 2]` x (forward) and y (left) in meters; NumPy float64 for NumPy
             or Python input, else a JAX array.
         """
-        xp, range_bin, azimuth_bin = _as_float(range_bin, azimuth_bin)
+        xp, range_bin, azimuth_bin = as_floats(range_bin, azimuth_bin)
         range_m = self.range_m[0] + range_bin * self.range_step_m
         azimuth = self.azimuth_rad[0] + azimuth_bin * self.azimuth_step_rad
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
@@ -229,7 +248,7 @@ class RadarGrid(ArrayValues):
         Returns:
             `[..., 2]` range and azimuth in bins; not clipped to the grid.
         """
-        xp, x_m, y_m = _as_float(x_m, y_m)
+        xp, x_m, y_m = as_floats(x_m, y_m)
         # The order of operations decides which way exact half bins round. This one
         # gives the released code's bins, and straight ahead the exact middle even in
         # float32: azimuth is counted from the middle of the axis, not from its edge.
@@ -251,7 +270,7 @@ class RadarGrid(ArrayValues):
         Returns:
             `[..., 2]` int32 range and azimuth indices.
         """
-        xp, x_m, y_m = _as_float(x_m, y_m)
+        xp, x_m, y_m = as_floats(x_m, y_m)
         nearest = xp.round(self.ego_to_bin(x_m, y_m))
         range_idx = xp.clip(nearest[..., 0], 0, self.num_range - 1)
         azimuth_idx = xp.clip(nearest[..., 1], 0, self.num_azimuth - 1)
@@ -265,20 +284,10 @@ class RadarGrid(ArrayValues):
 
     def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:
         """True where the sensor looks: in front, within maximum azimuth and range."""
-        xp, x_m, y_m = _as_float(x_m, y_m)
+        xp, x_m, y_m = as_floats(x_m, y_m)
         azimuth = xp.arctan2(y_m, x_m)
         return (
             (xp.abs(azimuth) <= self.fov_azimuth_rad)
             & (x_m >= 0)
             & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)
         )
-
-
-def _as_float(*values: Any) -> tuple[Any, ...]:
-    """The array module, then the values: float64 on the host, at least float32 in JAX."""
-    xp = array_module(*values)
-    if xp is np:
-        return (np, *(np.asarray(v, np.float64) for v in values))
-    arrays = [xp.asarray(v) for v in values]
-    dtype = xp.promote_types(xp.result_type(*arrays), xp.float32)
-    return (xp, *(v.astype(dtype) for v in arrays))

@@ -22,11 +22,9 @@ from __future__ import annotations
 from typing import Any
 
 import chex
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float, Real
 
-from radejax.geometry.boxes import ArrayT, array_module
+from radejax.geometry.boxes import ArrayT, array_module, as_floats
 
 _FAR = 1e6  # meters; stands for infinity along a line, finite so that 0 * _FAR is 0
 
@@ -108,7 +106,7 @@ def bev_intersection(
         >>> bev_intersection(car, car + [3, 0, 0, 0, 0, 0, 0]).round(6).tolist()
         [2.0]
     """
-    xp, a, b = _as_floats(a, b)
+    xp, a, b = as_floats(a, b)
     return _intersection(xp, _footprint(xp, a), _footprint(xp, b))
 
 
@@ -131,19 +129,10 @@ def shared_height(
 
 def _all_pairs(a: Any, b: Any) -> tuple[Any, Any, Any]:
     """The array module, then `[..., N, 1, 7 or 8]` and `[..., 1, M, 7 or 8]`."""
-    xp, a, b = _as_floats(a, b)
+    xp, a, b = as_floats(a, b)
     chex.assert_equal_rank([a, b])
     chex.assert_equal_shape_prefix([a, b], a.ndim - 2)
     return xp, a[..., :, None, :], b[..., None, :, :]
-
-
-def _as_floats(*boxes: Any) -> tuple[Any, ...]:
-    """The array module, then the boxes: float64 on the host, at least float32 in JAX."""
-    xp = array_module(*boxes)
-    if xp is np:
-        return (np, *(np.asarray(value, np.float64) for value in boxes))
-    arrays = [jnp.asarray(value) for value in boxes]
-    return (xp, *(v.astype(jnp.promote_types(v.dtype, jnp.float32)) for v in arrays))
 
 
 def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:

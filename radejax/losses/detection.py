@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, Num
 
-from radejax.core.errors import require
+from radejax.core.errors import POSITIVE, Range, check_options, one_of
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import boxes_at, check_maps, find_peaks, suppress
 from radejax.detection.nms import match_boxes
@@ -21,9 +21,7 @@ from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
 Assignment = Literal["center", "nms"]
-Number = float | Num[jax.Array, ""]
 Scalar = Num[jax.Array, ""]
-Weights = Mapping[str, Number]
 Maps = Float[jax.Array, "B R A C"]
 Boxes8 = Float[jax.Array, "B N 8"]
 Mask = Bool[jax.Array, "B N"]
@@ -43,9 +41,9 @@ class NmsAssignment(NamedTuple):
     """
 
     max_peaks: int = 128
-    score_threshold: Number = 0.3
-    nms_iou: Number = 0.3
-    match_iou: Number = 0.0
+    score_threshold: float = 0.3
+    nms_iou: float = 0.3
+    match_iou: float = 0.0
     threshold_inclusive: bool = False
     per_class: bool = False
 
@@ -71,7 +69,7 @@ class LossOptions:
         nms: Which predicted boxes have an object, for "nms".
 
     Raises:
-        UserError: A value is out of range. Traced numbers are not checked.
+        UserError: A value is out of range.
     """
 
     heatmap_sigma_mode: SigmaMode = "fixed"
@@ -80,39 +78,34 @@ class LossOptions:
     gwd_tau: float = 1.65
     normalize_yaw: bool = False
     assignment: Assignment = "center"
-    weights: Weights = dataclasses.field(
+    weights: Mapping[str, float] = dataclasses.field(
         default_factory=lambda: {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
     )
     normalize: bool = True
-    z0_m: Number = 0.0
+    z0_m: float = 0.0
     nms: NmsAssignment = NmsAssignment()  # noqa: RUF009, immutable
 
     def __post_init__(self) -> None:
-        for name, kind in (
-            ("heatmap_sigma_mode", SigmaMode),
-            ("gwd_transform", Transform),
-            ("assignment", Assignment),
-        ):
-            choices = get_args(kind)
-            self._check(name, choices.__contains__, f"one of {choices}")
-        for name in ("heatmap_sigma_bins", "gwd_tau"):
-            self._check(name, lambda value: 0 < value < math.inf, "a number above 0")
-        self._check("z0_m", math.isfinite, "a finite number")
         names = ", ".join(LOSSES)
-        expected = f"numbers of at least 0, not all 0, for some of {names}"
-        self._check("weights", _are_weights, expected)
+        ranges: dict[str, Range] = {
+            "heatmap_sigma_mode": one_of(*get_args(SigmaMode)),
+            "heatmap_sigma_bins": POSITIVE,
+            "gwd_transform": one_of(*get_args(Transform)),
+            "gwd_tau": POSITIVE,
+            "assignment": one_of(*get_args(Assignment)),
+            "weights": (
+                _are_weights,
+                f"numbers of at least 0, not all 0, for some of {names}",
+            ),
+            "z0_m": (math.isfinite, "a finite number"),
+        }
+        check_options(vars(self), "config.loss", ranges)
 
-    def _check(self, name: str, holds: Callable[[Any], bool], expected: str) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, jax.core.Tracer):
-            require(holds(value), f"config.loss.{name}", value, expected)
 
-
-def _are_weights(weights: Weights) -> bool:
-    numbers = [w for w in weights.values() if not isinstance(w, jax.core.Tracer)]
+def _are_weights(weights: Mapping[str, float]) -> bool:
+    numbers = weights.values()
     are_in_range = all(0 <= weight < math.inf for weight in numbers)
-    is_any = any(numbers) or len(numbers) < len(weights)
-    return set(weights) <= set(LOSSES) and are_in_range and is_any
+    return set(weights) <= set(LOSSES) and are_in_range and any(numbers)
 
 
 def detection_loss(
@@ -282,7 +275,7 @@ def _with_unit_yaw(boxes: Boxes8) -> Boxes8:
 
 
 def _weighted_sum(
-    terms: Mapping[str, Scalar], weights: Weights, normalize: bool
+    terms: Mapping[str, Scalar], weights: Mapping[str, float], normalize: bool
 ) -> Float[jax.Array, ""]:
     total = jnp.zeros((), jnp.float32)
     for name, weight in weights.items():
@@ -296,12 +289,14 @@ def _weighted_sum(
 
 # Assignment --------------------------------------------------------------------------
 
-Assigned = tuple[Boxes8, Boxes8, Mask]
-"""Predicted boxes, their objects, and which have one."""
+Assigned = tuple[
+    Float[jax.Array, "B K 8"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]
+]
+"""Predicted boxes, their objects, and which have one; K objects, or peaks."""
 
 
 def _at_centers(
-    maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid, z0_m: Number
+    maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid, z0_m: float
 ) -> Assigned:
     """Predictions at the objects' own bins."""
     bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
@@ -314,10 +309,8 @@ def _after_nms(
     boxes: Boxes8,
     is_valid: Mask,
     grid: RadarGrid,
-    z0_m: Number,
-) -> tuple[
-    Float[jax.Array, "B K 8"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]
-]:
+    z0_m: float,
+) -> Assigned:
     """Predictions that survive NMS, and the objects that they overlap."""
     # Which boxes are compared is a choice, not a function to differentiate.
     peaks = find_peaks(
@@ -336,7 +329,7 @@ def _after_nms(
 
 
 def _boxes_at(
-    maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid, z0_m: Number
+    maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid, z0_m: float
 ) -> Boxes8:
     """Predicted boxes at given bins of every frame."""
     # One gather per frame, so that a batch axis sharded over devices stays local.

@@ -451,13 +451,13 @@ def test_wrong_shapes_are_refused():
         run(maps_of(logits, params), KRADAR)
     with pytest.raises(ValueError, match=r"\[B, R, A, C\] and \[B, R, A, 8\], got"):
         run(maps_of(logits, params[..., :7]), GRID)
-    with pytest.raises(ValueError, match="max_detections must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="at least 1 peak must enter NMS, got 0"):
         D.decode(maps_of(logits, params), GRID, max_detections=0, score_threshold=0.3)
     with pytest.raises(ValueError, match="1 peak must enter NMS, got 0"):
         run(maps_of(logits, params), GRID, pre_nms=0)
     with pytest.raises(ValueError, match=r"roi must be \[6\]"):
         run(maps_of(logits, params), GRID, roi=np.zeros(4))
-    with pytest.raises(ValueError, match=r"raw_yaw one of .*, got 'yes'"):
+    with pytest.raises(ValueError, match=r"raw_yaw must be one of .*, got 'yes'"):
         run(maps_of(logits, params), GRID, raw_yaw="yes")
 
 

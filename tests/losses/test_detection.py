@@ -193,32 +193,34 @@ def small_scene(rng, counts=(0, 1, 3), rows=4):
 
 
 @partial(jax.jit, static_argnames="options")
-def _loss_and_grad(maps, batch, is_frame_valid, numbers, weights, options):
+def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
     def loss(maps):
-        z0_m, score_threshold, nms_iou = numbers
-        given = {} if weights is None else {"weights": weights}
+        score_threshold, nms_iou = numbers
+        chosen = dict(options)
+        if "weights" in chosen:
+            chosen["weights"] = dict(chosen["weights"])
         return detection_loss(
             maps,
             batch,
             GRID,
             is_frame_valid=is_frame_valid,
-            z0_m=z0_m,
             nms=NmsAssignment(score_threshold=score_threshold, nms_iou=nms_iou),
-            **dict(options),
-            **given,
+            **chosen,
         )
 
     return jax.value_and_grad(loss, has_aux=True)(maps)
 
 
-def loss_and_grad(maps, batch, is_frame_valid=None, weights=None, **options):
+def loss_and_grad(maps, batch, is_frame_valid=None, **options):
     """Compiled once per shape and set of options, not once per test."""
-    defaults = {"z0_m": 0.0, "score_threshold": 0.3, "nms_iou": 0.3}
+    defaults = {"score_threshold": 0.3, "nms_iou": 0.3}
     numbers = tuple(options.pop(name, value) for name, value in defaults.items())
     if is_frame_valid is None:
         is_frame_valid = jnp.ones(len(batch.boxes), bool)
+    if "weights" in options:
+        options["weights"] = tuple(options["weights"].items())
     return _loss_and_grad(
-        maps, batch, is_frame_valid, numbers, weights, tuple(sorted(options.items()))
+        maps, batch, is_frame_valid, numbers, tuple(sorted(options.items()))
     )
 
 
@@ -259,7 +261,7 @@ def test_parts_weigh_as_asked_whatever_their_size():
     (total, parts), grad = loss_and_grad(maps, batch)
     assert float(total) == pytest.approx(4)
     sizes = [float(parts[p]) for p in PARTS]
-    weights = dict(zip(PARTS, np.array([2, 1, 1]) / sizes, strict=True))
+    weights = {p: w / s for p, w, s in zip(PARTS, (2, 1, 1), sizes, strict=True)}
     (plain, parts), plain_grad = loss_and_grad(
         maps, batch, weights=weights, normalize=False
     )
