@@ -20,7 +20,7 @@ from radejax.models.lifting import (
     OFFICIAL_OFFSET_M,
     LiftingAxes,
     WeightingNetwork,
-    static_reference_points,
+    reference_points,
 )
 from radejax.weights import dinorade_torch, dinov3_hf
 from radejax.weights.convert import (
@@ -66,14 +66,8 @@ def released_geometry(shared):
         shared / "data/kradar/calib/common/cam_front0.yml",
         radar_from_lidar_m=OFFICIAL_OFFSET_M,
     )
-    return static_reference_points(
-        calibration,
-        LiftingAxes.official(),
-        256,
-        112,
-        image="pinhole",
-        out_of_view="official",
-    )
+    camera = calibration.camera("pinhole")
+    return reference_points(camera, LiftingAxes.official(), 256, 112, "official")
 
 
 def channels_last(x):
