@@ -222,7 +222,7 @@ def _model() -> ConfigDict:
             "input_stem": False,
             # A name of `radejax.models.backbone.BACKBONES`.
             "backbone": "unet",
-            # dilated, plain, or another name of `radejax.models.neck.NECKS`.
+            # dilated, plain, or another name of `radejax.models.heads.NECKS`.
             "neck": "dilated",
             # expanded, default, or another name of `radejax.models.heads.HEADS`.
             "heads": "expanded",

@@ -16,20 +16,6 @@ from radejax.models.lifting import LiftingAxes
 from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
 
-_VIT_FIELDS = (
-    "hidden_size",
-    "num_layers",
-    "num_heads",
-    "mlp_dim",
-    "patch_size",
-    "num_registers",
-    "gated_mlp",
-    "layer_scale",
-    "attention",
-)
-_IMAGE_FIELDS = ("kind", "size", "freeze", "standardize", "resnet_width", *_VIT_FIELDS)
-_GRID_FIELDS = ("range_m", "azimuth_deg", "elevation_deg")
-
 
 def build(config: Mapping[str, Any]) -> nn.Module:
     """The model that `config.model` describes.
@@ -62,15 +48,17 @@ def build(config: Mapping[str, Any]) -> nn.Module:
 def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
     """Attributes of `DinoRade` from the fields of its config."""
     image, fusion, grid = (fields.pop(k) for k in ("image", "fusion", "query_grid"))
-    fusion_fields = _own_fields(Fusion) - {"num_groups", "dtype", "remat"}
-    _check_keys(image, _IMAGE_FIELDS, "image.")
-    _check_keys(fusion, fusion_fields, "fusion.")
-    _check_keys(grid, _GRID_FIELDS, "query_grid.")
+    shared = {"num_groups", "dtype", "remat"}
+    vit_fields = _own_fields(ViT) - {*shared, "qkv_bias"}
+    own = {"kind", "size", "freeze", "standardize", "resnet_width"}
+    _check_keys(image, own | vit_fields, "image.")
+    _check_keys(fusion, _own_fields(Fusion) - shared, "fusion.")
+    _check_keys(grid, _own_fields(LiftingAxes) - {"num_elevation"}, "query_grid.")
     kinds = {"kind": one_of("vit", "resnet50")}
     check_options(image, "config.model.image", kinds)
     vit = None
     if image["kind"] == "vit":
-        vit = ViT(**{name: image[name] for name in _VIT_FIELDS})
+        vit = ViT(**{name: image[name] for name in vit_fields})
     return fields | {
         "vit": vit,
         "fusion": Fusion(**fusion),
@@ -91,7 +79,7 @@ def _plain(config: Any) -> Any:
     return config
 
 
-def _own_fields(module: type[nn.Module]) -> set[str]:
+def _own_fields(module: Any) -> set[str]:
     return {f.name for f in dataclasses.fields(module)} - {"parent", "name"}
 
 

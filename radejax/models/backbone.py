@@ -38,17 +38,15 @@ class ChannelAttention(nn.Module):
     sigmoid of the sum is the factor.
 
     Attributes:
-        reduction: Channels per hidden unit.
         dtype: Dtype of the computation and the output.
     """
 
-    reduction: int = REDUCTION
     dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
         channels = x.shape[-1]
-        hidden = max(1, channels // self.reduction)
+        hidden = max(1, channels // REDUCTION)
         squeeze = Dense(hidden, dtype=self.dtype, name="squeeze")
         excite = Dense(channels, dtype=self.dtype, name="excite")
         mean = x.mean((1, 2), dtype=jnp.float32).astype(self.dtype)

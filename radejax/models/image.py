@@ -187,11 +187,9 @@ class FrozenBatchNorm(nn.Module):
 
     Attributes:
         dtype: Dtype of the output.
-        epsilon: Added to the variance.
     """
 
     dtype: Any = jnp.float32
-    epsilon: float = 1e-5
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W C"]:
@@ -199,7 +197,7 @@ class FrozenBatchNorm(nn.Module):
         shape = (x.shape[-1],)
         scale, var = self.param("scale", ones, shape), self.param("var", ones, shape)
         bias, mean = self.param("bias", zeros, shape), self.param("mean", zeros, shape)
-        factor = scale * jax.lax.rsqrt(var + self.epsilon)
+        factor = scale * jax.lax.rsqrt(var + 1e-5)
         shift = jnp.expand_dims(bias - mean * factor, (0, 1, 2))
         return x * jnp.expand_dims(factor, (0, 1, 2)).astype(self.dtype) + shift.astype(
             self.dtype

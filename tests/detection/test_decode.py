@@ -215,6 +215,12 @@ def maps_of(logits, params):
     return DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
 
 
+def decode_scene(logits, params, **options):
+    """Detections of a scene on the small grid."""
+    options = {"max_detections": 16, "score_threshold": 0.3} | options
+    return decode(maps_of(logits, params), GRID, **options)
+
+
 def test_encoded_boxes_come_back():
     logits, params, cells, classes = scattered()
     rng = np.random.default_rng(1)
@@ -226,9 +232,7 @@ def test_encoded_boxes_come_back():
         offset = box[:2] - GRID.bin_to_ego(i, j)
         heading = [np.sin(box[6]), np.cos(box[6])]
         params[0, i, j] = [*offset, box[2] - 0.7, *box[3:6], *heading]
-    found = decode(
-        maps_of(logits, params), GRID, max_detections=16, score_threshold=0.3, z0_m=0.7
-    )
+    found = decode_scene(logits, params, z0_m=0.7)
     np.testing.assert_allclose(found.boxes[0, :6], boxes, atol=2e-5)
     np.testing.assert_array_equal(found.classes[0], [*classes] + [-1] * 10)
     np.testing.assert_array_equal(found.scores[0, 6:], 0)
@@ -256,24 +260,16 @@ def test_what_k_cuts_off_is_counted():
 def test_boxes_dropped_by_nms_are_not_counted_as_cut():
     logits, params, _, _ = scattered(num=10)
     params[..., 3:5] = 500  # everything overlaps
-    found = decode(maps_of(logits, params), GRID, max_detections=5, score_threshold=0.3)
+    found = decode_scene(logits, params, max_detections=5)
     assert int(found.is_valid[0].sum()) == 1
     assert int(found.num_truncated[0]) == 0
-    few = decode(
-        maps_of(logits, params),
-        GRID,
-        max_detections=5,
-        score_threshold=0.3,
-        pre_nms=7,
-    )
+    few = decode_scene(logits, params, max_detections=5, pre_nms=7)
     assert int(few.num_truncated[0]) == 3
 
 
 def test_more_rows_than_bins():
     logits, params, _, _ = scattered()
-    found = decode(
-        maps_of(logits, params), GRID, max_detections=300, score_threshold=0.3
-    )
+    found = decode_scene(logits, params, max_detections=300)
     assert found.boxes.shape == (1, GRID.num_range * GRID.num_azimuth, 7)
     assert found.classes[0, -1] == -1
     assert int(found.is_valid.sum()) == 6
@@ -285,9 +281,7 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     inside = (np.abs(y) <= 30) & (x <= 90)
     assert 3 < inside.sum() < 10
     roi = np.array([0, 90, -30, 30, 0, 0.0])
-    found = decode(
-        maps_of(logits, params), GRID, max_detections=16, score_threshold=0.3, roi=roi
-    )
+    found = decode_scene(logits, params, roi=roi)
     np.testing.assert_allclose(found.boxes[0, : inside.sum(), 0], x[inside], rtol=1e-6)
     # Peaks outside do not take the place of peaks inside.
     tight = find_peaks(
@@ -299,14 +293,7 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     )
     assert np.asarray(tight.is_valid).all()
     # The sensor height counts towards z.
-    above = decode(
-        maps_of(logits, params),
-        GRID,
-        max_detections=16,
-        score_threshold=0.3,
-        roi=roi,
-        z0_m=0.1,
-    )
+    above = decode_scene(logits, params, roi=roi, z0_m=0.1)
     assert not np.asarray(above.is_valid).any()
 
 
@@ -376,9 +363,9 @@ def test_thresholds_and_region_are_traced_values():
     count = _decode._cache_size()
     for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5), (0.5, 0.1)):
         roi = np.array([0.0, 100 * threshold, -50, 50, -1, 1])
-        found = decode(
-            maps_of(logits, params),
-            GRID,
+        found = decode_scene(
+            logits,
+            params,
             max_detections=9,
             score_threshold=threshold,
             nms_iou=nms_iou,
@@ -395,7 +382,7 @@ def test_frames_of_a_batch_do_not_mix():
     batch = maps_of(*(np.concatenate(x) for x in zip(*scenes, strict=True)))
     together = decode(batch, GRID, max_detections=16, score_threshold=0.3)
     for i, scene in enumerate(scenes):
-        alone = decode(maps_of(*scene), GRID, max_detections=16, score_threshold=0.3)
+        alone = decode_scene(*scene)
         for found, wanted in zip(
             jax.tree.leaves(together), jax.tree.leaves(alone), strict=True
         ):
@@ -410,12 +397,7 @@ def test_bfloat16_maps_and_saturated_or_missing_numbers():
     assert found.boxes.dtype == found.scores.dtype == jnp.float32
     assert int(found.is_valid.sum()) == 6
     for value in (np.inf, 100.0, np.nan, -np.inf):
-        flat = decode(
-            maps_of(np.full_like(logits, value), params),
-            GRID,
-            max_detections=16,
-            score_threshold=0.3,
-        )
+        flat = decode_scene(np.full_like(logits, value), params)
         assert np.isfinite(flat.boxes).all()
         assert np.isfinite(flat.scores).all()
         assert np.asarray(flat.is_valid).any() == (value > 0)

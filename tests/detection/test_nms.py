@@ -91,30 +91,6 @@ def test_longest_possible_chain():
     np.testing.assert_array_equal(keep, np.arange(K) % 2 == 0)
 
 
-@settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**32 - 1))
-def test_kept_boxes_are_all_kept_again(seed):
-    boxes = random_boxes(np.random.default_rng(seed), spread=4)
-    keep = np.asarray(nms(boxes, np.ones(K, bool), 0.3))
-    np.testing.assert_array_equal(nms(boxes, keep, 0.3), keep)
-    overlaps = overlap_matrix(boxes, 0.3) & ~np.eye(K, dtype=bool)
-    assert not overlaps[np.ix_(keep, keep)].any()
-    assert overlaps[np.ix_(keep, ~keep)].any(0).all()
-
-
-@settings(deadline=None, max_examples=20)
-@given(st.integers(0, 2**32 - 1))
-def test_order_of_rows_does_not_matter_once_sorted_by_score(seed):
-    rng = np.random.default_rng(seed)
-    boxes, scores = random_boxes(rng), rng.permutation(K)
-    shuffle = rng.permutation(K)
-    kept = []
-    for order in (np.arange(K), shuffle):
-        by_score = order[np.argsort(-scores[order])]
-        kept.append(by_score[np.asarray(nms(boxes[by_score], np.ones(K, bool), 0.3))])
-    np.testing.assert_array_equal(*kept)
-
-
 def test_batched_by_vmap_with_rows_in_different_states():
     rng = np.random.default_rng(0)
     boxes = np.stack([random_boxes(rng) for _ in range(3)])

@@ -136,18 +136,6 @@ def test_boxes_slid_along_an_edge_share_collinear_edges(along):
     np.testing.assert_allclose(bev_pairs(a, b), bev_host(a, b), atol=1e-6)
 
 
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_identical_boxes_in_every_quarter_turn(turns):
-    boxes = random_boxes(np.random.default_rng(4), 100)
-    same = boxes.copy()
-    same[:, 6] += turns * np.pi / 2
-    if turns % 2:
-        same[:, [3, 4]] = same[:, [4, 3]]
-    np.testing.assert_allclose(bev_host(boxes, same), 1, atol=1e-5)  # angles round
-    exact = bev_host(boxes, same)
-    np.testing.assert_allclose(bev_pairs(boxes, same), exact, atol=1e-6)
-
-
 def test_touching_boxes_do_not_overlap():
     a = np.array([[0.0, 0, 0, 4, 2, 1, 0]] * 4, np.float32)
     b = a.copy()
@@ -217,17 +205,6 @@ def test_against_shapely(a, b):
     a, b = as_box(a), as_box(b)
     expected = shapely_intersection(a, b)
     np.testing.assert_allclose(R.bev_intersection(a, b), expected, atol=1e-7)
-
-
-def test_contained_box_gives_the_ratio_of_areas():
-    rng = np.random.default_rng(5)
-    inner = random_boxes(rng, 200)
-    outer = inner.copy()
-    outer[:, 3:5] = 30
-    outer[:, 6] = rng.uniform(-3, 3, 200)
-    ratio = inner[:, 3] * inner[:, 4] / 900
-    np.testing.assert_allclose(bev_pairs(inner, outer), ratio, rtol=2e-6)
-    np.testing.assert_allclose(bev_pairs(outer, inner), ratio, rtol=2e-6)
 
 
 def test_degenerate_and_huge_boxes_are_finite():
