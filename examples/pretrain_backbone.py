@@ -44,7 +44,7 @@ from radejax.simulation.config import SimulationConfig, plain
 from radejax.simulation.simulator import make_source
 from radejax.simulation.world.scene import Sequence
 from radejax.simulation.world.traffic import SIZES
-from radejax.weights import dinov3_hf, resnet_torch
+from radejax.weights import dinov3_hf, image_backbone
 
 CONFIG = (
     pathlib.Path(__file__).resolve().parents[1]
@@ -242,7 +242,7 @@ def save(backbone: ViT | ResNetTrunk, variables: Any, out: pathlib.Path) -> None
         dinov3_hf.save(backbone, own["params"], out)
     else:
         out.mkdir(parents=True, exist_ok=True)
-        resnet_torch.save(frozen_params(own), out / RESNET_FILE)
+        image_backbone.save_resnet(frozen_params(own), out / RESNET_FILE)
 
 
 def pretrain(

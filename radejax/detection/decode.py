@@ -10,12 +10,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float, Int, Num, Real
+from jaxtyping import Bool, Float, Num, Real
 
 from radejax.core.errors import check_options, integer, number, one_of
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
@@ -209,7 +208,7 @@ def find_peaks(
         >>> peaks.bins[0, 0].tolist(), int(peaks.classes[0, 0]), int(peaks.num_found[0])
         ([5, 3], 1, 1)
     """
-    check_maps(maps, grid)
+    grid.check_maps(maps.heatmap_logits, maps.box_params)
     if max_peaks < 1:
         raise ValueError(f"at least 1 peak must enter NMS, got {max_peaks}")
     num_azimuth = maps.heatmap_logits.shape[2]
@@ -231,47 +230,12 @@ def find_peaks(
     bins = jnp.stack([flat // num_azimuth, flat % num_azimuth], -1)
     return Peaks(
         bins=bins,
-        boxes=boxes_at(params, bins, grid, z0_m),
+        boxes=grid.boxes_at(params, bins, z0_m),
         scores=top,
         classes=classes.astype(jnp.int32),
         is_valid=is_valid,
         num_found=jnp.sum(best > 0, axis=-1, dtype=jnp.int32),
     )
-
-
-def boxes_at(
-    params: Float[jax.Array, "*bins 8"],
-    bins: Int[jax.Array, "*bins 2"],
-    grid: RadarGrid,
-    z0_m: Scalar = 0.0,
-) -> Float[jax.Array, "*bins 8"]:
-    """Boxes described by the parameters of given bins.
-
-    Args:
-        params: `[..., 8]` raw dx, dy, dz, l, w, h, sin, cos.
-        bins: `[..., 2]` integer range and azimuth bins.
-        grid: The grid of the maps.
-        z0_m: Height added to dz.
-
-    Returns:
-        `[..., 8]` float32 x, y, z, l, w, h and the raw sin, cos.
-
-    Raises:
-        AssertionError: Shapes are not these.
-
-    Examples:
-        >>> grid = RadarGrid.kradar()
-        >>> boxes_at(jnp.ones((1, 8)), jnp.array([[10, 53]]), grid, z0_m=0.5)[0, 2:4].tolist()
-        [1.5, 1.0]
-    """
-    chex.assert_shape(params, (*bins.shape[:-1], 8))
-    chex.assert_axis_dimension(bins, -1, 2)
-    params = params.astype(jnp.float32)
-    range_m = jnp.asarray(grid.range_m, jnp.float32)[bins[..., 0]]
-    cos = jnp.asarray(np.cos(grid.azimuth_rad), jnp.float32)[bins[..., 1]]
-    sin = jnp.asarray(np.sin(grid.azimuth_rad), jnp.float32)[bins[..., 1]]
-    center = jnp.stack([range_m * cos, -range_m * sin, jnp.zeros_like(sin) + z0_m], -1)
-    return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
 
 
 def _with_raw_footprint(boxes: Boxes8) -> Boxes8:
@@ -341,24 +305,3 @@ def _compact(
 
 def _flat_bins(values: Num[jax.Array, "B R A C"]) -> Num[jax.Array, "B R*A C"]:
     return values.reshape(values.shape[0], -1, values.shape[-1])
-
-
-def check_maps(maps: DetectionMaps, grid: RadarGrid) -> None:
-    """Raise `ValueError` where shapes of maps and grid differ.
-
-    Examples:
-        >>> maps = DetectionMaps(jnp.zeros((1, 256, 107, 5)), jnp.zeros((1, 256, 107, 8)))
-        >>> check_maps(maps, RadarGrid.kradar())
-    """
-    logits, params = maps.heatmap_logits.shape, maps.box_params.shape
-    expected = (grid.num_range, grid.num_azimuth)
-    if len(logits) != 4 or params != (*logits[:3], 8):
-        raise ValueError(
-            f"maps must be [B, R, A, C] and [B, R, A, 8], got {logits} and {params}"
-        )
-    if logits[1:3] != expected:
-        raise ValueError(
-            f"maps have {logits[1]} x {logits[2]} range x azimuth bins, the grid "
-            f"{expected[0]} x {expected[1]}: pass the grid of the maps "
-            "(grid.padded(...) where the model pads and does not crop)"
-        )

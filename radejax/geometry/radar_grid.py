@@ -10,8 +10,11 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal
 
+import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Bool, Float, Int, Num, Real
 
 from radejax.geometry.boxes import as_floats
 
@@ -281,6 +284,61 @@ class RadarGrid(ArrayValues):
         return self.bin_to_ego(
             np.arange(self.num_range)[:, None], np.arange(self.num_azimuth)[None, :]
         )
+
+    def boxes_at(
+        self,
+        params: Float[jax.Array, "*bins 8"],
+        bins: Int[jax.Array, "*bins 2"],
+        z0_m: float | Num[jax.Array, ""] = 0.0,
+    ) -> Float[jax.Array, "*bins 8"]:
+        """Boxes described by the parameters of given bins of a detector's maps.
+
+        Args:
+            params: `[..., 8]` raw dx, dy, dz, l, w, h, sin, cos.
+            bins: `[..., 2]` integer range and azimuth bins.
+            z0_m: Height added to dz.
+
+        Returns:
+            `[..., 8]` float32 x, y, z, l, w, h and the raw sin, cos.
+
+        Raises:
+            AssertionError: Shapes are not these.
+
+        Examples:
+            >>> boxes = RadarGrid.kradar().boxes_at(
+            ...     jnp.ones((1, 8)), jnp.array([[10, 53]]), z0_m=0.5)
+            >>> boxes[0, 2:4].tolist()
+            [1.5, 1.0]
+        """
+        chex.assert_shape(params, (*bins.shape[:-1], 8))
+        chex.assert_axis_dimension(bins, -1, 2)
+        params = params.astype(jnp.float32)
+        range_m = jnp.asarray(self.range_m, jnp.float32)[bins[..., 0]]
+        cos = jnp.asarray(np.cos(self.azimuth_rad), jnp.float32)[bins[..., 1]]
+        sin = jnp.asarray(np.sin(self.azimuth_rad), jnp.float32)[bins[..., 1]]
+        zeros = jnp.zeros_like(sin)
+        center = jnp.stack([range_m * cos, -range_m * sin, zeros + z0_m], -1)
+        return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
+
+    def check_maps(self, heatmap: Any, box_params: Any) -> None:
+        """Raises `ValueError` where shapes of a detector's maps and the grid differ.
+
+        Examples:
+            >>> maps = jnp.zeros((1, 256, 107, 5)), jnp.zeros((1, 256, 107, 8))
+            >>> RadarGrid.kradar().check_maps(*maps)
+        """
+        logits, params = heatmap.shape, box_params.shape
+        expected = (self.num_range, self.num_azimuth)
+        if len(logits) != 4 or params != (*logits[:3], 8):
+            raise ValueError(
+                f"maps must be [B, R, A, C] and [B, R, A, 8], got {logits} and {params}"
+            )
+        if logits[1:3] != expected:
+            raise ValueError(
+                f"maps have {logits[1]} x {logits[2]} range x azimuth bins, the grid "
+                f"{expected[0]} x {expected[1]}: pass the grid of the maps "
+                "(grid.padded(...) where the model pads and does not crop)"
+            )
 
     def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:
         """True where the sensor looks: in front, within maximum azimuth and range."""

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, Num
 
 from radejax.core.errors import POSITIVE, Range, check_options, one_of
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.detection.decode import boxes_at, check_maps, find_peaks, suppress
+from radejax.detection.decode import find_peaks, suppress
 from radejax.detection.nms import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
@@ -148,7 +148,7 @@ def detection_loss(
         4.0
     """
     chosen = LossOptions(**options)
-    check_maps(maps, grid)
+    grid.check_maps(maps.heatmap_logits, maps.box_params)
     shape = batch.boxes.shape
     if len(shape) != 3 or shape[0] != len(maps.heatmap_logits) or shape[2] != 8:
         raise ValueError(
@@ -334,4 +334,4 @@ def _boxes_at(
     """Predicted boxes at given bins of every frame."""
     # One gather per frame, so that a batch axis sharded over devices stays local.
     gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
-    return boxes_at(gather(maps.box_params, bins), bins, grid, z0_m)
+    return grid.boxes_at(gather(maps.box_params, bins), bins, z0_m)

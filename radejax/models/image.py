@@ -2,7 +2,7 @@
 
 Images are normalized inside the jitted model, as frames travel as uint8. The ResNet's trunk
 (stem and the first three stages) is frozen and its last stage trained, so they are modules
-of their own; `radejax.weights.resnet_torch` reads both from torchvision's file.
+of their own; `radejax.weights.image_backbone` reads both from torchvision's file.
 
 References:
     DinoRADE, section 3.2; layers of the neck as in the released code. He et al., Deep

@@ -16,7 +16,7 @@ from radejax.core.config import load_config
 from radejax.core.errors import DataError
 from radejax.core.files import PathLike
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
-from radejax.weights import dinov3_hf, radenet_torch, resnet_torch
+from radejax.weights import dinov3_hf, radenet_torch
 from radejax.weights.convert import (
     from_torch,
     read_state_dict,
@@ -24,7 +24,7 @@ from radejax.weights.convert import (
     to_numpy,
     variable_shapes,
 )
-from radejax.weights.image_backbone import check_same_vit
+from radejax.weights.image_backbone import check_same_vit, resnet_names
 
 PART = "rad_backbone."
 """Start of names by which a state dict of DinoRADE is recognized."""
@@ -88,7 +88,7 @@ def read(
     if is_resnet and dinov3 is None:
         # The released code feeds its ResNet colors in [0, 1].
         config["image"] |= {"kind": "resnet50", "standardize": False}
-        names |= resnet_names()
+        names |= image_branch_names()
     else:
         names |= CAMERA_NECK | dinov3_hf.module_names(IMAGE_BACKBONE)
         tensors = dinov3_hf.with_prefix_tokens(_plain_backbone(tensors), IMAGE_BACKBONE)
@@ -186,12 +186,12 @@ def fusion_names() -> dict[str, str]:
     return {f"image_fusion/{k}": f"fusion.{v}" for k, v in names.items()}
 
 
-def resnet_names() -> dict[str, str]:
+def image_branch_names() -> dict[str, str]:
     """Torch's module by module of ours, of the image branch with a ResNet-50."""
     # Positions in the released Sequential: stem, its norm, ReLU, pooling, stages.
     conv, norm, *stages = (f"image_backbone.frozen_layers.{i}" for i in (0, 1, 4, 5, 6))
     last = "image_backbone.layer4"
-    names = resnet_torch.module_names(conv, norm, (*stages, last))
+    names = resnet_names(conv, norm, (*stages, last))
     return names | {"image_neck/proj": "image_backbone.projection"}
 
 

@@ -1,4 +1,7 @@
-"""Weights of image backbones: DINOv3 from Hugging Face, ResNet-50 from torchvision."""
+"""Weights of image backbones: DINOv3 from Hugging Face, ResNet-50 from torchvision.
+
+torch is not needed.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,21 @@ import jax
 import numpy as np
 
 from radejax import models
+from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, differences
 from radejax.data.records import open_embeddings
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.vit import ViT
-from radejax.weights import dinov3_hf, resnet_torch
-from radejax.weights.convert import shapes_of, variable_shapes
+from radejax.weights import dinov3_hf
+from radejax.weights.convert import (
+    from_torch,
+    read_state_dict,
+    shapes_of,
+    to_torch,
+    variable_shapes,
+    write_state_dict,
+)
 
 # Fields of a ViT that are not its weights' own.
 _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
@@ -62,7 +73,7 @@ def load_image_backbone(
             "which has no camera"
         )
     if model.vit is None:
-        part = resnet_torch.load(path, model.resnet_width)
+        part = load_resnet(path, model.resnet_width)
     else:
         vit, variables = dinov3_hf.load(path)
         check_same_vit(vit, model.vit, path)
@@ -116,3 +127,72 @@ def weights_sha256(params: Mapping[str, Any]) -> str:
         digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
         digest.update(np.ascontiguousarray(leaf, np.float32).tobytes())
     return digest.hexdigest()
+
+
+# ResNet-50 as torchvision distributes it ---------------------------------------------
+
+_DEPTHS = (3, 4, 6, 3)
+
+
+def resnet_names(
+    conv: str = "conv1",
+    norm: str = "bn1",
+    stages: tuple[str, ...] = ("layer1", "layer2", "layer3", "layer4"),
+) -> dict[str, str]:
+    """Torch's module by module of ours, for `convert`.
+
+    Args:
+        conv: First convolution.
+        norm: Its normalization.
+        stages: Prefixes of the four stages; the last one is part of our neck.
+    """
+    names = {"image_backbone/stem_conv": conv, "image_backbone/stem_norm": norm}
+    for stage, (theirs, depth) in enumerate(zip(stages, _DEPTHS, strict=True), 1):
+        ours = "image_neck/" if stage == 4 else f"image_backbone/stage_{stage}_"
+        for i in range(depth):
+            block = f"{ours}block_{i + 1}"
+            for k in (1, 2, 3):
+                names[f"{block}/conv_{k}"] = f"{theirs}.{i}.conv{k}"
+                names[f"{block}/norm_{k}"] = f"{theirs}.{i}.bn{k}"
+            names[f"{block}/conv_shortcut"] = f"{theirs}.{i}.downsample.0"
+            names[f"{block}/norm_shortcut"] = f"{theirs}.{i}.downsample.1"
+    return names
+
+
+def load_resnet(
+    state_dict_or_path: Mapping[str, Any] | PathLike, width: int = 64
+) -> dict[str, Any]:
+    """Variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
+
+    Args:
+        state_dict_or_path: The file, or its tensors by name.
+        width: Channels of the stem; torchvision's have 64.
+
+    Returns:
+        `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}`,
+        without the 1x1 projection, which is DinoRADE's own: for
+        `radejax.training.step.with_pretrained`. Of a file of `save_resnet`, which has no
+        last stage, only "image_backbone".
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: Tensors are missing, unexpected or of another shape; all are listed.
+    """
+    tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
+    names = resnet_names()
+    config = load_config("dinorade:rcw_resnet50").model
+    config.image.resnet_width = width
+    has_last = any(name.startswith("layer4.") for name in tensors)
+    shapes = {
+        path: shape
+        for path, shape in variable_shapes(models.build(config)).items()
+        if path.partition("/")[2].rpartition("/")[0] in names
+        and (has_last or "/image_neck/" not in path)
+    }
+    return from_torch(names, shapes, tensors, source, r"fc\.")
+
+
+def save_resnet(params: Mapping[str, Any], path: PathLike) -> None:
+    """Writes the parameters of a `ResNetTrunk` under torchvision's names."""
+    trunk = {"params": {"image_backbone": params}}
+    write_state_dict(path, to_torch(resnet_names(), trunk))

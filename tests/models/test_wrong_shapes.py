@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from radejax.detection.decode import boxes_at
 from radejax.detection.nms import greedy_suppression, match_boxes, rotated_nms
 from radejax.geometry.camera import Camera, project
 from radejax.geometry.radar_grid import RadarGrid
@@ -40,7 +39,7 @@ def zeros(*shape: int) -> jax.Array:
             lambda: match_boxes(zeros(4, 7), zeros(4) == 0, zeros(2, 7), zeros(4) == 0),
             r"\(4,\) but expected \(2\)",
         ),
-        (lambda: boxes_at(zeros(2, 3, 8), zeros(2, 4, 2), GRID), r"\(2, 4, 8\)"),
+        (lambda: GRID.boxes_at(zeros(2, 3, 8), zeros(2, 4, 2)), r"\(2, 4, 8\)"),
         (lambda: focal_loss(zeros(2, 8, 4, 5), zeros(2, 8, 4, 1)), r"\(2, 8, 4, 1\)"),
         (
             lambda: gaussian_heatmap(

@@ -259,7 +259,7 @@ def test_resnet_in_place_of_the_transformer(shared):
     config = load_config("dinorade:official,rcw_resnet50").model
     model = build(config)
     shapes = variable_shapes(model)
-    names = dinorade_torch.resnet_names()
+    names = dinorade_torch.image_branch_names()
     expected = {}
     for path, shape in shapes.items():
         if path.split("/")[1] in ("image_backbone", "image_neck"):

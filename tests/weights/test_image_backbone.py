@@ -10,7 +10,7 @@ from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.data.records import Records
 from radejax.models import build
-from radejax.weights import dinov3_hf, image_backbone, resnet_torch
+from radejax.weights import dinov3_hf, image_backbone
 
 CONFIG = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
 TRUNK = {"stem": np.arange(3.0)}
@@ -23,7 +23,7 @@ def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
         "params": {"image_backbone": TRUNK, "image_neck": STAGE},
         "batch_stats": {"image_neck": STAGE},
     }
-    monkeypatch.setattr(resnet_torch, "load", lambda path, width: part)
+    monkeypatch.setattr(image_backbone, "load_resnet", lambda path, width: part)
     return build(load_config(f"{CONFIG}:rcw_resnet50").model)
 
 

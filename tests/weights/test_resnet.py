@@ -1,4 +1,4 @@
-"""Tests of radejax.weights.resnet_torch."""
+"""ResNet-50 weights of torchvision."""
 
 import importlib.util
 
@@ -10,8 +10,8 @@ import pytest
 
 from radejax.core.errors import DataError, UserError
 from radejax.models.image import ResNetNeck, ResNetTrunk
-from radejax.weights import resnet_torch
 from radejax.weights.convert import read_content, write_state_dict
+from radejax.weights.image_backbone import load_resnet, save_resnet
 
 from ..torch_files import write_pth
 
@@ -59,7 +59,7 @@ def tensors():
 
 
 def test_every_tensor_finds_its_place(tensors):
-    loaded = resnet_torch.load(tensors)
+    loaded = load_resnet(tensors)
     trunk, neck = ResNetTrunk(), ResNetNeck()
     image = jnp.zeros((1, 32, 32, 3))
     expected = jax.eval_shape(trunk.init, jax.random.key(0), image)["params"]
@@ -114,7 +114,7 @@ def test_features_equal_torch(tensors):
             x = block(x, f"layer{stage}.{i}", 2 if stage > 1 and i == 0 else 1)
         if stage == 3:
             third = x
-    loaded = resnet_torch.load(tensors)
+    loaded = load_resnet(tensors)
     image = image.transpose(0, 2, 3, 1)
     features = jax.jit(ResNetTrunk().apply)(
         {"params": loaded["params"]["image_backbone"]}, image
@@ -140,11 +140,11 @@ def test_files_and_their_problems(tensors, tmp_path):
     broken["avgpool.weight"] = np.zeros(2, np.float32)
     write_pth(path, broken)
     with pytest.raises(DataError) as error:
-        resnet_torch.load(path)
+        load_resnet(path)
     assert "resnet50.pth does not fit, 2 problems: missing layer3.5.bn2" in str(error)
     assert "unexpected avgpool.weight" in str(error)
     with pytest.raises(FileNotFoundError):
-        resnet_torch.load(tmp_path / "nothing.pth")
+        load_resnet(tmp_path / "nothing.pth")
 
 
 def test_a_trunk_by_itself_is_written_and_read(tmp_path):
@@ -156,8 +156,8 @@ def test_a_trunk_by_itself_is_written_and_read(tmp_path):
         shapes["params"],
     )
     path = tmp_path / "resnet50.safetensors"
-    resnet_torch.save(params, path)
-    loaded = resnet_torch.load(path, width=4)
+    save_resnet(params, path)
+    loaded = load_resnet(path, width=4)
     assert loaded.keys() == {"params"}
     chex.assert_trees_all_equal(loaded["params"], {"image_backbone": params})
     # Its names are torchvision's: what another program would look for.
@@ -167,7 +167,7 @@ def test_a_trunk_by_itself_is_written_and_read(tmp_path):
     }
     assert names == {n for n in expected if not n.endswith("num_batches_tracked")}
     with pytest.raises(DataError, match=r"conv1.weight is float32.4, 3, 7, 7., expect"):
-        resnet_torch.load(path)
+        load_resnet(path)
 
 
 def test_torch_writes_what_it_reads_or_says_that_it_is_missing(tmp_path):
