@@ -24,8 +24,7 @@ from radejax.core.config import load_config
 from radejax.data.projection import project_jax
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.detector import Detector
-from radejax.inference.inputs import placeholder
+from radejax.inference.detector import Detector, placeholder
 from radejax.inference.saved import SavedModel
 from radejax.simulation.config import SimulationConfig
 
@@ -112,8 +111,6 @@ def _measure(
         functools.partial(
             decode,
             grid=models.map_grid(grid, detector.model, mapping),
-            score_threshold=detector.score_threshold,
-            nms_iou=detector.nms_iou,
             **detector.decode_options,
         )
     )
@@ -223,7 +220,7 @@ def main() -> None:
     if given.config:
         detector = untrained(load_config(given.config), dtype=given.dtype)
     else:
-        detector = Detector.from_checkpoint(given.source, dtype=given.dtype)
+        detector = Detector.from_workdir(given.source, dtype=given.dtype)
     is_tesseract = given.input == "tesseract"
     rows = measure(
         detector, given.batch_size, repeats=given.repeats, tesseract=is_tesseract

@@ -29,7 +29,7 @@ ROOMS = (
     "training.distributed",
     "training.step",
     "simulation",
-    "inference.inputs",
+    "inference.detector",
     "inference.predict",
     "visualize",
 )

@@ -17,10 +17,9 @@ from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.pipeline import require_images
 from radejax.data.records import open_embeddings
-from radejax.inference import embed
 from radejax.inference.detect_files import detect_files, output_name
 from radejax.inference.detector import Detector
-from radejax.inference.predict import predict_dataset
+from radejax.inference.predict import embed_dataset, predict_dataset
 from radejax.inference.saved import load_model
 from radejax.models import build
 from radejax.runs import experiment
@@ -117,9 +116,9 @@ def embeddings(data, from_images, tmp_path_factory):
     variables = image_backbone.load_image_backbone(data.backbone, model)
     frames = opened(from_images)[1].frames
     arguments = (model, variables, config.model.image, frames, out)
-    counts = embed.embed_dataset(*arguments, progress=False)
+    counts = embed_dataset(*arguments, progress=False)
     assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
-    counts = embed.embed_dataset(*arguments, progress=False)
+    counts = embed_dataset(*arguments, progress=False)
     assert counts == {"frames": 12, "embedded": 0, "found": 12, "missing": 0}
     return out
 

@@ -24,7 +24,7 @@ from sheet import Block, Point, Sheet
 from radejax import models
 from radejax.core.config import load_config
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.inputs import placeholder
+from radejax.inference.detector import placeholder
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 DATA, RADAR, ATTENTION, CAMERA, HEADS = (

@@ -187,7 +187,7 @@ def embed(
     from radejax import models
     from radejax.core.config import load_config
     from radejax.data.kradar import KRadar
-    from radejax.inference.embed import embed_dataset
+    from radejax.inference.predict import embed_dataset
     from radejax.runs.data import located, simulate_missing
     from radejax.weights.image_backbone import load_image_backbone
 

@@ -111,7 +111,7 @@ def export(
     SOURCE is the workdir of a run, its checkpoints, one of them, an exported folder or an
     official .pth file. "stablehlo" runs with jax only, for any batch size; "onnx" is for
     ONNX Runtime and TensorRT, for one batch size; "huggingface" is weights, config and
-    model card. Detector.from_checkpoint reads all of them.
+    model card. Detector.from_workdir reads all of them.
 
     Example: radejax export runs/quickstart --out exported
     """
@@ -119,7 +119,7 @@ def export(
     from radejax.inference.detector import Detector
 
     entry.set_up_jax()
-    detector = Detector.from_checkpoint(source, image_backbone=image_backbone)
+    detector = Detector.from_workdir(source, image_backbone=image_backbone)
     done = exporting.export(detector, out, **settings)
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:

@@ -207,14 +207,14 @@ def demo(out: pathlib.Path, seed: int) -> None:
         frames = KRadar([folder])
         (frame,) = frames
         projection = frame.read_projection(frames.grid)
-        detector = Detector.from_checkpoint(MODEL)
+        detector = Detector.from_workdir(MODEL)
         found = Boxes(**detector(projection).to_columns())
         scene = frame_scene(
             frame,
             projection,
             frames.grid,
             predictions=found,
-            score_threshold=detector.score_threshold,
+            score_threshold=detector.decode_options["score_threshold"],
             roi=NARROW_ROI,
             title=f"simulated frame, seed {seed}, {frame.weather}",
         )

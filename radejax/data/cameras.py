@@ -6,7 +6,7 @@ import dataclasses
 import io
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -118,7 +118,7 @@ class CameraOptions:
         """Options of `config.data`; the defaults where it has no camera."""
         return cls(**data.get("camera", {}))
 
-    def shift(self, own_m: Sequence[float], own_z_m: float) -> tuple[float, ...]:
+    def shift(self, own_m: Any, own_z_m: float) -> tuple[float, ...]:
         """t of `p_radar = p_lidar + t` from a frame's own t and the height in it."""
         if self.radar_from_lidar_m is not None:
             return tuple(map(float, self.radar_from_lidar_m))

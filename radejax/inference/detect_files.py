@@ -10,7 +10,7 @@ import dataclasses
 import json
 import os
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,8 @@ from radejax.core.structures import Detections
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
 from radejax.data.pipeline import camera_inputs
-from radejax.data.tesseract import read_frame
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.saved import Step
 
@@ -182,11 +180,11 @@ def detect_files(
                 f"{output_name(path)}.json: detect each root into a folder of its own"
             )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
-    saved, out = detector.saved, pathlib.Path(out)
+    data, out = detector.saved.config.data, pathlib.Path(out)
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or saved.config.data.labels
-        known = front_images(frames, detector, labels, saved.config.data.label_version)
+        labels = labels or data.labels
+        known = front_images(frames, detector, labels, data.label_version)
     out.mkdir(parents=True, exist_ok=True)
     if file_format == "kitti":
         names = list(map(frame_key, frames))
@@ -194,7 +192,11 @@ def detect_files(
         files.write_json(out / "frames.json", table)
     chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
     count = {"frames": 0, "boxes": 0, "clipped": 0}
-    found = detector.stream(_batches(chunks, detector.grid, known), **settings)
+    inputs: list[Any] = chunks
+    if known:
+        images = {path: known.get(path.absolute(), (None, None)) for path in frames}
+        inputs = [(c, *zip(*map(images.get, c), strict=True)) for c in chunks]
+    found = detector.stream(inputs, **settings)
     with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:
         for chunk, detections in zip(chunks, found, strict=True):
             for name, text in _as_files(
@@ -208,21 +210,6 @@ def detect_files(
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
     return count
-
-
-def _batches(
-    chunks: Sequence[Sequence[pathlib.Path]],
-    grid: RadarGrid,
-    known: Mapping[pathlib.Path, tuple[pathlib.Path, Camera]],
-) -> Iterator[tuple[Any, ...]]:
-    """What a detector takes, by chunks of files; with images if any are known."""
-    for chunk in chunks:
-        radar = np.stack([read_frame(path, grid) for path in chunk])
-        if known:
-            pairs = [known.get(path.absolute(), (None, None)) for path in chunk]
-            yield radar, *map(list, zip(*pairs, strict=True))
-        else:
-            yield (radar,)
 
 
 def _as_files(

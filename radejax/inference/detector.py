@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import logging
+import os
+import pathlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -13,20 +16,38 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Real, Shaped
+from jaxtyping import Bool, Real, Shaped, UInt8
 
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike
-from radejax.core.structures import Array, Batch, Detections, to_float
-from radejax.data.cameras import CameraOptions
-from radejax.data.projection import project_jax
+from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
+from radejax.data.cameras import CameraOptions, no_camera, read_left_image
+from radejax.data.projection import MAX_LEVEL, project_jax
+from radejax.data.tesseract import read_frame
 from radejax.detection.decode import DecodeOptions, decode
+from radejax.geometry.camera import (
+    KRADAR_RADAR_FROM_LIDAR_Z_M,
+    Camera,
+    CameraCalibration,
+    stack_cameras,
+)
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference import inputs as detector_inputs
 from radejax.inference.saved import SavedModel, Step, load_model, load_torch
+from radejax.models.dinorade import IMAGE_BACKBONE
+
+_log = logging.getLogger(__name__)
 
 UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
+SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
+"""Shapes of the arguments of `decode` that change without compiling again."""
+
+Frames = Array | PathLike | Sequence[Array | PathLike]
+Images = Array | Sequence[Array | PathLike | None]
+Calibration = CameraCalibration | Camera | PathLike
+Calibrations = Calibration | Sequence[Calibration | None]
+
+_PATH = (str, os.PathLike)
 
 
 def detect(
@@ -103,12 +124,7 @@ class Detector:
         batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
     ) -> None:
         config = saved.config.copy_and_resolve_references()
-        if score_threshold is not None:
-            config.decode.score_threshold = float(score_threshold)
-        if nms_iou is not None:
-            config.decode.nms_iou = float(nms_iou)
-        if roi is not None:
-            config.decode.roi = tuple(detector_inputs.named_region(roi))
+        config.decode.update(_settings(score_threshold, nms_iou, roi))
         if dtype is not None:
             config.model.dtype = dtype
         self.saved = dataclasses.replace(saved, config=config)
@@ -117,11 +133,7 @@ class Detector:
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = CameraOptions.from_config(config.data)
         self.classes = tuple(config.classes)
-        options = dataclasses.asdict(DecodeOptions(**config.decode))
-        self.score_threshold: float = options.pop("score_threshold")
-        self.nms_iou: float = options.pop("nms_iou")
-        self.roi = options.pop("roi")
-        self.decode_options: dict[str, Any] = options
+        self.decode_options = dataclasses.asdict(DecodeOptions(**config.decode))
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = (
             NamedSharding(self.sharding.mesh, PartitionSpec())
@@ -150,13 +162,14 @@ class Detector:
         image_backbone: PathLike | None = None,
         **options: Any,
     ) -> Detector:
-        """Detector of a training run.
+        """Detector of a training run, or of anything else that `load_model` takes.
 
         Args:
-            path: Workdir of `train.py`; or anything else that `load_model` takes.
+            path: Workdir of `train.py`, its `checkpoints` or one of them, a folder of
+                `radejax export`, or an official file.
             step: Step of the checkpoint, or "best"; the latest if None.
             image_backbone: Weights of a frozen image backbone, if they are not where
-                the run was trained from.
+                the run was trained from, or the exported folder has none.
             **options: Arguments of `Detector`.
 
         Raises:
@@ -166,25 +179,11 @@ class Detector:
         return cls(saved, **options)
 
     @classmethod
-    def from_checkpoint(
-        cls, path: PathLike, *, image_backbone: PathLike | None = None, **options: Any
-    ) -> Detector:
-        """Detector of an exported folder, or of one checkpoint without its run.
-
-        Args:
-            path: See `load_model`.
-            image_backbone: Weights of the image backbone, if the folder has none.
-            **options: Arguments of `Detector`.
-        """
-        return cls(load_model(path, image_backbone=image_backbone), **options)
-
-    @classmethod
     def from_torch(
         cls,
         path_or_state_dict: PathLike | Mapping[str, Any],
         *,
         image_backbone: PathLike | None = None,
-        model_overrides: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> Detector:
         """Detector of an official RADE-Net or DinoRADE checkpoint.
@@ -192,13 +191,9 @@ class Detector:
         Args:
             path_or_state_dict: File, or mapping of names to arrays, see `load_torch`.
             image_backbone: Folder of DINOv3, for DinoRADE files without its weights.
-            model_overrides: Fields of the model that names and shapes do not determine.
             **options: Arguments of `Detector`.
         """
-        overrides = model_overrides or {}
-        saved = load_torch(
-            path_or_state_dict, image_backbone=image_backbone, **overrides
-        )
+        saved = load_torch(path_or_state_dict, image_backbone=image_backbone)
         return cls(saved, **options)
 
     def __repr__(self) -> str:
@@ -235,9 +230,9 @@ class Detector:
 
     def __call__(
         self,
-        frames: detector_inputs.Frames | Batch,
-        image: detector_inputs.Images | None = None,
-        camera: detector_inputs.Calibrations | None = None,
+        frames: Frames | Batch,
+        image: Images | None = None,
+        camera: Calibrations | None = None,
         *,
         score_threshold: float | None = None,
         nms_iou: float | None = None,
@@ -267,22 +262,21 @@ class Detector:
             is_tesseract = False
             inputs = frames.projection, frames.image, frames.camera
         else:
-            radar, is_tesseract = detector_inputs.radar_batch(frames, self.grid)
-            inputs = radar, *self._camera_inputs(image, camera, len(radar))
-            num_invalid = detector_inputs.count_invalid(
+            radar, is_tesseract = radar_batch(frames, self.grid)
+            image, camera, num_radar_only = camera_batch(
+                image, camera, len(radar), self.model, self.camera_options
+            )
+            inputs = radar, image, camera
+            num_invalid = count_invalid(
                 radar, is_tesseract, warn=not self.num_invalid_frames
             )
             with self._lock:
                 self.num_invalid_frames += num_invalid
-        detector_inputs.check_backbone(inputs[1], self.variables)
-        roi = self.roi if roi is None else detector_inputs.named_region(roi)
-        settings = (
-            np.float32(
-                self.score_threshold if score_threshold is None else score_threshold
-            ),
-            np.float32(self.nms_iou if nms_iou is None else nms_iou),
-            np.asarray(UNBOUNDED_ROI if roi is None else roi, np.float32),
-        )
+                self.num_radar_only += num_radar_only
+        check_backbone(inputs[1], self.variables)
+        options = {**self.decode_options, **_settings(score_threshold, nms_iou, roi)}
+        options["roi"] = options["roi"] or UNBOUNDED_ROI
+        settings = {name: np.asarray(options[name], np.float32) for name in SETTINGS}
         parts = []
         largest = self._batch_sizes[-1]
         for start in range(0, len(inputs[0]), largest):
@@ -292,25 +286,12 @@ class Detector:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def _camera_inputs(self, image: Any, camera: Any, num_frames: int) -> Any:
-        """Images and cameras as arrays; counts the frames without."""
-        if not self.takes_camera:
-            if image is None and camera is None:
-                return None, None
-            raise UserError("image and camera are given, but the model is radar-only")
-        image, camera, num_missing = detector_inputs.prepare(
-            image, camera, num_frames, self.model, self.camera_options
-        )
-        with self._lock:
-            self.num_radar_only += num_missing
-        return image, camera
-
     def _detect(self, inputs: Any, settings: Any, is_tesseract: bool) -> Detections:
         """Detections of at most the largest batch size."""
         count = inputs[0].shape[0]
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
-        found = self._run(self.variables, *inputs, *settings, is_tesseract=is_tesseract)
+        found = self._run(self.variables, *inputs, settings, is_tesseract=is_tesseract)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # Devices that share cores miss each other where batches pile up.
             jax.block_until_ready(found)
@@ -335,20 +316,19 @@ class Detector:
         if pending is not None:
             yield pending
 
-    def warmup(
-        self, batch_size: int = 1, *, tesseract: bool = False, image: bool | None = None
-    ) -> Detector:
+    def warmup(self, batch_size: int = 1, *, tesseract: bool = False) -> Detector:
         """Compile for a batch size, so that the first call is fast.
+
+        A radar-camera model is compiled for frames with images.
 
         Args:
             batch_size: Of the calls to come.
             tesseract: They pass tesseracts, not projections.
-            image: They pass images; None: if the model takes them.
         """
         shape = self.grid.shape_drea if tesseract else self.grid.projection_shape
         inputs: tuple[Any, ...] = (np.zeros((batch_size, *shape), np.float32),)
-        if self.takes_camera and image in (None, True):
-            images, camera = detector_inputs.placeholder(batch_size, self.model)
+        if self.takes_camera:
+            images, camera = placeholder(batch_size, self.model)
             inputs += images, camera.replace(is_valid=np.ones(batch_size, bool))
         jax.block_until_ready(self(*inputs))
         return self
@@ -356,8 +336,8 @@ class Detector:
     def detect_function(self) -> Callable[..., Detections]:
         """The pure function that is jitted: `detect` of this model and options.
 
-        Its arguments are variables, frames, image, camera (or None, None), score
-        threshold, NMS IoU, region `[6]`, and the keyword `is_tesseract`.
+        Its arguments are variables, frames, image, camera (or None, None), a dictionary
+        of `SETTINGS`, and the keyword `is_tesseract`.
         """
         mapping = self.saved.config.data.azimuth_mapping
         grid = models.map_grid(self.grid, self.model, mapping)
@@ -367,14 +347,11 @@ class Detector:
             frames: jax.Array,
             image: jax.Array | None,
             camera: Any,
-            score_threshold: jax.Array,
-            nms_iou: jax.Array,
-            roi: jax.Array,
+            settings: Mapping[str, jax.Array],
             *,
             is_tesseract: bool,
         ) -> Detections:
-            thresholds = {"score_threshold": score_threshold, "nms_iou": nms_iou}
-            options = {**self.decode_options, **thresholds, "roi": roi}
+            options = {**self.decode_options, **settings}
             inputs = variables, frames, image, camera
             found = detect(
                 self.model, grid, options, *inputs, is_tesseract=is_tesseract
@@ -403,3 +380,235 @@ def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]
         return x
     xp: Any = np if isinstance(x, np.ndarray) else jnp
     return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0], 0)])
+
+
+# Inputs ------------------------------------------------------------------------------
+
+
+def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bool]:
+    """Radar frames as one array with a leading axis of B.
+
+    Args:
+        frames: Projections or tesseracts, one array or a list of them, or the path of
+            a file or several; see `Detector`.
+        grid: Axes of the sensor.
+
+    Returns:
+        `[B, R, A, D+E]` or `[B, D, R, E, A]`, and whether they are tesseracts.
+
+    Raises:
+        UserError: The shape is of neither, or there is no frame.
+    """
+    if isinstance(frames, _PATH):
+        frames = [frames]
+    if isinstance(frames, Sequence):
+        if not frames:
+            raise UserError("no frames: the list is empty")
+        frames = np.stack(
+            [
+                read_frame(pathlib.Path(x), grid) if isinstance(x, _PATH) else x
+                for x in frames
+            ]
+        )
+    shape = tuple(np.shape(frames))
+    projection, tesseract = grid.projection_shape, grid.shape_drea
+    for expected, is_tesseract in ((projection, False), (tesseract, True)):
+        if shape == expected:
+            return frames[None], is_tesseract
+        if shape[1:] == expected and shape[0]:
+            return frames, is_tesseract
+    raise UserError(
+        f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
+        f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
+        f"[B, {', '.join(map(str, tesseract))}]"
+    )
+
+
+_MAX_DECIBELS = 300.0
+
+
+def count_invalid(
+    frames: Real[Any, "B ..."], is_tesseract: bool, *, warn: bool = True
+) -> int:
+    """Number of frames whose values are not a linear power, or a level of a projection.
+
+    Decibels are neither: noise alone spans more than they do, with bins below 1. Arrays
+    on a device are not checked, nor is uint8, of which every value is a level.
+    """
+    if not isinstance(frames, np.ndarray) or frames.dtype == np.uint8:
+        return 0
+    axes = tuple(range(1, frames.ndim))
+    low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
+    limit = np.finfo(np.float32).max if is_tesseract else MAX_LEVEL
+    lowest = 0.0 if is_tesseract else -MAX_LEVEL
+    is_decibels = (low > 1.0) & (high <= _MAX_DECIBELS)
+    count = int((~((low >= lowest) & (high <= limit)) | is_decibels).sum())
+    if count and warn:
+        _log.warning(
+            "%d of %d frames contain NaN, Inf or out-of-range values (expected linear "
+            "power or its projection; is the input in decibels?). Their detections are "
+            "meaningless; further ones are counted in num_invalid_frames",
+            count,
+            len(frames),
+        )
+    return count
+
+
+def camera_batch(
+    image: Images | None,
+    camera: Calibrations | None,
+    num_frames: int,
+    model: Any,
+    options: CameraOptions,
+) -> tuple[Real[Array, "B _ _ _"] | None, Camera | None, int]:
+    """Images and cameras as arrays, as `data.pipeline` puts them into a `Batch`.
+
+    Args:
+        image: `[B, H, W, 3]` uint8 (or `[H, W, 3]` of the only frame), what
+            `model.embed` made of it, or a list with one image, path or None per frame.
+        camera: One calibration for all frames or a list with one (or None) per frame:
+            `CameraCalibration`, path of a file of K-Radar, or `Camera`. Also a batch of
+            `Camera`.
+        num_frames: B.
+        model: A radar-only model takes neither.
+        options: How calibrations are used.
+
+    Returns:
+        Images `[B, ...]`, a `Camera` with leading axes of B (both None without any
+        image), and the number of frames that a radar-camera model predicts without one.
+
+    Raises:
+        UserError: A size or number is not as expected, image or camera is given without
+            the other, or an image is missing where that is not allowed.
+    """
+    if not models.has_camera(model):
+        if image is None and camera is None:
+            return None, None, 0
+        raise UserError("image and camera are given, but the model is radar-only")
+    if (image is None) != (camera is None):
+        raise UserError("image and camera belong together: give both or none")
+    images, cameras, has_image = None, None, np.zeros(num_frames, bool)
+    if image is not None:
+        images, has_image = _images(image, model, options.resize)
+        cameras = _cameras(camera, num_frames, model, options)
+        for what, count in (
+            ("images", len(images)),
+            ("cameras", len(cameras.is_valid)),
+        ):
+            if count != num_frames:
+                raise UserError(f"{count} {what} for {num_frames} frames")
+        has_image = has_image & np.asarray(cameras.is_valid, bool)
+        cameras = cameras.replace(is_valid=has_image)
+    num_missing = int((~has_image).sum())
+    if num_missing and not options.allow_missing:
+        raise UserError(
+            f"{num_missing} of {num_frames} frames have no image or calibration, the "
+            f"first is frame {int(has_image.argmin())} of the batch; "
+            "config.data.camera.allow_missing=True predicts them from the radar only"
+        )
+    return images, cameras, num_missing
+
+
+def _images(
+    image: Any, model: Any, resize: bool
+) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
+    """Images as one array, and which of them are not None."""
+    sizes = ((*model.image_size, 3), model.feature_shape)
+    if isinstance(image, _PATH):
+        image = [image]
+    if isinstance(image, Sequence):
+        has_image = np.array([one is not None for one in image])
+        images = [
+            read_left_image(pathlib.Path(one), model.image_size, resize=resize)
+            if isinstance(one, _PATH)
+            else one
+            for one in image
+        ]
+        black = np.zeros(sizes[0], np.uint8)
+        like = next((np.asarray(one) for one in images if one is not None), black)
+        empty = np.zeros_like(like)
+        image = np.stack([empty if one is None else one for one in images])
+    else:
+        image = image[None] if np.ndim(image) == 3 else image
+        has_image = np.ones(len(image), bool)
+    if image.shape[1:] not in sizes:
+        expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in sizes)
+        raise UserError(f"image has shape {list(image.shape)}, expected {expected}")
+    if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
+        raise UserError(f"image has dtype {image.dtype}, expected uint8")
+    return image, has_image
+
+
+def _cameras(
+    camera: Any, num_frames: int, model: Any, options: CameraOptions
+) -> Camera:
+    """A batch of cameras."""
+    if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 1:
+        return camera
+    if not isinstance(camera, list | tuple):
+        camera = [camera] * num_frames
+    return stack_cameras(
+        [
+            no_camera(model.image_size) if one is None else _one_camera(one, options)
+            for one in camera
+        ]
+    )
+
+
+def _one_camera(camera: Any, options: CameraOptions) -> Camera:
+    if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 0:
+        return camera
+    z_m = None
+    if isinstance(camera, _PATH):
+        camera = CameraCalibration.from_kradar(pathlib.Path(camera))
+        z_m = KRADAR_RADAR_FROM_LIDAR_Z_M
+    if not isinstance(camera, CameraCalibration):
+        raise UserError(
+            f"camera is a {type(camera).__name__}, expected a CameraCalibration, a "
+            "Camera, the path of a cam_*.yml file of K-Radar or None, one for all frames "
+            "or one per frame"
+        )
+    own_m = camera.radar_from_lidar_m
+    shift_m = options.shift(own_m, own_m[2] if z_m is None else z_m)
+    camera = dataclasses.replace(camera, radar_from_lidar_m=np.array(shift_m))
+    return camera.camera(options.projection)
+
+
+def placeholder(
+    num_frames: int, model: Any
+) -> tuple[UInt8[np.ndarray, "{num_frames} H W 3"], Camera]:
+    """Black images and a camera that sees nothing, of the shapes of real ones."""
+    image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
+    return image, stack_cameras([no_camera(model.image_size)] * num_frames)
+
+
+def check_backbone(
+    image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
+) -> None:
+    """`UserError` for images if the variables lack the weights of the backbone.
+
+    Args:
+        image: `[B, H, W, 3]`, what the backbone made of it, or None.
+        variables: Variables of a model.
+    """
+    is_raw = image is not None and image.shape[-1] == 3
+    if is_raw and IMAGE_BACKBONE not in variables["params"]:
+        raise UserError(
+            "these weights are without the image backbone: give image_backbone=FOLDER "
+            "(--image-backbone FOLDER) with the weights of DINOv3, or embedded images"
+        )
+
+
+def _settings(
+    score_threshold: float | None,
+    nms_iou: float | None,
+    roi: Sequence[float] | str | None,
+) -> dict[str, Any]:
+    """Those of `SETTINGS` that are given."""
+    given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
+    settings: dict[str, Any] = {k: float(v) for k, v in given.items() if v is not None}
+    if roi is not None:
+        limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
+        require(len(limits) == 6, "roi", roi, "narrow, wide or x0, x1, y0, y1, z0, z1")
+        settings["roi"] = limits
+    return settings

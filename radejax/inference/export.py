@@ -19,11 +19,11 @@ import jax.numpy as jnp
 from flax import traverse_util
 
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
-from radejax.inference.detector import Detector
+from radejax.inference.detector import SETTINGS, Detector
 from radejax.inference.saved import save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
 
@@ -44,7 +44,6 @@ CAMERA_SHAPES = {
 CHUNK_SIZE = 1024
 """Queries at once of the deformable attention in ONNX files, unless the config says."""
 
-SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
 RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
 
 _README = """---
@@ -56,20 +55,22 @@ tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
 # {name}: 3D object detection in 4D radar tensors
 
 - Classes: {classes}
-- Input: projections [B, {shape}]; inputs and outputs are described in docs/deploy.md of
-  radejax
-- Use: `radejax.Detector.from_checkpoint(folder)`{use}
-- `config.json`: config and axes of the sensor; `model.safetensors`: weights, {dtype}
+- Input: projections [B, {shape}]; docs/deploy.md of radejax describes inputs, outputs and
+  files
+- Use: `radejax.Detector.from_workdir(folder)`
 - Left out: {left_out}
-{backbone}
+
 {origin}
 """
-_USE = {
-    "stablehlo": ", or `from load import load; detect = load()`, which needs `pip install "
-    "jax flatbuffers`",
-    "onnx": ", or ONNX Runtime with `detector.onnx`, or `network.onnx` before decoding",
-    "huggingface": "",
-}
+_LEFT_OUT = (
+    "the frozen DINOv3 weights, whose license restricts redistribution: download them "
+    "from their owner and pass `image_backbone=FOLDER`"
+)
+_SIMULATED = "Trained on simulated data only: no use on frames of a real radar."
+_MEASURED = (
+    "Before publishing, check the license of the data that the weights were trained on\n"
+    "(K-Radar: CC BY-NC-ND)."
+)
 
 
 def export(
@@ -90,23 +91,23 @@ def export(
         kind: "stablehlo": program, weights and `load.py`, which needs jax, flatbuffers
             and numpy only; "onnx": network, and network with decoding and NMS, for one
             batch size; "huggingface": weights, config and model card.
-        platforms: Platforms of StableHLO, of `KNOWN_PLATFORMS`; "gpu" is CUDA.
+        platforms: Platforms of StableHLO, of `KNOWN_PLATFORMS`.
         with_backbone: Keep the weights of the image transformer, see `save_model`.
         batch_size: Frames of a call of the ONNX files.
         half: Store float16; only of "huggingface".
 
     Returns:
-        "kind", "folder", "bytes" and "left_out".
+        "bytes" of all files, and "left_out", names of variables.
 
     Raises:
         UserError: An unknown kind or platform; ONNX without jax2onnx; half with
             a program, which takes float32 weights.
     """
-    if kind not in FORMATS:
-        raise UserError(f"format is {kind!r}, expected one of {FORMATS}")
+    require(kind in FORMATS, "format", kind, f"one of {FORMATS}")
+    is_known = set(platforms) <= set(KNOWN_PLATFORMS)
+    require(is_known, "platforms", platforms, f"some of {KNOWN_PLATFORMS}")
     if half and kind != "huggingface":
         raise UserError("--half is only supported with --format huggingface")
-    platforms = _checked_platforms(platforms)
     folder = pathlib.Path(folder)
     programs: dict[str, bytes] = {}
     if kind == "stablehlo":
@@ -124,45 +125,24 @@ def export(
     if kind == "stablehlo":
         loader = pathlib.Path(exported_loader.__file__)
         files.write_text(folder / "load.py", loader.read_text())
-    dtype = "float16" if half else "float32"
-    text = _readme(detector, kind, content["left_out"], dtype)
-    files.write_text(folder / "README.md", text)
+    files.write_text(folder / "README.md", _readme(detector, content["left_out"]))
     return {
-        "kind": kind,
-        "folder": str(folder),
         "bytes": sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()),
         "left_out": content["left_out"],
     }
 
 
-def _readme(detector: Detector, kind: str, left_out: Sequence[str], dtype: str) -> str:
+def _readme(detector: Detector, left_out: Sequence[str]) -> str:
     """The model card, which is short: docs/deploy.md has the rest."""
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _README.format(
         name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
-        dtype=dtype,
         classes=", ".join(detector.classes),
         shape=", ".join(map(str, detector.grid.projection_shape)),
-        left_out=", ".join(left_out) or "nothing",
-        use=_USE[kind],
-        backbone="\nThe license of the frozen DINOv3 weights restricts redistribution: "
-        "download them from their owner and pass `image_backbone=FOLDER`.\n"
-        * bool(left_out),
-        origin="Trained on simulated data only: no use on frames of a real radar."
-        if is_simulated
-        else "Before publishing, check the license of the data that the weights were "
-        "trained on\n(K-Radar: CC BY-NC-ND).",
+        left_out=_LEFT_OUT if left_out else "nothing",
+        origin=_SIMULATED if is_simulated else _MEASURED,
     )
-
-
-def _checked_platforms(platforms: Sequence[str]) -> tuple[str, ...]:
-    names = ["cuda" if p.strip() == "gpu" else p.strip() for p in platforms]
-    for name in names:
-        if name not in KNOWN_PLATFORMS:
-            known = ", ".join(KNOWN_PLATFORMS)
-            raise UserError(f"platform is {name!r}, expected some of {known}")
-    return tuple(dict.fromkeys(names))
 
 
 # Programs ----------------------------------------------------------------------------
@@ -200,10 +180,9 @@ def _detect(
     """The detector on inputs as `_exported` shapes them; the program of both formats."""
     projection, *rest = inputs
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
+    given = dict(zip(SETTINGS, settings, strict=True))
     function = detector.detect_function()
-    found = function(
-        variables, projection, image, camera, *settings, is_tesseract=False
-    )
+    found = function(variables, projection, image, camera, given, is_tesseract=False)
     return {name: getattr(found, name) for name in RESULTS}
 
 
@@ -282,15 +261,11 @@ def onnx_files(
         )
         return model.SerializeToString()
 
-    log = logging.getLogger("onnx_ir")
-    level = log.level
-    log.setLevel(logging.ERROR)  # it warns of every shape that is not static
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
-            return {
-                "network.onnx": convert(network, {}, ("heatmap_logits", "box_params")),
-                "detector.onnx": convert(program, SETTINGS, RESULTS),
-            }
-    finally:
-        log.setLevel(level)
+    # It warns of every shape that is not static.
+    logging.getLogger("onnx_ir").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
+        return {
+            "network.onnx": convert(network, {}, ("heatmap_logits", "box_params")),
+            "detector.onnx": convert(program, SETTINGS, RESULTS),
+        }

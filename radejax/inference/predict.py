@@ -1,26 +1,33 @@
-"""Detections on whole data sets, on all devices of all processes."""
+"""Detections and embedded images of whole data sets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
+import flax.linen as nn
+import grain
 import jax
 import numpy as np
 import tqdm
-from jaxtyping import Shaped
+from jaxtyping import Shaped, UInt8
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
-from radejax.data.dataset import FrameSequence
+from radejax.data.cameras import read_left_image
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import (
     CameraInputs,
     LoaderOptions,
     make_loader,
     make_table,
 )
-from radejax.data.records import Records
+from radejax.data.records import Records, embedding_fields
 from radejax.inference.detector import Detector
+from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.training import distributed
+from radejax.weights.image_backbone import weights_sha256
 
 
 def predict_dataset(
@@ -33,7 +40,7 @@ def predict_dataset(
     progress: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> dict[str, Shaped[np.ndarray, "N ..."]]:
-    """Detections on every frame of a data set; the same on every process.
+    """Detections on every frame, on all devices; the same on every process.
 
     Args:
         detector: Over the devices of several processes each reads its part of a batch.
@@ -96,4 +103,80 @@ def predict_dataset(
     return {
         name: np.concatenate([part[name] for part in parts])
         for name in ("frame", "box", "cls", "score")
+    }
+
+
+def embed_dataset(
+    model: nn.Module,
+    variables: Mapping[str, Any],
+    image_config: Mapping[str, Any],
+    frames: Sequence[LabelledFrame],
+    folder: str | os.PathLike,
+    *,
+    dtype: str = "float32",
+    resize: bool = False,
+    batch_size: int = 8,
+    num_threads: int = 2,
+    progress: bool = True,
+) -> dict[str, int]:
+    """Write the backbone's features of every front image that has none yet.
+
+    Args:
+        model: A `DinoRade`.
+        variables: With the backbone's parameters, `params/image_backbone`.
+        image_config: `config.model.image`, kept with the embeddings.
+        frames: Of a dataset, normally without a split.
+        folder: Folder of the embeddings; made if needed.
+        dtype: "float32", with which training is the same as from images, or "float16",
+            half the size.
+        resize: Resize images of another size than the model's.
+        batch_size: Images at once.
+        num_threads: Threads that read images.
+        progress: Show a progress bar.
+
+    Returns:
+        Counts: "frames", "embedded", "found", "missing" (frames without an image).
+
+    Raises:
+        UserError: The folder has other records; no frames; an unknown dtype.
+        DataError: An image is corrupted or of another size.
+    """
+    if not len(frames):
+        raise UserError("no frames to embed")
+    params = variables["params"][IMAGE_BACKBONE]
+    source = {
+        "image": embedding_fields(image_config),
+        "weights_sha256": weights_sha256(params),
+    }
+    records = Records.create(folder, model.feature_shape, dtype, source)
+    keys = records.keys()
+    images = [f for f in frames if f.camera_path is not None and f.key not in keys]
+    found = sum(frame.key in keys for frame in frames)
+
+    def read(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+        return read_left_image(frame.camera_path, model.image_size, resize=resize)
+
+    embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
+    params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
+    batches: grain.IterDataset[np.ndarray] = (
+        grain.MapDataset.source(images)
+        .map(read)
+        .batch(batch_size)
+        .to_iter_dataset(
+            grain.ReadOptions(num_threads, prefetch_buffer_size=num_threads)
+        )
+    )
+    bar = tqdm.tqdm(total=len(images), unit="frame", desc="embed", disable=not progress)
+    with bar:
+        for i, batch in enumerate(batches):
+            empty = [(0, batch_size - len(batch)), (0, 0), (0, 0), (0, 0)]
+            features = np.asarray(embed(params, np.pad(batch, empty))).astype(dtype)
+            for row, frame in enumerate(images[i * batch_size :][: len(batch)]):
+                records.write(frame.key, features[row])
+            bar.update(len(batch))
+    return {
+        "frames": len(frames),
+        "embedded": len(images),
+        "found": found,
+        "missing": len(frames) - len(images) - found,
     }

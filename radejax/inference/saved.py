@@ -35,7 +35,6 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES
 from radejax.data.cameras import CameraOptions
-from radejax.data.records import open_embeddings
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
@@ -47,6 +46,9 @@ _log = logging.getLogger(__name__)
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 FORMAT = "radejax-2"
+
+FROZEN_BACKBONE = "sha256 of the frozen image backbone"
+"""Name of the first 16 digits among what a checkpoint says of its run."""
 
 Step = int | Literal["best"] | None
 """Step of a checkpoint, "best" by the metric of the run, or None for the latest."""
@@ -62,8 +64,9 @@ class SavedModel:
         grid: Axes of the sensor.
         variables: Parameters and other collections of the model, NumPy arrays.
         step: Step of the checkpoint, or None.
-        run: Data and versions of the run, see `radejax.runs.experiment.run_info`; empty
-            for what is not a checkpoint.
+        run: Data, frozen weights and versions of the run, see
+            `radejax.runs.experiment.checkpoint_info`; empty for what is not a
+            checkpoint.
     """
 
     config: ConfigDict
@@ -96,7 +99,7 @@ def load_model(
     Raises:
         FileNotFoundError: There is no model, or no such checkpoint.
         UserError: A step of what holds one model only; the backbone is not the one that
-            the embeddings of the run are from.
+            the run was trained with.
         DataError: A file is corrupted, or config and weights do not fit.
     """
     path = pathlib.Path(path).absolute()
@@ -262,14 +265,10 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         folder = path / "checkpoints"
     elif any(map(_is_checkpoint, path.iterdir())):
         folder = path
-    elif (path / CONFIG_FILE).is_file():
-        raise FileNotFoundError(
-            f"no checkpoints in {path}: the run has not trained yet"
-        )
     else:
         raise FileNotFoundError(
             f"no model in {path}: expected {CONFIG_FILE} and {WEIGHTS_FILE}, the workdir "
-            "of a run, its checkpoints, or one of them"
+            "of a run that has trained, its checkpoints, or one of them"
         )
     with Checkpoints(folder, read_only=True) as checkpoints:
         chosen = checkpoints.best_step() if step == "best" else step
@@ -280,45 +279,47 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         RadarGrid.from_dict(info["grid"]),
         {"params": params, **(state.get("model_state") or {})},
         number,
-        info["run"],
+        {**info["same"], **info["run"]},
     )
 
 
 def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
     """The same with the weights of its image backbone, where they are available."""
-    is_complete = IMAGE_BACKBONE in saved.variables["params"]
+    params = saved.variables["params"]
+    is_complete = IMAGE_BACKBONE in params
     if "image" not in saved.config.model or (is_complete and given is None):
         return saved
-    params = {**saved.variables["params"], **_find_backbone(saved, given)}
+    source, part = _find_backbone(saved, given)
+    if IMAGE_BACKBONE not in part:
+        return saved
+    backbone, sha256 = part[IMAGE_BACKBONE], saved.run.get(FROZEN_BACKBONE)
+    if sha256 is not None:
+        image_backbone.check_same_backbone(backbone, sha256, source)
+    params = {**params, IMAGE_BACKBONE: backbone}
     return dataclasses.replace(saved, variables={**saved.variables, "params": params})
 
 
-def _find_backbone(saved: SavedModel, given: PathLike | None) -> dict[str, Any]:
-    """`{"image_backbone": parameters}`, empty where they are not available.
+def _find_backbone(
+    saved: SavedModel, given: PathLike | None
+) -> tuple[PathLike, Mapping[str, Any]]:
+    """Where the weights of an image backbone are, and parameters with them if any.
 
     In this order: what is given, what the run was trained with, what it started from.
     """
     data, start = saved.config.data, saved.run.get("init_from")
-    embeddings, source = data.embeddings, given or data.image_backbone
-    if given is None and source is not None and not pathlib.Path(source).exists():
+    source = given or data.image_backbone
+    if given is not None or (source and pathlib.Path(source).exists()):
+        part = image_backbone.load_image_backbone(source, saved.model)
+        return source, part["params"] if part else {}
+    if source is not None:
         _log.warning(
             "image backbone weights not found at %s; the model accepts embedded images "
             "only",
             source,
         )
-        source = None
-    if source is not None:
-        part = image_backbone.load_image_backbone(source, saved.model)
-    elif start is not None and pathlib.Path(start).exists() and not embeddings:
-        part = _fitting_variables(start, saved.config.model)
-    else:
-        return {}
-    if part is None or IMAGE_BACKBONE not in part["params"]:
-        return {}
-    params = part["params"][IMAGE_BACKBONE]
-    if source is not None and embeddings and pathlib.Path(embeddings).exists():
-        image_backbone.check_same_backbone(params, embeddings, source)
-    return {IMAGE_BACKBONE: params}
+    if start and pathlib.Path(start).exists() and not data.embeddings:
+        return start, _fitting_variables(start, saved.config.model)["params"]
+    return "", {}
 
 
 # Weights that a training starts from -------------------------------------------------
@@ -329,13 +330,11 @@ class StartingWeights:
     """What a training starts from instead of random weights.
 
     Attributes:
-        source: Path of `variables`, or None.
         variables: Variables of the whole model, or None.
         pretrained: A part that replaces random weights, or None.
         frozen_sha256: Checksum of the frozen image backbone; None if there is none.
     """
 
-    source: str | None = None
     variables: Mapping[str, Any] | None = None
     pretrained: Mapping[str, Any] | None = None
     frozen_sha256: str | None = None
@@ -345,7 +344,7 @@ def starting_weights(
     config: Any,
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
-    embeddings: PathLike | None = None,
+    embeddings_sha256: str | None = None,
 ) -> StartingWeights:
     """Read the weights that are to be trained further or to stay frozen.
 
@@ -354,28 +353,26 @@ def starting_weights(
         init_from: What `load_model` takes; None initializes all weights randomly.
         image_backbone_path: Weights of the image backbone, see
             `image_backbone.load_image_backbone`.
-        embeddings: Folder of `radejax embed` that replaces the frozen part.
+        embeddings_sha256: Checksum of the weights that the embeddings of `radejax
+            embed` are from, which replace the frozen part.
 
     Raises:
         UserError: They do not fit the model; names what differs.
     """
     model: Any = models.build(config)
-    variables = pretrained = digest = source = None
+    variables = pretrained = digest = None
     if init_from is not None:
-        source = str(pathlib.Path(init_from).absolute())
         variables = _fitting_variables(init_from, config)
     if variables is None or IMAGE_BACKBONE not in variables["params"]:
         pretrained = image_backbone.load_image_backbone(
-            image_backbone_path, model, embeddings
+            image_backbone_path, model, embeddings_sha256
         )
     if models.has_camera(model) and model.freeze:
-        if embeddings is not None:
-            digest = open_embeddings(embeddings).source["weights_sha256"]
-        else:
-            given = variables if pretrained is None else pretrained
-            assert given is not None  # without both there has been an error
+        digest = embeddings_sha256
+        if digest is None:
+            given: Any = variables if pretrained is None else pretrained
             digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
-    return StartingWeights(source, variables, pretrained, digest)
+    return StartingWeights(variables, pretrained, digest)
 
 
 def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
@@ -387,9 +384,7 @@ def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
         if lines := files.differences(found, wanted, "config.model"):
             raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
         return other.variables
-    if "image" in config:
-        _, variables = dinorade_torch.read(path)
-        image_backbone.check_fits(models.build(config), variables, path)
-        return variables
     structure = {name: value for name, value in wanted.items() if name != "name"}
-    return radenet_torch.read(path, **structure)[1]
+    variables = load_torch(path, **({} if "image" in config else structure)).variables
+    image_backbone.check_fits(models.build(config), variables, path)
+    return variables

@@ -27,8 +27,7 @@ from radejax.evaluation.boxes import Columns, roi_bounds
 from radejax.evaluation.files import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
-from radejax.inference.detector import Detector
-from radejax.inference.inputs import check_backbone
+from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import figures

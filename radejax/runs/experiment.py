@@ -37,8 +37,13 @@ from radejax.core.config import without_data_paths
 from radejax.core.errors import require
 from radejax.core.files import PathLike
 from radejax.data.dataset import FrameSequence
+from radejax.data.records import open_embeddings
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.saved import StartingWeights, starting_weights
+from radejax.inference.saved import (
+    FROZEN_BACKBONE,
+    StartingWeights,
+    starting_weights,
+)
 from radejax.runs import checks
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation
@@ -77,9 +82,12 @@ def run(
     model = models.build(config.model)
     folder = default_workdir(workdir, name)
     with claimed(folder, config):
+        digest = None
+        if config.data.embeddings is not None:
+            embeddings = open_embeddings(config.data.embeddings)
+            digest = embeddings.source["weights_sha256"]
         weights = starting_weights(
-            *(config.model, init_from),
-            *(config.data.image_backbone, config.data.embeddings),
+            config.model, init_from, config.data.image_backbone, digest
         )
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid
@@ -90,7 +98,7 @@ def run(
                 ", ".join(data.options.roots),
             )
         loader = data.training_batches(frames, config.train, config.seed)
-        info = run_info(folder, weights.source)
+        info = run_info(folder, init_from)
         if distributed.is_main():
             files.write_json(folder / "run.json", info)
         validate = None
@@ -173,12 +181,16 @@ def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
     )
 
 
-def run_info(workdir: pathlib.Path, init_from: str | None = None) -> dict[str, Any]:
+def run_info(
+    workdir: pathlib.Path, init_from: PathLike | None = None
+) -> dict[str, Any]:
     """Versions, command and starting weights of a run; plain values.
 
     A run that continues keeps the weights that it started from.
     """
-    if init_from is None and (workdir / "run.json").exists():
+    if init_from is not None:
+        init_from = str(pathlib.Path(init_from).absolute())
+    elif (workdir / "run.json").exists():
         init_from = files.read_object(workdir / "run.json").get("init_from")
     versions = {"radejax": radejax.__version__, "jax": jax.__version__}
     return {
@@ -219,7 +231,7 @@ def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, An
         "sha256 of their keys": hashlib.sha256(keys.encode()).hexdigest()[:16],
     }
     if weights.frozen_sha256 is not None:
-        values["sha256 of the frozen image backbone"] = weights.frozen_sha256[:16]
+        values[FROZEN_BACKBONE] = weights.frozen_sha256[:16]
     return values
 
 

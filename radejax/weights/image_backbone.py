@@ -18,7 +18,6 @@ from radejax import models
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, differences
-from radejax.data.records import open_embeddings
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.vit import ViT
 from radejax.weights import dinov3_hf
@@ -36,15 +35,16 @@ _FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
 
 
 def load_image_backbone(
-    path: PathLike | None, model: nn.Module, embeddings: PathLike | None = None
+    path: PathLike | None, model: nn.Module, embeddings_sha256: str | None = None
 ) -> Mapping[str, Any] | None:
     """Pretrained part of the variables, for `radejax.training.step.with_pretrained`.
 
     Args:
         path: A DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
         model: Says which kind is expected.
-        embeddings: Folder of `radejax embed` that stands for the frozen part: what is
-            left is the ResNet's last stage, and nothing of a DINOv3.
+        embeddings_sha256: Checksum of the weights that embeddings are from, which stand
+            for the frozen part: what is left is the ResNet's last stage, and nothing of
+            a DINOv3.
 
     Returns:
         None without a path, and where embeddings leave nothing.
@@ -58,7 +58,7 @@ def load_image_backbone(
     """
     has_camera = models.has_camera(model)
     if path is None:
-        is_embedded = embeddings is not None and has_camera and model.vit is not None
+        is_embedded = embeddings_sha256 and has_camera and model.vit is not None
         if has_camera and model.freeze and not is_embedded:
             raise UserError(
                 "config.model.image.freeze is True, but no weights are given: "
@@ -78,23 +78,27 @@ def load_image_backbone(
         vit, variables = dinov3_hf.load(path)
         check_same_vit(vit, model.vit, path)
         part = {"params": {IMAGE_BACKBONE: variables["params"]}}
-    if embeddings is not None:
+    if embeddings_sha256 is not None:
         params = dict(part["params"])
-        check_same_backbone(params.pop(IMAGE_BACKBONE), embeddings, path)
+        check_same_backbone(params.pop(IMAGE_BACKBONE), embeddings_sha256, path)
         part = {**part, "params": params}
     return part
 
 
-def check_same_backbone(params: Any, embeddings: PathLike, source: PathLike) -> None:
-    """`UserError` unless embeddings were made with these weights."""
-    found, wanted = (
-        open_embeddings(embeddings).source["weights_sha256"],
-        weights_sha256(params),
-    )
-    if found != wanted:
+def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
+    """`UserError` unless weights have the checksum of those of a run or of embeddings.
+
+    Args:
+        params: Parameters of an image backbone.
+        sha256: Checksum that `weights_sha256` gave, or how it begins.
+        source: Where `params` are from.
+    """
+    found = weights_sha256(params)
+    if not found.startswith(sha256):
         raise UserError(
-            f"{source} is not the backbone that {embeddings} was made with: weights "
-            f"{wanted[:12]}, the embeddings' {found[:12]} (sha256)"
+            f"{source} is not the image backbone that was trained with or that the "
+            f"embeddings are from: its weights have sha256 {found[:12]}, theirs "
+            f"{sha256[:12]}"
         )
 
 

@@ -54,8 +54,8 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
             train_online(_config(), parts, num_sequences=2)
     assert saved == [1]
     assert train_online(_config(), parts, num_sequences=2).step == 4
-    expected = Detector.from_checkpoint(whole / "checkpoints")
-    found = Detector.from_checkpoint(parts / "checkpoints")
+    expected = Detector.from_workdir(whole / "checkpoints")
+    found = Detector.from_workdir(parts / "checkpoints")
     jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
     # The folder is a run like any other, but for its data, which are nowhere.
     again = Detector.from_workdir(whole)

@@ -200,7 +200,7 @@ def test_region_of_decode_options_holds_where_none_is_given(
     boxes = np.asarray(found.boxes)[np.asarray(found.is_valid)]
     assert len(boxes)
     assert (boxes[:, 0] <= 15).all()
-    assert Detector(saved, roi=other).roi == other
+    assert Detector(saved, roi=other).decode_options["roi"] == other
 
 
 def test_detections_carry_the_names_of_their_detector(
@@ -251,14 +251,14 @@ def test_decibels_are_warned_of(
 
 def test_arguments_by_name_and_wrong_ones() -> None:
     detector = small.detector(roi="narrow")
-    assert tuple(detector.roi) == tuple(NARROW_ROI)
+    assert tuple(detector.decode_options["roi"]) == tuple(NARROW_ROI)
     assert repr(detector).startswith("Detector(RadeNet, grid ")
     assert "classes Sedan" in repr(detector)
     saved = dataclasses.replace(small.saved(), step=7)
     assert "step 7" in repr(Detector(saved))
     for wrong, message in (
-        ({"roi": "middle"}, "roi 'middle', expected narrow, wide or x0"),
-        ({"roi": (0, 1)}, r"roi \(0, 1\), expected narrow"),
+        ({"roi": "middle"}, "roi is 'middle', expected narrow, wide or x0"),
+        ({"roi": (0, 1)}, r"roi is \(0, 1\), expected narrow"),
         (
             {"batch_sizes": (0,)},
             r"batch_sizes is \(0,\), expected integers of at least",

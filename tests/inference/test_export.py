@@ -105,7 +105,7 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(
     _check(found, "strict", strict)
     config = json.loads((folder / "config.json").read_text())
     assert config["config"]["decode"]["score_threshold"] == 0.1
-    again = Detector.from_checkpoint(folder, batch_sizes=(4,))
+    again = Detector.from_workdir(folder, batch_sizes=(4,))
     _check(found, "3", again(projection))
 
 

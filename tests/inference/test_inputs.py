@@ -16,8 +16,7 @@ from radejax.geometry.camera import (
     RADAR_FROM_LIDAR_M,
     stack_cameras,
 )
-from radejax.inference.inputs import prepare
-from radejax.models.lifting import reference_points
+from radejax.inference.detector import camera_batch
 
 from .. import small_models as small
 
@@ -48,15 +47,12 @@ def test_every_form_of_a_camera_gives_the_same(
     path.write_text(calibration.to_kradar_text())
     camera = calibration.camera("raw")
     expected = fusion(projection, image, calibration)
-    axes = fusion.model.query_grid
-    points = reference_points(camera, axes, 16, 16)
     for given in (
         path,
         [calibration, path],
         camera,
         [camera, calibration],
         stack_cameras([camera, camera]),
-        points,
     ):
         _equal(fusion(projection, image, given), expected)
     _equal(
@@ -131,8 +127,8 @@ def test_a_stream_of_frames_with_images(fusion: Detector) -> None:
 @pytest.mark.parametrize(
     ("image", "camera", "message"),
     [
-        (small.images(2), None, "image is given without camera"),
-        (None, small.calibration(), "camera is given without image"),
+        (small.images(2), None, "belong together: give both"),
+        (None, small.calibration(), "belong together: give both"),
         (small.images(3), small.calibration(), "3 images for 2 frames"),
         (small.images(2)[:, :8], small.calibration(), r"\[2, 8, 48, 3\], expected"),
         (small.images(2).astype(int), small.calibration(), "dtype int64"),
@@ -147,7 +143,7 @@ def test_what_does_not_fit_is_named(
     image: Any, camera: Any, message: str, fusion: Detector
 ) -> None:
     with pytest.raises((UserError, FileNotFoundError), match=message):
-        prepare(image, camera, 2, fusion.model, CameraOptions())
+        camera_batch(image, camera, 2, fusion.model, CameraOptions())
 
 
 def test_a_radar_model_takes_no_image() -> None:
@@ -159,7 +155,7 @@ def test_the_shift_and_projection_of_a_config_are_used() -> None:
     calibration = small.calibration(distortion=(0.1, 0, 0, 0, 0))
     options = CameraOptions("pinhole", (-2.08, -0.13, 0.9))
     model = small.detector("camera").model
-    _, camera, _ = prepare(small.images(1), calibration, 1, model, options)
+    _, camera, _ = camera_batch(small.images(1), calibration, 1, model, options)
     assert not camera.distortion.any()
     expected = -calibration.rotation @ np.array([-2.08, -0.13, 0.9])
     np.testing.assert_allclose(camera.cam_from_ego[0, :, 3], expected, atol=1e-6)
@@ -173,7 +169,7 @@ def test_the_height_of_the_radar_is_the_models_or_kradars(
     model = small.detector("camera").model
 
     def shift(camera: Any, **options: Any) -> Any:
-        _, camera, _ = prepare(
+        _, camera, _ = camera_batch(
             small.images(1), camera, 1, model, CameraOptions(**options)
         )
         return -small.calibration().rotation.T @ camera.cam_from_ego[0, :, 3]

@@ -11,8 +11,7 @@ from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.data.records import preprocess
-from radejax.inference import inputs as detector_inputs
-from radejax.inference.detector import Detector
+from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
 from radejax.runs.data import Data
@@ -126,10 +125,10 @@ def test_images_need_the_weights_of_the_backbone() -> None:
     image = np.zeros((1, 4, 4, 3), np.uint8)
     lacking, whole = {"params": {}}, {"params": {"image_backbone": {}}}
     with pytest.raises(UserError, match="without the image backbone"):
-        detector_inputs.check_backbone(image, lacking)
-    detector_inputs.check_backbone(image, whole)
-    detector_inputs.check_backbone(None, lacking)
-    detector_inputs.check_backbone(np.zeros((1, 4, 4, 16)), lacking)
+        check_backbone(image, lacking)
+    check_backbone(image, whole)
+    check_backbone(None, lacking)
+    check_backbone(np.zeros((1, 4, 4, 16)), lacking)
 
 
 def test_a_detector_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:

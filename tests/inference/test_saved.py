@@ -17,7 +17,6 @@ from radejax import Detector, UserError, models
 from radejax.cli.figures import MODEL
 from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
-from radejax.data.records import Records
 from radejax.inference import exported_loader, saved
 from radejax.inference.saved import load_model, save_model, starting_weights
 from radejax.runs import experiment
@@ -66,13 +65,13 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path: pathlib.Path) -> None:
 
 def test_a_run_that_has_not_trained_says_so(tmp_path: pathlib.Path) -> None:
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
-        Detector.from_checkpoint(tmp_path / "gone")
+        Detector.from_workdir(tmp_path / "gone")
     with pytest.raises(
         FileNotFoundError, match=r"no model in .*: expected config\.json"
     ):
         load_model(tmp_path)
     (tmp_path / "config.json").write_text(base_config().to_json())
-    with pytest.raises(FileNotFoundError, match=r"the run has not trained yet"):
+    with pytest.raises(FileNotFoundError, match="a run that has trained"):
         Detector.from_workdir(tmp_path)
 
 
@@ -108,7 +107,6 @@ def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> N
     model = small.saved()
     save_model(model, tmp_path)
     weights = starting_weights(model.config.model, init_from=tmp_path)
-    assert weights.source == str(tmp_path)
     assert weights.pretrained is None
     jax.tree.map(
         np.testing.assert_array_equal, weights.variables, dict(model.variables)
@@ -135,9 +133,7 @@ def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> No
     assert found.pretrained is None
     assert found.frozen_sha256 == weights_sha256(weights)
     # Embeddings of the same backbone stand for it.
-    source = {"image": {}, "weights_sha256": found.frozen_sha256}
-    Records.create(tmp_path, (2, 3, 4), "float32", source)
-    embedded = starting_weights(config, embeddings=tmp_path)
+    embedded = starting_weights(config, embeddings_sha256=found.frozen_sha256)
     assert embedded.frozen_sha256 == found.frozen_sha256
     assert embedded.variables is embedded.pretrained is None
     tuned = small.saved("camera", model__image__freeze=False).config.model
@@ -154,11 +150,12 @@ def test_an_exported_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) ->
     assert content["left_out"] == []
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["config.json", "model.safetensors"]
-    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    loaded = Detector.from_workdir(tmp_path, batch_sizes=(4,))
     assert loaded.model == detector.model
     assert loaded.classes == detector.classes
     assert loaded.grid == small.small_grid()  # exact in JSON
-    assert (loaded.nms_iou, loaded.score_threshold) == (0.2, 0.1)
+    assert loaded.decode_options == detector.decode_options
+    assert loaded.decode_options["nms_iou"] == 0.2
     _equal(loaded(small.projections(3)), detector(small.projections(3)))
     assert load_model(tmp_path).config.to_json() == detector.saved.config.to_json()
 
@@ -199,12 +196,12 @@ def test_an_exported_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> N
     names = safetensors.numpy.load_file(tmp_path / "model.safetensors")
     assert not any("image_backbone" in name for name in names)
     inputs = small.projections(2), small.images(2), small.calibration()
-    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    loaded = Detector.from_workdir(tmp_path, batch_sizes=(4,))
     _equal(loaded(inputs[0]), detector(inputs[0]))
     with pytest.raises(UserError, match="give"):
         loaded(*inputs)
     save_model(detector.saved, tmp_path, with_backbone=True)
-    loaded = Detector.from_checkpoint(tmp_path, batch_sizes=(4,))
+    loaded = Detector.from_workdir(tmp_path, batch_sizes=(4,))
     _equal(loaded(*inputs), detector(*inputs))
     assert loaded.camera_options == detector.camera_options
     with pytest.raises(UserError, match="--with-backbone"):

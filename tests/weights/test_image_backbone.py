@@ -8,7 +8,6 @@ import pytest
 
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
-from radejax.data.records import Records
 from radejax.models import build
 from radejax.weights import dinov3_hf, image_backbone
 
@@ -27,31 +26,26 @@ def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
     return build(load_config(f"{CONFIG}:rcw_resnet50").model)
 
 
-def _write_manifest(folder, params):
-    source = {"image": {}, "weights_sha256": image_backbone.weights_sha256(params)}
-    Records.create(folder, (2, 3, 4), "float32", source)
-
-
-def test_embeddings_leave_the_last_stage_to_load(resnet, tmp_path):
+def test_embeddings_leave_the_last_stage_to_load(resnet):
     whole = image_backbone.load_image_backbone("resnet50.pth", resnet)
     assert set(whole["params"]) == {"image_backbone", "image_neck"}
-    _write_manifest(tmp_path, TRUNK)
-    part = image_backbone.load_image_backbone("resnet50.pth", resnet, tmp_path)
+    sha256 = image_backbone.weights_sha256(TRUNK)
+    part = image_backbone.load_image_backbone("resnet50.pth", resnet, sha256)
     assert set(part["params"]) == {"image_neck"}
     assert part["batch_stats"] == whole["batch_stats"]
     with pytest.raises(UserError, match="--image-backbone FOLDER"):
-        image_backbone.load_image_backbone(None, resnet, tmp_path)
+        image_backbone.load_image_backbone(None, resnet, sha256)
 
 
-def test_embeddings_of_other_weights_are_refused(resnet, tmp_path):
-    _write_manifest(tmp_path, {"stem": np.arange(3.0) + 1})
-    with pytest.raises(UserError, match=r"resnet50\.pth is not the backbone that"):
-        image_backbone.load_image_backbone("resnet50.pth", resnet, tmp_path)
+def test_embeddings_of_other_weights_are_refused(resnet):
+    sha256 = image_backbone.weights_sha256({"stem": np.arange(3.0) + 1})
+    with pytest.raises(UserError, match=r"resnet50\.pth is not the image backbone"):
+        image_backbone.load_image_backbone("resnet50.pth", resnet, sha256)
 
 
-def test_embeddings_stand_for_all_of_a_transformer(tmp_path):
+def test_embeddings_stand_for_all_of_a_transformer():
     model = build(load_config(str(CONFIG)).model)
-    assert image_backbone.load_image_backbone(None, model, tmp_path) is None
+    assert image_backbone.load_image_backbone(None, model, "0" * 64) is None
 
 
 def test_weights_of_another_transformer_are_refused(monkeypatch):
