@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import logging
 import os
 import pathlib
@@ -58,6 +59,7 @@ def detect(
     frames: Real[Array, "B R A DE"] | Real[Array, "B D R E A"],
     image: Real[Array, "B _ _ _"] | None = None,
     camera: Any = None,
+    settings: Mapping[str, Array] | None = None,
     *,
     is_tesseract: bool = False,
 ) -> Detections:
@@ -71,13 +73,14 @@ def detect(
         frames: Projections as they are stored, or tesseracts.
         image: Of a radar-camera model, or None for the radar alone.
         camera: Likewise.
+        settings: Options that replace those in `options`, of `SETTINGS`, traced.
         is_tesseract: `frames` are tesseracts, linear power.
     """
     if is_tesseract:
         frames = project_jax(frames)
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
     maps: Any = model.apply(variables, *inputs, train=False)
-    return decode(maps, grid, **options)
+    return decode(maps, grid, **{**options, **(settings or {})})
 
 
 class Detector:
@@ -128,7 +131,7 @@ class Detector:
         if dtype is not None:
             config.model.dtype = dtype
         self.saved = dataclasses.replace(saved, config=config)
-        self.grid, self.step = saved.grid, saved.step
+        self.grid = saved.grid
         self.model: Any = self.saved.model
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = CameraOptions.from_config(config.data)
@@ -140,8 +143,6 @@ class Detector:
             if isinstance(self.sharding, NamedSharding)
             else self.sharding
         )
-        devices: set[Any] = self.sharding.device_set
-        self.num_processes = len({device.process_index for device in devices})
         self._set_batch_sizes(batch_sizes)
         self.variables = jax.device_put(saved.variables, self.replicated)
         self.num_radar_only = self.num_invalid_frames = 0
@@ -195,13 +196,6 @@ class Detector:
         """
         saved = load_torch(path_or_state_dict, image_backbone=image_backbone)
         return cls(saved, **options)
-
-    def __repr__(self) -> str:
-        grid = " x ".join(map(str, self.grid.shape_drea))
-        return (
-            f"Detector({type(self.model).__name__}, grid {grid}, classes "
-            f"{', '.join(self.classes)}, step {self.step}, on {self.sharding})"
-        )
 
     def replace(
         self,
@@ -295,6 +289,7 @@ class Detector:
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # Devices that share cores miss each other where batches pile up.
             jax.block_until_ready(found)
+        found = found.replace(class_names=self.classes)
         return found if count == size else jax.tree.map(lambda x: x[:count], found)
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
@@ -334,31 +329,10 @@ class Detector:
         return self
 
     def detect_function(self) -> Callable[..., Detections]:
-        """The pure function that is jitted: `detect` of this model and options.
-
-        Its arguments are variables, frames, image, camera (or None, None), a dictionary
-        of `SETTINGS`, and the keyword `is_tesseract`.
-        """
+        """The pure function that is jitted: `detect` of this model and its options."""
         mapping = self.saved.config.data.azimuth_mapping
         grid = models.map_grid(self.grid, self.model, mapping)
-
-        def function(
-            variables: Any,
-            frames: jax.Array,
-            image: jax.Array | None,
-            camera: Any,
-            settings: Mapping[str, jax.Array],
-            *,
-            is_tesseract: bool,
-        ) -> Detections:
-            options = {**self.decode_options, **settings}
-            inputs = variables, frames, image, camera
-            found = detect(
-                self.model, grid, options, *inputs, is_tesseract=is_tesseract
-            )
-            return found.replace(class_names=self.classes)
-
-        return function
+        return functools.partial(detect, self.model, grid, self.decode_options)
 
     def put(self, x: Shaped[Any, "b ..."]) -> Shaped[jax.Array, "B ..."]:
         """Copy the rows of this process to the devices; the caller may then reuse `x`.

@@ -111,10 +111,9 @@ def export(
     folder = pathlib.Path(folder)
     programs: dict[str, bytes] = {}
     if kind == "stablehlo":
-        program = stablehlo(detector, platforms, with_backbone=with_backbone)
-        programs = {PROGRAM_FILE: program}
+        programs[PROGRAM_FILE] = _stablehlo(detector, platforms, with_backbone)
     elif kind == "onnx":
-        programs = onnx_files(detector, batch_size, with_backbone=with_backbone)
+        programs = _onnx_files(detector, batch_size, with_backbone)
     content = save_model(
         detector.saved,
         folder,
@@ -182,15 +181,12 @@ def _detect(
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
     given = dict(zip(SETTINGS, settings, strict=True))
     function = detector.detect_function()
-    found = function(variables, projection, image, camera, given, is_tesseract=False)
+    found = function(variables, projection, image, camera, given)
     return {name: getattr(found, name) for name in RESULTS}
 
 
-def stablehlo(
-    detector: Detector,
-    platforms: Sequence[str] = PLATFORMS,
-    *,
-    with_backbone: bool = False,
+def _stablehlo(
+    detector: Detector, platforms: Sequence[str], with_backbone: bool
 ) -> bytes:
     """The serialized program: weights, inputs, settings -> dictionary of arrays.
 
@@ -212,8 +208,8 @@ def stablehlo(
     return bytes(exported.serialize())
 
 
-def onnx_files(
-    detector: Detector, batch_size: int, *, with_backbone: bool = False
+def _onnx_files(
+    detector: Detector, batch_size: int, with_backbone: bool
 ) -> dict[str, bytes]:
     """`network.onnx` and, with decoding and rotated NMS, `detector.onnx`.
 

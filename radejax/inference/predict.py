@@ -68,7 +68,8 @@ def predict_dataset(
         classes=detector.classes,
         images=images,
     )
-    num_devices, count = len(detector.sharding.device_set), detector.num_processes
+    devices: set[Any] = detector.sharding.device_set
+    num_devices, count = len(devices), len({d.process_index for d in devices})
     rows = -(-batch_size // num_devices) * num_devices // count
     options = LoaderOptions(
         batch_size=rows,

@@ -1,7 +1,6 @@
 """Frames in folders, their images, models of every kind, names of results."""
 
 import json
-import pathlib
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,7 +24,7 @@ from .. import small_models as small
 
 
 @pytest.fixture
-def root(tmp_path: pathlib.Path) -> pathlib.Path:
+def root(tmp_path):
     for name in (
         "5/radar_tesseract/tesseract_00033.mat",
         "5/radar_tesseract/tesseract_00034.mat",
@@ -39,9 +38,7 @@ def root(tmp_path: pathlib.Path) -> pathlib.Path:
     return tmp_path
 
 
-def test_every_frame_is_found_once_and_its_projection_preferred(
-    root: pathlib.Path,
-) -> None:
+def test_every_frame_is_found_once_and_its_projection_preferred(root):
     found = [path.relative_to(root).as_posix() for path in find_frames([root])]
     assert sorted(found) == [
         "5/DERA_tesseract/DERA_tesseract_00034.npy",
@@ -51,7 +48,7 @@ def test_every_frame_is_found_once_and_its_projection_preferred(
     assert find_frames([root, root / "5"]) == find_frames([root])
 
 
-def test_names_of_results_are_unique_among_sequences(root: pathlib.Path) -> None:
+def test_names_of_results_are_unique_among_sequences(root):
     names = [output_name(path) for path in find_frames([root])]
     assert sorted(names) == [
         "5_00033",
@@ -60,7 +57,7 @@ def test_names_of_results_are_unique_among_sequences(root: pathlib.Path) -> None
     ]
 
 
-def test_a_part_of_the_frames(root: pathlib.Path) -> None:
+def test_a_part_of_the_frames(root):
     for sequence, weather in (("5", "fog"), ("6", "rain")):
         (root / sequence / "description.txt").write_text(f"urban,day,{weather}\n")
     assert [output_name(p) for p in find_frames([root], (6, 9))] == ["6_00033"]
@@ -69,21 +66,19 @@ def test_a_part_of_the_frames(root: pathlib.Path) -> None:
         find_frames([root], (5,), ("rain",))
 
 
-def test_nothing_found_and_nothing_there(tmp_path: pathlib.Path) -> None:
+def test_nothing_found_and_nothing_there(tmp_path):
     with pytest.raises(UserError, match=r"no frames in .* looked for tesseract_\*"):
         find_frames([tmp_path])
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
         find_frames([tmp_path / "gone"])
 
 
-def test_a_folder_named_twice_is_one(
-    root: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_named_twice_is_one(root, monkeypatch):
     monkeypatch.chdir(root)
     assert len(find_frames([root, "."])) == 3
 
 
-def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
+def test_boxes_of_an_exported_folder(tmp_path):
     detector = small.detector(batch_sizes=(2,))  # as below
     save_model(detector.saved, tmp_path / "packed")
     frames = small.projections(3)
@@ -127,7 +122,7 @@ def test_boxes_of_an_exported_folder(tmp_path: pathlib.Path) -> None:
         load_model(tmp_path / "packed", step="best")
 
 
-def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:
+def test_two_frames_of_one_name_are_refused(tmp_path):
     for disk in ("a", "b"):
         path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
         path.parent.mkdir(parents=True)
@@ -136,7 +131,7 @@ def test_two_frames_of_one_name_are_refused(tmp_path: pathlib.Path) -> None:
         detect_files(tmp_path, [tmp_path / "a", tmp_path / "b"], tmp_path / "out")
 
 
-def test_images_of_simulated_folders_are_found(tmp_path: pathlib.Path) -> None:
+def test_images_of_simulated_folders_are_found(tmp_path):
     """Their labels are in `info_label_v2_1`."""
     config = default_config() | {"output": "projection", "frames_per_sequence": 1}
     config.update(train_sequences=1, test_sequences=0)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pathlib
 import subprocess
 import sys
 from typing import Any
@@ -47,7 +46,7 @@ np.savez(out, **found)
 """
 
 
-def _run_elsewhere(folder: pathlib.Path, arrays: dict[str, Any]) -> dict[str, Any]:
+def _run_elsewhere(folder, arrays):
     inputs, out = folder.parent / "inputs.npz", folder.parent / "found.npz"
     np.savez(inputs, **arrays)
     unset = ("PYTHONPATH", "JAX_NUM_CPU_DEVICES")
@@ -66,7 +65,7 @@ def _run_elsewhere(folder: pathlib.Path, arrays: dict[str, Any]) -> dict[str, An
         return dict(found)
 
 
-def _check(found: dict[str, Any], suffix: str, expected: Any) -> None:
+def _check(found, suffix, expected):
     is_valid = np.asarray(expected.is_valid)
     assert is_valid.any()
     np.testing.assert_array_equal(found[f"is_valid_{suffix}"], is_valid)
@@ -78,9 +77,7 @@ def _check(found: dict[str, Any], suffix: str, expected: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_fresh_process_without_radejax_finds_the_same_boxes(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     detector, projection = small.detector(), small.projections(3)
     folder = tmp_path / "exported"
     done = export.export(detector, folder)
@@ -111,7 +108,7 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("with_backbone", [True, False])
-def test_a_radar_camera_model_too(with_backbone: bool, tmp_path: pathlib.Path) -> None:
+def test_a_radar_camera_model_too(with_backbone, tmp_path):
     detector = small.detector("camera")
     projection, image = small.projections(3), small.images(3)
     camera = stack_cameras([small.calibration().camera()] * 3)
@@ -127,7 +124,7 @@ def test_a_radar_camera_model_too(with_backbone: bool, tmp_path: pathlib.Path) -
     _check(found, "1", detector(projection[:1], image[:1], small.calibration()))
 
 
-def test_huggingface_files_name_what_is_left_out(tmp_path: pathlib.Path) -> None:
+def test_huggingface_files_name_what_is_left_out(tmp_path):
     done = export.export(small.detector("camera"), tmp_path, kind="huggingface")
     assert done["left_out"] == ["params/image_backbone"]
     card = (tmp_path / "README.md").read_text()
@@ -142,9 +139,7 @@ def test_huggingface_files_name_what_is_left_out(tmp_path: pathlib.Path) -> None
         export.export(small.detector(), tmp_path, kind="tflite")
 
 
-def test_onnx_without_its_library_says_what_to_install(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_onnx_without_its_library_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(
         UserError, match=r'needs jax2onnx: pip install "radejax\[onnx\]"'
@@ -159,7 +154,7 @@ def test_onnx_without_its_library_says_what_to_install(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["radar", "camera"])
-def test_onnx_files_give_the_same_boxes(kind: str, tmp_path: pathlib.Path) -> None:
+def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     pytest.importorskip("jax2onnx")
     runtime = pytest.importorskip("onnxruntime")
     detector, count = small.detector(kind), 2
@@ -174,7 +169,7 @@ def test_onnx_files_give_the_same_boxes(kind: str, tmp_path: pathlib.Path) -> No
         inputs |= {f"camera_{name}": array for name, array in vars(camera).items()}
     export.export(detector, tmp_path, kind="onnx", batch_size=count)
 
-    def run(file: str, feed: dict[str, Any]) -> dict[str, Any]:
+    def run(file, feed):
         session = runtime.InferenceSession(tmp_path / file)
         names = [output.name for output in session.get_outputs()]
         return dict(zip(names, session.run(None, feed), strict=True))

@@ -1,9 +1,5 @@
 """Images and calibrations of every kind become the same arrays; what lacks is counted."""
 
-import dataclasses
-import pathlib
-from typing import Any
-
 import jax
 import numpy as np
 import pytest
@@ -22,23 +18,21 @@ from .. import small_models as small
 
 
 @pytest.fixture(scope="module")
-def fusion() -> Detector:
+def fusion():
     return small.detector("camera")
 
 
-def _equal(a: Any, b: Any) -> None:
+def _equal(a, b):
     assert np.asarray(a.is_valid).any()
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), a, b)
 
 
-def _differs(a: Any, b: Any) -> bool:
+def _differs(a, b):
     return not np.allclose(a.scores, b.scores, atol=1e-4)
 
 
 @pytest.mark.slow
-def test_every_form_of_a_camera_gives_the_same(
-    fusion: Detector, tmp_path: pathlib.Path
-) -> None:
+def test_every_form_of_a_camera_gives_the_same(fusion, tmp_path):
     projection, image = small.projections(2), small.images(2)
     # A path says nothing about the radar's place: it has K-Radar's.
     shift = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
@@ -69,9 +63,7 @@ def test_every_form_of_a_camera_gives_the_same(
     assert _differs(fusion(projection), expected)
 
 
-def test_missing_images_are_predicted_from_the_radar_and_counted(
-    fusion: Detector,
-) -> None:
+def test_missing_images_are_predicted_from_the_radar_and_counted(fusion):
     projection, image = small.projections(3), small.images(3)
     calibration = small.calibration()
     whole = fusion(projection, image, calibration)
@@ -92,18 +84,18 @@ def test_missing_images_are_predicted_from_the_radar_and_counted(
         strict(projection)
 
 
+def _without_backbone(variables):
+    params = {k: v for k, v in variables["params"].items() if k != "image_backbone"}
+    return {**variables, "params": params}
+
+
 @pytest.mark.slow
-def test_embedded_images_and_weights_without_the_backbone(fusion: Detector) -> None:
+def test_embedded_images_and_weights_without_the_backbone(fusion):
     projection, image = small.projections(1), small.images(1)
     expected = fusion(projection, image, small.calibration())
     features = fusion.model.apply(fusion.variables, image, method="embed")
     _equal(fusion(projection, features, small.calibration()), expected)
-    params = dict(fusion.variables["params"])
-    del params["image_backbone"]
-    saved = dataclasses.replace(
-        small.saved("camera"), variables={**fusion.variables, "params": params}
-    )
-    lean = Detector(saved, score_threshold=0.1, batch_sizes=(4,))
+    lean = fusion.replace(variables=_without_backbone(fusion.variables))
     _equal(lean(projection, features, small.calibration()), expected)
     with pytest.raises(
         UserError, match="without the image backbone: give image_backbone"
@@ -111,7 +103,14 @@ def test_embedded_images_and_weights_without_the_backbone(fusion: Detector) -> N
         lean(projection, image, small.calibration())
 
 
-def test_a_stream_of_frames_with_images(fusion: Detector) -> None:
+def test_batches_with_images_need_the_weights_of_the_backbone(fusion):
+    detector = fusion.replace(variables=_without_backbone(fusion.variables))
+    rows = [None] * 4  # boxes, classes, is_valid, frame
+    with pytest.raises(UserError, match="without the image backbone"):
+        detector(Batch(small.projections(1), *rows, small.images(1)))
+
+
+def test_a_stream_of_frames_with_images(fusion):
     projection, image = small.projections(3), small.images(3)
     calibration = small.calibration()
     items = [(projection[i], image[i], calibration) for i in range(3)]
@@ -139,19 +138,17 @@ def test_a_stream_of_frames_with_images(fusion: Detector) -> None:
         ),
     ],
 )
-def test_what_does_not_fit_is_named(
-    image: Any, camera: Any, message: str, fusion: Detector
-) -> None:
+def test_what_does_not_fit_is_named(image, camera, message, fusion):
     with pytest.raises((UserError, FileNotFoundError), match=message):
         camera_batch(image, camera, 2, fusion.model, CameraOptions())
 
 
-def test_a_radar_model_takes_no_image() -> None:
+def test_a_radar_model_takes_no_image():
     with pytest.raises(UserError, match="radar-only"):
         small.detector()(small.projections(1), small.images(1), small.calibration())
 
 
-def test_the_shift_and_projection_of_a_config_are_used() -> None:
+def test_the_shift_and_projection_of_a_config_are_used():
     calibration = small.calibration(distortion=(0.1, 0, 0, 0, 0))
     options = CameraOptions("pinhole", (-2.08, -0.13, 0.9))
     model = small.detector("camera").model
@@ -161,14 +158,12 @@ def test_the_shift_and_projection_of_a_config_are_used() -> None:
     np.testing.assert_allclose(camera.cam_from_ego[0, :, 3], expected, atol=1e-6)
 
 
-def test_the_height_of_the_radar_is_the_models_or_kradars(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_the_height_of_the_radar_is_the_models_or_kradars(tmp_path):
     path = tmp_path / "cam_front0.yml"
     path.write_text(small.calibration().to_kradar_text())
     model = small.detector("camera").model
 
-    def shift(camera: Any, **options: Any) -> Any:
+    def shift(camera, **options):
         _, camera, _ = camera_batch(
             small.images(1), camera, 1, model, CameraOptions(**options)
         )

@@ -1,7 +1,6 @@
 """Predictions and scores of a data set: the same on one device and on eight."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +8,8 @@ import pytest
 from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
-from radejax.core.structures import Batch
 from radejax.data.records import preprocess
-from radejax.inference.detector import Detector, check_backbone
+from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
 from radejax.runs.data import Data
@@ -23,7 +21,7 @@ from ..small_models import drawn
 
 
 @pytest.fixture(scope="module")
-def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+def setup(tmp_path_factory):
     """Five simulated frames, and a detector that was never trained."""
     folder = tmp_path_factory.mktemp("predict")
     simulation = default_config()
@@ -61,26 +59,24 @@ def setup(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     )
 
 
-def _predict(setup: SimpleNamespace, num_devices: int) -> dict[str, np.ndarray]:
+def _predict(setup, num_devices):
     mesh = distributed.make_mesh(num_devices)
     evaluation = Evaluation(setup.config, setup.data, mesh=mesh)
     return evaluation.predict(setup.variables, progress=False)
 
 
-def _saved(setup: SimpleNamespace) -> SavedModel:
+def _saved(setup):
     return SavedModel(setup.config, setup.records.grid, setup.variables)
 
 
-def _assert_same(actual: Any, expected: Any) -> None:
+def _assert_same(actual, expected):
     np.testing.assert_array_equal(actual["frame"], expected["frame"])
     np.testing.assert_array_equal(actual["cls"], expected["cls"])
     np.testing.assert_allclose(actual["score"], expected["score"], rtol=1e-5)
     np.testing.assert_allclose(actual["box"], expected["box"], rtol=1e-4, atol=1e-4)
 
 
-def test_eight_devices_and_a_detector_predict_the_same_as_one(
-    setup: SimpleNamespace,
-) -> None:
+def test_eight_devices_and_a_detector_predict_the_same_as_one(setup):
     expected = _predict(setup, 1)
     assert set(expected["frame"]) == set(range(5))
     assert len(expected["frame"]) > 50
@@ -91,16 +87,16 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(
 
 
 @pytest.mark.wrong_types
-def test_an_empty_split_is_said(setup: SimpleNamespace) -> None:
+def test_an_empty_split_is_said(setup):
     with pytest.raises(UserError, match="no frames to detect objects in"):
         predict_dataset(None, setup.records, setup.frames[:0])
 
 
-def test_a_detector_sees_no_frames_that_are_not_there(setup: SimpleNamespace) -> None:
+def test_a_detector_sees_no_frames_that_are_not_there(setup):
     seen = []
 
     class Spy(Detector):
-        def __call__(self, frames: Any, *inputs: Any) -> Any:
+        def __call__(self, frames, *inputs):
             seen.append(len(frames.frame))
             return super().__call__(frames, *inputs)
 
@@ -108,10 +104,10 @@ def test_a_detector_sees_no_frames_that_are_not_there(setup: SimpleNamespace) ->
     assert seen == [3, 2]
 
 
-def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
+def test_a_prediction_stops_where_it_is_told_to(setup):
     asked = []
 
-    def should_stop() -> bool:
+    def should_stop():
         asked.append(True)
         return True
 
@@ -121,33 +117,7 @@ def test_a_prediction_stops_where_it_is_told_to(setup: SimpleNamespace) -> None:
     assert asked == [True]
 
 
-def test_images_need_the_weights_of_the_backbone() -> None:
-    image = np.zeros((1, 4, 4, 3), np.uint8)
-    lacking, whole = {"params": {}}, {"params": {"image_backbone": {}}}
-    with pytest.raises(UserError, match="without the image backbone"):
-        check_backbone(image, lacking)
-    check_backbone(image, whole)
-    check_backbone(None, lacking)
-    check_backbone(np.zeros((1, 4, 4, 16)), lacking)
-
-
-def test_a_detector_says_that_the_backbone_is_missing(setup: SimpleNamespace) -> None:
-    detector = Detector(_saved(setup), batch_sizes=(8,))
-    projection = np.zeros((8, *setup.records.grid.projection_shape), np.float16)
-    none = np.zeros((8, 0), np.float32)
-    batch = Batch(
-        projection=projection,
-        boxes=none,
-        classes=none,
-        is_valid=none,
-        frame=np.arange(8, dtype=np.int32),
-        image=np.zeros((8, 4, 4, 3), np.uint8),
-    )
-    with pytest.raises(UserError, match="without the image backbone"):
-        detector(batch)
-
-
-def test_scores_during_training_name_their_protocol(setup: SimpleNamespace) -> None:
+def test_scores_during_training_name_their_protocol(setup):
     state = SimpleNamespace(eval_variables=setup.variables)
     scores = Evaluation(setup.config, setup.data).validate(state, 7)
     name = "validation/map_3d_iou30/coco101/score>0.45"

@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import pathlib
 import random
-from typing import Any
 
 import grain
 import jax
@@ -27,7 +25,7 @@ from radejax.weights.image_backbone import weights_sha256
 from .. import small_models as small
 
 
-def _equal(a: Any, b: Any) -> None:
+def _equal(a, b):
     assert np.asarray(a.is_valid).any()
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
@@ -35,7 +33,7 @@ def _equal(a: Any, b: Any) -> None:
 # Runs and official files -------------------------------------------------------------
 
 
-def _write_torch(path: pathlib.Path, **changes: Any) -> ConfigDict:
+def _write_torch(path, **changes):
     config = small.radar_config().model
     config.update(doppler_bins=64, elevation_bins=37, num_groups=32)
     config.update(widths=(32, 32), decoder_width=64, **changes)
@@ -47,7 +45,7 @@ def _write_torch(path: pathlib.Path, **changes: Any) -> ConfigDict:
     return config
 
 
-def test_a_torch_file_is_loaded_like_a_folder(tmp_path: pathlib.Path) -> None:
+def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
     path = tmp_path / "best.npz"
     config = _write_torch(path)
     loaded = load_model(path)
@@ -63,7 +61,7 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path: pathlib.Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, weights, loaded.variables)
 
 
-def test_a_run_that_has_not_trained_says_so(tmp_path: pathlib.Path) -> None:
+def test_a_run_that_has_not_trained_says_so(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
         Detector.from_workdir(tmp_path / "gone")
     with pytest.raises(
@@ -75,9 +73,7 @@ def test_a_run_that_has_not_trained_says_so(tmp_path: pathlib.Path) -> None:
         Detector.from_workdir(tmp_path)
 
 
-def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(tmp_path):
     """A checkpoint has its own config; a training compares its config with the folder's."""
     config, grid = small.radar_config(), small.small_grid()
     info = experiment.checkpoint_info(config, grid, {}, {})
@@ -103,7 +99,7 @@ def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(
 # Weights to start from ---------------------------------------------------------------
 
 
-def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> None:
+def test_weights_of_another_run_need_the_same_model(tmp_path):
     model = small.saved()
     save_model(model, tmp_path)
     weights = starting_weights(model.config.model, init_from=tmp_path)
@@ -118,14 +114,14 @@ def test_weights_of_another_run_need_the_same_model(tmp_path: pathlib.Path) -> N
         starting_weights(other, init_from=tmp_path)
 
 
-def test_without_anything_to_start_from_all_is_initialized() -> None:
+def test_without_anything_to_start_from_all_is_initialized():
     config = small.radar_config().model
     assert starting_weights(config) == saved.StartingWeights()
     with pytest.raises(UserError, match="which has no camera"):
         starting_weights(config, image_backbone_path="dinov3")
 
 
-def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> None:
+def test_a_frozen_backbone_is_known_by_its_weights(tmp_path):
     model = small.saved("camera")
     weights, config = model.variables["params"]["image_backbone"], model.config.model
     save_model(model, tmp_path / "all", with_backbone=True)
@@ -143,7 +139,7 @@ def test_a_frozen_backbone_is_known_by_its_weights(tmp_path: pathlib.Path) -> No
 # Exported folders --------------------------------------------------------------------
 
 
-def test_an_exported_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) -> None:
+def test_an_exported_radar_model_gives_the_same_boxes(tmp_path):
     model = small.saved(data__azimuth_mapping="stretched", seed=3)
     detector = Detector(model, nms_iou=0.2, score_threshold=0.1, batch_sizes=(4,))
     content = save_model(detector.saved, tmp_path)
@@ -160,9 +156,7 @@ def test_an_exported_radar_model_gives_the_same_boxes(tmp_path: pathlib.Path) ->
     assert load_model(tmp_path).config.to_json() == detector.saved.config.to_json()
 
 
-def test_a_model_stored_in_half_is_half_and_computes_in_float32(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_a_model_stored_in_half_is_half_and_computes_in_float32(tmp_path):
     for half in (False, True):
         save_model(small.saved(), tmp_path / str(half), half=half)
     sizes = [
@@ -170,7 +164,7 @@ def test_a_model_stored_in_half_is_half_and_computes_in_float32(
     ]
     assert sizes[1] < 0.6 * sizes[0]
 
-    def same(ours: Any, theirs: Any) -> None:
+    def same(ours, theirs):
         assert ours.dtype == np.float32
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-7)
 
@@ -178,7 +172,7 @@ def test_a_model_stored_in_half_is_half_and_computes_in_float32(
     jax.tree.map(same, found, dict(small.saved().variables))
 
 
-def test_the_demo_has_a_small_model_of_simulated_data() -> None:
+def test_the_demo_has_a_small_model_of_simulated_data():
     assert sum(path.stat().st_size for path in MODEL.iterdir()) < 4e6
     loaded = load_model(MODEL)
     card = (MODEL / "README.md").read_text()
@@ -189,7 +183,7 @@ def test_the_demo_has_a_small_model_of_simulated_data() -> None:
 
 
 @pytest.mark.slow
-def test_an_exported_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> None:
+def test_an_exported_camera_model_is_without_dinov3(tmp_path):
     detector = small.detector("camera")
     content = save_model(detector.saved, tmp_path)
     assert content["left_out"] == ["params/image_backbone"]
@@ -208,7 +202,7 @@ def test_an_exported_camera_model_is_without_dinov3(tmp_path: pathlib.Path) -> N
         save_model(small.saved("camera", model__image__freeze=False), tmp_path)
 
 
-def test_bfloat16_computes_close_to_float32() -> None:
+def test_bfloat16_computes_close_to_float32():
     full, half = small.detector(), small.detector(dtype="bfloat16")
     assert half.model.dtype == "bfloat16"
     inputs = small.projections(1)
@@ -221,7 +215,7 @@ def test_bfloat16_computes_close_to_float32() -> None:
         small.detector(dtype="float16")
 
 
-def test_a_flipped_bit_of_the_weights_is_found(tmp_path: pathlib.Path) -> None:
+def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
     programs = {"detector.stablehlo": b"a program"}
     save_model(small.saved(), tmp_path, programs=programs)
     path, draw = tmp_path / "model.safetensors", random.Random(0)
@@ -240,7 +234,7 @@ def test_a_flipped_bit_of_the_weights_is_found(tmp_path: pathlib.Path) -> None:
         exported_loader.load(tmp_path)
 
 
-def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> None:
+def test_whatever_is_wrong_in_the_config_is_named(tmp_path):
     save_model(small.saved(), tmp_path)
     path = tmp_path / "config.json"
     content = json.loads(path.read_text())
@@ -269,7 +263,7 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path: pathlib.Path) -> Non
     [("radenet", x) for x in ("base", "paper", "official", "stem", "sedan")]
     + [("dinorade", x) for x in ("rc", "rcw", "rcw_resnet50", "official", "r")],
 )
-def test_a_config_in_json_makes_the_same_model(name: str, options: str) -> None:
+def test_a_config_in_json_makes_the_same_model(name, options):
     config = load_module(small.CONFIGS / f"{name}.py").get_config(options).model
     again = ConfigDict(json.loads(config.to_json()), convert_dict=True)
     assert models.build(again) == models.build(config)
