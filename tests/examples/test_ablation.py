@@ -1,11 +1,7 @@
 """The ablations: what is run, that it goes on, differences and verdicts."""
 
 import json
-import os
 import pathlib
-import subprocess
-import sys
-import time
 from typing import Any
 
 import ablation
@@ -179,92 +175,6 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
     for claim in study.claims:
         assert {claim.a, claim.b} <= set(study.cells)
         assert claim.cls in (*CLASSES, "mean")
-
-
-_SMALL = """
-import dataclasses, ablation
-ablation.COMMON |= {
-    "simulation.train_sequences": 8,
-    "simulation.image_width": 0,
-    "simulation.image_height": 0,
-    "simulation.grid": {
-        "num_doppler": 4, "num_range": 24, "num_elevation": 3, "num_azimuth": 16,
-        "max_range_m": 75.6,
-    },
-    "model.doppler_bins": 4,
-    "model.elevation_bins": 3,
-    "model.widths": (8, 8),
-    "model.decoder_width": 8,
-    "model.num_groups": 4,
-    "train.checkpoint_every_steps": 3,
-    "train.num_epochs": 10,
-}
-study = ablation.STUDIES["sigma"]
-ablation.STUDIES["sigma"] = dataclasses.replace(study, held_out=8)
-ablation.main()
-"""
-
-
-def _start(out: pathlib.Path) -> subprocess.Popen[str]:
-    folder = str(ablation.CONFIGS.parent / "examples")
-    paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
-    command = ["--table", "sigma", "--seeds", "0", "--cells", "sigma 3,sigma 0.75"]
-    return subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            _SMALL,
-            *command,
-            "--resamples",
-            "20",
-            "--out",
-            str(out),
-        ],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def _ended(process: subprocess.Popen[str]) -> str:
-    text = process.communicate(timeout=600)[0]
-    assert process.returncode == 0, text
-    return text
-
-
-@pytest.mark.slow  # trains two cells twice
-def test_killed_within_a_run_it_goes_on_and_ends_with_the_same_digits(
-    tmp_path: pathlib.Path,
-) -> None:
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    process = _start(killed)
-    steps = killed / "runs" / "quickstart" / "sigma_3" / "seed0" / "checkpoints"
-    until = time.monotonic() + 300
-    while not any(path.name.isdecimal() for path in steps.glob("*")):
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    process.kill()
-    process.communicate()
-    assert not (steps.parent / "evaluation").exists()
-    text = _ended(_start(killed))
-    assert "continuing from step" in text
-    assert "2 of 2 cells are done" in text
-    _ended(_start(whole))
-    for name in ("sigma_3", "sigma_0.75"):
-        ends = pathlib.Path("runs", "quickstart", name, "seed0")
-        losses, found = [], []
-        for out in (killed, whole):
-            rows = (out / ends / "metrics.jsonl").read_text().splitlines()
-            losses.append([json.loads(row).get("focal") for row in rows])
-            with np.load(out / ends / "held" / "resampled_20.npz") as stored:
-                found.append(stored["all"])
-        assert losses[0] == losses[1]
-        np.testing.assert_array_equal(*found)
-    tables = [(out / "table_sigma.json").read_text() for out in (killed, whole)]
-    assert json.loads(tables[0])["rows"] == json.loads(tables[1])["rows"]
-    assert "2 of 2 cells are done" in _ended(_start(killed))  # nothing left to do
 
 
 @pytest.mark.parametrize("table", sorted(ablation.STUDIES))
