@@ -1,6 +1,5 @@
-"""Every command in README and docs is understood, and run somewhere by a test."""
+"""Every command in README and docs is understood, and those on data folders run."""
 
-import ast
 import contextlib
 import functools
 import io
@@ -21,6 +20,8 @@ from radejax.cli.evaluate import evaluate
 from radejax.cli.train import train
 from radejax.core.config import load_config, override
 
+from . import small_models as small
+
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [
     ROOT / "README.md",
@@ -29,59 +30,13 @@ PAGES = [
 ]
 PROGRAMS = ("python", "python3", "radejax", "pip", "pytest", "git", ".", "cd")
 
-HELP = "tests/test_documented_commands.py::test_a_script_explains_itself"
-
-# The test, or the line of .ci/run, that runs each kind of command for real.
-RUN_IN = {
-    "train.py": "tests/test_quickstart.py::test_from_nothing_to_metrics_and_pictures",
-    "radejax train": "tests/cli/test_train.py::test_train_takes_a_part_of_the_data",
-    "evaluate.py": "tests/test_quickstart.py"
-    "::test_evaluate_reproduces_the_table_and_detect_writes_boxes",
-    "radejax simulate": "tests/test_documented_commands.py"
-    "::test_data_check_finds_simulated_folders_whole",
-    "radejax data": "tests/test_documented_commands.py"
-    "::test_data_check_finds_simulated_folders_whole",
-    "radejax preprocess": "tests/test_documented_commands.py"
-    "::test_preprocess_then_nothing_is_left_to_do",
-    "radejax overlay": "tests/cli/test_figures.py"
-    "::test_the_first_frame_of_a_sequence_is_drawn",
-    "radejax view": "tests/test_documented_commands.py::test_view_writes_a_recording",
-    "radejax demo": ".ci/run: radejax demo",
-    "radejax detect": ".ci/run: radejax detect --workdir",
-    "radejax evaluate": "tests/test_quickstart.py"
-    "::test_evaluate_reproduces_the_table_and_detect_writes_boxes",
-    "radejax score": "tests/cli/test_main.py"
-    "::test_score_evaluates_predictions_in_files",
-    "radejax compare": "tests/evaluation/test_compare.py::test_command_line",
-    "radejax export": "tests/cli/test_main.py::test_export_takes_an_exported_folder",
-    "radejax embed": "tests/test_fusion_run.py::test_embed_command",
-    "examples/cfar_baseline.py": "tests/examples/test_cfar_baseline.py"
-    "::test_cfar_baseline_fits_detects_and_reports",
-    "examples/fusion_by_lens.py": "tests/test_fusion_run.py"
-    "::test_example_compares_fusion_and_radar_by_the_lens",
-    "examples/echo_accuracy.py": "tests/examples/test_echo_accuracy.py"
-    "::test_scenes_are_measured",
-    "examples/center_distance.py": "tests/examples/test_center_distance.py"
-    "::test_a_report_is_told_in_two_tables",
-    "examples/silhouettes.py": "tests/examples/test_silhouettes.py"
-    "::test_both_runs_see_the_same_scenes_and_the_bar_decides",
-    "examples/ablation.py": "tests/examples/test_ablation.py"
-    "::test_what_is_missing_is_run_and_judged",
-    "examples/pretrain_backbone.py": "tests/examples/test_pretrain_backbone.py"
-    "::test_it_learns_and_what_it_writes_is_a_frozen_backbone",
-    "examples/online_training.py": "tests/examples/test_online_training.py"
-    "::test_fresh_frames_train_a_model_and_a_stop_changes_nothing",
-    "examples/reference_points.py": "tests/test_fusion_run.py"
-    "::test_example_draws_reference_points",
-    # Measured by hand on quiet machines: that they start is tested.
-    **{
-        f"benchmarks/{path.name}": HELP
-        for path in (ROOT / "benchmarks").glob("*.py")
-        if "__main__" in path.read_text(encoding="utf-8")  # not modules of the others
-    },
-    "docs/images/networks.py": HELP,
-    "docs/images/simulator_pictures.py": HELP,
-}
+# What can be called by itself; other files are modules of these.
+SCRIPTS = sorted(
+    str(path.relative_to(ROOT))
+    for folder in ("benchmarks", "docs/images", "examples")
+    for path in (ROOT / folder).glob("*.py")
+    if "__main__" in path.read_text(encoding="utf-8")
+)
 
 
 def _commands() -> list[tuple[str, str]]:
@@ -215,44 +170,9 @@ def _help(script: str) -> str:
     return output.getvalue()
 
 
-SCRIPTS = sorted(name for name in RUN_IN if "/" in name)
-
-
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_script_explains_itself(script: str) -> None:
     assert _help(script).lower().startswith("usage: ")
-
-
-def _kind(command: str) -> str | None:
-    """Key of `RUN_IN`; None where nothing of ours is run."""
-    words = shlex.split(command, comments=True)
-    if words[0] == "radejax" and not words[1].startswith("-"):
-        return " ".join(words[:2])
-    if words[0] in ("python", "python3") and words[1].endswith(".py"):
-        return words[1]
-    return None
-
-
-def test_every_kind_of_command_is_run_by_a_test() -> None:
-    kinds = {_kind(command) for _, command in COMMANDS} - {None}
-    kinds |= {f"radejax {name}" for name in main.main.commands}
-    assert kinds - set(RUN_IN) == set()
-    assert {kind for kind in RUN_IN if "/" in kind} >= {
-        str(path.relative_to(ROOT))
-        for path in (ROOT / "examples").glob("*.py")
-        if "__main__" in path.read_text()  # the rest are modules of the others
-    }
-
-
-@pytest.mark.parametrize("place", sorted(set(RUN_IN.values())))
-def test_the_place_that_runs_a_command_is_there(place: str) -> None:
-    if place.startswith(".ci/run: "):
-        lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-        assert any(line.strip().startswith(place[len(".ci/run: ") :]) for line in lines)
-        return
-    path, _, name = place.partition("::")
-    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-    assert name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
 
 
 # Run for real, on two frames --------------------------------------------------------
@@ -262,15 +182,9 @@ def test_the_place_that_runs_a_command_is_there(place: str) -> None:
 def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """Two frames of one sequence, made by `radejax simulate`."""
     folder = tmp_path_factory.mktemp("commands")
-    config = folder / "tiny.py"
-    quickstart = ROOT / "configs" / "quickstart.py"
-    config.write_text(
-        "from radejax.core.config import load_config\n"
-        "def get_config():\n"
-        f"    config = load_config({str(quickstart)!r})\n"
-        "    config.simulation.update(train_sequences=1, test_sequences=0)\n"
-        "    return config\n"
-    )
+    settings = load_config("quickstart")
+    settings.simulation.update(train_sequences=1, test_sequences=0)
+    config = small.write_config(folder / "tiny.py", settings)
     out = folder / "data"
     _run("simulate", "--config", config, "--frames", 2, "--out", out)
     return out
