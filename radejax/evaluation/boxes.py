@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Real, Shaped
@@ -103,30 +101,13 @@ def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
         wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
         if missing := [column for column in wanted if column not in table]:
             raise UserError(f"{name} lack the columns {missing}; found {sorted(table)}")
-        frame = _integers(table["frame"], name)
-        arrays = {
-            "box": np.asarray(table["box"], np.float64),
-            "cls": np.asarray(table["cls"]),
-        }
-        if scored:
-            arrays["score"] = np.asarray(table["score"], np.float64)
-        if frame.size == 0:  # an empty list has neither type nor width
-            arrays |= {"box": arrays["box"].reshape(0, 7), "cls": np.zeros(0, str)}
-        for column, values in arrays.items():
-            expected = (frame.size, 7) if column == "box" else (frame.size,)
-            if values.shape != expected:
-                raise UserError(
-                    f"{name}: column {column!r} has shape {values.shape}, expected "
-                    f"{expected}"
-                )
-        if arrays["cls"].dtype.kind not in "UO":
-            raise UserError(
-                f"{name}: column 'cls' is {arrays['cls'].dtype}, expected class names as "
-                "strings"
-            )
-        arrays["cls"] = arrays["cls"].astype(str)
+        frame = _frame_column(table, name)
+        box = np.asarray(table["box"], np.float64)
+        box = box if frame.size else np.zeros((0, 7))  # an empty list has no width
+        cls = np.asarray(table["cls"]).astype(str)
+        score = np.asarray(table["score"], np.float64) if scored else None
         try:
-            boxes = Boxes(frame, **arrays)
+            boxes = Boxes(frame, box, cls, score)
         except DataError as error:
             raise DataError(f"{name}: {error}") from None
     is_empty = boxes.box[:, 3:6] <= 0
@@ -140,20 +121,15 @@ def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
     return boxes
 
 
-def _integers(column: ArrayLike, name: str) -> Int[np.ndarray, " N"]:
-    """A column of frame ids as int64."""
-    values = np.asarray(column)
-    if values.ndim != 1:
+def _frame_column(table: AnyColumns, name: str) -> Int[np.ndarray, " N"]:
+    """Frame ids of a table as int64."""
+    ids = np.asarray(table["frame"])
+    if ids.ndim != 1 or (ids.size and ids.dtype.kind not in "iu"):
         raise UserError(
-            f"{name}: column 'frame' has shape {values.shape}, expected [N]"
+            f"{name}: column 'frame' is {ids.dtype} of shape {ids.shape}, expected "
+            "integer frame ids [N]"
         )
-    if values.dtype.kind == "f" and np.all(values == np.floor(values)):
-        values = values.astype(np.int64)
-    if values.size and values.dtype.kind not in "iu":
-        raise UserError(
-            f"{name}: column 'frame' is {values.dtype}, expected integer frame ids"
-        )
-    return values.astype(np.int64)
+    return ids.astype(np.int64)
 
 
 def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
@@ -165,27 +141,17 @@ def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
     """
     if "frame" not in frames:
         raise UserError(f"frames need a column 'frame', found {sorted(frames)}")
-    ids = _integers(frames["frame"], "frames")
+    ids = _frame_column(frames, "frames")
     values, count = np.unique(ids, return_counts=True)
     if (count > 1).any():
         raise DataError(f"frames: frame {values[count > 1][0]} occurs twice")
     for name, column in frames.items():
-        if np.shape(column)[:1] != ids.shape:
+        if np.shape(column) != ids.shape:
             raise UserError(
-                f"frames: column {name!r} has {np.shape(column)} entries for"
-                f" {ids.size} frames"
+                f"frames: column {name!r} has shape {np.shape(column)}, expected one "
+                f"value for each of {ids.size} frames"
             )
     return ids
-
-
-def are_simulated(frames: AnyColumns | None) -> bool:
-    """Whether a frame table says that some of its frames are simulated.
-
-    Examples:
-        >>> are_simulated({"frame": [0, 1], "simulated": [False, True]})
-        True
-    """
-    return frames is not None and bool(np.any(frames.get("simulated", False)))
 
 
 def class_indices(
@@ -202,7 +168,7 @@ def class_indices(
         >>> class_indices(boxes, ["Sedan"], "ground truth").tolist()
         [0, -1]
     """
-    index_of = dict.fromkeys((*classes, *KNOWN_CLASSES), -1)
+    index_of = dict.fromkeys(KNOWN_CLASSES, -1)
     index_of |= {name: i for i, name in enumerate(classes)}
     names, inverse = np.unique(boxes.cls, return_inverse=True)
     index = np.array([index_of.get(n, -2) for n in names.tolist()], np.int64)[inverse]
@@ -227,28 +193,25 @@ def frame_positions(
         >>> frame_positions(np.array([9, 7, 7]), np.array([7, 9]), "predictions").tolist()
         [1, 0, 0]
     """
-    order = np.argsort(ids, kind="stable")
-    position = np.searchsorted(ids[order], frame)
-    position = np.minimum(position, max(ids.size - 1, 0))
-    known = ids[order][position] == frame if ids.size else np.zeros(frame.size, bool)
-    if not known.all():
-        row = int(np.argmin(known))
+    is_known = np.isin(frame, ids)
+    if not is_known.all():
+        row = int(np.argmin(is_known))
         raise DataError(
             f"{name}: frame {frame[row]}, row {row}: no such frame among the"
             f" {ids.size} frames that are evaluated"
         )
-    return order[position]
+    order = np.argsort(ids)
+    return order[np.searchsorted(ids, frame, sorter=order)]
 
 
-def take_frames(table: Columns, ids: Shaped[np.ndarray, " F"]) -> Columns:
-    """Rows of a table that are of some frames.
+def take(table: AnyColumns, rows: Shaped[np.ndarray, " K"]) -> Columns:
+    """Rows of a table, by position or mask.
 
     Examples:
         >>> table = {"frame": np.array([0, 1, 1]), "cls": np.array(["a", "b", "c"])}
-        >>> take_frames(table, np.array([1]))["cls"].tolist()
+        >>> take(table, np.array([1, 2]))["cls"].tolist()
         ['b', 'c']
     """
-    rows = np.isin(table["frame"], ids)
     return {name: np.asarray(column)[rows] for name, column in table.items()}
 
 
@@ -264,7 +227,7 @@ def frame_keys(frames: Columns) -> list[str]:
     """
     if "name" not in frames:
         return [str(frame) for frame in np.asarray(frames["frame"]).tolist()]
-    names = [_strip(str(name)) for name in np.asarray(frames["name"]).tolist()]
+    names = [_without_suffix(name) for name in np.asarray(frames["name"]).tolist()]
     if "sequence" not in frames:
         return names
     sequences = np.asarray(frames["sequence"]).tolist()
@@ -274,64 +237,48 @@ def frame_keys(frames: Columns) -> list[str]:
     ]
 
 
-def _known_frames(frames: Columns) -> dict[str, int]:
-    """Ids by key, and by the part of it that a radar file has: "sequence/radar"."""
-    ids = np.asarray(frames["frame"]).tolist()
-    keys = dict(zip(frame_keys(frames), ids, strict=True))
-    return {key.rpartition("_")[0]: frame for key, frame in keys.items()} | keys
+def _without_suffix(name: object) -> str:
+    return str(name).removesuffix(".txt")
 
 
-def _strip(name: str) -> str:
-    return name.removesuffix(".txt")
+def with_ids(
+    table: Columns, frames: Columns | None, where: str, *, skip: bool = False
+) -> Columns:
+    """A table whose frames are named by id, key or "sequence/radar", with ids.
 
-
-def find_frames(named: Any, frames: Columns | None, *, where: str) -> np.ndarray:
-    """Ids of frames that are named by id, key or "sequence/radar".
+    Args:
+        table: With a column frame; ids stay as they are.
+        frames: Frame table to look names up in.
+        where: The table in errors.
+        skip: Leave out rows of frames that the frame table does not have, unless it has
+            none of them.
 
     Raises:
-        DataError: A frame that the table does not have, or names without a table.
+        DataError: A name that the frame table does not have.
 
     Examples:
-        >>> frames = {"frame": [7], "name": ["5/00012_00001"]}
-        >>> find_frames(["5/00012_00001"], frames, where="boxes.json").tolist()
+        >>> frames = {"frame": np.array([7]), "name": np.array(["5/00012_00001"])}
+        >>> table = {"frame": np.array(["5/00012"])}
+        >>> with_ids(table, frames, "boxes.json")["frame"].tolist()
         [7]
     """
-    named = np.asarray(named)
-    if named.size == 0:
-        return np.zeros(0, np.int64)
-    if named.dtype.kind in "iu":
-        return named.astype(np.int64)
-    # Rows of a frame are neighbors: look each frame up once.
-    first = np.flatnonzero(np.append(True, named[1:] != named[:-1]))
-    text = [_strip(str(name)) for name in named[first].tolist()]
-    if all(re.fullmatch("-?[0-9]{1,18}", name) for name in text):
-        found = [int(name) for name in text]
-    elif frames is None:
-        raise DataError(f"{where}: frames are named ({text[0]!r}), but none are known")
-    else:
-        known = _known_frames(frames)
-        for row, name in zip(first.tolist(), text, strict=True):
-            if name not in known:
-                count, such = len(frames["frame"]), next(iter(frame_keys(frames)), "-")
-                raise DataError(
-                    f"{where}: row {row}: no frame {name!r:.80} among the {count} frames"
-                    f" that are evaluated (such as {such!r})"
-                )
-        found = [known[name] for name in text]
-    return np.repeat(np.array(found, np.int64), np.diff(first, append=named.size))
-
-
-def of_known_frames(columns: Columns, frames: Columns) -> Columns:
-    """Rows of frames that the table has; all rows if there are none.
-
-    Examples:
-        >>> frames = {"frame": [0], "name": ["5/00012_00001"]}
-        >>> columns = {"frame": np.array(["5/00012", "5/00013"])}
-        >>> of_known_frames(columns, frames)["frame"].tolist()
-        ['5/00012']
-    """
-    known = _known_frames(frames)
-    is_known = [_strip(str(name)) in known for name in columns["frame"].tolist()]
-    if not any(is_known):
-        return columns
-    return {name: column[np.array(is_known)] for name, column in columns.items()}
+    named = np.asarray(table["frame"])
+    if named.dtype.kind in "iu" or not named.size:
+        return {**table, "frame": named.astype(np.int64)}
+    names = [_without_suffix(name) for name in named.tolist()]
+    known: dict[str, int] = {}
+    if frames is not None:
+        keys, ids = frame_keys(frames), np.asarray(frames["frame"]).tolist()
+        known = dict(zip((key.rpartition("_")[0] for key in keys), ids, strict=True))
+        known |= dict(zip(keys, ids, strict=True))
+    is_known = np.array([name in known for name in names])
+    if skip and is_known.any():
+        table = take(table, is_known)
+        names = [name for name in names if name in known]
+    elif not is_known.all():
+        row = int(np.argmin(is_known))
+        raise DataError(
+            f"{where}: row {row}: frame {names[row]!r:.80}, expected one of the frames "
+            f"that are evaluated, such as {next(iter(known), None)!r}"
+        )
+    return {**table, "frame": np.array([known[name] for name in names], np.int64)}

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,10 +26,10 @@ from radejax.data.kradar import KRadar
 from radejax.evaluation.boxes import (
     AnyColumns,
     Columns,
-    find_frames,
+    frame_ids,
     frame_keys,
-    of_known_frames,
-    take_frames,
+    take,
+    with_ids,
 )
 from radejax.evaluation.kitti import read_kitti
 
@@ -39,11 +39,11 @@ from radejax.evaluation.kitti import read_kitti
 def read_table(
     path: PathLike, frames: Columns | None = None, *, scored: bool = True
 ) -> Columns:
-    """Read predictions (or, not `scored`, ground truth) from .npz or .json.
+    """Read predictions (or, not `scored`, ground truth) from a file or folder.
 
     Args:
-        path: The file; or the folder of `radejax detect`, a .json per frame, of which
-            frames that the table does not have are ignored.
+        path: A .npz or .json file, a folder in KITTI's layout, or the folder of `radejax
+            detect`, of which frames that the table does not have are ignored.
         frames: Frame table to look frames up in; None leaves integer ids as they are.
         scored: Whether a score is expected.
 
@@ -59,70 +59,63 @@ def read_table(
     path = pathlib.Path(path)
     wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
     columns: Columns
-    if path.is_dir():
-        records = [r for p in sorted(path.glob("*.json")) for r in _records(p, wanted)]
-        columns = _columns_of_records(records, wanted)
-        if frames is not None:
-            columns = of_known_frames(columns, frames)
-    elif not path.is_file():
-        raise FileNotFoundError(2, "no such file", str(path))
-    elif path.suffix == ".json":
-        columns = _columns_of_records(_records(path, wanted), wanted)
+    if _is_kitti(path):
+        columns = read_kitti(path)[1 if scored else 0]
+        if frames is not None and (path / "frames.json").is_file():
+            # Of `radejax detect`, whose frame table names the numbered files.
+            names = _read_frames(path / "frames.json")["name"]
+            columns = {**columns, "frame": names[columns["frame"]]}
+    elif path.is_dir() or path.suffix == ".json":
+        parts = sorted(path.glob("*.json")) if path.is_dir() else [path]
+        records = [record for part in parts for record in _records(part, scored)]
+        frame, cls, box, score = ([r[i] for r in records] for i in range(4))
+        columns = {
+            "frame": np.array(frame),
+            "cls": np.array(cls, str),
+            "box": np.array(box, np.float64).reshape(-1, 7),
+            "score": np.array(score, np.float64),
+        }
     elif path.suffix == ".npz":
         columns = read_npz(path)
         if missing := [name for name in wanted if name not in columns]:
             raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
     else:
         raise UserError(
-            f"{path}: cannot read '{path.suffix}'; known: .npz, .json and folders in "
+            f"{path} is no .npz or .json file, and no folder of `radejax detect` or in "
             "KITTI's layout"
         )
     table = {name: columns[name] for name in wanted}
-    table["frame"] = find_frames(columns["frame"], frames, where=str(path))
-    return table
+    return with_ids(table, frames, str(path), skip=path.is_dir())
 
 
-def _records(path: pathlib.Path, wanted: Sequence[str]) -> list[dict[str, Any]]:
-    """Records of a file, each with the wanted fields, checked."""
+def _is_kitti(path: pathlib.Path) -> bool:
+    """Whether a folder is in KITTI's layout and not one of `radejax detect`'s .json."""
+    return path.is_dir() and ((path / "preds").is_dir() or not any(path.glob("*.json")))
+
+
+def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
+    """Frame, class, box and score of every record of a file, checked."""
     content = files.read_json(path)
-    if not isinstance(content, list):
-        raise DataError(f"{path}: expected a list of records with {', '.join(wanted)}")
-    records = []
-    for row, record in enumerate(content):
-        if not isinstance(record, dict):
-            raise DataError(f"{path}: row {row}: expected a record, got {record!r:.80}")
-        spelled = [record.get(name) for name in BOX_FIELDS]
-        entry = {"box": spelled, **record}
-        if lacking := [name for name in wanted if name not in entry]:
-            raise DataError(f"{path}: row {row}: lacks {lacking[0]!r}")
-        box = entry["box"] if isinstance(entry["box"], list) else []
-        numbers = [*box, entry["score"]] if "score" in wanted else box
-        is_number = all(type(value) in (int, float) for value in numbers)
-        if len(box) != len(BOX_FIELDS) or not is_number:
-            raise DataError(
-                f"{path}: row {row}, frame {entry['frame']!r:.80}: box is {box!r:.200} "
-                f"and score {entry.get('score')!r:.80}, expected 7 numbers "
-                f"{', '.join(BOX_FIELDS)} and a score"
-            )
-        for name in ("frame", "cls"):
+    for row, record in enumerate(content if isinstance(content, list) else [content]):
+        values = record if isinstance(record, dict) else {}
+        frame, cls = values.get("frame"), values.get("cls")
+        box = values.get("box", [values.get(name) for name in BOX_FIELDS])
+        score = values.get("score") if scored else 0.0
+        numbers = [*box, score] if isinstance(box, list) else []
+        is_good = (
+            type(frame) in (int, str)
+            and type(cls) is str
             # An array of names is as wide as its longest name.
-            if len(str(entry[name])) > 200:
-                raise DataError(f"{path}: row {row}: {name} has over 200 characters")
-        records.append(entry)
-    return records
-
-
-def _columns_of_records(
-    records: Sequence[dict[str, Any]], wanted: Sequence[str]
-) -> dict[str, np.ndarray]:
-    columns = {
-        "frame": np.array([str(record["frame"]) for record in records]),
-        "cls": np.array([str(record["cls"]) for record in records], str),
-        "box": np.array([r["box"] for r in records], np.float64).reshape(-1, 7),
-    }
-    if "score" in wanted:
-        columns["score"] = np.array([r["score"] for r in records], np.float64)
-    return columns
+            and max(len(str(frame)), len(cls)) <= 200
+            and len(numbers) == 8
+            and all(type(number) in (int, float) for number in numbers)
+        )
+        if not is_good:
+            raise DataError(
+                f"{path}: row {row} is {record!r:.300}, expected a list of records with "
+                f"frame, cls, score and numbers {', '.join(BOX_FIELDS)} (or as box)"
+            )
+        yield frame, cls, box, score
 
 
 def write_table(
@@ -250,7 +243,7 @@ def load(
         found = read_table(path / "predictions.npz", frames)
     else:
         truth, given, left_out = _load_ground_truth(path, source, classes)
-        found = _load_predictions(path, given)
+        found = read_table(path, given)
         frames = given or {"frame": np.union1d(truth["frame"], found["frame"])}
     box = np.array(found["box"], np.float64).reshape(-1, 7)
     box[:, 2] += source.z_offset_m
@@ -271,14 +264,12 @@ def load(
                 f"no frames of {column} {', '.join(map(str, wanted))}; there are "
                 f"{', '.join(np.unique(values))}"
             )
-        frames = {name: np.asarray(v)[is_chosen] for name, v in frames.items()}
-        truth, found = (take_frames(table, frames["frame"]) for table in (truth, found))
+        frames = take(frames, is_chosen)
+        truth, found = (
+            take(table, np.isin(table["frame"], frames["frame"]))
+            for table in (truth, found)
+        )
     return truth, found, frames, left_out
-
-
-def _is_kitti(path: pathlib.Path) -> bool:
-    """Whether a folder is in KITTI's layout and not one of `radejax detect`'s .json."""
-    return path.is_dir() and ((path / "preds").is_dir() or not any(path.glob("*.json")))
 
 
 def _load_ground_truth(
@@ -312,19 +303,6 @@ def _load_ground_truth(
     )
 
 
-def _load_predictions(path: pathlib.Path, frames: Columns | None) -> Columns:
-    """Predictions of a file or folder, with frames by id."""
-    if not _is_kitti(path):
-        return read_table(path, frames)
-    found = read_kitti(path)[1]
-    if frames is None or not (path / "frames.json").is_file():
-        return found
-    # Of `radejax detect`, whose frame table names the numbered files.
-    names = _read_frames(path / "frames.json")["name"]
-    named = of_known_frames({**found, "frame": names[found["frame"]]}, frames)
-    return {**named, "frame": find_frames(named["frame"], frames, where=str(path))}
-
-
 def stored_from(path: PathLike) -> float:
     """Score from which on predictions were stored, as the report of a run says; or 0."""
     path = pathlib.Path(path)
@@ -335,17 +313,12 @@ def stored_from(path: PathLike) -> float:
 
 def _read_frames(path: PathLike) -> Columns:
     """A frame table as `report.write_report` writes it."""
-    columns = files.read_json(path)
-    lists = columns.values() if isinstance(columns, dict) else [0]
-    if not all(isinstance(values, list) for values in lists) or "frame" not in columns:
-        raise DataError(f"{path}: expected columns (lists), with 'frame' among them")
-    for name, values in columns.items():
-        if len(values) != len(columns["frame"]):
-            raise DataError(
-                f"{path}: column {name!r} has {len(values)} entries for "
-                f"{len(columns['frame'])} frames"
-            )
-        kinds = {type(value) for value in values}
-        if len(kinds) > 1 or not kinds <= {int, str, bool, float}:
-            raise DataError(f"{path}: column {name!r} mixes types, or has other values")
-    return {name: np.asarray(values) for name, values in columns.items()}
+    content = files.read_json(path)
+    try:
+        columns = {name: np.asarray(values) for name, values in dict(content).items()}
+        frame_ids(columns)
+        if any(column.dtype.kind == "O" for column in columns.values()):
+            raise DataError("a column has values that are no numbers or words")
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{path} is no table of frames: {error}") from None
+    return columns

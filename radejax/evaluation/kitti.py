@@ -23,12 +23,17 @@ import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from jaxtyping import Int
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
-from radejax.evaluation.boxes import Columns, find_frames, frame_ids, frame_positions
+from radejax.evaluation.boxes import (
+    Columns,
+    frame_ids,
+    frame_positions,
+    take,
+    with_ids,
+)
 
 CLASS_KEYS = {
     "Sedan": "sed",
@@ -79,23 +84,26 @@ def write_kitti(
         DataError: A frame that the table does not have.
     """
     ids = frame_ids(frames)
-    ground_truth = _with_ids(ground_truth, frames, "ground truth")
-    predictions = _with_ids(predictions, frames, "predictions")
     if not len(ground_truth["frame"]):
         raise UserError("no frame has ground truth: K-Radar's tools write none of them")
+    is_above = np.asarray(predictions["score"]) > score_threshold
+    by_position = {}
+    for name, table, scored in (
+        ("ground truth", ground_truth, False),
+        ("predictions", take(predictions, is_above), True),
+    ):
+        frame = with_ids(table, frames, name)["frame"]
+        numbered = {**table, "frame": frame_positions(frame, ids, name)}
+        by_position[name] = _lines(numbered, scored=scored)
+    truth, found = by_position.values()
     root = pathlib.Path(folder) / f"{float(score_threshold)}"
-    above = np.flatnonzero(np.asarray(predictions["score"]) > score_threshold)
-    truth = _lines(ground_truth, range(len(ground_truth["cls"])), scored=False)
-    found = _lines(predictions, above, scored=True)
     kinds = [kind for kind in conditions if kind in frames]
-    listed: dict[pathlib.Path, list[str]] = {root / "all": []}
-    for position, frame in enumerate(ids.tolist()):
-        if frame not in truth:
-            continue
+    listed: dict[pathlib.Path, list[str]] = {}
+    for position, lines in sorted(truth.items()):
         tags = {kind: str(np.asarray(frames[kind])[position]) for kind in kinds}
         texts = {
-            "gts": "\n".join(truth[frame]) + "\n",
-            "preds": "\n".join(found.get(frame, [DUMMY])) + "\n",
+            "gts": "\n".join(lines) + "\n",
+            "preds": "\n".join(found.get(position, [DUMMY])) + "\n",
             "desc": "\n".join(tags.get(kind, "unknown") for kind in DESCRIPTION),
         }
         for tag in ("all", *tags.values()):
@@ -105,16 +113,8 @@ def write_kitti(
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(text, encoding="utf-8")
     for part, names in listed.items():
-        part.mkdir(parents=True, exist_ok=True)
         files.write_text(part / "val.txt", "".join(f"{name}\n" for name in names))
-    return len(listed[root / "all"])
-
-
-def _with_ids(table: Columns, frames: Columns, name: str) -> Columns:
-    """The table with frames by id, all of which the frame table has."""
-    ids = frame_ids(frames)
-    found = find_frames(table["frame"], frames, where=name)
-    return {**table, "frame": ids[frame_positions(found, ids, name)]}
+    return len(truth)
 
 
 def prediction_texts(
@@ -130,94 +130,73 @@ def prediction_texts(
         UserError: K-Radar has no key for a class.
     """
     columns = detections.to_columns(classes)
-    found = _lines(columns, range(len(columns["score"])), scored=True)
+    found = _lines(columns, scored=True)
     num_frames = detections.is_valid.shape[0]
     return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
 
 
-def _lines(
-    table: Columns, rows: range | Int[np.ndarray, " K"], *, scored: bool
-) -> dict[int, list[str]]:
-    """Lines of chosen rows by frame, as ground truth or as predictions."""
+def _lines(table: Columns, *, scored: bool) -> dict[int, list[str]]:
+    """Lines by frame, as ground truth or as predictions."""
     header = PRED_HEADER if scored else GT_HEADER
     box = np.asarray(table["box"], np.float64).reshape(-1, 7)
     numbers = (box if scored else np.round(box, 2))[:, BOX_ORDER]
     if scored:
-        score = np.asarray(table["score"], np.float64)
-        numbers = np.column_stack([numbers, score])
-    frame, cls = np.asarray(table["frame"]).tolist(), np.asarray(table["cls"]).tolist()
+        numbers = np.column_stack([numbers, np.asarray(table["score"], np.float64)])
+    frames, names = (np.asarray(table[column]).tolist() for column in ("frame", "cls"))
     lines: dict[int, list[str]] = {}
-    for row in rows:
-        if cls[row] not in CLASS_KEYS:
+    for frame, cls, row in zip(frames, names, numbers.tolist(), strict=True):
+        if cls not in CLASS_KEYS:
             raise UserError(
-                f"K-Radar's tools have no key for class {cls[row]!r} (frame {frame[row]},"
-                f" row {row}); known: {', '.join(CLASS_KEYS)}"
+                f"K-Radar's tools have no key for class {cls!r} (frame {frame}); known: "
+                f"{', '.join(CLASS_KEYS)}"
             )
-        words = [CLASS_KEYS[cls[row]], header, *map(repr, numbers[row].tolist())]
-        lines.setdefault(frame[row], []).append(" ".join(words))
+        words = [CLASS_KEYS[cls], header, *map(repr, row)]
+        lines.setdefault(frame, []).append(" ".join(words))
     return lines
 
 
-def read_kitti(
-    folder: str | pathlib.Path, *, condition: str = "all"
-) -> tuple[Columns, Columns, Columns]:
+def read_kitti(folder: str | pathlib.Path) -> tuple[Columns, Columns, Columns]:
     """Reads ground truth, predictions and frame table from a folder of K-Radar's tools.
 
     Args:
-        folder: A folder with `preds` (or `pred`) and perhaps `gts` (or `gt`) and `desc`,
-            or the folder of a score threshold around it, or the one around that if it holds a
-            single score threshold.
-        condition: Which condition's folder to read.
+        folder: A folder with `preds` and perhaps `gts` and `desc`; or the folder of a
+            score threshold around its condition "all", or the one around that if it holds
+            a single score threshold.
 
     Returns:
         Ground truth, predictions and frame table. The frame id is the number of the file;
         the frame table has weather, environment and time where `desc` tells them.
 
     Raises:
-        FileNotFoundError: No such folder.
         UserError: Nothing to read in it, or several score thresholds.
         DataError: A malformed line; names the file and the line.
     """
-    root = _find_root(pathlib.Path(folder), condition)
-    preds, gts = _part(root, "preds", "pred"), _part(root, "gts", "gt")
-    numbers, found = _read_folder(preds, scored=True)
-    others, truth = _read_folder(gts, scored=False)
-    frames = _frame_table(sorted({*numbers, *others}), _part(root, "desc"))
+    root = _find_root(pathlib.Path(folder))
+    numbers, found = _read_folder(root / "preds", scored=True)
+    others, truth = _read_folder(root / "gts", scored=False)
+    frames = _frame_table(sorted({*numbers, *others}), root / "desc")
     return truth, found, frames
 
 
-def _find_root(folder: pathlib.Path, condition: str) -> pathlib.Path:
-    if not folder.is_dir():
-        raise FileNotFoundError(2, "no such folder", str(folder))
-    for root in (folder, folder / condition):
-        if _part(root, "preds", "pred"):
-            return root
-    folders = [
-        p for p in sorted(folder.iterdir()) if _part(p / condition, "preds", "pred")
-    ]
-    if len(folders) == 1:
-        return folders[0] / condition
-    if folders:
-        names = ", ".join(p.name for p in folders)
-        raise UserError(
-            f"{folder} holds several score thresholds ({names}): name one of them"
-        )
+def _find_root(folder: pathlib.Path) -> pathlib.Path:
+    for pattern in ("preds", "all/preds", "*/all/preds"):
+        found = sorted(folder.glob(pattern))
+        if len(found) > 1:
+            names = ", ".join(path.parts[-3] for path in found)
+            raise UserError(
+                f"{folder} holds several score thresholds ({names}): name one of them"
+            )
+        if found:
+            return found[0].parent
     raise UserError(
-        f"{folder} has no folder 'preds' of predictions, neither itself nor in"
-        f" '{condition}'"
+        f"{folder} has no folder 'preds' of predictions, neither itself nor in 'all'"
     )
 
 
-def _part(root: pathlib.Path, *names: str) -> pathlib.Path | None:
-    return next((root / name for name in names if (root / name).is_dir()), None)
-
-
-def _read_folder(
-    folder: pathlib.Path | None, *, scored: bool
-) -> tuple[list[int], Columns]:
+def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Columns]:
     """Numbers of the files in a folder, if there is one, and columns of all lines."""
     numbers, rows = [], []
-    for path in sorted(folder.glob("*.txt")) if folder else ():
+    for path in sorted(folder.glob("*.txt")):
         if not re.fullmatch("[0-9]{1,9}", path.stem):
             raise DataError(
                 f"{path}: expected a file named by its number, as 000012.txt"
@@ -243,23 +222,26 @@ def _read_line(line: str, scored: bool, where: str) -> tuple | None:
     expected = 16 if scored else 15
     if len(fields) != expected:
         raise DataError(f"{where}: {len(fields)} fields, expected {expected}")
-    name = CLASS_NAMES.get(fields[0], fields[0][:80])
+    if fields[0] not in CLASS_NAMES:
+        known = ", ".join(CLASS_NAMES)
+        raise DataError(f"{where}: unknown class {fields[0]!r:.80}; known: {known}")
     try:
         height, width, length, y, z, x, yaw = (float(f) for f in fields[8:15])
         score = float(fields[15]) if scored else 0.0
     except ValueError as error:
         raise DataError(f"{where}: {error}") from None
-    return name, (x, y, z, length, width, height, yaw), score
+    box = (x, y, z, length, width, height, yaw)
+    return CLASS_NAMES[fields[0]], box, score
 
 
-def _frame_table(numbers: list[int], desc: pathlib.Path | None) -> Columns:
+def _frame_table(numbers: list[int], desc: pathlib.Path) -> Columns:
     ids = {"frame": np.array(numbers, np.int64)}
-    if desc is None:
+    if not desc.is_dir():
         return ids
     tags = []
     for number in numbers:
         path = desc / f"{number:06d}.txt"
         words = files.read_text(path).split() if path.is_file() else []
-        tags.append([w[:80] for w in words] if len(words) == 3 else ["unknown"] * 3)
+        tags.append(words if len(words) == 3 else ["unknown"] * 3)
     columns = np.array(tags, dtype=str).reshape(-1, 3).T
     return ids | dict(zip(DESCRIPTION, columns, strict=True))

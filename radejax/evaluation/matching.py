@@ -59,7 +59,12 @@ def candidate_pairs(
 
 
 def chunks(count: Int[np.ndarray, " R"]) -> list[Int[np.ndarray, " _"]]:
-    """Rows in chunks, of about so many pairs in all as are compared at once."""
+    """Rows, in parts with about as many pairs as are compared at once.
+
+    Examples:
+        >>> [rows.tolist() for rows in chunks(np.array([10**6, 2 * 10**6]))]
+        [[0], [1]]
+    """
     num_chunks = 1 + int(count.sum()) // PAIRS_PER_CHUNK
     return np.array_split(np.arange(count.size), num_chunks)
 

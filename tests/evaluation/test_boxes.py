@@ -16,18 +16,9 @@ def test_roi_names_and_bounds():
         boxes.roi_bounds((0, 0, 1, 2, 3, 4))
 
 
-def test_in_roi_looks_at_centers_only_and_includes_bounds():
-    box = np.zeros((4, 7))
-    box[:, 0] = [0, 72, 72.0001, -1e-9]
-    box[:, 3:6] = 100
-    assert boxes.in_roi(box, "narrow").tolist() == [True, True, False, False]
-    assert boxes.in_roi(box, None).all()
-
-
 def test_frame_ids():
     np.testing.assert_array_equal(boxes.frame_ids({"frame": [3, 1]}), [3, 1])
-    np.testing.assert_array_equal(boxes.frame_ids({"frame": np.array([3.0])}), [3])
-    with pytest.raises(UserError, match="need a column 'frame', found \\['name'\\]"):
+    with pytest.raises(UserError, match=r"need a column 'frame', found \['name'\]"):
         boxes.frame_ids({"name": ["a"]})
     with pytest.raises(DataError, match="frame 5 occurs twice"):
         boxes.frame_ids({"frame": [5, 1, 5]})
@@ -38,24 +29,15 @@ def test_frame_ids():
 def test_frame_positions_of_any_order():
     position = boxes.frame_positions(np.array([5, 3, 5]), np.array([3, 9, 5]), "x")
     assert position.tolist() == [2, 0, 2]
-    with pytest.raises(DataError, match="x: frame 4, row 1: no such frame among the 2"):
-        boxes.frame_positions(np.array([3, 4]), np.array([3, 5]), "x")
-    with pytest.raises(DataError, match="among the 0 frames"):
-        boxes.frame_positions(np.array([3]), np.zeros(0, int), "x")
-    assert boxes.frame_positions(np.zeros(0, int), np.zeros(0, int), "x").size == 0
+    none = np.zeros(0, int)
+    with pytest.raises(DataError, match="x: frame 3, row 0: no such frame among the 0"):
+        boxes.frame_positions(np.array([3]), none, "x")
+    assert boxes.frame_positions(none, none, "x").size == 0
 
 
-def _named(*cls, frame=0):
-    return Boxes(np.full(len(cls), frame), np.ones((len(cls), 7)), np.array(cls))
-
-
-def test_class_indices():
-    several = _named("Bicycle", "Sedan", "Bicycle Group")
-    index = boxes.class_indices(several, ("Sedan", "Bicycle"), "x")
-    assert index.tolist() == [1, 0, -1]
-    assert boxes.class_indices(_named("Tram"), ("Tram",), "x").tolist() == [0]
-    with pytest.raises(DataError, match="frame 4, row 0: unknown class 'sedan'"):
-        boxes.class_indices(_named("sedan", frame=4), ("Sedan",), "x")
+def test_a_class_that_k_radar_does_not_have_may_be_asked_for():
+    tram = Boxes(np.zeros(1, int), np.ones((1, 7)), np.array(["Tram"]))
+    assert boxes.class_indices(tram, ("Tram",), "x").tolist() == [0]
 
 
 def test_read_boxes_takes_lists_and_empty_tables():

@@ -639,13 +639,13 @@ def test_missing_and_misshapen_columns():
         with pytest.raises(UserError, match=f"predictions lack the columns.*{column}"):
             evaluate(truth, part)
     for column, value, match in (
-        ("box", np.zeros((1, 8)), r"shape \(1, 8\), expected \(1, 7\)"),
-        ("cls", np.zeros(1, int), "expected class names as strings"),
-        ("score", np.zeros(2), "column 'score' has shape"),
-        ("frame", np.zeros((1, 1), int), "column 'frame' has shape"),
+        ("box", np.zeros((1, 8)), r"predictions: columns .* boxes \(1, 8\)"),
+        ("cls", np.zeros(1, int), "predictions: frame 0, row 0: unknown class '0'"),
+        ("score", np.zeros(2), "predictions: columns of boxes differ: .* 2 scores"),
+        ("frame", np.zeros((1, 1), int), "column 'frame' is int64 of shape"),
         ("frame", np.array([0.5]), "expected integer frame ids"),
     ):
-        with pytest.raises(UserError, match=match):
+        with pytest.raises((DataError, UserError), match=match):
             evaluate(truth, {**found, column: value})
 
 
