@@ -151,14 +151,10 @@ def test_holm():
         bootstrap.Comparison("a", "3d", 0.3, "all_point", 0, 0, 0, 0, 0, value, value)
         for value in p
     ]
-    adjusted = [row.p_adjusted for row in bootstrap._holm(rows)]
+    rows = bootstrap._holm(rows)
+    adjusted = [row.p_adjusted for row in rows]
     assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert [row.is_significant for row in bootstrap._holm(rows)] == [
-        True,
-        False,
-        False,
-        True,
-    ]
+    assert [row.is_significant for row in rows] == [True, False, False, True]
 
 
 def test_runs_on_different_data_cannot_be_compared(scene):

@@ -331,21 +331,6 @@ def test_kradar_fixture(kradar_fixture, shared):
     assert checked == 3 * 2 * 8 * 2 * 3 * 5
 
 
-def test_kradar_fixture_through_single_calls(kradar_fixture, shared):
-    """Conditions given as separate sets, as a user would."""
-    truth, found, frames = kradar_fixture
-    expected = json.loads(
-        (shared / "fixtures/kradar_eval/expected_ap.json").read_text()
-    )
-    numbers = expected["variants"]["revised"]["conf_0.0"]["fog"]["classes"]
-    in_fog = frames["weather"] == "fog"
-    parts = [{k: v[in_fog[t["frame"]]] for k, v in t.items()} for t in (truth, found)]
-    for result in evaluate(*parts, iou_thresholds=(0.3, 0.5, 0.7)):
-        key = {n: k for k, n in expected["classes"].items()}[result.cls]
-        ap = numbers[key][result.space][str(result.iou)]
-        assert result.ap == pytest.approx(ap, abs=1e-9)
-
-
 def test_kradar_fixture_curves(kradar_fixture, shared):
     truth, found, frames = kradar_fixture
     folder = shared / "fixtures/kradar_eval"
@@ -560,24 +545,23 @@ def test_weights_repeat_frames(random_scene):
 # Wrong use ------------------------------------------------------------------------------
 
 
-def test_unknown_things_are_named():
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"protocol": "r40"}, "unknown protocol 'r40'; known: kradar_r40"),
+        ({"spaces": "2d"}, "spaces is .* expected some of"),
+        ({"empty_frames": "all"}, "empty_frames is 'all', expected one of"),
+        ({"roi": "wider"}, "roi is 'wider', expected one of narrow, wide"),
+        ({"roi": (0, 1, 2)}, "expected x0, x1, y0, y1"),
+        ({"classes": "Sedan"}, "expected different class names"),
+        ({"classes": ("Sedan", "Sedan")}, "expected different class names"),
+        ({"iou_thresholds": 30}, r"expected numbers in \[0, 1\)"),
+    ],
+)
+def test_unknown_things_are_named(change, message):
     truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
-    with pytest.raises(UserError, match="unknown protocol 'r40'; known: kradar_r40"):
-        evaluate(truth, found, protocol="r40")
-    with pytest.raises(UserError, match=r"spaces is .* expected some"):
-        evaluate(truth, found, spaces="2d")
-    with pytest.raises(UserError, match="empty_frames is 'all', expected one of"):
-        evaluate(truth, found, empty_frames="all")
-    with pytest.raises(UserError, match="roi is 'wider', expected one of narrow, wide"):
-        evaluate(truth, found, roi="wider")
-    with pytest.raises(UserError, match="expected x0, x1, y0, y1"):
-        evaluate(truth, found, roi=(0, 1, 2))
-    with pytest.raises(UserError, match="expected different class names"):
-        evaluate(truth, found, classes="Sedan")
-    with pytest.raises(UserError, match="expected different class names"):
-        evaluate(truth, found, classes=("Sedan", "Sedan"))
-    with pytest.raises(UserError, match=r"expected numbers in \[0, 1\)"):
-        evaluate(truth, found, iou_thresholds=30)
+    with pytest.raises(UserError, match=message):
+        evaluate(truth, found, **change)
 
 
 def test_bad_rows_are_named():

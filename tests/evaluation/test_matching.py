@@ -55,31 +55,7 @@ def test_kradar_pair_fixture(shared):
 
 def pairs(*triples):
     pred, gt, iou = (np.array(column) for column in zip(*triples, strict=True))
-    return pred.astype(int), gt.astype(int), iou.astype(float)
-
-
-def test_greedy_by_hand():
-    # Claimant 0 takes target 1, so claimant 1 is left with its second choice 0.
-    claimant = np.array([0, 0, 1, 1])
-    target = np.array([0, 1, 0, 1])
-    preference = np.array([0.5, 0.9, 0.3, 0.8])
-    chosen = matching.greedy(claimant, target, preference, np.zeros(4, int), 2)
-    assert sorted(zip(claimant[chosen], target[chosen], strict=True)) == [
-        (0, 1),
-        (1, 0),
-    ]
-
-
-def test_greedy_takes_the_first_of_equals():
-    chosen = matching.greedy(
-        np.zeros(3, int), np.array([2, 0, 1]), np.ones(3), np.zeros(3, int), 3
-    )
-    assert chosen.tolist() == [1]
-
-
-def test_greedy_of_nothing():
-    none = np.zeros(0, int)
-    assert matching.greedy(none, none, none, none, 0).size == 0
+    return matching.Pairs(pred.astype(int), gt.astype(int), iou.astype(float))
 
 
 def naive_greedy(claimant, target, preference, group):
@@ -116,10 +92,8 @@ def test_kradar_passes_differ():
     # First pass by score: ground truth 0 takes prediction 1 (score 0.9), 1 takes 0.
     # Second pass by IoU at a threshold that both reach: 0 takes 0, and 1, which only
     # overlaps prediction 0, gets nothing. Sinking to 0.5 adds no true positive then.
-    pred, gt, iou = pairs((0, 0, 0.8), (1, 0, 0.6), (0, 1, 0.7))
-    match = matching.match_kradar(
-        matching.Pairs(pred, gt, iou), np.array([0.5, 0.9]), np.zeros(2, int), 0.3
-    )
+    chosen = pairs((0, 0, 0.8), (1, 0, 0.6), (0, 1, 0.7))
+    match = matching.match_kradar(chosen, np.array([0.5, 0.9]), np.zeros(2, int), 0.3)
     first = dict(zip(match.first_gt.tolist(), match.first_pred.tolist(), strict=True))
     assert first == {0: 1, 1: 0}
     steps = dict(
@@ -131,11 +105,9 @@ def test_kradar_passes_differ():
 def test_a_prediction_that_displaces_another_adds_nothing():
     # At 0.5, prediction 1 enters and takes ground truth 0 from prediction 0, which
     # overlaps nothing else: ground truth 1, that only knows prediction 1, stays alone.
-    pred, gt, iou = pairs((0, 0, 0.5), (1, 0, 0.9), (1, 1, 0.6))
+    chosen = pairs((0, 0, 0.5), (1, 0, 0.9), (1, 1, 0.6))
     score = np.array([0.9, 0.5])
-    match = matching.match_kradar(
-        matching.Pairs(pred, gt, iou), score, np.zeros(2, int), 0.3
-    )
+    match = matching.match_kradar(chosen, score, np.zeros(2, int), 0.3)
     steps = dict(
         zip(match.event_pred.tolist(), match.event_delta.tolist(), strict=True)
     )
@@ -168,9 +140,8 @@ def test_second_pass_equals_a_loop_at_every_threshold(monkeypatch, seed, chunk):
     pred, gt = grid.reshape(2, -1)[:, rng.random(num_pred * num_gt) < 0.12]
     iou = np.round(rng.uniform(0.1, 1, pred.size), 1)
     score = np.round(rng.random(num_pred), 1)
-    match = matching.match_kradar(
-        matching.Pairs(pred, gt, iou), score, np.zeros(num_gt, int), 0.3
-    )
+    chosen = matching.Pairs(pred, gt, iou)
+    match = matching.match_kradar(chosen, score, np.zeros(num_gt, int), 0.3)
     keep = iou > 0.3
     for threshold in np.unique(score):
         steps = match.event_delta[score[match.event_pred] >= threshold].sum()
@@ -180,35 +151,27 @@ def test_second_pass_equals_a_loop_at_every_threshold(monkeypatch, seed, chunk):
 
 def test_best_and_free_differ():
     # Both predictions prefer ground truth 0; only the free rule gives 1 the other one.
-    pred, gt, iou = pairs((0, 0, 0.9), (1, 0, 0.8), (1, 1, 0.5))
+    chosen = pairs((0, 0, 0.9), (1, 0, 0.8), (1, 1, 0.5))
     score = np.array([0.9, 0.8])
-    best = matching.match_best(matching.Pairs(pred, gt, iou), score, 0.3)
-    free = matching.match_free(
-        matching.Pairs(pred, gt, iou), score, np.zeros(2, int), 2, 0.3
-    )
+    best = matching.match_best(chosen, score, 0.3)
+    free = matching.match_free(chosen, score, np.zeros(2, int), 2, 0.3)
     assert best.tolist() == [0, -1]
     assert free.tolist() == [0, 1]
 
 
 def test_best_needs_the_threshold_of_the_best_one_only():
-    pred, gt, iou = pairs((0, 0, 0.3), (0, 1, 0.3))
-    assert matching.match_best(
-        matching.Pairs(pred, gt, iou), np.array([0.9]), 0.3
-    ).tolist() == [-1]
-    assert matching.match_best(
-        matching.Pairs(pred, gt, iou), np.array([0.9]), 0.2
-    ).tolist() == [0]
+    chosen = pairs((0, 0, 0.3), (0, 1, 0.3))
+    assert matching.match_best(chosen, np.array([0.9]), 0.3).tolist() == [-1]
+    assert matching.match_best(chosen, np.array([0.9]), 0.2).tolist() == [0]
 
 
 def test_higher_score_wins_and_first_row_breaks_ties():
-    pred, gt, iou = pairs((0, 0, 0.9), (1, 0, 0.5), (2, 0, 0.6))
+    chosen = pairs((0, 0, 0.9), (1, 0, 0.5), (2, 0, 0.6))
     score = np.array([0.4, 0.8, 0.8])
-    assert matching.match_best(matching.Pairs(pred, gt, iou), score, 0.3).tolist() == [
+    assert matching.match_best(chosen, score, 0.3).tolist() == [
         -1,
         0,
         -1,
     ]
-    free = matching.match_free(
-        matching.Pairs(pred, gt, iou), score, np.zeros(3, int), 1, 0.3
-    )
+    free = matching.match_free(chosen, score, np.zeros(3, int), 1, 0.3)
     assert free.tolist() == [-1, 0, -1]

@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.core.errors import UserError
 from radejax.evaluation import protocols
 
 
@@ -103,11 +102,3 @@ def test_frames_of_weight_zero_leave_no_trace():
         **terms,
     )
     assert some.ap == more.ap
-
-
-def test_registry():
-    assert protocols.RECOMMENDED in protocols.PROTOCOLS
-    for name, protocol in protocols.PROTOCOLS.items():
-        assert protocols.get_protocol(name) is protocol
-    with pytest.raises(UserError, match="unknown protocol 'coco'; known: kradar_r40"):
-        protocols.get_protocol("coco")
