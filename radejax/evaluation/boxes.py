@@ -268,9 +268,10 @@ def with_ids(
     names = [_without_suffix(name) for name in named.tolist()]
     known: dict[str, int] = {}
     if frames is not None:
-        keys, ids = frame_keys(frames), np.asarray(frames["frame"]).tolist()
-        known = dict(zip((key.rpartition("_")[0] for key in keys), ids, strict=True))
-        known |= dict(zip(keys, ids, strict=True))
+        ids = np.asarray(frames["frame"]).tolist()
+        by_key = dict(zip(frame_keys(frames), ids, strict=True))
+        by_radar = {key.rpartition("_")[0]: i for key, i in by_key.items()}
+        known = by_key | by_radar | by_key  # keys first, and they win
     is_known = np.array([name in known for name in names])
     if skip and is_known.any():
         table = take(table, is_known)
