@@ -51,6 +51,7 @@ def bev_iou(
         AssertionError: `a` and `b` differ in leading axes.
 
     Examples:
+        >>> import jax.numpy as jnp
         >>> car = jnp.array([[0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]])
         >>> moved = car.at[0, 0].set(2.0)
         >>> round(float(bev_iou(car, moved)[0, 0]), 4)
@@ -76,6 +77,7 @@ def iou_3d(
         `[..., N, M]` in [0, 1].
 
     Examples:
+        >>> import jax.numpy as jnp
         >>> car = jnp.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
         >>> round(float(iou_3d(car, car.at[0, 2].set(0.75))[0, 0]), 4)
         0.3333
@@ -102,6 +104,7 @@ def bev_intersection(
         b: `[..., 7]` or `[..., 8]` boxes.
 
     Examples:
+        >>> import numpy as np
         >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
         >>> bev_intersection(car, car + [3, 0, 0, 0, 0, 0, 0]).round(6).tolist()
         [2.0]
@@ -116,6 +119,7 @@ def shared_height(
     """Height in meters that corresponding boxes share; 0 where they do not overlap.
 
     Examples:
+        >>> import numpy as np
         >>> car = np.array([[0.0, 0, 0, 4, 2, 1.5, 0]])
         >>> shared_height(car, car + [0, 0, 0.5, 0, 0, 0, 0]).tolist()
         [1.0]
