@@ -117,12 +117,11 @@ def _is_running(process: int) -> bool:
 
 
 @contextlib.contextmanager
-def disk_full(path: PathLike, message: str | None = None) -> Iterator[None]:
+def disk_full(path: PathLike) -> Iterator[None]:
     """Turns errors on a full disk into one line; a `with` block or a decorator.
 
     Args:
         path: File that is written in the block.
-        message: Replaces the default message.
 
     Raises:
         DiskFullError: No space is left, or a quota is used up.
@@ -132,11 +131,10 @@ def disk_full(path: PathLike, message: str | None = None) -> Iterator[None]:
     except Exception as error:
         if not is_no_space(error):
             raise
-        default = (
+        raise DiskFullError(
             f"no space left on the disk of {pathlib.Path(path).parent}; nothing half-"
             "written was kept, run the same command again with space to continue"
-        )
-        raise DiskFullError(message or default) from error
+        ) from error
 
 
 def is_no_space(error: BaseException) -> bool:
