@@ -82,9 +82,9 @@ def data() -> None:
 @click.option("--deep", is_flag=True, help="Read every tesseract whole.")
 @entry.json_option
 def check(roots: tuple[pathlib.Path, ...], as_json: bool, **options: Any) -> None:
-    """Report what is there, what is missing and what is damaged.
+    """Report what is there, what is missing and what is corrupted.
 
-    Exit code 1 if anything is missing or damaged.
+    Exit code 1 if anything is missing or corrupted.
 
     Example: radejax data check /disk1/kradar /disk2/kradar
     """

@@ -41,7 +41,7 @@ _WRONG_PATH = (
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with one line instead of a traceback for the user's errors.
 
-    Exit code 2 for wrong use (arguments, folders), 1 for damaged data or a full disk, 130
+    Exit code 2 for wrong use (arguments, folders), 1 for corrupted data or a full disk, 130
     for an interrupt: see `core.errors`. Where the caller closed standard error, what is
     said goes nowhere instead of into the next file that is opened.
 

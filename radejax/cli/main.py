@@ -24,4 +24,4 @@ _COMMANDS = (
 )
 @click.version_option(package_name="radejax")
 def main() -> None:
-    """3D object detection in 4D radar tensors: data, training, pictures."""
+    """3D object detection in 4D radar tensors: data, training, figures."""

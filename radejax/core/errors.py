@@ -37,7 +37,7 @@ class DiskFullError(UserError):
 
 
 class DataError(_OneLine):
-    """A file that is missing parts, malformed or damaged; the message names it."""
+    """A file that is missing parts, malformed or corrupted; the message names it."""
 
     exit_code = 1
 

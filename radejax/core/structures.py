@@ -1,4 +1,4 @@
-"""The containers that travel between the rooms: all are JAX pytrees of fixed shape.
+"""The containers that the packages pass to each other: all are JAX pytrees of fixed shape.
 
 B frames, R range bins, A azimuth bins, D Doppler and E elevation bins, N padded
 ground-truth boxes, K padded detections, C classes. Boxes live in the radar-centred
@@ -56,7 +56,7 @@ class Batch(struct.PyTreeNode):
         frame: int32 index of the frame in its data set; -1 where the batch is filled up.
         image: `[B, H, W, 3]` uint8 left front camera images, or what the image backbone
             made of them; or None.
-        camera: `Camera` or `ReferencePoints` of rooms above, `[B, ...]`; or None.
+        camera: `Camera` or `ReferencePoints` of higher layers, `[B, ...]`; or None.
     """
 
     # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.

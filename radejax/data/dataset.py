@@ -75,7 +75,7 @@ class LabelledFrame(Protocol):
         boxes: x, y, z, l, w, h, yaw in the radar frame: metres, radians.
         classes: Class names of `boxes`.
         radar_path: File of the radar tensor; None where it is missing.
-        camera_path: Picture of the (left) front camera; None where there is none.
+        camera_path: Image of the (left) front camera; None where there is none.
         camera_calibration_path: Its calibration, or None.
         radar_from_lidar_m: Offset from where the calibration is measured to where boxes
             are: x, y, z; zeros where the two are the same.

@@ -71,7 +71,7 @@ def detect(
         options: Keyword arguments of `radejax.detection.decode.decode`.
         variables: Of the model.
         frames: Projections as they are stored, or tesseracts.
-        image: Of a radar-camera model, or None for the radar alone.
+        image: Of a radar-camera model, or None for the radar only.
         camera: Likewise.
         settings: Options that replace those in `options`, of `SETTINGS`, traced.
         is_tesseract: `frames` are tesseracts, linear power.

@@ -110,7 +110,7 @@ class DinoRade(RadeNet, kw_only=True):
         """Predicts from projections and images.
 
         Frames without an image (`camera.is_valid` or `has_image` False) and calls
-        without images or camera are predicted from the radar alone.
+        without images or camera are predicted from the radar only.
 
         Args:
             projection: `[B, R, A, D+E]`, Doppler channels first; any float dtype.

@@ -97,7 +97,7 @@ class Fusion(nn.Module):
         Args:
             radar: `[B, R, A, C]` features of the radar backbone.
             elevation: `[B, R, A, D]` elevation channels of the projection.
-            camera: `[B, h, w, C]` camera map, or None to go by the radar alone.
+            camera: `[B, h, w, C]` camera map, or None to use the radar only.
             reference: Places of the R x A x E queries in the image.
             train: Whether dropout drops; needs the "dropout" random stream.
 

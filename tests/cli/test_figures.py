@@ -48,7 +48,7 @@ def test_the_first_frame_of_a_sequence_is_drawn(
     [
         ("first", "expected sequence/radar_lidar"),
         ("1/00000_00000", "no frame 00000_00000 in sequence 1; there are"),
-        ("7", "no labels of sequences [7]"),
+        ("7", "of sequences [7]; there are [1]"),
         ("", "expected sequence/radar_lidar"),
     ],
 )

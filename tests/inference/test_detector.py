@@ -222,11 +222,11 @@ def test_arguments_by_name_and_wrong_ones():
         ({"batch_sizes": ()}, r"batch_sizes is \(\), expected"),
         (
             {"score_threshold": float("nan")},
-            "score_threshold is nan, expected a number from 0",
+            "score_threshold is nan, expected a number",
         ),
         (
             {"nms_iou": 1.5},
-            r"config\.decode\.nms_iou is 1\.5, expected a number from 0 to 1",
+            r"config\.decode\.nms_iou is 1\.5, expected a number of at least 0",
         ),
     ):
         with pytest.raises(UserError, match=message):

@@ -159,13 +159,13 @@ def check_dataset(
     with tqdm(total=total, unit="file", desc="check", disable=not progress) as bar:
         for number, folder in folders.items():
             own = by_sequence.get(number, [])
-            damaged = 0
+            corrupted = 0
             for path in _tensors(folder):
                 try:
                     check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
                 except (DataError, OSError) as error:
-                    summary.problems.append(("tesseract damaged", str(error)))
-                    damaged += 1
+                    summary.problems.append(("tesseract corrupted", str(error)))
+                    corrupted += 1
                 bar.update()
             published = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
             conditions = published
@@ -191,7 +191,7 @@ def check_dataset(
                     "test": in_split["test"],
                     "tesseracts": len(_tensors(folder)),
                     "tesseracts_missing": sum(f.tesseract_path is None for f in own),
-                    "tesseracts_damaged": damaged,
+                    "tesseracts_corrupted": corrupted,
                     "projections": len(folder.listing("DERA_tesseract")),
                     "images": len(folder.listing("cam-front")),
                     "images_missing": sum(frame.camera_path is None for frame in own),

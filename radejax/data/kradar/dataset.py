@@ -139,7 +139,7 @@ class Frame:
         """Read the float32 projection; see `tesseract.read_frame`.
 
         Raises:
-            FileNotFoundError: There is no file of the radar.
+            FileNotFoundError: The frame has no radar file.
             DataError: It is corrupted, or of another shape than the grid.
         """
         if self.radar_path is None:
@@ -431,7 +431,7 @@ class KRadar(Sequence[Frame]):
             return None
 
     def _read_label_files(self, keys: list[Key]) -> dict[Key, LabelFile]:
-        """Label files; damaged ones are reported."""
+        """Label files; corrupted ones are reported."""
         files: dict[Key, LabelFile] = {}
         for key in keys:
             try:

@@ -22,7 +22,7 @@ def test_healthy_copy(root):
     assert "no problems" in report.to_text()
     row = report.sequences[1]
     wanted = {"sequence": 2, "weather": "fog", "labels": 6, "train": 4, "test": 2}
-    wanted |= {"tesseracts": 6, "tesseracts_missing": 0, "tesseracts_damaged": 0}
+    wanted |= {"tesseracts": 6, "tesseracts_missing": 0, "tesseracts_corrupted": 0}
     wanted |= {"calibration": "-2.5, 0.25"}
     assert {name: row[name] for name in wanted} == wanted
     rows = {(row["split"], row["weather"]): row for row in report.objects}
@@ -55,7 +55,7 @@ def test_everything_that_is_wrong_is_named(root):
         "tesseract missing": 1,
         "split": 7,  # one frame in both, all of sequence 2 in none
         "label file missing": 1,
-        "tesseract damaged": 2,
+        "tesseract corrupted": 2,
         "calibration": 1,
     }
     text = report.to_text()
@@ -63,7 +63,7 @@ def test_everything_that_is_wrong_is_named(root):
     assert "tesseract_00007.mat: arrDREA has shape (2, 3, 4, 5), the sensor's" in text
     assert "frame difference 9, but radar minus LiDAR" in text
     assert "1/00004_00001: the first of 1 frames that are in both" in text
-    assert report.sequences[0]["tesseracts_damaged"] == 2
+    assert report.sequences[0]["tesseracts_corrupted"] == 2
     assert f"{report.num_problems} problems" in text
 
 
@@ -74,7 +74,7 @@ def test_deep_reads_what_the_head_does_not_say(root):
     write.write_tesseract(path, tesseract)
     assert check_dataset(root).num_problems == 0
     report = check_dataset(root, deep=True)
-    assert report.summary.problem_counts() == {"tesseract damaged": 1}
+    assert report.summary.problem_counts() == {"tesseract corrupted": 1}
 
 
 def test_a_part_that_is_not_there_is_wrong_use_and_no_clean_bill(root):
@@ -95,7 +95,7 @@ def test_disk_without_labels(tmp_path):
     report = check_dataset(tmp_path)
     assert report.summary.problem_counts() == {
         "labels missing": 1,
-        "tesseract damaged": 1,  # not K-Radar's shape
+        "tesseract corrupted": 1,  # not K-Radar's shape
     }
     assert report.sequences[0]["weather"] == "normal"
     with pytest.raises(UserError, match="no sequence folders"):

@@ -147,7 +147,7 @@ class TestWrittenTree:
         assert source.frames(3)[1].indices == (34, 4, 8, 12, 14)
 
     def test_missing_labels(self, tmp_path):
-        with pytest.raises(FileNotFoundError, match="no such labels"):
+        with pytest.raises(FileNotFoundError, match="No such file"):
             simulate_dataset(
                 make_config(tmp_path / "nowhere"), tmp_path / "out", progress=False
             )

@@ -1,0 +1,47 @@
+"""Terms that were replaced by standard ones do not come back (CONTRIBUTING.md, Code)."""
+
+import pathlib
+import re
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+
+REPLACED = {
+    r"\bhouse\b": "architecture",
+    r"\brooms?\b": "package",
+    r"\bdoors?\b": "entry point",
+    r"\bmend(s|ed|ing)?\b": "fix",
+    r"\bseldom\b": "less often",
+    r"\bcircles of\b": "reference cycles",
+    r"\b(labels?|images?) exchanged\b": "shuffled",
+    r"\bof before\b": "of earlier versions",
+    r"\bin turns\b": "alternating",
+    r"\bradar alone\b": "radar only",
+    r"\bprocessor (time|minutes|seconds)\b": "CPU time",
+    r"\bfalling score\b": "descending score",
+    r"\bscore cuts?\b": "score threshold",
+    r"\bcomes along\b": "bundled",
+    r"\bat hand\b": "available",
+    r"\bwithout a word\b": "silently",
+    r"\bsmall road users?\b": "VRU",
+    r"\bpictures?\b": "figure or image",
+    r"\bdamaged\b": "corrupted",
+    r"\bis no (number|file|header|folder)\b": "is not a",
+}
+
+
+def test_replaced_terms_do_not_come_back() -> None:
+    files = [ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")]
+    files += [
+        path
+        for folder, ending in (("docs", "md"), ("radejax", "py"), ("configs", "py"))
+        for path in (ROOT / folder).rglob(f"*.{ending}")
+    ]
+    assert len(files) > 100
+    found = [
+        f"{path.relative_to(ROOT)}:{number}: {match[0]!r}, write {term}"
+        for path in files
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1)
+        for pattern, term in REPLACED.items()
+        for match in re.finditer(pattern, line, re.IGNORECASE)
+    ]
+    assert not found, "\n".join(found)
