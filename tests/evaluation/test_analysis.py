@@ -104,7 +104,7 @@ def test_box_errors_by_hand(data):
 
 
 def test_worst_frames_by_hand(data):
-    worst = analysis.worst_frames(data, {"sequence": [5, 5, 5, 6]}, 0.3)
+    worst = analysis.worst_frames(data, {"sequence": np.array([5, 5, 5, 6])}, 0.3)
     assert [(w["frame"], w["missed"], w["false"], w["found"]) for w in worst] == [
         (100, 1, 1, 1),
         (101, 1, 1, 0),
