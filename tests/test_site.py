@@ -66,3 +66,10 @@ def test_links_of_root_pages_lead_to_pages_of_the_site(name: str) -> None:
             or (ROOT / "docs" / path).is_file()
             or (path.startswith("notebooks/") and (ROOT / path).is_file())
         ), target
+
+
+def test_every_option_has_a_help_text() -> None:
+    for name, command in pages.commands(pages.main, "radejax"):
+        options = [p for p in command.params if p.param_type_name == "option"]
+        lacking = [option.opts for option in options if not option.help]
+        assert not lacking, (name, lacking)

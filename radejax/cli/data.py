@@ -165,8 +165,20 @@ def preprocess(
 @entry.labels
 @entry.sequences
 @entry.weather
-@click.option("--dtype", type=click.Choice(["float32", "float16"]), default="float32")
-@click.option("--batch-size", type=entry.COUNT, default=8)
+@click.option(
+    "--dtype",
+    type=click.Choice(["float32", "float16"]),
+    default="float32",
+    show_default=True,
+    help="Type of the stored embeddings.",
+)
+@click.option(
+    "--batch-size",
+    type=entry.COUNT,
+    default=8,
+    show_default=True,
+    help="Images per call of the backbone.",
+)
 def embed(
     roots: tuple[pathlib.Path, ...],
     config: str,

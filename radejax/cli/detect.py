@@ -35,7 +35,13 @@ from radejax.cli import entry
     show_default=True,
     help="kitti: preds/000000.txt as K-Radar's tools write them.",
 )
-@click.option("--batch-size", type=entry.COUNT, default=8, show_default=True)
+@click.option(
+    "--batch-size",
+    type=entry.COUNT,
+    default=8,
+    show_default=True,
+    help="Frames per call of the detector.",
+)
 @entry.image_backbone
 @entry.json_option
 def detect(
@@ -76,6 +82,7 @@ def detect(
     type=click.Choice(["stablehlo", "onnx", "huggingface"]),
     default="stablehlo",
     show_default=True,
+    help="Format of the exported folder.",
 )
 @entry.several(
     "--platforms",

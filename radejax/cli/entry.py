@@ -230,7 +230,13 @@ weather = several(
 )
 labelled_frames = together(
     labels,
-    click.option("--label-version", "version", default="v2.1", show_default=True),
+    click.option(
+        "--label-version",
+        "version",
+        default="v2.1",
+        show_default=True,
+        help="Version of the labels: v1.0, v1.1, v2.0 or v2.1.",
+    ),
     sequences,
     weather,
 )

@@ -23,7 +23,13 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
 @click.argument("name", metavar="[FRAME]", default="")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
 @entry.labelled_frames
-@click.option("--out", type=entry.FILE, default="overlay.png", show_default=True)
+@click.option(
+    "--out",
+    type=entry.FILE,
+    default="overlay.png",
+    show_default=True,
+    help="Image file; of a sequence .gif or .mp4.",
+)
 @click.option("--slices", is_flag=True, help="Draw slices of the projection.")
 @click.option(
     "--roi",
@@ -104,7 +110,13 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
 
 @click.command(cls=entry.Command)
 @entry.roots
-@click.option("--out", type=entry.FILE, default="recording.rrd", show_default=True)
+@click.option(
+    "--out",
+    type=entry.FILE,
+    default="recording.rrd",
+    show_default=True,
+    help="File of the recording.",
+)
 @entry.labelled_frames
 @click.option("--workdir", type=entry.EXISTING, help="Run whose detections are shown.")
 @entry.max_frames
@@ -167,7 +179,13 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
 
 
 @click.command(cls=entry.Command)
-@click.option("--out", type=entry.FILE, default="demo.png", show_default=True)
+@click.option(
+    "--out",
+    type=entry.FILE,
+    default="demo.png",
+    show_default=True,
+    help="Image file of the figure.",
+)
 @click.option(
     "--seed",
     type=click.IntRange(0),

@@ -78,9 +78,12 @@ class _Command(entry.Command):
     is_flag=True,
     help="One of several processes, as Slurm starts them.",
 )
-@click.option("--coordinator", help="host:port of process 0, where no cluster tells.")
-@click.option("--num-processes", type=int, help="Likewise.")
-@click.option("--process-id", type=int, help="Likewise, from 0.")
+@click.option(
+    "--coordinator",
+    help="host:port of process 0. Default: detected under Slurm, Open MPI and on TPU pods.",
+)
+@click.option("--num-processes", type=int, help="Total number of processes.")
+@click.option("--process-id", type=int, help="Rank of this process, from 0.")
 @click.pass_context
 def train(
     ctx: click.Context,
