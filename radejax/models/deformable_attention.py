@@ -179,7 +179,7 @@ def lifted_attention(
     Returns:
         `[B, N, heads, D]`.
     """
-    b = len(value)
+    b = value.shape[0]  # symbolic in exports
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
     by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
 
