@@ -83,7 +83,7 @@ def train_online(
         )
         _log.info("%d frames to draw from, simulated anew", len(batches.frame_names))
         model = models.build(config.model)
-        return loop.train(
+        state, _ = loop.train(
             config,
             model,
             batches.loader(),
@@ -97,6 +97,7 @@ def train_online(
             ),
             steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
         )
+    return state
 
 
 @click.command()
