@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -15,7 +16,9 @@ from radejax.core.structures import CLASSES, Boxes
 from radejax.evaluation import boxes, matching, protocols
 from radejax.evaluation.boxes import AnyColumns, Roi
 from radejax.evaluation.protocols import Curve, Protocol
-from radejax.geometry.rotated_iou import bev_iou, iou_3d
+from radejax.geometry.rotated_iou import bev_intersection, shared_height
+
+T = TypeVar("T")
 
 SPACES = ("bev", "3d")
 
@@ -175,9 +178,7 @@ class EvaluationSet:
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
         # Shared by the results of all protocols, thresholds and frames.
-        self.overlap = functools.cache(self._overlap)
-        self._cached_match = functools.cache(self._match)
-        self._cached_ranking = functools.cache(self._ranking)
+        self._shared: dict[tuple[Any, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
         """Sorted boxes of the classes in the region, and their rows; counts the others."""
@@ -218,8 +219,19 @@ class EvaluationSet:
 
     # Shared work ---------------------------------------------------------------------
 
-    def _overlap(self, geometry: str, space: str) -> Float[np.ndarray, " P"]:
+    def _once(self, function: Callable[..., T], *arguments: Any) -> T:
+        """Result of a method for some arguments, computed at the first call."""
+        key = (function.__name__, *arguments)
+        if key not in self._shared:
+            self._shared[key] = function(*arguments)
+        return self._shared[key]
+
+    def overlap(self, geometry: str, space: str) -> Float[np.ndarray, " P"]:
         """IoU of the candidate pairs under a protocol's geometry."""
+        return self._once(self._overlaps, geometry)[SPACES.index(space)]
+
+    def _overlaps(self, geometry: str) -> Float[np.ndarray, "2 P"]:
+        """BEV and 3D IoU of the candidate pairs, of one intersection each."""
         truth, found = self.gt.box, self.pred.box
         if geometry != "plain":
             truth = np.round(truth, 2)
@@ -227,13 +239,18 @@ class EvaluationSet:
             swap = [0, 1, 2, 4, 3, 5, 6]
             truth, found = truth[:, swap], found[:, swap]
         z_center = 1.0 if geometry == "swapped_lw_z_top" else 0.5
-        parts = []
+        values = np.zeros((2, self.pair_gt.size))
         # A pair has about 32 temporary arrays.
         for rows in matching.chunks(np.full(self.pair_gt.size, 32)):
-            pair = found[self.pair_pred[rows], None], truth[self.pair_gt[rows], None]
-            iou = bev_iou(*pair) if space == "bev" else iou_3d(*pair, z_center)
-            parts.append(iou[:, 0, 0])
-        values = np.concatenate(parts)
+            a, b = found[self.pair_pred[rows]], truth[self.pair_gt[rows]]
+            area = bev_intersection(a, b)
+            volume = area * shared_height(a, b, z_center)
+            area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
+            volumes = area_a * a[:, 5] + area_b * b[:, 5]
+            values[:, rows] = (
+                area / (area_a + area_b - area),
+                volume / (volumes - volume),
+            )
         if geometry == "plain":
             return values
         # The original stores overlaps in single and compares them in double precision.
@@ -241,10 +258,12 @@ class EvaluationSet:
 
     def match(self, protocol: Protocol, space: str, iou: float) -> Matches:
         """Matches of all frames and classes: `KradarMatches` or each one's object or -1."""
-        geometry: str = protocol.geometry
+        return self._match_by(protocol.geometry, protocol.matching, space, iou)
+
+    def _match_by(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
         if geometry == "swapped_lw_z_top" and space == "bev":
             geometry = "swapped_lw"  # z plays no part
-        return self._cached_match(geometry, protocol.matching, space, iou)
+        return self._once(self._match, geometry, rule, space, iou)
 
     def _match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
         values = self.overlap(geometry, space)
@@ -349,7 +368,9 @@ class EvaluationSet:
         weight: Int[np.ndarray, " F"],
     ) -> Curve:
         """Curve and AP of one class over weighted frames."""
-        ranked = self._cached_ranking(protocol, space, iou, score_threshold, cls)
+        # Protocols that match alike share their rankings.
+        rule = protocol.geometry, protocol.matching
+        ranked = self._once(self._ranking, *rule, space, iou, score_threshold, cls)
         num_gt = int(weight @ self.gt_count[:, cls])
         if protocol.matching == "kradar":
             matched, events, detections = (
@@ -368,7 +389,13 @@ class EvaluationSet:
         )
 
     def _ranking(
-        self, protocol: Protocol, space: str, iou: float, threshold: float, cls: int
+        self,
+        geometry: str,
+        rule: str,
+        space: str,
+        iou: float,
+        threshold: float,
+        cls: int,
     ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """What a curve of one class needs for any weights of the frames.
 
@@ -376,7 +403,8 @@ class EvaluationSet:
         protocols the counts that they add instead: to the matches of the first pass, to
         the true positives of the second, and to the predictions.
         """
-        match, mine = self.match(protocol, space, iou), self.by_score[cls]
+        match = self._match_by(geometry, rule, space, iou)
+        mine = self.by_score[cls]
         if isinstance(match, matching.KradarMatches):
             counted = [
                 (match.first_pred, np.ones_like(match.first_pred)),
@@ -390,7 +418,8 @@ class EvaluationSet:
         for pred, count in counted:
             keep = (self.pred.cls[pred] == cls) & (self.score[pred] > threshold)
             pred, count = pred[keep], count[keep]
-            order = np.argsort(-self.score[pred], kind="stable")
-            pred, count = pred[order], count[order]
+            if np.any(np.diff(self.score[pred]) > 0):
+                order = np.argsort(-self.score[pred], kind="stable")
+                pred, count = pred[order], count[order]
             ranked.append((self.score[pred], self.pred.frame[pred], count))
         return ranked

@@ -68,7 +68,9 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
     finer = default_config() | {"train_sequences": 0, "test_sequences": 1}
     finer |= {"frames_per_sequence": 1, "output": "projection"}
     data = simulate_dataset(finer, tmp_path / "finer", progress=False)
-    with pytest.raises(UserError, match=r"16 x 64 .*expected 4 x 16 .*model was trained"):
+    with pytest.raises(
+        UserError, match=r"16 x 64 .*expected 4 x 16 .*model was trained"
+    ):
         evaluate_run(whole, other={"roots": (str(data),)})
     assert not (data / "records").exists()
     rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
