@@ -1,4 +1,4 @@
-"""`radejax simulate`, `data check`, `preprocess`, `embed`: data sets before training."""
+"""`radejax simulate`, `data check`, `preprocess` and `embed`: datasets for training."""
 
 from __future__ import annotations
 
@@ -73,13 +73,13 @@ def simulate(
 
 @click.group()
 def data() -> None:
-    """Look at a copy of K-Radar."""
+    """Inspect a K-Radar copy."""
 
 
 @data.command(cls=entry.Command)
 @entry.roots
 @entry.labelled_frames
-@click.option("--deep", is_flag=True, help="Read every tesseract whole.")
+@click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
 def check(roots: tuple[pathlib.Path, ...], as_json: bool, **options: Any) -> None:
     """Report what is there, what is missing and what is corrupted.
@@ -111,7 +111,7 @@ def _shard(text: str) -> tuple[int, int]:
 @click.option(
     "--dtype",
     type=click.Choice(["float16", "uint8", "float32"]),
-    help="Default: that of the records in the folder, else float16.",
+    help="Type of the records. Default: that of existing ones, otherwise float16.",
 )
 @entry.workers
 @click.option(
@@ -152,7 +152,11 @@ def preprocess(
 
 @click.command(cls=entry.Command)
 @click.argument("roots", nargs=-1, type=entry.EXISTING)
-@click.option("--config", required=True, help="As of `radejax train`, :options too.")
+@click.option(
+    "--config",
+    required=True,
+    help="Config as of `radejax train`, such as dinorade:official.",
+)
 @click.option(
     "--image-backbone",
     required=True,
@@ -188,10 +192,10 @@ def embed(
     batch_size: int,
     **part: Any,
 ) -> None:
-    """Run the front images through the frozen backbone once, to train from.
+    """Precompute frozen-backbone features of the front camera images.
 
-    Resumes where it stopped. Training then takes --embeddings OUT in place of images.
-    Without ROOTS: of the data set that the config simulates, made if it is not there.
+    An interrupted job resumes. `radejax train --embeddings OUT` then needs no images.
+    Without ROOTS, the dataset that the config simulates is used, and made if missing.
 
     Example: radejax embed /disk1/kradar --config dinorade
     --image-backbone dinov3-vits16 --out /fast/embeddings

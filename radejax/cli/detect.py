@@ -1,4 +1,4 @@
-"""`radejax detect` and `export`: a trained model at work, here and elsewhere."""
+"""`radejax detect` and `export`: run a trained model, or write it for other programs."""
 
 from __future__ import annotations
 
@@ -18,15 +18,19 @@ from radejax.cli import entry
     "source",
     required=True,
     type=entry.EXISTING,
-    help="Run of train.py, or what `radejax export` takes.",
+    help="Run of train.py, or any other SOURCE of `radejax export`.",
 )
 @click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
 @entry.step
 @entry.labels
 @entry.sequences
 @entry.weather
-@click.option("--score-threshold", type=float, help="Default: that of the config.")
-@click.option("--nms-iou", type=float, help="Default: that of the config.")
+@click.option(
+    "--score-threshold", type=float, help="Score threshold. Default: the config's."
+)
+@click.option(
+    "--nms-iou", type=float, help="IoU threshold of NMS. Default: the config's."
+)
 @click.option(
     "--format",
     "file_format",
@@ -88,7 +92,7 @@ def detect(
     "--platforms",
     default=["cpu,cuda,tpu"],
     show_default=True,
-    help="Of the StableHLO program.",
+    help="Platforms of the StableHLO program.",
 )
 @entry.image_backbone
 @click.option(
@@ -113,7 +117,7 @@ def export(
     image_backbone: pathlib.Path | None,
     **settings: Any,
 ) -> None:
-    """Write a model as a folder that works elsewhere.
+    """Export a model as a folder for other programs.
 
     SOURCE is the workdir of a run, its checkpoints, one of them, an exported folder or an
     official .pth file. "stablehlo" runs with jax only, for any batch size; "onnx" is for

@@ -223,10 +223,12 @@ sequences = several(
     "sequence_numbers",
     kind=int,
     metavar="1,5,58",
-    help="Only these; all by default.",
+    help="Use these sequences only. Default: all.",
 )
 weather = several(
-    "--weather", metavar="fog,rain", help="Only sequences of these; all by default."
+    "--weather",
+    metavar="fog,rain",
+    help="Use sequences with this weather only. Default: all.",
 )
 labelled_frames = together(
     labels,
@@ -254,7 +256,9 @@ image_backbone = click.option(
     help="Weights of the image backbone, if the model has none.",
 )
 max_frames = click.option(
-    "--max-frames", type=COUNT, help="Frames of an animation or recording, if not all."
+    "--max-frames",
+    type=COUNT,
+    help="Frames of an animation or recording. Default: all.",
 )
 workers = click.option(
     "--workers",

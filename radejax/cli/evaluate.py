@@ -22,18 +22,25 @@ _DATA = together(
         "--split",
         default="test",
         show_default=True,
-        help="train, test, all, a split file, or of a run: validation.",
+        help="train, test, all, validation (of a run), or a split file.",
     ),
-    several("--data", help="Roots of K-Radar; for a run, other ones than its own."),
+    several("--data", help="Roots of K-Radar. Default: those of the run."),
     click.option("--labels", help="Folder or zip of a label revision."),
-    click.option("--label-version", help="Such as v1.0. Default: v2.1, or the run's."),
-    several("--sequences", kind=int, metavar="1,5,58", help="Only frames of these."),
-    several("--weather", metavar="fog,rain", help="Only frames of these weathers."),
+    click.option(
+        "--label-version", help="Version of the labels. Default: v2.1, or the run's."
+    ),
+    several(
+        "--sequences", kind=int, metavar="1,5,58", help="Evaluate these sequences only."
+    ),
+    several("--weather", metavar="fog,rain", help="Evaluate this weather only."),
 )
 _SETTINGS = together(
-    several("--classes", help="Default: K-Radar's five, or the run's."),
     several(
-        "--protocols", help="In addition to all_point. Default: all, or the run's."
+        "--classes", help="Classes to evaluate. Default: K-Radar's five, or the run's."
+    ),
+    several(
+        "--protocols",
+        help="Protocols in addition to all_point. Default: all, or the run's.",
     ),
     several(
         "--iou",
@@ -51,7 +58,7 @@ _SETTINGS = together(
     click.option(
         "--score-threshold",
         type=float,
-        help="Of all protocols except all_point. Default: 0, or the run's.",
+        help="Threshold of all protocols except all_point. Default: 0, or the run's.",
     ),
     click.option(
         "--empty-frames",
@@ -106,7 +113,9 @@ _OTHER_DATA = (
 @click.option("--out", help="Output folder. Default: in the workdir.")
 @click.option("--name", "run", help="Name of the run in tables.")
 @_DATA
-@click.option("--records", help="Preprocessed frames of --data; made if missing.")
+@click.option(
+    "--records", help="Preprocessed frames of --data; missing ones are written."
+)
 @click.option("--camera-calibration", help="Folder of camera calibrations of --data.")
 @click.option("--embeddings", help="Folder of `radejax embed` of the images of --data.")
 @entry.image_backbone
@@ -116,7 +125,7 @@ _OTHER_DATA = (
     help="Seed. Sanity check: pair every frame with another frame's image.",
 )
 @click.option(
-    "--min-score", type=float, help="Discard predictions below before storing."
+    "--min-score", type=float, help="Do not store predictions below this score."
 )
 @click.option("--batch-size", type=int, help="Frames per batch.")
 @click.option("--num-visualizations", type=int, help="Number of frames to draw.")

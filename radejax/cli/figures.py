@@ -28,7 +28,7 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
     type=entry.FILE,
     default="overlay.png",
     show_default=True,
-    help="Image file; of a sequence .gif or .mp4.",
+    help="Image file, or .gif or .mp4 for a sequence.",
 )
 @click.option("--slices", is_flag=True, help="Draw slices of the projection.")
 @click.option(
@@ -118,7 +118,7 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
     help="File of the recording.",
 )
 @entry.labelled_frames
-@click.option("--workdir", type=entry.EXISTING, help="Run whose detections are shown.")
+@click.option("--workdir", type=entry.EXISTING, help="Run whose detections are drawn.")
 @entry.max_frames
 @click.option(
     "--open", "open_it", is_flag=True, help="Open the recording in the viewer."

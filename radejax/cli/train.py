@@ -40,7 +40,7 @@ class _Command(entry.Command):
     help="A bundled config, such as radenet:official, or a file.py[:OPTIONS].",
 )
 @click.option(
-    "--workdir", help="Folder of the run; runs/<name of the config> by default."
+    "--workdir", help="Folder of the run. Default: runs/<name of the config>."
 )
 @entry.several(
     "--data",
@@ -48,23 +48,31 @@ class _Command(entry.Command):
     help="Roots of K-Radar. Without it, configs with a `simulation` section simulate "
     "one under data/.",
 )
-@click.option("--labels", help="Folder or zip of a label revision; the sequences' own.")
+@click.option(
+    "--labels",
+    help="Label revision (folder or zip). Default: those in the sequence folders.",
+)
 @entry.sequences
 @entry.weather
-@click.option("--records", help="Projected frames; made beside the data if missing.")
 @click.option(
-    "--init-from", help="Weights to start: official .pth, or another workdir."
+    "--records",
+    help="Folder of preprocessed frames; missing ones are written. Default: in the data.",
 )
-@click.option("--embeddings", help="Folder of `radejax embed`, in place of images.")
+@click.option(
+    "--init-from", help="Initial weights: an official .pth file or another workdir."
+)
+@click.option(
+    "--embeddings", help="Folder of `radejax embed`, used instead of the images."
+)
 @click.option(
     "--image-backbone",
-    help="Its weights: a DINOv3 folder from Hugging Face, or torchvision's ResNet-50 "
-    "file.",
+    help="Weights of the image backbone: a DINOv3 folder from Hugging Face or "
+    "torchvision's ResNet-50 file.",
 )
 @click.option(
     "--camera-calibration",
     help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
-    "repository); the roots' own by default.",
+    "repository). Default: in the roots.",
 )
 @entry.several(
     "--seeds",
