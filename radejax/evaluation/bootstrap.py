@@ -10,14 +10,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from radejax.core.errors import UserError
 from radejax.evaluation import protocols
-from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, mean_ap
+from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 
 LEVEL = 0.95
 
@@ -51,20 +50,28 @@ def resample(
     protocol: str,
     space: str,
     iou: float,
-    **settings: Any,
+    *,
+    empty_frames: str = "protocol",
+    score_threshold: float = 0.0,
 ) -> Float[np.ndarray, "B _"]:
     """`[B, C + 1]` AP of every class, then their mean, in every resample.
 
     NaN where a resample has no object of a class; the mean is over classes that occur.
-    The settings are those of `EvaluationSet.results`.
     """
-    settings |= {"spaces": space, "iou_thresholds": iou, "curves": False}
-    rows = []
-    for weight in weights:
-        results = data.results(protocol, weights=weight, **settings)
-        aps = [result.ap if result.is_defined else np.nan for result in results]
-        rows.append([*aps, mean_ap(results)])
-    return np.array(rows)
+    chosen = protocols.get_protocol(protocol)
+    empty_frames = chosen.resolve_empty_frames(empty_frames)
+    ap = np.full((len(weights), len(data.classes) + 1), np.nan)
+    for row, weight in enumerate(weights):
+        by_class = data.frame_weights(empty_frames, weight)
+        for cls in range(len(data.classes)):
+            curve = data.curve(
+                chosen, space, iou, float(score_threshold), cls, by_class[:, cls]
+            )
+            if curve.num_gt:
+                ap[row, cls] = curve.ap
+        present = ap[row, ~np.isnan(ap[row])]
+        ap[row, -1] = present.mean() if present.size else np.nan
+    return ap
 
 
 def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:

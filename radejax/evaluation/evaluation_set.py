@@ -318,7 +318,7 @@ class EvaluationSet:
             raise UserError(
                 f"iou_thresholds is {iou_thresholds}, expected numbers in [0, 1)"
             )
-        frame_weights = self._frame_weights(empty_frames, weights)
+        frame_weights = self.frame_weights(empty_frames, weights)
         points = () if curves else ("precision", "recall", "score")
         dropped = dict.fromkeys(points, np.zeros(0))
         num_frames = (frame_weights > 0).sum(axis=0).tolist()
@@ -327,7 +327,7 @@ class EvaluationSet:
             spaces, ious, enumerate(self.classes)
         ):
             weight = frame_weights[:, index]
-            curve = self._curve(chosen, space, iou, score_threshold, index, weight)
+            curve = self.curve(chosen, space, iou, score_threshold, index, weight)
             result = Result(
                 cls=name,
                 space=space,
@@ -346,7 +346,7 @@ class EvaluationSet:
             results.append(result)
         return results
 
-    def _frame_weights(
+    def frame_weights(
         self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None
     ) -> Int[np.ndarray, "F C"]:
         """Weights of the frames for every class, 0 for frames that are ignored."""
@@ -358,7 +358,7 @@ class EvaluationSet:
             counts = counts * (self.gt_count.sum(axis=1, keepdims=True) > 0)
         return np.broadcast_to(counts, self.gt_count.shape)
 
-    def _curve(
+    def curve(
         self,
         protocol: Protocol,
         space: str,
