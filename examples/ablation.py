@@ -1,20 +1,25 @@
-"""The ablations of both papers on simulated data: trained, compared, judged.
+"""Repeats the ablations of both papers on simulated data and checks their claims.
 
     python examples/ablation.py --table sigma --seeds 0,1,2
     python examples/ablation.py --table 3 --minutes 60
     python examples/ablation.py --table 4 --seeds 0,1,2
 
-Table 3 is RADE-Net's (attention, heads, neck, stem, decoder), 4 DinoRADE's (radar, camera,
-elevation weights, backbone), sigma the spread of the heatmap's targets, quickstart what the
-quickstart's own input and longer training bring, camera what the camera adds to that. Every
-cell is an ordinary run of a config, trained on scenes of its seed and evaluated on other
-ones, which all cells share. The same command goes on where an earlier one ended or was
-killed, also within a run. `--table_only` writes the tables of what is there. Given several times at
-once it works on as many seeds, best one a core (`taskset -c 0 python ...`).
+| table | compares |
+|---|---|
+| 3 | RADE-Net's Table III: attention, heads, neck, stem, decoder |
+| 4 | DinoRADE's Table 4: radar, camera, elevation weights, backbone |
+| sigma | widths of the Gaussians in the heatmap targets |
+| quickstart | the quickstart's input scaling and longer training |
+| camera | the quickstart with and without a camera |
 
-AP is BEV at IoU 0.3, protocol `all_point`, mean over seeds; intervals are of 95 %, paired,
-over resampled sequences of the scenes to evaluate on. A claim is supported where the interval
-lies above 0 (and the difference reaches the claimed one), contradicted where it ends below.
+Every variant is an ordinary run of a config. It is trained on scenes of its seed and evaluated on
+held-out scenes, which are the same for all variants. The same command resumes after an
+interruption. `--table_only` writes the tables of the finished runs. Several processes with the
+same command share the seeds; give each its own core (`taskset -c 0 python ...`).
+
+AP is BEV at IoU 0.3, protocol `all_point`, mean over seeds. Intervals are paired, 95 %, from
+resampled sequences of the held-out scenes. A claim is supported if the interval lies above 0 and
+the difference reaches the claimed one, and contradicted if the interval ends below it.
 """
 
 from __future__ import annotations
@@ -60,77 +65,77 @@ COMMON = {
     "simulation.test_sequences": 2,  # evaluated on the held-out scenes instead
     "evaluation.num_visualizations": 0,
 }
-"""Fields of every run, beside its seed and its cell's."""
+"""Fields of every run, in addition to those of the seed and the variant."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """Where a study's runs and data are, and how they are made.
+    """Runs and data of a study.
 
     Attributes:
-        study: What is compared.
-        out: Folder of all.
+        study: The study.
+        out: Folder of all runs and data.
     """
 
     study: Study
     out: pathlib.Path
 
     def fields(self, cell: Cell, seed: int) -> dict[str, Any]:
-        """Fields of the config of a run, by their dotted names."""
+        """Config fields of a run, by dotted name."""
         return {"seed": seed, "simulation.seed": seed, **COMMON, **cell.fields}
 
     def config(self, cell: Cell, seed: int) -> ConfigDict:
-        """Of a run."""
-        name, _, words = cell.config.partition(":")
-        config = load_config(f"{CONFIGS / name}.py:{words}")
+        """Config of a run."""
+        name, _, options = cell.config.partition(":")
+        config = load_config(f"{CONFIGS / name}.py:{options}")
         config.update_from_flattened_dict(self.fields(cell, seed))
         return config
 
     def run_folder(self, name: str, seed: int) -> pathlib.Path:
-        """Work folder of a cell's run."""
+        """Workdir of a variant's run."""
         cell = self.study.cells[name]
         kind = cell.config.partition(":")[0]
         folder = (cell.exchanges or name).replace(" ", "_")
         return self.out / "runs" / kind / folder / f"seed{seed}"
 
     def report(self, name: str, seed: int) -> pathlib.Path:
-        """Evaluation of a cell on the held-out scenes."""
+        """Folder of the evaluation of a variant on the held-out scenes."""
         end = "_shuffled" if self.study.cells[name].exchanges else ""
         return self.run_folder(name, seed) / f"held{end}"
 
     def is_done(self, name: str, seed: int) -> bool:
-        """Whether a cell is trained and evaluated: what is written last is there."""
+        """Whether a variant is trained and evaluated; `cell.json` is written last."""
         return (self.report(name, seed) / "cell.json").exists()
 
     def root(self, cell: Cell, seed: int | None) -> pathlib.Path:
-        """Folder of the data of a seed's runs, or of the held-out scenes for None."""
+        """Folder of the training data of a seed, or of the held-out scenes for None."""
         kind, name = cell.config.partition(":")[0], "held"
         if seed is not None:
             name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
         return self.out / "data" / f"{kind}-{name}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
-        """These data; simulated if missing."""
+        """Simulate the data if they are missing and return their folder."""
         simulation = plain(self.config(cell, seed or 0).simulation)
         if seed is None:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
-            simulation["vru_density_scale"] = 1.0  # of training scenes alone
+            simulation["vru_density_scale"] = 1.0  # scaled in training scenes only
         return str(simulate_dataset(simulation, self.root(cell, seed)))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Keeps other processes from what all seeds share, until they may."""
+        """Lock that is held while data shared by all seeds are made."""
         return files.lock(self.out / "shared.lock")
 
     def backbone(self, cell: Cell) -> pathlib.Path | None:
-        """Where the frozen image backbone is that a cell needs."""
-        _, *words = re.split("[:,]", cell.config)
-        if "resnet50" in words:
+        """Path of the frozen image backbone of a variant, or None."""
+        _, *options = re.split("[:,]", cell.config)
+        if "resnet50" in options:
             return self.out / "backbone_resnet50" / pretrain_backbone.RESNET_FILE
-        return self.out / "backbone" if "pretrained" in words else None
+        return self.out / "backbone" if "pretrained" in options else None
 
     def image_backbone(self, cell: Cell) -> str | None:
-        """The same, pretrained if missing."""
+        """Pretrain the image backbone of a variant if it is missing and return its path."""
         if (path := self.backbone(cell)) is None:
             return None
         folder = path.parent if path.suffix else path
@@ -140,15 +145,17 @@ class Work:
         return str(path)
 
     def command(self, name: str, seed: int) -> str:
-        """What makes a cell's run anew and evaluates it, with the data of `out`."""
+        """Command that repeats and evaluates a run with the data in `out`."""
         cell = self.study.cells[name]
-        file, _, words = cell.config.partition(":")
+        file, _, options = cell.config.partition(":")
         fields = self.fields(cell, seed).items()
-        # Of the current folder: a committed table names no one's home.
+        # Relative paths, as the tables are committed.
         data, held = map(
             os.path.relpath, (self.root(cell, seed), self.root(cell, None))
         )
-        parts = [f"python train.py --config configs/{file}.py{words and f':{words}'}"]
+        parts = [
+            f"python train.py --config configs/{file}.py{options and f':{options}'}"
+        ]
         parts += [f"--config.{key}={value}" for key, value in fields]
         parts.append(f"--data {data} --workdir RUN")
         if backbone := self.backbone(cell):
@@ -157,7 +164,7 @@ class Work:
         return " ".join([*parts, *["--shuffle-images 0"] * bool(cell.exchanges)])
 
     def make(self, name: str, seed: int) -> bool:
-        """Trains and evaluates a cell; False where a signal ended it early."""
+        """Train and evaluate a variant; False if a signal stopped it."""
         cell, folder = self.study.cells[name], self.run_folder(name, seed)
         started, backbone = time.perf_counter(), self.image_backbone(cell)
         trained = folder / "evaluation" / "metrics.json"
@@ -168,7 +175,7 @@ class Work:
             experiment.run(config, name=name, workdir=folder)
         if not trained.exists():
             return False
-        with self.alone():  # the held-out scenes are simulated and projected once
+        with self.alone():  # the held-out scenes are simulated and preprocessed once
             evaluate_run(
                 folder,
                 split="all",
@@ -188,7 +195,7 @@ class Work:
 
 
 def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """`[F]` masks of the frames by condition; of a camera also by weather and lens."""
+    """Boolean masks `[F]` of frames by condition; camera studies add weather and lens."""
     weather = np.asarray(frames["weather"])
     found = {"all": np.ones(len(weather), bool)}
     base = work.study.cells[work.study.base]
@@ -202,7 +209,7 @@ def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
 def resampled(
     work: Work, name: str, seed: int, resamples: int
 ) -> dict[str, np.ndarray]:
-    """`[1 + B, C + 1]` APs by condition, of all sequences first, of classes and mean."""
+    """APs `[1 + B, C + 1]` by condition: all sequences, then resamples; classes, then mean."""
     path = work.report(name, seed) / f"resampled_{resamples}.npz"
     if path.exists():
         with np.load(path) as stored:
@@ -229,7 +236,7 @@ def resampled(
 
 
 def verdict(difference: float, low: float, high: float, least: float = 0.0) -> str:
-    """Of a claim that a difference is positive, and reaches what is claimed."""
+    """Verdict on the claim that a difference is positive and at least `least`."""
     if low > 0 and difference >= least:
         return "supported"
     return "contradicted" if high < least or high < 0 else "inconclusive"
@@ -237,7 +244,7 @@ def verdict(difference: float, low: float, high: float, least: float = 0.0) -> s
 
 @dataclasses.dataclass
 class Comparer:
-    """Differences of cells over the seeds that both have."""
+    """Differences of variants over the seeds that both have."""
 
     work: Work
     seeds: tuple[int, ...]
@@ -249,15 +256,15 @@ class Comparer:
         )
 
     def done(self, *names: str) -> list[int]:
-        """Seeds with all of some cells."""
+        """Seeds for which all of the named variants are finished."""
         return [s for s in self.seeds if all(self.work.is_done(n, s) for n in names)]
 
     def mean(self, name: str, seeds: list[int], condition: str) -> np.ndarray:
-        """`[1 + B, C + 1]` APs, mean over seeds."""
+        """APs `[1 + B, C + 1]`, mean over seeds."""
         return np.mean([self.samples(name, s)[condition] for s in seeds], axis=0)
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """AP of every cell, condition and class, and its difference to the base."""
+        """AP of every variant, condition and class, and its difference to the base."""
         base = self.work.study.base
         for name in self.work.study.cells:
             if not (seeds := self.done(name)):
@@ -293,7 +300,7 @@ class Comparer:
 def write_tables(
     work: Work, table: str, seeds: tuple[int, ...], resamples: int
 ) -> None:
-    """`table_<name>.md`, `.tex` and `.json` of the cells that are done."""
+    """Write `table_<name>.md`, `.tex` and `.json` of the finished variants."""
     comparer = Comparer(work, seeds, resamples)
     rows, claims = list(comparer.rows()), list(comparer.claims())
     made = tables(work.study, rows, claims)
@@ -312,36 +319,38 @@ def write_tables(
     click.echo(f"written to {path}.md, .tex and .json")
 
 
-def told(work: Work, left: list[tuple[str, int]], num_all: int) -> str:
-    """What is left, and about how long that takes."""
+def progress(work: Work, left: list[tuple[str, int]], num_all: int) -> str:
+    """Text that says how many runs are left and about how long they take."""
     paths = work.out.glob("runs/*/*/seed*/held*/cell.json")
     minutes = [files.read_json(path)["minutes"] for path in paths]
     hours = len(left) * float(np.mean(minutes)) / 60 if minutes else None
     about = "" if hours is None else f", about {hours:.1f} hours"
     names = "; next: {}, seed {}".format(*left[0]) if left else ""
-    return f"{num_all - len(left)} of {num_all} cells are done{about}{names}"
+    return f"{num_all - len(left)} of {num_all} runs are done{about}{names}"
 
 
 def chosen(study: Study, cells: str | None) -> list[str]:
-    """Cells by the names that were given; all without."""
+    """Names of the selected variants; all if none are selected."""
     names = [name.strip() for name in cells.split(",")] if cells else [*study.cells]
     if unknown := [name for name in names if name not in study.cells]:
         raise UserError(
-            f"--cells: no cell {unknown[0]!r}; cells: {', '.join(study.cells)}"
+            f"--cells: unknown variant {unknown[0]!r}, expected some of {', '.join(study.cells)}"
         )
     return names
 
 
 @click.command()
 @click.option("--table", type=click.Choice(sorted(STUDIES)), required=True)
-@click.option("--seeds", default="0,1,2", show_default=True)
-@click.option("--cells", help="Train only these, by name, with commas between.")
+@click.option("--seeds", default="0,1,2", show_default=True, help="Seeds to train.")
+@click.option("--cells", help="Variants to train, comma-separated. Default: all.")
 @click.option("--out", default="runs/ablation", type=click.Path(path_type=pathlib.Path))
-@click.option("--minutes", type=click.FloatRange(0), help="Then save and stop.")
+@click.option(
+    "--minutes", type=click.FloatRange(0), help="Save and stop after this time."
+)
 @click.option("--resamples", default=1000, show_default=True, type=click.IntRange(1))
-@click.option("--table_only", is_flag=True, help="Train nothing.")
+@click.option("--table_only", is_flag=True, help="Write the tables without training.")
 def main(table, seeds, cells, out, minutes, resamples, table_only):
-    """Trains what is missing of a table, and writes it."""
+    """Train the missing runs of a table and write the table."""
     entry.set_up_jax()
     with entry.exit_codes():
         seeds = tuple(map(int, seeds.split(",")))
@@ -351,30 +360,30 @@ def main(table, seeds, cells, out, minutes, resamples, table_only):
         def left(*of: int) -> list[tuple[str, int]]:
             return [(n, s) for s, n in every if s in of and not work.is_done(n, s)]
 
-        if minutes is not None:  # the training under way saves a checkpoint
+        if minutes is not None:  # the running training saves a checkpoint
             alarm = threading.Timer(
                 60 * minutes, os.kill, (os.getpid(), signal.SIGTERM)
             )
             alarm.daemon = True
             alarm.start()
 
-        def tell() -> None:
+        def report() -> None:
             if len(left(*seeds)) < len(every):
                 write_tables(work, table, seeds, resamples)
-            click.echo(told(work, left(*seeds), len(every)))
+            click.echo(progress(work, left(*seeds), len(every)))
 
-        tell()
+        report()
         for seed in () if table_only else seeds:
             with contextlib.ExitStack() as held:
                 try:
                     held.enter_context(files.lock(out / f"seed{seed}.lock", "busy"))
                 except UserError:
-                    click.echo(f"seed {seed}: another process is at it")
+                    click.echo(f"seed {seed}: another process works on it")
                     continue
                 while todo := left(seed):
                     if not work.make(*todo[0]):
                         return
-                    tell()
+                    report()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What `ablation.py` trains and compares: cells and claims of the papers' tables."""
+"""Variants and claims that `ablation.py` compares."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _VARIANTS = load_module(CONFIGS / "radenet.py").VARIANTS
 _RADAR = "quickstart:ablation"
 _LABELS = {"data.label_permutation_seed": 0}
 _OWN_INPUT = {"model.input_center": 0.545, "model.input_scale": 25.0}
-"""The quickstart's own."""
+"""Centering and scaling of the quickstart's input."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A run, or another look at one.
+    """A variant: a run, or another evaluation of one.
 
     Attributes:
-        config: File and words.
-        fields: Of the config, on top.
-        exchanges: The cell whose run is evaluated with the images of other frames.
+        config: Name of a config file and its options, such as "quickstart:ablation".
+        fields: Config fields that the variant changes.
+        exchanges: Variant whose run is evaluated with shuffled images.
     """
 
     config: str
@@ -35,7 +35,7 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """That cell `a` is better than `b` in a class, by so many points at `least`."""
+    """The claim that variant `a` beats `b` in a class by at least `least` points."""
 
     text: str
     a: str
@@ -46,14 +46,14 @@ class Claim:
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """A table.
+    """A table of variants.
 
     Attributes:
-        title: Of the table.
-        base: Cell that the others are compared with.
-        cells: By name; equal ones of two studies are one run.
-        claims: That are judged.
-        held_out: Scenes to evaluate on.
+        title: Title of the table.
+        base: Variant that the others are compared with.
+        cells: Variants by name; equal variants of two studies share a run.
+        claims: Claims to check.
+        held_out: Number of scenes for the evaluation.
     """
 
     title: str
@@ -69,7 +69,7 @@ def _radar(**fields: Any) -> Cell:
 
 
 def _row(name: str) -> Cell:
-    """A row of Table III; its wide decoder is twice the quickstart's own too."""
+    """Variant of a row of Table III, with the decoder's width doubled as in the paper."""
     fields = {f"model.{k}": v for k, v in _VARIANTS[name].items()}
     return Cell(
         _RADAR, fields | ({"model.decoder_width": 64} if name == "expand" else {})

@@ -1,4 +1,4 @@
-"""How `ablation.py` prints what it compared: APs, differences with intervals, verdicts."""
+"""Tables of `ablation.py`: APs, differences with intervals, verdicts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from radejax.evaluation.tables import Table, number
 
 
 def interval_text(row: Mapping[str, Any]) -> str:
-    """A difference as "+1.2 (0.3 to 2.1)"."""
+    """Format a difference as "+1.2 (0.3 to 2.1)"."""
     if "difference" not in row:
         return "-"
     low, high = (number(row[name], digits=1) for name in ("low", "high"))
@@ -20,7 +20,7 @@ def interval_text(row: Mapping[str, Any]) -> str:
 
 
 def tables(study: Study, rows: list[dict], claims: list[dict]) -> list[Table]:
-    """One table of APs, one of differences a condition, one of claims."""
+    """A table of APs, a table of differences per condition, and a table of claims."""
     terms = "AP BEV at IoU 0.3, all_point, mean over seeds"
     by = {(row["condition"], row["cell"], row["cls"]): row for row in rows}
     columns, cells = (

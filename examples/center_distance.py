@@ -1,12 +1,13 @@
-"""What is found near where it is, whatever the boxes overlap.
+"""Evaluates detections by the distance between centers instead of IoU.
 
     python examples/center_distance.py runs/quickstart/evaluation
 
-AP where a prediction counts whose center lies within some metres of an object of its
-class on the ground, as nuScenes has it; how far the centers are off along and across the
-line of sight; and how many of these boxes overlap theirs by 0.3, as they are and without
-one of their errors. What has a high AP here and a low one by overlap is seen, and boxed
-too coarsely; what is low in both is not seen.
+The first table has AP with the matching of nuScenes: a prediction matches an object of its class
+if the distance of their centers on the ground is below a threshold. The second table has the
+errors of the centers along and across the line of sight, and the fraction of matched boxes with
+an IoU above 0.3, as predicted and with one error removed. A class with a high AP here and a low
+one by IoU is detected, but its boxes are inaccurate. A class with a low AP in both is not
+detected.
 """
 
 import itertools
@@ -26,24 +27,32 @@ from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.tables import Table, number
 from radejax.geometry.rotated_iou import bev_iou
 
-DISTANCES_M = (0.0, 20.0, 40.0, 73.0)  # to the region's far corners
+DISTANCES_M = (
+    0.0,
+    20.0,
+    40.0,
+    73.0,
+)  # 73 m is the distance of the far corners of the region
 IOU = 0.3
 
 
 def matched(data: EvaluationSet, within_m: float) -> np.ndarray:
-    """`[M]` object of every prediction, -1 without; by falling score the nearest free."""
+    """Index `[M]` of the matched object of every prediction, -1 without a match.
+
+    Each prediction, by descending score, takes the nearest free object within `within_m` meters.
+    """
     first = np.searchsorted(data.gt_group, data.pred_group)
     after = np.searchsorted(data.gt_group, data.pred_group, side="right")
     pred, gt = ranges(first, after - first)
     gap = data.pred.box[pred, :2] - data.gt.box[gt, :2]
-    # The nearest is the best where the farthest allowed is the threshold.
+    # match_free prefers the largest value above the threshold, here the smallest distance.
     pairs = Pairs(pred, gt, -np.hypot(gap[:, 0], gap[:, 1]))
     score, groups = data.pred.score, data.pred_group
     return match_free(pairs, score, groups, len(data.gt), -within_m)
 
 
 def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float:
-    """Area under the exact curve of one class, in percent."""
+    """All-point AP of one class in percent."""
     chosen = np.flatnonzero(data.pred.cls == cls)
     order = chosen[np.argsort(-data.pred.score[chosen], kind="stable")]
     curve = pooled_curve(
@@ -57,7 +66,7 @@ def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float
 
 
 def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`[N, 2]` metres in the plane, along the line of sight to true boxes and across."""
+    """Errors `[N, 2]` in meters, along the line of sight to the true boxes and across it."""
     gap, to = found[:, :2] - truth[:, :2], truth[:, :2]
     to = to / np.linalg.norm(to, axis=1, keepdims=True)
     along = (gap * to).sum(1, keepdims=True) * to
@@ -65,7 +74,11 @@ def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def overlapping(truth: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
-    """`[N]` which boxes overlap: so, right along, right across, of right size and yaw."""
+    """Masks `[N]` of boxes with IoU above the threshold.
+
+    The boxes are taken as predicted, without the error along the line of sight, without the error
+    across it, and with true size and yaw.
+    """
     along, across = errors(truth, found)
     tried = [found.copy() for _ in range(4)]
     tried[1][:, :2] -= along
@@ -75,7 +88,7 @@ def overlapping(truth: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
 
 
 def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
-    """APs by class and distance allowed."""
+    """APs by class and distance threshold."""
     matches = [matched(data, limit) for limit in within]
     rows = [
         [name, int((data.gt.cls == cls).sum())]
@@ -83,11 +96,11 @@ def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
         for cls, name in enumerate(data.classes)
     ]
     head = ["Class", "Objects", *(f"{limit:g} m" for limit in within)]
-    return Table("AP where centers are near, region narrow", head, rows)
+    return Table("AP by center distance, narrow region", head, rows)
 
 
 def error_rows(data: EvaluationSet, match: np.ndarray) -> Iterator[list[str | int]]:
-    """Classes by distance of the object: how many are matched, and how well."""
+    """Number of matches, errors and overlaps by class and distance of the object."""
     hit = np.flatnonzero(match >= 0)
     truth, found = data.gt.take(match[hit]), data.pred.box[hit]
     sizes = [np.linalg.norm(e, axis=1) for e in errors(truth.box, found)]
@@ -117,19 +130,24 @@ def error_rows(data: EvaluationSet, match: np.ndarray) -> Iterator[list[str | in
     show_default=True,
 )
 def main(report: pathlib.Path, within: tuple[float, ...]) -> None:
-    """AP by distance of centers in REPORT, the folder of an evaluation, and errors."""
+    """Print AP by center distance and center errors of REPORT, an evaluation folder."""
     with entry.exit_codes():
         if not (report / "predictions.npz").is_file():
             raise UserError(
-                f"{report} is no folder of an evaluation: predictions.npz is missing; "
+                f"{report} is not an evaluation folder: predictions.npz is missing; "
                 "evaluate.py writes one, for a run RUN it is RUN/evaluation"
             )
         truth, found, frames, _ = load(report, Source(), CLASSES)
         data = EvaluationSet(truth, found, frames=frames, roi="narrow")
         farthest = max(within)
         head = ["Class", "Distance", "Objects", "Found", "Along m", "Across m"]
-        head += [f"IoU > {IOU:g}", "along right", "across right", "size, yaw right"]
-        title = f"centers within {farthest:g} m: medians of errors, boxes that overlap"
+        head += [
+            f"IoU > {IOU:g}",
+            "no error along",
+            "no error across",
+            "true size, yaw",
+        ]
+        title = f"centers within {farthest:g} m: median errors, fraction of overlapping boxes"
         rows = list(error_rows(data, matched(data, farthest)))
         for table in (ap_table(data, within), Table(title, head, rows)):
             made = table.marked(is_simulated=data.is_simulated)

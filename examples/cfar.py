@@ -1,13 +1,13 @@
-"""The classical detector to beat: CA-CFAR, clusters, boxes by rule.
+"""A classical baseline: CA-CFAR, clustering, and boxes by rules.
 
-Cells that stand out of their surroundings (cell-averaging CFAR) are grouped into
-clusters; the cross-section that the radar equation gives a cluster chooses its class,
-and the class's usual size its box. Only the steps between the classes are fitted.
+Bins that exceed the mean of their neighborhood (cell-averaging CFAR) are grouped into clusters.
+The radar cross-section (RCS) of a cluster from the radar equation selects its class, and the
+mean size of the class gives its box. Only the RCS limits between classes are fitted.
 
 References:
     Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
-    Clusters of radar detections: Kellner et al., "Grid-based DBSCAN for clustering
-    extended objects in radar data", IV 2012.
+    Clusters of radar detections: Kellner et al., "Grid-based DBSCAN for clustering extended
+    objects in radar data", IV 2012.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ class CfarSettings:
     """Settings of the baseline.
 
     Attributes:
-        threshold_db: How far a cell stands above the mean of its surroundings.
-        guard_cells: Half width around a cell that does not count as surroundings.
-        training_cells: Half width of the surroundings beyond the guard.
-        peak_drop_db: A cluster ends where power falls this far below its peak.
-        merge_m: Clusters whose peaks are nearer become one.
-        rcs_steps: Smallest apparent cross-section in dBsm of each class, the largest
-            first; weaker clusters are clutter. A cell holds a part of an object's power
-            only. `fit_rcs_steps` finds them on a training split; the defaults are those
-            of the quickstart's data set.
+        threshold_db: Power of a detected bin above the mean of its training cells.
+        guard_cells: Half width of the guard around a bin, in bins.
+        training_cells: Half width of the ring of training cells around the guard.
+        peak_drop_db: A cluster ends where the power is this far below its peak.
+        merge_m: Clusters whose peaks are closer than this are merged.
+        rcs_steps: Smallest apparent RCS in dBsm of each class, in descending order; weaker
+            clusters are clutter. A bin contains only a part of an object's power.
+            `fit_rcs_steps` estimates the limits on a training split; the defaults are
+            those of the quickstart's dataset.
     """
 
     threshold_db: float = 9.0
@@ -63,21 +63,21 @@ def fit_rcs_steps(
     balanced: bool = False,
     least_gap_db: float = 1.0,
 ) -> tuple[tuple[str, float], ...]:
-    """Steps between classes from apparent cross-sections of labelled objects.
+    """Fit the RCS limits between classes to labeled objects.
 
-    Classes are ordered by their medians; the step between neighbours is the one that
-    takes the fewest of their objects for the other class. The last class ends at its
-    lower quartile: what is weaker is clutter.
+    Classes are ordered by their median. The limit between two neighbors is the one with the fewest
+    classification errors. The limit of the last class is its lower quartile: weaker clusters are
+    clutter.
 
     Args:
-        cls: Class names, one an object.
-        rcs_dbsm: Apparent cross-sections, see `object_rcs_db`.
-        balanced: Count errors as shares of their classes, so that rare classes weigh as
-            much as frequent ones.
-        least_gap_db: Width that a class keeps at least.
+        cls: Class name of each object.
+        rcs_dbsm: Apparent RCS of each object, see `object_rcs_db`.
+        balanced: Count errors as fractions of their classes, so that rare classes have the
+            same weight as frequent ones.
+        least_gap_db: Smallest RCS interval of a class.
 
     Returns:
-        Pairs of name and smallest cross-section, for `CfarSettings.rcs_steps`.
+        Pairs of name and smallest RCS, for `CfarSettings.rcs_steps`.
     """
     cls, values = np.asarray(cls), np.asarray(rcs_dbsm, float)
     groups = {name: values[cls == name] for name in CLASSES if (cls == name).any()}
@@ -108,9 +108,9 @@ def object_rcs_db(
     *,
     margin_m: float = 0.5,
 ) -> np.ndarray:
-    """`[N]` apparent cross-section of boxes `[N, 7]`: of the strongest cell in each.
+    """Apparent RCS `[N]` of boxes `[N, 7]`: that of the strongest bin in each box.
 
-    NaN for boxes that hold no cell's center.
+    NaN for boxes that contain no bin center.
     """
     power_db = _power_db(projection, grid)
     rcs = apparent_rcs_db(power_db, grid.range_m[:, None], parameters)
@@ -127,12 +127,12 @@ def object_rcs_db(
 
 
 def apparent_rcs_db(power_db, range_m, parameters: RadarParameters):
-    """Cross-section in dBsm that the radar equation gives a cell's power in dB."""
+    """RCS in dBsm from the radar equation and a bin's power in dB."""
     return power_db - parameters.gain_db + 40.0 * np.log10(np.maximum(range_m, 1.0))
 
 
 def _power_db(projection: np.ndarray, grid: RadarGrid) -> np.ndarray:
-    """`[R, A]` range-azimuth map in dB."""
+    """Range-azimuth map `[R, A]` in dB."""
     return projection[..., : grid.num_doppler].max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
 
 
@@ -144,18 +144,18 @@ def detect(
     *,
     ground_m: float = -1.6,
 ) -> dict[str, np.ndarray]:
-    """Boxes in one projection.
+    """Detect boxes in one projection.
 
     Args:
-        projection: `[R, A, D+E]` normalised projection.
-        grid: Its axes.
-        parameters: Gain and noise of the radar, for cross-sections.
+        projection: Normalized projection `[R, A, D+E]`.
+        grid: Sensor axes of the projection.
+        parameters: Gain and noise of the radar, for the RCS.
         settings: Thresholds; None for the defaults.
-        ground_m: Height of the ground in the ego frame, on which boxes stand.
+        ground_m: Height of the ground in the radar frame, on which boxes stand.
 
     Returns:
-        Columns `box [K, 7]` (ego frame), `cls [K]` class names and `score [K]` in
-        [0, 1], strongest first.
+        Columns `box [K, 7]` (radar frame), `cls [K]` class names and `score [K]` in [0, 1], by
+        descending score.
     """
     settings = settings or CfarSettings()
     power_db = _power_db(projection, grid)
@@ -180,10 +180,9 @@ def detect(
 
 
 def local_mean_db(power_db: np.ndarray, settings: CfarSettings) -> np.ndarray:
-    """`[R, A]` mean power of a frame of cells around each cell, without the guard.
+    """Mean power `[R, A]` of the training cells around each bin, in dB.
 
-    Linear power is averaged, as cell-averaging CFAR does; cells beyond the edges of
-    the map repeat the edge.
+    Linear power is averaged. The map is padded with its edge values.
     """
     power = 10.0 ** (power_db / 10.0)
     inner = 2 * settings.guard_cells + 1
@@ -200,7 +199,7 @@ def find_peaks(
     grid: RadarGrid,
     settings: CfarSettings,
 ) -> list[tuple[int, int]]:
-    """Local maxima above the threshold, strongest first, none near a stronger one."""
+    """Local maxima above the threshold by descending power, none close to a stronger one."""
     is_peak = (power_db == ndimage.maximum_filter(power_db, 3)) & (
         excess_db > settings.threshold_db
     )
@@ -209,7 +208,7 @@ def find_peaks(
     places = grid.bin_to_ego(cells[:, 0].astype(float), cells[:, 1].astype(float))
     kept: list[int] = []
     for i, place in enumerate(places):
-        # One object shows several flashes, most along the range axis.
+        # One object has several peaks, most of them along the range axis.
         gap = np.hypot(*(places[kept] - place).T) if kept else np.zeros(0)
         if not (gap < settings.merge_m).any():
             kept.append(i)
@@ -228,13 +227,13 @@ def _near_side(power_db, r, a, grid, settings) -> np.ndarray:
         left -= 1
     while right < grid.num_azimuth - 1 and row[right + 1] > level:
         right += 1
-    # The window smears a point over two bins on either side.
+    # The window spreads a point over two bins on either side.
     near = min(first + 1.5, r)
     return np.asarray(grid.bin_to_ego(float(near), 0.5 * (left + right)))
 
 
 def _fit_box(name: str, near: np.ndarray, ground_m: float) -> list[float]:
-    """A box of the class's mean size, driving along x, whose near side is seen."""
+    """Box of the mean size of a class, heading along x, with a given near side."""
     length, width, height = SIZES[name][0]
     x, y = near
     return [x + length / 2.0, y, ground_m + height / 2.0, length, width, height, 0.0]

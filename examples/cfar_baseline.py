@@ -1,11 +1,11 @@
-"""CA-CFAR on a data set: the rows of the classical detector in `docs/simulator.md`.
+"""Evaluates the CA-CFAR baseline on a dataset.
 
     python examples/cfar_baseline.py --data DATA --out DATA/cfar
 
-DATA is a K-Radar folder, simulated (`train.py` leaves one under data/) or real, with its
-projected records in DATA/records. Steps between the classes are fitted on the training
-split (of another folder with `--fit-data`), the detector runs on the test split, and OUT
-gets the same report as a network's (`report.txt`, `metrics.json`, `tables.md`, ...).
+DATA is a K-Radar folder, simulated (`train.py` writes one below data/) or real, with its records
+in DATA/records. The RCS limits between classes are fitted to the training split (of another
+folder with `--fit-data`), the detector runs on the test split, and OUT contains the same report
+as that of a network (`report.txt`, `metrics.json`, `tables.md`, ...).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions
 from radejax.simulation.radar.tensor import RadarParameters
 
-# The gain only shifts the cross-sections, and the steps between classes with them.
+# The gain shifts all cross-sections and the limits between classes alike.
 PARAMETERS = RadarParameters()
 
 
@@ -53,16 +53,16 @@ def run_baseline(
     balanced: bool = False,
     fit_data: str | pathlib.Path | None = None,
 ) -> Report:
-    """Fits on the training split, detects on the test split, writes the report.
+    """Fit on the training split, detect on the test split and write the report.
 
     Args:
         data: K-Radar folder with `records/` in it.
         out: Folder of the report.
         protocols: Names of evaluation protocols.
-        score_threshold: As in the config of the network to compare with.
-        bootstrap: Resamples of sequences for intervals.
-        balanced: Rare classes count as much as frequent ones in the fit.
-        fit_data: Folder with the training split, where it is not `data`.
+        score_threshold: Score threshold of the network that it is compared with.
+        bootstrap: Number of resamples of sequences for confidence intervals.
+        balanced: Rare classes have the same weight as frequent ones in the fit.
+        fit_data: Folder of the training split, if it is not `data`.
     """
     data, fit_data = pathlib.Path(data), pathlib.Path(fit_data or data)
     to_fit = KRadar(fit_data, split="train")
@@ -96,7 +96,7 @@ def run_baseline(
 
 
 def fit(records: Records, frames: KRadar, *, balanced: bool = False) -> CfarSettings:
-    """Settings with class steps from the objects of a split."""
+    """Settings with RCS limits that are fitted to the objects of a split."""
     names, values = [], []
     for frame in tqdm(frames, unit="frame", desc="fit"):
         projection = decode(records[frame.key])
@@ -125,7 +125,7 @@ def predict(
 
 
 def main() -> None:
-    """Reads the command line."""
+    """Evaluate a CA-CFAR detector on a dataset."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,17 +1,17 @@
-"""How well the echo of a small road user alone says where they are.
+"""Measures how accurately the radar echo of a VRU gives its position.
 
     python examples/echo_accuracy.py
     python examples/echo_accuracy.py --cls Bicycle --range-bins 164
     python examples/echo_accuracy.py --cls Motorcycle --full-size
 
-A yardstick for detectors, no bound: in simulated scenes of the quickstart's radar, or of
-K-Radar's own, the Doppler bin of an object's body is taken as known, the strongest cell
-beside its own is found, and its place between the bins by a parabola through three cells
-in decibels, along and across. The mean distance of the echo to the center, a part of the
-body's size, is taken off. Told is the share of boxes of the right size and heading that
-would overlap the true one by 0.3; of one such box an object, in no order, the AP would
-be about the share's square. A network sees more cells than three, and is not told the
-Doppler.
+The result is a reference for detectors, not an upper bound. In simulated scenes with the radar of
+the quickstart or of K-Radar, the Doppler bin of the object's body is assumed to be known. The
+strongest bin near the object is located, and its position between bins is interpolated by
+parabolas in range and azimuth. The mean distance from the echo to the center is removed, as it
+depends on the size of the object. The table lists the fraction of boxes of true size and heading
+at these positions that overlap the true box with an IoU above 0.3. If every object had one such
+box in random order, AP would be about the square of that fraction. A network sees more than three
+bins, but does not know the Doppler bin.
 """
 
 from collections.abc import Iterator
@@ -33,14 +33,14 @@ DISTANCES_M = ((5.0, 20.0), (20.0, 40.0))
 
 
 def between(values: np.ndarray) -> float:
-    """Place of the top of a parabola through three values, in bins from the middle."""
+    """Position of the maximum of a parabola through three values, in bins from the middle."""
     left, middle, right = map(float, values)
     bend = left - 2.0 * middle + right
     return float(np.clip((left - right) / (2.0 * bend), -0.5, 0.5)) if bend < 0 else 0.0
 
 
 def locate(power_db: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Place in bins of the echo in a `[R, A]` map of one Doppler bin, beside a cell."""
+    """Position in bins of the strongest echo near a bin in a map `[R, A]` of one Doppler bin."""
     row, column = np.clip(cell, 2, np.array(power_db.shape) - 3)
     beside = power_db[row - 1 : row + 2, column - 1 : column + 2]
     top = np.unravel_index(beside.argmax(), beside.shape)
@@ -53,7 +53,7 @@ def locate(power_db: np.ndarray, cell: np.ndarray) -> np.ndarray:
 def measured(
     config: SimulationConfig, cls: str
 ) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Box, error along [m] and across [m] of every visible object of a class."""
+    """Box, range error [m] and azimuth error [m] of every visible object of a class."""
     grid, source = config.make_grid(), make_source(config)
     doppler_step = grid.doppler_mps[1] - grid.doppler_mps[0]
     for name in source.numbers:
@@ -79,7 +79,7 @@ def measured(
 
 
 def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """`[N]` BEV IoU of true boxes with themselves moved by errors [m]."""
+    """BEV IoU `[N]` of true boxes with themselves after moving them by errors [m]."""
     bearing = np.arctan2(boxes[:, 1], boxes[:, 0])
     ahead, aside = np.cos(bearing), np.sin(bearing)
     moved = boxes.copy()
@@ -89,7 +89,7 @@ def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndar
 
 
 def table(config: SimulationConfig, cls: str) -> Table:
-    """Errors and share of overlapping boxes by distance."""
+    """Errors and fraction of overlapping boxes by distance."""
     found = np.array([[*box, *errors] for box, *errors in measured(config, cls)])
     boxes, along, across = np.split(found.reshape(-1, 9), (7, 8), axis=1)
     distance, rows = np.hypot(boxes[:, 0], boxes[:, 1]), []
@@ -97,8 +97,8 @@ def table(config: SimulationConfig, cls: str) -> Table:
         at = (low <= distance) & (distance < high)
         if not at.any():
             raise UserError(
-                f"{config.train_sequences} scenes have no {cls} that the radar sees"
-                f" at {low:g} to {high:g} m: give more --scenes"
+                f"{config.train_sequences} scenes have no {cls} visible to the radar"
+                f" at {low:g} to {high:g} m; increase --scenes"
             )
         center = np.mean(along[at])
         left, right = along[at, 0] - center, across[at, 0] - np.mean(across[at])
@@ -108,8 +108,8 @@ def table(config: SimulationConfig, cls: str) -> Table:
         rows.append(
             [f"{low:g}-{high:g} m", int(at.sum()), *texts, f"{100 * share:.0f} %"]
         )
-    title = f"where the echo of a {cls} is, {config.make_grid().num_range} range bins"
-    head = ["Distance", "Objects", "Echo - center m", "Along m", "Across m"]
+    title = f"echo position of class {cls}, {config.make_grid().num_range} range bins"
+    head = ["Distance", "Objects", "Echo - center m", "Range m", "Azimuth m"]
     return Table(title, [*head, "IoU > 0.3"], rows).marked(is_simulated=True)
 
 
@@ -118,18 +118,24 @@ def table(config: SimulationConfig, cls: str) -> Table:
 @click.option(
     "--cls", default="Pedestrian", show_default=True, type=click.Choice(CLASSES)
 )
-@click.option("--range-bins", type=click.IntRange(8), help="[default: 64]")
-@click.option("--full-size", is_flag=True, help="K-Radar's grid; without --range-bins.")
+@click.option(
+    "--range-bins", type=click.IntRange(8), help="Number of range bins. Default: 64."
+)
+@click.option(
+    "--full-size", is_flag=True, help="K-Radar's grid; excludes --range-bins."
+)
 @click.option("--seed", default=500, show_default=True, type=click.IntRange(0))
 def main(
     scenes: int, cls: str, range_bins: int | None, full_size: bool, seed: int
 ) -> None:
-    """Errors of the echo's place by distance, medians, and how many boxes overlap."""
+    """Print median errors of the echo position and the fraction of overlapping boxes."""
     entry.set_up_jax()
     with entry.exit_codes():
         values: dict[str, Any] = default_config()
         if full_size and range_bins:
-            raise UserError("--full-size has 256 range bins: give it or --range-bins")
+            raise UserError(
+                "--full-size has 256 range bins and cannot be combined with --range-bins"
+            )
         values["grid"]["num_range"] = range_bins or 64
         values |= {"seed": seed, "train_sequences": scenes, "test_sequences": 0}
         values |= {"frames_per_sequence": 1, "vru_density_scale": 5.0}

@@ -1,15 +1,14 @@
-"""What the camera adds, with a clean and with a covered lens.
+"""Measures what the camera adds with a clean and with a covered lens.
 
     python train.py --config configs/quickstart_fusion.py
     python train.py --config configs/quickstart_fusion.py:radar
     python examples/fusion_by_lens.py runs/quickstart_fusion runs/quickstart_fusion-radar
 
-Compares two runs on the same simulated test frames, by weather and by the state of the
-lens, which the simulator knows: AP of both, their difference with an interval from
-resampled sequences, and the camera's share in the fused map with the same. Writes
-tables into OUT. `--data ROOT` takes another simulated data set, on which
-both were evaluated by `python evaluate.py --workdir RUN --data ROOT`, with the same
-`--split`.
+Compares two runs on the same simulated test frames, by weather and by the state of the lens,
+which the simulator knows: AP of both, their difference with an interval from resampled sequences,
+and the weight of the camera in the fused map. Writes tables into OUT. `--data ROOT` selects
+another simulated dataset on which both runs were evaluated with
+`python evaluate.py --workdir RUN --data ROOT` and the same `--split`.
 """
 
 import collections
@@ -43,7 +42,7 @@ GROUPS = {
 
 
 def conditions(weather, lens):
-    """Masks of frames by condition: all, every weather, `GROUPS`."""
+    """Masks of frames by condition: all, every kind of weather, and `GROUPS`."""
     found = {"all": np.ones(len(weather), bool)}
     found |= {str(name): np.asarray(weather) == name for name in np.unique(weather)}
     for name, rule in GROUPS.items():
@@ -52,7 +51,7 @@ def conditions(weather, lens):
 
 
 def lens_of_frames(root, frames):
-    """State of the lens in the rows of a frame table of a simulated data set."""
+    """State of the lens in every row of the frame table of a simulated dataset."""
     marker = pathlib.Path(root) / MARKER
     if not marker.exists():
         raise UserError(f"{root} is no simulated data set: {MARKER} is missing")
@@ -71,7 +70,7 @@ def lens_of_frames(root, frames):
 
 
 def evaluation_set(report, classes, roi, chosen):
-    """Ground truth and predictions of a report on some of its frames."""
+    """Ground truth and predictions of a report for some of its frames."""
     truth, found, frames, _ = load(report, Source(), classes)
     found, _ = repair_sizes(found, "false_positive")
     ids = np.asarray(frames["frame"])[chosen]
@@ -88,13 +87,13 @@ def evaluation_set(report, classes, roi, chosen):
 
 
 def share_rows(share, sequence, groups, resamples):
-    """The camera's share by condition, and that less the share in all frames.
+    """Weight of the camera by condition, and its difference to that of all frames.
 
     Args:
-        share: `[F]` mean over a frame's bins in view; NaN without an image.
-        sequence: `[F]`.
+        share: `[F]` mean over the bins in view of a frame; NaN without an image.
+        sequence: `[F]` sequence numbers.
         groups: `[F]` masks by condition.
-        resamples: Of sequences, for intervals of 95 %.
+        resamples: Number of resamples of sequences, for 95 % intervals.
     """
     counts = bootstrap.sequence_weights(sequence, resamples=resamples, seed=0)
     counts = np.concatenate([np.ones((1, len(share))), counts])
@@ -114,7 +113,7 @@ def share_rows(share, sequence, groups, resamples):
 
 
 def rows_of_group(name, reports, config, chosen, resamples):
-    """One row for Sedan, one for the mean of the classes that occur."""
+    """A row for Sedan and a row for the mean of the classes that occur."""
     options = config.evaluation
     fusion, radar = (
         evaluation_set(report, tuple(config.classes), tuple(options.roi), chosen)
@@ -155,7 +154,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
 @click.option("--split", default="test", show_default=True, help="Or all.")
 @click.option("--resamples", default=1000, show_default=True)
 def main(fusion, radar, out, data, split, resamples):
-    """Compares FUSION with RADAR, two work folders evaluated on the same test split."""
+    """Compare the workdirs FUSION and RADAR, evaluated on the same test split."""
     entry.set_up_jax()
     with entry.exit_codes():
         run = open_model(fusion)
@@ -186,7 +185,7 @@ def main(fusion, radar, out, data, split, resamples):
 
         files.write_json(out / "camera_share.json", average_shares(by_lens(), run.grid))
         sequences = np.asarray(frames["sequence"])
-        # Intervals come from resampled sequences: one alone has none.
+        # Intervals come from resampled sequences: a single one has none.
         is_small = {
             name: len(set(sequences[chosen])) < 2 for name, chosen in groups.items()
         }

@@ -1,8 +1,8 @@
-"""Training batches straight from the simulator: no disk, a new frame every time.
+"""Training batches that are simulated when they are needed.
 
-The host draws scenes and scatterers; the accelerator makes the projections of a whole
-batch in one call. A batch depends on the seed and its step only, so a run resumes by
-knowing its step.
+The host samples scenes and scatterers, and the accelerator computes the projections of a whole
+batch in one call. A batch depends only on the seed and its step, so that a run resumes from its
+step.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ _CACHED_SEQUENCES = 64
 
 
 class OnlineBatches:
-    """Endless iterator of freshly simulated batches.
+    """Endless iterator of simulated batches.
 
     Args:
-        config: Plain values as `default_config`; sequences of its training split.
-        batch_size: Frames a batch.
+        config: Plain values as from `default_config`; its training sequences are used.
+        batch_size: Frames per batch.
         max_objects: Rows for boxes, N of `Batch`.
-        seed: Which frames are drawn, and their noise; the scenes follow the config's
-            own seed.
-        num_threads: Threads that prepare scatterers.
-        start_step: First step; to resume, the step reached.
+        seed: Seed of the choice of frames and of their noise; scenes follow the config's seed.
+        num_threads: Threads that compute scatterers.
+        start_step: First step; to resume, the step that was reached.
 
     Attributes:
         step: Step of the next batch; save it to resume.
-        num_cut: Boxes that did not fit into `max_objects` so far.
+        num_cut: Number of boxes so far that did not fit into `max_objects`.
     """
 
     def __init__(
@@ -74,12 +73,12 @@ class OnlineBatches:
         return self
 
     def __next__(self) -> Batch:
-        """The next batch."""
+        """Return the next batch."""
         self.step += 1
         return self.batch(self.step - 1)
 
     def batch(self, step: int) -> Batch:
-        """The batch of any step: a pure function of config, seed and step."""
+        """Batch of any step: a pure function of config, seed and step."""
         rng = np.random.default_rng([self._seed, step])
         chosen = rng.integers(len(self._specs), size=self._batch_size)
         rows = range(self._batch_size)
@@ -87,14 +86,14 @@ class OnlineBatches:
         return self._assemble(list(frames))
 
     def loader(self) -> grain.DatasetIterator:
-        """The same batches, prepared ahead, at a position that a checkpoint keeps."""
+        """Iterator of the same batches with prefetching, whose position can be saved."""
         steps = grain.MapDataset.range(np.iinfo(np.int32).max)
         reading = grain.ReadOptions(num_threads=2, prefetch_buffer_size=2)
         return iter(steps.map(self.batch).to_iter_dataset(reading))
 
     @property
     def frame_names(self) -> list[str]:
-        """Sequence and frame that each index of `Batch.frame` stands for."""
+        """Sequence and frame of each index in `Batch.frame`."""
         return [f"{number}/{spec.name}" for number, spec in self._specs]
 
     def _make_simulator(self, number: int) -> SequenceSimulator:
@@ -103,9 +102,9 @@ class OnlineBatches:
         )
 
     def _frame(self, index: int, step: int, row: int):
-        """Radar input, boxes `[n, 7]` of the ego frame and classes of one frame."""
+        """Radar input, boxes `[n, 7]` in the radar frame and classes of one frame."""
         number, spec = self._specs[index]
-        with self._lock:  # one thread makes a scene, the others find it
+        with self._lock:  # one thread creates a scene, the others reuse it
             simulator = self._simulator(number)
         frame = simulator.sequence.frame(spec.scene_idx)
         given = simulator.radar_input(frame)
@@ -148,7 +147,7 @@ class OnlineBatches:
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def _simulate_batch(scatterers, noise, keys, grid, parameters):
-    """`[B, R, A, D+E]` projections of a batch."""
+    """Projections `[B, R, A, D+E]` of a batch."""
     one = functools.partial(
         tensor.simulate,
         grid=grid,
@@ -158,7 +157,7 @@ def _simulate_batch(scatterers, noise, keys, grid, parameters):
 
 
 def _stack(inputs: list[RadarInput]) -> tuple[tensor.Scatterers, np.ndarray]:
-    """Inputs of one batch, padded to the longest, in steps that bound recompiling."""
+    """Stack inputs, padded to the longest in steps that limit recompilation."""
     capacity = max(given.scatterers.range_m.shape[0] for given in inputs)
     capacity = -(-capacity // 1024) * 1024
 

@@ -1,11 +1,10 @@
-"""Trains RADE-Net on frames that are simulated as they are needed: no data set, no disk.
+"""Trains RADE-Net on frames that are simulated when they are needed, without a dataset on disk.
 
     python examples/online_training.py --config configs/quickstart.py \\
         --workdir runs/online --sequences 1000
 
-Every step sees new frames of procedural scenes, so that there is nothing to overfit
-but the simulator itself. The same command continues after an interruption. Then, for a
-look at the result:
+Every step uses new frames of procedural scenes, so that only the simulator itself can be overfit.
+The same command resumes after an interruption. To detect objects with the result:
 
     radejax detect --model runs/online/checkpoints --out boxes data/sim
 """
@@ -32,39 +31,42 @@ from radejax.training import distributed, loop
 from radejax.training.step import TrainState
 
 SEED_OFFSET = 1_000_003
-"""Added to the seed of scenes: those of a data set of the same config stay unseen."""
+"""Added to the seed of the scenes, so that a dataset of the same config is held out."""
 
 _log = logging.getLogger(__name__)
 
 
 def train_online(
     config: ConfigDict, workdir: str | os.PathLike, *, num_sequences: int = 1000
-) -> tuple[TrainState, bool]:
-    """Trains a radar model on fresh frames; run again, it continues.
+) -> TrainState:
+    """Train a radar model on new frames; resumes an earlier run in the workdir.
 
-    An epoch is as many frames as the sequences have. Frames are drawn with
-    replacement and get new noise each time; they are not augmented.
+    An epoch has as many frames as the sequences have in all. Frames are sampled with replacement,
+    have new noise every time and are not augmented.
 
     Args:
-        config: With a `simulation` section that describes sensor and frames a
-            sequence. Its data set is neither made nor used.
-        workdir: Of the run: `config.json`, `checkpoints/`, `metrics.jsonl`.
-        num_sequences: Procedural sequences that frames are drawn from.
+        config: Config with a `simulation` section that describes the sensor and the number of
+            frames per sequence. Its dataset is not used.
+        workdir: Workdir of the run: `config.json`, `checkpoints/`, `metrics.jsonl`.
+        num_sequences: Number of procedural sequences.
+
+    Returns:
+        The state after the last step.
 
     Raises:
-        UserError: A camera, other classes, real scenes or several processes are asked
-            for, or the folder belongs to a run with another config.
+        UserError: The config has a camera model, other classes or real scenes, there are several
+            processes, or the workdir belongs to a run with another config.
     """
     simulation = plain(config.get("simulation") or {})
     for is_wrong, text in (
         (not simulation, "the config has no `simulation` section"),
         (simulation.get("scenes") != "procedural", "scenes must be procedural"),
-        (config.model.name == "dinorade", "the model takes a camera"),
+        (config.model.name == "dinorade", "the model has a camera"),
         (tuple(config.classes) != CLASSES, f"classes must be {CLASSES}"),
         (jax.process_count() > 1, "one process only"),
     ):
         if is_wrong:
-            raise UserError(f"on-line training: {text}")
+            raise UserError(f"online training: {text}")
     simulation |= {
         "train_sequences": num_sequences,
         "test_sequences": 0,
@@ -81,7 +83,9 @@ def train_online(
             seed=config.seed,
             num_threads=config.data.num_threads,
         )
-        _log.info("%d frames to draw from, simulated anew", len(batches.frame_names))
+        _log.info(
+            "%d frames to sample from, simulated when needed", len(batches.frame_names)
+        )
         model = models.build(config.model)
         state, _ = loop.train(
             config,
@@ -101,18 +105,22 @@ def train_online(
 
 
 @click.command()
-@click.option("--config", required=True, help="With a `simulation` section.")
+@click.option("--config", required=True, help="Config with a `simulation` section.")
 @click.option("--workdir", required=True, type=click.Path(path_type=pathlib.Path))
 @click.option("--sequences", type=click.IntRange(1), default=1000, show_default=True)
-@click.option("--epochs", type=click.IntRange(1), help="Instead of the config's.")
+@click.option(
+    "--epochs",
+    type=click.IntRange(1),
+    help="Number of epochs. Default: that of the config.",
+)
 def main(config, workdir, sequences, epochs):
-    """Trains on sequences that are never written."""
+    """Train on procedural sequences that are not written to disk."""
     entry.set_up_jax()
     with entry.exit_codes():
         settings = load_config(config)
         if epochs is not None:
             settings.train.num_epochs = epochs
-        state, _ = train_online(settings, workdir, num_sequences=sequences)
+        state = train_online(settings, workdir, num_sequences=sequences)
         click.echo(f"{state.step} steps; checkpoints in {workdir / 'checkpoints'}")
 
 

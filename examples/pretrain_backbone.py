@@ -1,16 +1,15 @@
-"""Trains a small image backbone on simulated images, to be used frozen.
+"""Pretrains a small image backbone on simulated images, to be used frozen.
 
     python examples/pretrain_backbone.py --out backbones/small
     python train.py --config configs/quickstart_fusion.py:pretrained \\
         --image-backbone backbones/small
 
-What DINOv3 is for K-Radar, this is for simulated data: a backbone that knows images
-before the detector is trained, and stays as it is. It learns from images alone, of
-scenes of another seed than the data set's, what of each class every patch shows and how
-near it is, which the renderer knows; no detection label enters. The folder is one of
-Hugging Face's DINOv3 format; with `--config configs/quickstart_fusion.py:resnet50` it has
-a `resnet50.safetensors` with torchvision's names. Average precision by class tells, on scenes of a
-third seed, how well patches that show an object are told from the others.
+It takes the place of DINOv3 on simulated data. It is trained on images of scenes with another seed
+than those of the dataset, to predict which classes each patch shows and how near they are, which
+the renderer knows; labels of the detector are not used. The output folder has Hugging Face's
+DINOv3 format; with `--config configs/quickstart_fusion.py:resnet50` it has a
+`resnet50.safetensors` with torchvision's names. The average precision of the patches of each
+class is printed for scenes of a third seed.
 """
 
 from __future__ import annotations
@@ -52,24 +51,24 @@ CONFIG = (
     / "quickstart_fusion.py:pretrained"
 )
 SEEDS = (2_000_003, 3_000_017)
-"""Added to the seed of the data: of scenes to learn from, of those to be tested on."""
+"""Added to the seed of the dataset, for training images and test images."""
 
 REPORT, RESNET_FILE = "pretraining.json", "resnet50.safetensors"
 PIXELS_SHOWN = 4
-"""From so many pixels of a class on, a patch shows it."""
+"""Number of pixels of a class from which on a patch counts as showing it."""
 NEAR_M = 10.0
 SMALL = tuple(map(CLASSES.index, ("Pedestrian", "Motorcycle", "Bicycle")))
 SHARE_TURNED = 0.4
-"""Of the cars in the images to learn from; see `with_small_ones`."""
+"""Fraction of the cars in training images that become VRUs; see `with_small_ones`."""
 
 
 class Images(NamedTuple):
-    """Images and what their patches show.
+    """Images and the content of their patches.
 
     Attributes:
         image: `[N, H, W, 3]` uint8.
-        pixels: `[N, h, w, K]` uint16 pixels of each class.
-        nearness: `[N, h, w]` 10 m / distance, mean over the pixels of objects.
+        pixels: `[N, h, w, K]` uint16, number of pixels of each class.
+        nearness: `[N, h, w]`, 10 m / distance, mean over the pixels of objects.
     """
 
     image: np.ndarray
@@ -78,7 +77,7 @@ class Images(NamedTuple):
 
 
 def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
-    """A share of the cars become people and two-wheelers, which are few otherwise."""
+    """Replace a fraction of the cars by VRUs, which are rare otherwise."""
     rng = np.random.default_rng([seed, sequence.name, 17])
     tracks, cls = sequence.tracks, sequence.tracks.cls.copy()
     size, position = tracks.size_m.copy(), tracks.position_m.copy()
@@ -95,12 +94,14 @@ def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
 def draw(
     simulation: dict[str, Any], patch: int, count: int, seed: int, share: float = 0.0
 ) -> Images:
-    """One image of each of `count` procedural scenes; for `share` see above."""
+    """One image of each of `count` procedural scenes; `share` as in `with_small_ones`."""
     fields = {"seed": seed, "train_sequences": count, "test_sequences": 0}
     fields |= {"frames_per_sequence": 1}
     config = SimulationConfig.from_mapping(simulation | fields)
     if config.scenes != "procedural" or not config.image_width:
-        raise UserError("images are drawn of procedural scenes, of a size above 0")
+        raise UserError(
+            "simulation.scenes must be procedural and simulation.image_width above 0"
+        )
     height, width = config.image_height, config.image_width
     cameras = stereo_calibration(config.radar_from_lidar_m, width, height)
     origin = camera_position(cameras[0])
@@ -113,7 +114,7 @@ def draw(
     )
 
     def of_patches(pixels: np.ndarray) -> np.ndarray:
-        """`[H, W, K]` summed over patches."""
+        """Sum `[H, W, K]` over patches."""
         rows, columns = shape[1:]
         return pixels.reshape(rows, patch, columns, patch, -1).sum((1, 3))
 
@@ -128,7 +129,7 @@ def draw(
         )
         frame = sequence.frame(0)
         box = renderer.shown_boxes(frame, 0)
-        cls = np.append(frame.cls, -1)[box]  # the last for -1, no box
+        cls = np.append(frame.cls, -1)[box]  # -1 where there is no box
         near = NEAR_M / np.linalg.norm(frame.boxes[:, :3] - origin, axis=1)
         near = np.append(near, 0.0)[box][..., None]
         pixels = of_patches(cls[..., None] == np.arange(len(CLASSES)))
@@ -143,7 +144,7 @@ def draw(
 
 
 class Patches(nn.Module):
-    """A backbone with a linear layer: `[B, h, w, K + 1]` logits and nearness."""
+    """Backbone with a linear layer: `[B, h, w, K + 1]` logits and nearness."""
 
     backbone: ViT | ResNetTrunk
 
@@ -161,8 +162,8 @@ class Patches(nn.Module):
 
 
 def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
-    """Of what patches show: cross-entropy by class, and the error of the nearness."""
-    # A few pixels of a class are it: a far pedestrian has no more.
+    """Cross-entropy by class plus the squared error of the nearness."""
+    # A few pixels are enough, as a distant pedestrian has no more.
     target = jnp.minimum(pixels / (2.0 * PIXELS_SHOWN), 1.0)
     entropy = optax.sigmoid_binary_cross_entropy(found[..., :-1], target)
     entropy = jnp.sum(entropy * (1.0 + 2.0 * target), axis=-1)
@@ -173,7 +174,7 @@ def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
 def train(
     model: Patches, data: Images, *, epochs: int, seed: int, batch_size: int = 16
 ) -> Any:
-    """Variables after so many epochs: AdamW, a cosine, mirrored at random."""
+    """Train with AdamW, a cosine schedule and random mirroring; returns the variables."""
     steps = epochs * (len(data.image) // batch_size)
     schedule = optax.warmup_cosine_decay_schedule(0.0, 1.5e-3, steps // 20, steps)
     optimizer = optax.chain(
@@ -216,14 +217,14 @@ def train(
 
 
 def average_precision(score: np.ndarray, is_shown: np.ndarray) -> float:
-    """Of the order of scores; NaN where nothing is shown."""
+    """Average precision of a ranking; NaN without positives."""
     right = is_shown.ravel()[np.argsort(-score.ravel(), kind="stable")]
     precision = np.cumsum(right) / np.arange(1, right.size + 1)
     return float(precision[right].mean()) if right.any() else float("nan")
 
 
 def patch_ap(model: Patches, variables: Any, data: Images) -> dict[str, float]:
-    """Average precision of patches by class: do they show so many pixels of it?"""
+    """Average precision by class of the patches that show at least `PIXELS_SHOWN` pixels."""
     predict = jax.jit(model.apply)
     found = [
         predict(variables, data.image[i : i + 32]) for i in range(0, len(data[0]), 32)
@@ -236,7 +237,7 @@ def patch_ap(model: Patches, variables: Any, data: Images) -> dict[str, float]:
 
 
 def save(backbone: ViT | ResNetTrunk, variables: Any, out: pathlib.Path) -> None:
-    """Writes what `--image-backbone` reads."""
+    """Write the backbone in the format that `--image-backbone` reads."""
     own = {name: part["backbone"] for name, part in variables.items()}
     if isinstance(backbone, ViT):
         dinov3_hf.save(backbone, own["params"], out)
@@ -254,15 +255,15 @@ def pretrain(
     epochs: int = 10,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Writes a backbone for a config, for its kind of images; patch AP by class.
+    """Pretrain and write the backbone of a config; returns the patch AP by class.
 
     Args:
-        config: Of a radar-camera model, with a `simulation` section.
-        out: Folder; Hugging Face's DINOv3 format, or `resnet50.safetensors`.
-        images: To learn from.
-        held_out: Images to be tested on.
-        epochs: Times that each is seen.
-        seed: Of weights and order, and added to that of the scenes.
+        config: Config of a radar-camera model with a `simulation` section.
+        out: Folder for Hugging Face's DINOv3 format, or for `resnet50.safetensors`.
+        images: Number of training images.
+        held_out: Number of test images.
+        epochs: Number of epochs.
+        seed: Seed of weights and order, and added to that of the scenes.
 
     Raises:
         UserError: The config has no simulated images.
@@ -274,30 +275,32 @@ def pretrain(
     vit = detector.vit
     patch = STRIDE if vit is None else vit.patch_size
     started, base = time.perf_counter(), simulation["seed"] + seed
-    learnt, tested = (
+    train_data, test_data = (
         draw(simulation, patch, count, base + offset, share)
         for count, offset, share in zip(
             (images, held_out), SEEDS, (SHARE_TURNED, 0.0), strict=True
         )
     )
     seconds = time.perf_counter() - started
-    click.echo(f"{images + held_out} images drawn in {seconds:.0f} s")
+    click.echo(f"{images + held_out} images rendered in {seconds:.0f} s")
     model = Patches(vit or ResNetTrunk(detector.resnet_width, frozen=False))
-    variables = train(model, learnt, epochs=epochs, seed=seed)
-    found = patch_ap(model, variables, tested)
+    variables = train(model, train_data, epochs=epochs, seed=seed)
+    found = patch_ap(model, variables, test_data)
     save(model.backbone, variables, out)
     minutes = (time.perf_counter() - started) / 60
     report = {"images": images, "epochs": epochs, "seed": seed, "minutes": minutes}
     files.write_json(out / REPORT, report | {"patch_ap": found})
     text = ", ".join(f"{cls} {ap:.2f}" for cls, ap in found.items())
-    click.echo(f"patches found on {held_out} other images (AP): {text}")
+    click.echo(f"AP of patches on {held_out} held-out images: {text}")
     click.echo(f"{minutes:.1f} minutes; written to {out}")
     return found
 
 
 @click.command()
 @click.option(
-    "--config", default=str(CONFIG), help="Of the detector: its images and backbone."
+    "--config",
+    default=str(CONFIG),
+    help="Config of the detector. Default: quickstart_fusion.",
 )
 @click.option("--out", required=True, type=click.Path(path_type=pathlib.Path))
 @click.option("--images", default=3072, show_default=True, type=click.IntRange(16))
@@ -305,7 +308,7 @@ def pretrain(
 @click.option("--epochs", default=10, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
 def main(config, out, **options):
-    """Pretrains the image backbone of a config into the folder OUT."""
+    """Pretrain the image backbone of a config and write it into the folder OUT."""
     entry.set_up_jax()
     with entry.exit_codes():
         pretrain(load_config(config), out, **options)

@@ -1,10 +1,10 @@
-"""Where the radar's queries look in a camera image, with the labelled boxes.
+"""Draws the reference points of the radar queries and the labeled boxes on a camera image.
 
     python examples/reference_points.py cam-front_00001.png cam_front0.yml \\
         --label 00033_00001.txt --out reference_points.png
 
-The picture of DinoRADE's Figure 2 for one image: reference points of every 16th range
-bin red, boxes of the label file, the radar's place blue where it is in view.
+Repeats DinoRADE's Figure 2 for one image: reference points of every 16th range bin in red, boxes
+of the label file in white, and the position of the radar in blue if it is in view.
 """
 
 import pathlib
@@ -35,26 +35,26 @@ def draw_reference_points(
     *,
     every: tuple[int, int, int] = (16, 2, 1),
 ) -> int:
-    """Draws valid reference points and the radar's place onto axes with an image.
+    """Draw valid reference points and the radar's position onto the axes of an image.
 
     Args:
-        ax: Axes in pixels, e.g. from `radejax.visualize.camera.draw_camera`.
-        points: `[R, A, E, 2]` (x, y) in 0..1 from edge to edge of the image, as in
+        ax: Axes in pixels, for example from `radejax.visualize.camera.draw_camera`.
+        points: `[R, A, E, 2]` (x, y) from 0 to 1 between the edges of the image, as in
             `radejax.models.lifting.ReferencePoints`, of one frame.
-        is_valid: `[R, A, E]` bool, True for points that lie in the image.
-        calibration: The camera they were computed with.
-        every: Draw each so many bins of range, azimuth and elevation.
+        is_valid: `[R, A, E]` bool, True for points in the image.
+        calibration: Calibration that the points were computed with.
+        every: Steps in range, azimuth and elevation bins.
 
     Returns:
         Number of points drawn.
 
     References:
-        DinoRADE, figure 2: points red, radar blue.
+        DinoRADE, figure 2.
     """
     step = tuple(slice(None, None, n) for n in every)
     size = (calibration.width, calibration.height)
     points = np.asarray(points)[step][np.asarray(is_valid)[step]] * size
-    # Pixel centers are whole numbers in imshow, half numbers in the calibration.
+    # Pixel centers are integers in imshow and half-integers in the calibration.
     points = points - 0.5
     ax.scatter(*points.T, s=2.0, color=POINT_COLOR, linewidths=0, alpha=0.7, zorder=2)
     pixel, depth = calibration.project_ego(np.zeros(3))
@@ -70,10 +70,12 @@ FILE = click.Path(exists=True, path_type=pathlib.Path)
 @click.argument("image", type=FILE)
 @click.argument("calibration", type=FILE)
 @click.option("--label", type=FILE, help="Label file of the frame.")
-@click.option("--version", default="v2.1", show_default=True, help="Of the label file.")
+@click.option(
+    "--version", default="v2.1", show_default=True, help="Version of the label file."
+)
 @click.option("--out", default="reference_points.png", show_default=True)
 def main(image, calibration, label, version, out):
-    """Draws reference points and boxes on IMAGE through CALIBRATION."""
+    """Draw reference points and boxes on IMAGE with the camera of CALIBRATION."""
     with entry.exit_codes():
         camera = CameraCalibration.from_kradar(calibration)
         pixels = read_left_image(image, (camera.height, camera.width))

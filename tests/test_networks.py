@@ -10,7 +10,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 IMAGES = pathlib.Path(__file__).resolve().parents[1] / "docs" / "images"
-sys.path.append(str(IMAGES))  # where `python docs/images/networks.py` finds its sheet
+sys.path.append(str(IMAGES))  # the folder of sheet.py, which networks.py imports
 networks = SimpleNamespace(**runpy.run_path(str(IMAGES / "networks.py")))
 SHAPES = {
     "radenet": {"64 × 256 × 37 × 107", "32 × 14 × 512", "256 × 112 × 5"},
@@ -25,7 +25,7 @@ def test_pictures_show_the_models_and_no_text_meets_another(name: str) -> None:
     sheet = lay_out(networks.Network.of(config))
     lines = {line for block in sheet.blocks for line in block.lines}
     assert SHAPES[name] <= lines
-    said = " ".join([*lines, *(text for *_, text in sheet.remarks)])
+    said = " ".join([*lines, *(text for *_, text in sheet.notes)])
     assert PARAMETERS[name] in said
     figure = sheet.draw()
     renderer = FigureCanvasAgg(figure).get_renderer()

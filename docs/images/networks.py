@@ -1,10 +1,10 @@
-"""Draws both detectors from their modules: what each part is called with and returns.
+"""Draws both networks with the shapes that their modules take and return.
 
     python docs/images/networks.py
 
 writes docs/images/radenet.png and docs/images/dinorade.png. Shapes, channels and numbers of
-parameters are read from the models of configs/radenet.py and configs/dinorade.py as they
-are traced (`flax.linen.intercept_methods`); only the places on the sheet are written here.
+parameters are read from the models of configs/radenet.py and configs/dinorade.py while they
+are traced (`flax.linen.intercept_methods`); only the positions are written here.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ DATA, RADAR, ATTENTION, CAMERA, HEADS = (
 )
 
 
-# What the models say -----------------------------------------------------------------
+# Shapes of the models -----------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """A detector that was traced with one frame.
+    """A network that was traced with one frame.
 
     Attributes:
         model: The module.
@@ -123,7 +123,7 @@ def radenet(net: Network) -> Sheet:
     doppler, elevation = net.model.doppler_bins, net.model.elevation_bins
     grid = RadarGrid.kradar()
     tesseract = sheet.block(
-        1.05, rows[0], 1.7, 1.0, title="Tesseract", color=DATA,
+        1.05, rows[0], 1.7, 1.0, title="4D radar tensor", color=DATA,
         lines=(_size((0, *grid.shape_drea)), "Doppler, range,", "elevation, azimuth"),
     )  # fmt: skip
     projection = sheet.block(
@@ -158,7 +158,7 @@ def radenet(net: Network) -> Sheet:
     )  # fmt: skip
     corner = (x_encoder, rows[-1])
     sheet.arrow(encoders[-1].bottom, corner, bottleneck.left)
-    sheet.remarks.append((x_encoder + 0.1, rows[-1] + 0.48, "max pooling 2 × 2"))
+    sheet.notes.append((x_encoder + 0.1, rows[-1] + 0.48, "max pooling 2 × 2"))
     before, way = bottleneck.right, [(x_decoder, rows[-1])]
     for number in range(1, levels + 1):
         y, skip = rows[levels - number], encoders[levels - number]
@@ -180,16 +180,16 @@ def radenet(net: Network) -> Sheet:
             sheet.arrow(skip.right, decoder.left)
         sheet.arrow(before, *way, decoder.bottom)
         before, way = decoder.top, []
-    sheet.remarks.append((x_decoder + 0.1, rows[-1] + 0.48, "upsampling 2 × 2"))
+    sheet.notes.append((x_decoder + 0.1, rows[-1] + 0.48, "upsampling 2 × 2"))
     _neck_and_heads(sheet, net, decoder.right, x=11.35, y=rows[0])
-    sheet.remarks.append(
+    sheet.notes.append(
         (
             0.2,
             0.55,
             f"Backbone {net.count('backbone')}, neck {net.count('neck')}, heads "
             f"{net.count('heads')}. Shapes: range × azimuth × channels, from "
-            "configs/radenet.py, traced.\nEncoder, bottleneck and decoder: two 3 × 3 "
-            "convolutions with group normalisation and SiLU, and a residual.",
+            "configs/radenet.py.\nEncoder, bottleneck and decoder: two 3 × 3 "
+            "convolutions with group normalization and SiLU, and a residual.",
         )
     )
     return sheet
@@ -198,7 +198,7 @@ def radenet(net: Network) -> Sheet:
 def _neck_and_heads(
     sheet: Sheet, net: Network, start: Point, *, x: float, y: float
 ) -> None:
-    """Both networks end so."""
+    """Neck, heads and decoding, which both networks share."""
     blocks = [n for n in net.calls if n.startswith("neck/block_")]
     neck = sheet.block(
         x, y, 1.55, 0.95, title="Neck", color=RADAR,
@@ -233,7 +233,7 @@ def _neck_and_heads(
 
 
 def dinorade(net: Network) -> Sheet:
-    """Radar above, camera below, deformable attention where they meet."""
+    """Radar branch above, camera branch below, deformable attention between them."""
     sheet = Sheet(16.4, 6.9)
     top, middle, low = 5.85, 3.85, 1.75
     padded = net.taken("backbone")
@@ -262,7 +262,7 @@ def dinorade(net: Network) -> Sheet:
     rows = net.calls["image_fusion"][0][3].is_valid.shape
     points = sheet.block(
         3.45, 2.6, 1.85, 0.8, title="Reference points", color=CAMERA,
-        lines=(_size(rows), "by the calibration"),
+        lines=(_size(rows), "from the calibration"),
     )  # fmt: skip
     camera = sheet.block(
         1.05, 2.6, 1.7, 0.62, title="Calibration", color=DATA,
@@ -283,7 +283,7 @@ def dinorade(net: Network) -> Sheet:
     )  # fmt: skip
     neck = sheet.block(
         5.85, 1.3, 1.75, 0.95, title="Camera neck", color=CAMERA,
-        lines=("up twice", net.given("image_neck"), net.count("image_neck")),
+        lines=("two upsampling stages", net.given("image_neck"), net.count("image_neck")),
     )  # fmt: skip
     dilated = sheet.block(
         5.85, 2.6, 1.75, 0.8, title="Dilated neck", color=CAMERA,
@@ -326,18 +326,18 @@ def _fusion(
                 (attention.x - 0.3, attention.top[1]))  # fmt: skip
     gate = sheet.block(
         10.75, top, 1.7, 0.95, title="Gate", color=ATTENTION,
-        lines=("share of the camera", "per bin and channel", net.given("image_fusion")),
+        lines=("weight of the camera", "per bin and channel", net.given("image_fusion")),
     )  # fmt: skip
     sheet.arrow((attention.x - 0.3, top), gate.left)
     sheet.arrow(attention.right, (gate.x, middle), gate.bottom)
     _neck_and_heads(sheet, net, gate.right, x=12.75, y=top)
-    sheet.remarks.append(
+    sheet.notes.append(
         (
             6.95,
             0.75,
             f"Fusion {net.count('image_fusion')}, neck {net.count('neck')}, heads "
             f"{net.count('heads')}.\nShapes: range × azimuth (× elevation) × channels; "
-            "camera: height × width × channels;\nfrom configs/dinorade.py, traced.",
+            "camera: height × width × channels;\nfrom configs/dinorade.py.",
         )
     )
     return sheet
@@ -350,7 +350,7 @@ SHEETS = {
 
 
 def main() -> None:
-    """Draws both pictures."""
+    """Draw both figures."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=pathlib.Path, default=ROOT / "docs" / "images")
     out = parser.parse_args().out

@@ -1,4 +1,4 @@
-"""Boxes, arrows and remarks on a sheet: the pictures of the networks are made of them."""
+"""Blocks, arrows and notes on a page, of which the figures of the networks consist."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Point = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """A box with a title and smaller lines; its place is its middle."""
+    """A block with a title and smaller lines below it; x and y are its center."""
 
     x: float
     y: float
@@ -44,26 +44,26 @@ class Block:
 
 @dataclasses.dataclass
 class Sheet:
-    """Blocks, arrows and remarks of one picture, in inches."""
+    """Blocks, arrows and notes of one figure, in inches."""
 
     width: float
     height: float
     blocks: list[Block] = dataclasses.field(default_factory=list)
     arrows: list[tuple[list[Point], str]] = dataclasses.field(default_factory=list)
-    remarks: list[tuple[float, float, str]] = dataclasses.field(default_factory=list)
+    notes: list[tuple[float, float, str]] = dataclasses.field(default_factory=list)
 
     def block(self, *place: float, title: str, color: str, lines: Any = ()) -> Block:
-        """Adds a box; place: x, y, width, height."""
+        """Add a block; `place` is x, y, width, height."""
         made = Block(*place, title, tuple(lines), color)
         self.blocks.append(made)
         return made
 
     def arrow(self, *way: Point, color: str = PALE) -> None:
-        """Adds an arrow along points."""
+        """Add an arrow along points."""
         self.arrows.append((list(way), color))
 
     def draw(self) -> Figure:
-        """The picture."""
+        """Return the figure."""
         figure = Figure(figsize=(self.width, self.height), dpi=150, facecolor="white")
         axes = figure.add_axes(
             (0, 0, 1, 1), xlim=(0, self.width), ylim=(0, self.height)
@@ -84,7 +84,7 @@ class Sheet:
             axes.add_patch(tip)
         for block in self.blocks:
             _draw_block(axes, block)
-        for x, y, text in self.remarks:
+        for x, y, text in self.notes:
             axes.text(x, y, text, size=8.5, color=PALE, va="center", linespacing=1.5)
         return figure
 

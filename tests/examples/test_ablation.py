@@ -70,11 +70,11 @@ def test_what_is_missing_is_run_and_judged(
     runs = _Runs(monkeypatch)
     runs.stops_at = "adaptive"  # as a signal does
     text = _call(tmp_path, "--seeds", "0")
-    assert "3 of 6 cells are done" in text
+    assert "3 of 6 runs are done" in text
     assert "next: adaptive, seed 0" in text
     runs.stops_at = None
     text = _call(tmp_path, "--seeds", "0,4")
-    assert "12 of 12 cells are done" in text
+    assert "12 of 12 runs are done" in text
     names = [(name, config.seed) for name, config in runs.trained]
     cells = list(ablation.STUDIES["sigma"].cells)
     assert names == [(n, 0) for n in [*cells[:4], *cells[3:]]] + [(n, 4) for n in cells]
@@ -118,9 +118,9 @@ def test_each_of_several_processes_has_seeds_of_its_own(
     runs = _Runs(monkeypatch)
     with files.lock(tmp_path / "seed0.lock", "of another"):
         text = _call(tmp_path, "--seeds", "0,4")
-    assert "seed 0: another process is at it" in text
+    assert "seed 0: another process works on it" in text
     assert {config.seed for _, config in runs.trained} == {4}
-    assert "12 of 12 cells are done" in _call(tmp_path, "--seeds", "0,4")
+    assert "12 of 12 runs are done" in _call(tmp_path, "--seeds", "0,4")
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_boxes_overlap_without_the_error_that_keeps_them_apart() -> None:
     assert shape.tolist() == [True, False, False, True]
 
 
-def test_a_report_is_told_in_two_tables(tmp_path: pathlib.Path) -> None:
+def test_a_report_gives_two_tables(tmp_path: pathlib.Path) -> None:
     np.savez(tmp_path / "ground_truth.npz", **TRUTH)
     np.savez(tmp_path / "predictions.npz", **FOUND)
     (tmp_path / "frames.json").write_text(json.dumps({"frame": [0, 1]}))
@@ -114,7 +114,7 @@ def test_a_report_is_told_in_two_tables(tmp_path: pathlib.Path) -> None:
     assert "Pedestrian 20-40 m 1 1 0.00 2.50 0 % 0 % 100 % 0 %" in lines
 
 
-def test_what_is_no_evaluation_is_told(tmp_path: pathlib.Path) -> None:
+def test_a_folder_without_an_evaluation_is_an_error(tmp_path: pathlib.Path) -> None:
     result = CliRunner().invoke(center_distance.main, [str(tmp_path)])
     assert result.exit_code == 2
     assert "predictions.npz is missing" in result.output

@@ -59,7 +59,7 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     np.testing.assert_array_equal(found["box"][found["frame"] == last], expected["box"])
 
 
-def test_data_without_a_training_split_are_told(tmp_path: pathlib.Path) -> None:
+def test_data_without_a_training_split_are_an_error(tmp_path: pathlib.Path) -> None:
     config = default_config() | {"train_sequences": 0, "test_sequences": 1}
     config |= {"frames_per_sequence": 1, "image_width": 0, "output": "projection"}
     simulate_dataset(config, tmp_path / "data", progress=False)

@@ -1,10 +1,12 @@
-"""Training without a data set: resumable, and what it cannot do is said."""
+"""Tests of training on simulated frames without a dataset."""
 
 import json
 
 import jax
 import numpy as np
 import pytest
+import online_training
+from click.testing import CliRunner
 from online_training import train_online
 
 from radejax import Detector
@@ -32,13 +34,13 @@ def _config(num_epochs=2):
 
 
 @pytest.mark.slow
-def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeypatch):
+def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
     mesh = distributed.make_mesh(1)
     monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     result = train_online(_config(), whole, num_sequences=2)
-    assert result.step == 4  # 4 frames an epoch
-    # Stops after the first checkpoint, as if killed, and goes on.
+    assert result.step == 4  # 4 frames per epoch
+    # Stops after the first checkpoint as if killed, then resumes.
     saved = []
 
     save = Checkpoints.save
@@ -53,11 +55,14 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
         with pytest.raises(KeyboardInterrupt):
             train_online(_config(), parts, num_sequences=2)
     assert saved == [1]
-    assert train_online(_config(), parts, num_sequences=2).step == 4
+    monkeypatch.setattr(online_training, "load_config", lambda _: _config())
+    options = ["--config", "small", "--workdir", str(parts), "--sequences", "2"]
+    resumed = CliRunner().invoke(online_training.main, options, catch_exceptions=False)
+    assert "4 steps" in resumed.output
     expected = Detector.from_workdir(whole / "checkpoints")
     found = Detector.from_workdir(parts / "checkpoints")
     jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
-    # The folder is a run like any other, but for its data, which are nowhere.
+    # The workdir is that of an ordinary run, except that its data are not on disk.
     again = Detector.from_workdir(whole)
     jax.tree.map(np.testing.assert_array_equal, again.variables, expected.variables)
     with pytest.raises(UserError, match=r"never written, .* give --data ROOT"):
@@ -84,7 +89,7 @@ def test_fresh_frames_train_a_model_and_a_stop_changes_nothing(tmp_path, monkeyp
         ({"simulation": {"scenes": "labels.zip"}}, "scenes must be procedural"),
     ],
 )
-def test_what_it_cannot_do_is_said(changes, message, tmp_path):
+def test_unsupported_configs_are_errors(changes, message, tmp_path):
     config = _config()
     config.update(changes)
     with pytest.raises(UserError, match=message):

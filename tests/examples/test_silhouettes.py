@@ -40,7 +40,7 @@ def _run(score_of_camera: float, seen: list[Any]) -> Any:
 
 
 @pytest.mark.parametrize(("score", "exit_code"), [(0.5, 0), (0.0, 1)])
-def test_both_runs_see_the_same_scenes_and_the_bar_decides(
+def test_both_runs_see_the_same_scenes_and_the_gain_decides(
     score: float,
     exit_code: int,
     tmp_path: pathlib.Path,
@@ -51,7 +51,7 @@ def test_both_runs_see_the_same_scenes_and_the_bar_decides(
     arguments = ["--workdir", str(tmp_path), "--resamples", "50", "--seed", "3"]
     result = CliRunner().invoke(silhouettes.main, arguments)
     assert result.exit_code == exit_code, result.output
-    assert ("met" if exit_code == 0 else "missed") in result.output.splitlines()[-1]
+    assert ("yes" if exit_code == 0 else "no") in result.output.splitlines()[-1]
     radar, camera = seen
     assert (radar.model.name, camera.model.name) == ("radenet", "dinorade")
     assert radar.simulation == camera.simulation

@@ -1,6 +1,6 @@
-"""Makes the pictures of `docs/simulator.md`: one row of maps per weather, full size.
+"""Draws the figures of `docs/simulator.md`: one row of full-size maps per kind of weather.
 
-python docs/images/simulator_pictures.py --out docs/images
+python docs/images/simulator_figures.py --out docs/images
 """
 
 import argparse
@@ -35,14 +35,14 @@ SCENES = (
 )
 OFFSET = (-2.54, 0.3, 0.7)
 GRID = RadarGrid.kradar()
-LIMITS_DB = (96, 130)  # noise to echoes of cars
-ANGLE_LIMITS_DB = (96, 150)  # the strongest of all ranges: mostly near ones
+LIMITS_DB = (96, 130)  # from the noise to the echoes of cars
+ANGLE_LIMITS_DB = (96, 150)  # the maximum over ranges comes mostly from near objects
 SEEN = {"color": "white", "lw": 1.0, "ls": "-"}
 UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
 
 def draw(weather, environment, time, seed, path):
-    """Camera image, range-azimuth, azimuth-elevation and range-Doppler maps in a row."""
+    """Draw camera image, range-azimuth, azimuth-elevation and range-Doppler maps."""
     sequence = make_sequence(
         seed, environment=environment, time=time, weather=weather, num_frames=60,
         rng=np.random.default_rng(seed),
@@ -66,14 +66,14 @@ def draw(weather, environment, time, seed, path):
         axis.yaxis.label.set_size(8)
         bar = figure.colorbar(drawn, ax=axis, extend="both", pad=0.02)
         bar.ax.tick_params(labelsize=7)
-    bar.set_label("largest power of the other axes (dB)", fontsize=8)
-    figure.draw_without_rendering()  # labels need the final places of axes
+    bar.set_label("maximum power over the other axes [dB]", fontsize=8)
+    figure.draw_without_rendering()  # labels need the final positions of the axes
     draw_boxes(axes[1], frame, simulator.is_radar_visible(frame, given))
-    figure.savefig(path, dpi=110)  # in all colours: a palette loses the orange
+    figure.savefig(path, dpi=110)  # a color palette would lose the orange
 
 
 def draw_maps(axes, power_db):
-    """The three maps, each the maximum over the axes that it does not show."""
+    """Draw three maps, each the maximum over the axes that it does not show."""
     ground, angles, doppler = axes
     centers = GRID.bin_centers_ego()
     colors = {"cmap": COLOR_MAP, "vmin": LIMITS_DB[0], "vmax": LIMITS_DB[1]}
@@ -105,7 +105,7 @@ def draw_maps(axes, power_db):
 
 
 def draw_boxes(axis, frame, is_visible):
-    """Boxes in the field of view: `R` white and named, `L` orange and dashed."""
+    """Draw boxes in the field of view: flag `R` white with name, `L` orange and dashed."""
     labels = []
     for box, is_seen, cls in zip(frame.boxes, is_visible, frame.cls, strict=True):
         if not GRID.in_field_of_view(box[0], box[1]):
@@ -119,7 +119,10 @@ def draw_boxes(axis, frame, is_visible):
     axis.legend(
         handles=[
             Line2D([], [], label=name, path_effects=halo(style["lw"] + 1.0), **style)
-            for name, style in (("label R: seen", SEEN), ("label L: hidden", UNSEEN))
+            for name, style in (
+                ("R: visible to the radar", SEEN),
+                ("L: not visible", UNSEEN),
+            )
         ],
         loc="lower right",
         fontsize=6,
@@ -130,7 +133,7 @@ def draw_boxes(axis, frame, is_visible):
 
 
 def main():
-    """Draws all scenes, or those named."""
+    """Draw all scenes, or those of the named kinds of weather."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/images"))
     parser.add_argument("--weather", nargs="*", default=[s[0] for s in SCENES])
