@@ -1,4 +1,4 @@
-"""One measurement of `run.py`, and what the measured parts share."""
+"""A measurement of `run.py`, and functions that measurements share."""
 
 import dataclasses
 import functools
@@ -11,20 +11,19 @@ import numpy as np
 
 @dataclasses.dataclass(kw_only=True)
 class Case:
-    """A measurement that alternates with those it is compared with.
+    """A measurement of several implementations in alternation.
 
     Attributes:
-        name: What is done.
-        columns: Name -> function that runs it once and gives wall and CPU seconds;
-            "radejax" is ours.
-        frames: Frames of one call.
-        dtype: Of the computation.
-        error: Greatest difference of the results, relative to the greatest value; None
-            where there is nothing to compare with.
-        tolerance: That `error` may have; a case beyond it is no measurement.
-        mib: Memory that the program needs beside its arguments.
-        compile_s: Seconds that our program took to compile.
-        note: What else to know; or a function that says it after the measurement.
+        name: Name of the measurement.
+        columns: Function per implementation that runs it once and returns wall and CPU seconds;
+            "radejax" is this package.
+        frames: Frames per call.
+        dtype: Data type of the computation.
+        error: Largest difference of the results relative to the largest value, or None.
+        tolerance: Largest permitted `error`; a case above it is not measured.
+        mib: Memory of the program without its arguments.
+        compile_s: Compile time of radejax in seconds.
+        note: Remark, or a function that returns it after the measurement.
     """
 
     name: str
@@ -39,7 +38,7 @@ class Case:
 
 
 def difference(found, wanted):
-    """Greatest difference of arrays, relative to the greatest value of each."""
+    """Largest difference of arrays, relative to the largest value of each."""
     return max(
         float(np.abs(np.asarray(a, np.float32) - b).max() / np.abs(b).max())
         for a, b in zip(found, wanted, strict=True)
@@ -47,9 +46,9 @@ def difference(found, wanted):
 
 
 def compiled(function, *arguments, precision=None, **options):
-    """Compiled program, and the fields of a `Case` that say what it cost.
+    """Compiled program, and the fields of a `Case` with its memory and compile time.
 
-    Memory is beside arguments and results.
+    The memory excludes arguments and results.
     """
     began = time.perf_counter()
     with jax.default_matmul_precision(precision or "default"):
@@ -67,5 +66,5 @@ def timed(function):
 
 
 def waiting(program, *arguments):
-    """Function for a column: seconds of a call until its results are there."""
+    """Function for a column: seconds of a call until its results are ready."""
     return functools.partial(timed, lambda: jax.block_until_ready(program(*arguments)))

@@ -1,7 +1,7 @@
-"""The table of benchmarks: what `run.py` measures, beside what, at which sizes.
+"""Benchmarks of `run.py`: what is measured, compared with what, and at which sizes.
 
-Each entry yields cases one after the other; what a case holds is let go before the next
-is built.
+Each entry yields cases one after the other; the data of a case are released before the next one is
+built.
 """
 
 import collections

@@ -1,10 +1,10 @@
-"""Corrupted inputs for every reader of foreign files, for minutes; what became of them.
+"""Reads randomly corrupted files with every reader of foreign files.
 
     python benchmarks/fuzz.py --minutes 30 [--readers labels,split] [--out FILE.json]
 
-Each reader gets its share of the time. Every input has a number: a later run with `--start`
-has others. What is neither read nor refused as documented is printed at once; exit code 1.
-`--keep READER:NUMBER` puts an input into tests/fuzz/corpus.
+All readers get the same time. Every input has a number; a later run with `--start` uses other
+inputs. An input that is neither read nor rejected with a documented exception is printed at once,
+and the exit code is 1. `--keep READER:NUMBER` adds an input to tests/fuzz/corpus.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""Inputs of the benchmarks: tensors, maps, records and predictions, and the released loops.
+"""Inputs of the benchmarks: tensors, maps, records, predictions, and the released loops.
 
-Sizes are K-Radar's. Random numbers do where their values do not matter for the time.
+Sizes are K-Radar's. Values are random where they do not matter for the time.
 """
 
 import contextlib

@@ -1,14 +1,15 @@
-"""Kills a short run with SIGKILL at random moments; the final digits must not change.
+"""Kills a short run with SIGKILL at random moments and checks that its results do not change.
 
     python benchmarks/kill.py --kills 20 [--seed 0] [--workdir DIR]
 
-First an undisturbed run, then the same one killed again and again: every start gets a
-random time to live, up to that of a whole start. A run that comes to its end all the same
-is compared, and another one begins. Compared are all parameters, bit for bit, the logged
-losses and the metrics of the evaluation.
+An uninterrupted run comes first, then the same run is killed again and again after a random time,
+up to the duration of a whole start. A run that ends before it is killed is compared, and another
+one begins. All parameters, the logged losses and the metrics of the evaluation must be
+bit-identical.
 
-Data and records are made by the undisturbed run: no kill falls into simulation or
-projection, and evaluation on the way is off. tests/test_quickstart.py kills at all stages.
+Data and records are made by the uninterrupted run, so that no kill interrupts simulation or
+preprocessing, and there is no evaluation during training. `tests/test_quickstart.py` kills at all
+stages.
 """
 
 import argparse
@@ -31,7 +32,7 @@ from radejax.runs import experiment
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
-# Every start is a new process that has the modules already: imports are not tested.
+# Every start forks a process that has imported the modules; imports are not tested.
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
     ["radejax.cli.entry", "radejax.runs.evaluate", "radejax.simulation.dataset"]
@@ -39,7 +40,7 @@ PROCESSES.set_forkserver_preload(
 
 
 def make_config(steps):
-    """The quickstart in so small that most of a start is not training."""
+    """The quickstart, so small that a start takes longer than training."""
     path = REPOSITORY / "configs" / "quickstart.py"
     module = load_module(path)
     config = module.get_config("short")
@@ -52,7 +53,7 @@ def make_config(steps):
         neck="plain",
         heads="default",
     )
-    # Ten frames are two steps of an epoch.
+    # Ten frames are two steps per epoch.
     config.train.update(
         num_epochs=steps // 2, checkpoint_every_steps=7, log_every_steps=5
     )
@@ -61,7 +62,7 @@ def make_config(steps):
 
 
 def run(folder, name, steps):
-    """What a child process does."""
+    """Train in a child process."""
     sys.stdout = sys.stderr = (folder / f"{name}.log").open("a")
     jax.config.update("jax_platforms", "cpu")
     entry.set_up_jax()
@@ -83,7 +84,7 @@ def finish(process):
 
 
 def stage(folder):
-    """What a killed run had reached."""
+    """Stage that a killed run had reached."""
     if (folder / "evaluation").exists():
         return "evaluation"
     steps = [p.name for p in (folder / "checkpoints").glob("*") if p.name.isdigit()]
@@ -91,7 +92,7 @@ def stage(folder):
 
 
 def same(folder, a, b):
-    """Names of what is not equal."""
+    """Names of the values that differ."""
     different = []
     variables = [load_model(folder / run).variables for run in (a, b)]
     equal = jax.tree.map(np.array_equal, *variables)
@@ -129,7 +130,9 @@ def main():
     whole = arguments.longest
     if whole is None:
         begin = time.perf_counter()
-        finish(start(folder, "warm", arguments.steps))  # data and programs are there
+        finish(
+            start(folder, "warm", arguments.steps)
+        )  # data and compiled programs exist
         whole = time.perf_counter() - begin
         sys.stdout.write(f"an undisturbed run takes {whole:.1f} s\n")
     moments = random.Random(arguments.seed)
@@ -158,7 +161,7 @@ def main():
 
 
 def compare(folder, process, name):
-    """Ends the program where a finished run is not what it should be."""
+    """Exit if a finished run differs from the uninterrupted one."""
     finish(process)
     different = same(folder, "undisturbed", name)
     if different:

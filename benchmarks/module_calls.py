@@ -1,4 +1,4 @@
-"""The parts that a detector calls, with what goes in and what comes out."""
+"""Inputs and outputs of the modules that a detector calls."""
 
 from __future__ import annotations
 

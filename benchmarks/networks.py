@@ -1,4 +1,4 @@
-"""Cases of the networks, beside the same ones in plain torch, with the same weights.
+"""Benchmarks of the networks, compared with the same networks in PyTorch with the same weights.
 
 Random weights and inputs at full size: 256 x 107 x 101 projections, 720 x 1280 images.
 """

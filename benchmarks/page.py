@@ -1,4 +1,4 @@
-"""The tables of `docs/reports/benchmarks.md`, from the JSON files in `docs/reports/benchmarks/`."""
+"""Tables of `docs/reports/benchmarks.md` from the JSON files in `docs/reports/benchmarks/`."""
 
 import json
 import pathlib
@@ -13,7 +13,7 @@ BEGIN, END = "<!-- tables: benchmarks/run.py -->", "<!-- end of tables -->"
 
 
 def store(run, folder):
-    """Writes a run into its device's file, which keeps what this run did not measure."""
+    """Write a run into its device's file, which keeps the other measurements."""
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^a-z0-9]+", "_", run["device"].lower()).strip("_")
     path = folder / f"{name}.json"
@@ -26,7 +26,7 @@ def store(run, folder):
 
 
 def write_page():
-    """Puts the tables of all JSON files into the page, between its two marks."""
+    """Write the tables of all JSON files between the two marks of the page."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
     before, rest = PAGE.read_text().split(BEGIN)
     _, after = rest.split(END)
@@ -35,7 +35,7 @@ def write_page():
 
 
 def table(result):
-    """Markdown of one file: of a device, of programs, or of runs of other commands."""
+    """Markdown table of one file."""
     if "tables" in result:
         return "\n\n".join(map(plain_table, result["tables"]))
     return devices_table(result["runs"]) if "runs" in result else programs_table(result)

@@ -1,16 +1,15 @@
-"""What the programs for GPU and TPU hold, lowered here and not run, beside rooflines.
+"""Analyzes programs that are lowered for GPU and TPU without running them; lower time bounds.
 
-    python benchmarks/programs.py             # full size, bfloat16; a minute, no accelerator
+    python benchmarks/programs.py    # full size, bfloat16; a minute, without accelerator
 
-Written are `docs/reports/benchmarks/programs.json` and its table in `docs/reports/benchmarks.md`.
+Writes `docs/reports/benchmarks/programs.json` and its table in `docs/reports/benchmarks.md`.
 
-Every program is lowered by `jax.export` for a platform that need not be there. `facts`
-reads its text: types, host callbacks, convolutions, transposes, loops. `work` counts the
-operations and bytes of matrix products, convolutions and gathers, loops and the chosen
-branches of `platform_dependent` included, which XLA's own analysis counts once or not at
-all; everything between them is elementwise or a reduction and fuses into its neighbours.
-The time on a device is at least the sum, over these, of the greater of operations over
-peak and bytes over bandwidth.
+Every program is lowered with `jax.export` for a platform that need not be available. `facts`
+extracts types, host callbacks, convolutions, transposes and loops from its text. `work` counts the
+operations and bytes of matrix products, convolutions and gathers, including loops and the chosen
+branches of `platform_dependent`, which XLA's own analysis counts once or not at all. Everything
+else is elementwise or a reduction and is fused. The lower bound is the sum over these operations
+of the larger of operations / peak and bytes / bandwidth.
 """
 
 import argparse

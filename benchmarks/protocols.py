@@ -1,9 +1,9 @@
-"""How much the protocol alone moves AP: the tables of docs/evaluation.md.
+"""Evaluates one set of predictions in all protocols: the tables of docs/why_aps_differ.md.
 
     python benchmarks/protocols.py ../shared/fixtures/kradar_eval
 
-Takes a folder with ground_truth.npz and predictions.npz (columns frame, box, cls, score
-and class_names, and a frame table frame_weather) and prints Markdown tables.
+The folder has ground_truth.npz and predictions.npz (columns frame, box, cls, score and class_names,
+and a frame table frame_weather). Prints Markdown tables.
 """
 
 import argparse

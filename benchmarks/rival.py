@@ -1,7 +1,7 @@
-"""Torch's half of a process pair, seen from ours: builds, runs and times networks there.
+"""PyTorch networks in a second process, for comparison in alternation.
 
-Neither library's threads or memory are in the other's way; while one half runs, the other
-waits. The half itself is `torch_half.py`.
+While one process runs, the other waits, so that threads and memory do not interfere. The code of
+the second process is `torch_half.py`.
 """
 
 import functools
@@ -17,7 +17,7 @@ ATTENTION = 128, 4, 4
 
 
 class Rival:
-    """Torch in another process; `columns` are what `run.py` times beside ours.
+    """PyTorch in another process; `columns` are measured next to radejax.
 
     Args:
         device: "cpu" or "cuda".
@@ -38,7 +38,7 @@ class Rival:
         self.is_there = self._connection.recv()
 
     def ask(self, *message):
-        """The answer to a message; what fails there fails here."""
+        """Send a message and return the answer; an exception there is raised here."""
         self._connection.send(message)
         answer = self._connection.recv()
         if isinstance(answer, Exception):
@@ -60,7 +60,7 @@ class Rival:
 
 
 def start(platform):
-    """The rival on the device that jax names; None where torch is not installed or blind to it."""
+    """Start PyTorch on the device of JAX; None if it is not installed or lacks the device."""
     if importlib.util.find_spec("torch") is None:
         return None
     rival = Rival("cpu" if platform == "cpu" else "cuda")

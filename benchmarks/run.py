@@ -1,16 +1,15 @@
-"""Every benchmark that fits this machine, ours beside the reference's, in one command.
+"""Runs all benchmarks that fit this machine, in alternation with the reference implementations.
 
-    python benchmarks/run.py                          # everything
-    python benchmarks/run.py --only radenet tpm       # a part
-    python benchmarks/run.py --minutes 15             # what did not fit is listed
-    python benchmarks/run.py --tables                 # only write the page's tables again
+    python benchmarks/run.py                       # everything
+    python benchmarks/run.py --only radenet tpm    # some
+    python benchmarks/run.py --minutes 15          # what did not fit is listed
+    python benchmarks/run.py --tables              # only write the tables again
 
-Ours and torch (where it is installed: eager, and `torch.compile` on a GPU) are a pair of
-processes that alternate; results are compared first, and a case whose numbers differ
-is an error and no measurement. Written are `docs/reports/benchmarks/DEVICE.json`, and from all
-such files the tables of `docs/reports/benchmarks.md`. Times are medians of wall and processor
-time a frame; ratios are of CPU time on a CPU, where others may be at work, else of
-wall time. What is measured again takes the place of what the file had, the rest stays.
+radejax and torch (where it is installed: eager, and `torch.compile` on a GPU) run in two processes
+that alternate. Results are compared first; a case whose results differ is an error. Writes
+`docs/reports/benchmarks/DEVICE.json` and the tables of `docs/reports/benchmarks.md`. Times are
+medians of wall and CPU time per frame. Ratios are of CPU time on a CPU, where other processes may
+run, and of wall time otherwise. New measurements replace earlier ones of the same file.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Time from a tensor in host memory to boxes, by stage and by part of the network.
+"""Measures the time from a tensor in host memory to boxes, by stage and module.
 
 python benchmarks/stages.py runs/quickstart --batch-size 1 10
 """

@@ -1,7 +1,7 @@
-"""How long a command takes to its first step, and a detector to its first boxes.
+"""Measures the time from a command to its first step, and from import to the first boxes.
 
-Each time is of a process of its own. "radejax" finds the compiled programs of an earlier
-start, "first start" none.
+Each time is that of a new process. "radejax" uses the compilation cache of an earlier start,
+"first start" has none.
 """
 
 import functools

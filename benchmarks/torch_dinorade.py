@@ -1,10 +1,10 @@
 """DinoRADE in PyTorch, for comparison only.
 
-The network of `configs/dinorade.py` without a word: layers and sizes as described in
-the paper and the released code, every query in the image. Deformable attention is in its
-pure-torch form (`grid_sample`), as the released code runs where its CUDA operator was
-not built; self-attention is torch's own fused one. Tensors of the radar branch have
-RADE-Net's released names, the others those of our parameters (`networks.torch_state`).
+The network of `configs/dinorade.py` without options: layers and sizes as described in the paper and
+the released code, with every query in the image. Deformable attention is the pure PyTorch form
+(`grid_sample`), which the released code uses where its CUDA operator was not built; self-attention
+is PyTorch's fused one. Tensors of the radar branch have RADE-Net's released names, the others those
+of radejax's parameters (`networks.torch_state`).
 """
 
 import collections

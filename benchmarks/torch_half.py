@@ -1,4 +1,4 @@
-"""The other half of a process pair, see `rival.py`: networks in plain torch."""
+"""The second process of `rival.py`: networks in plain PyTorch."""
 
 import functools
 import multiprocessing.connection
@@ -12,7 +12,7 @@ from rival import ATTENTION
 
 
 def serve(address, key, device):
-    """Builds networks and runs them on request, until None comes."""
+    """Build and run networks on request until None is received."""
     connection = multiprocessing.connection.Client(address, authkey=bytes.fromhex(key))
     connection.send(device == "cpu" or torch.cuda.is_available())
     torch.set_float32_matmul_precision("highest")
@@ -28,7 +28,7 @@ def serve(address, key, device):
                 answer = timed(calls[name])
             else:
                 answer = [x.detach().float().cpu().numpy() for x in calls[name]()]
-        except Exception as error:  # it goes to the other half, which raises it
+        except Exception as error:  # the other process raises it
             answer = RuntimeError(f"torch, {name}: {error!r}")
         connection.send(answer)
 

@@ -1,7 +1,7 @@
-"""RADE-Net in PyTorch, for comparison only: speed, and numbers for the tests.
+"""RADE-Net in PyTorch, for comparison only: speed, and reference values of tests.
 
-Written from the description of the released network; tensors have its names, so that
-state dicts pass through `radejax.weights.radenet_torch` in both directions.
+Written from the description of the released network. Tensors have its names, so that state dicts
+can be converted by `radejax.weights.radenet_torch` in both directions.
 """
 
 import torch

@@ -1,4 +1,4 @@
-"""DinoRADE on K-Radar: the rows of Table 4, and paper or released settings.
+"""DinoRADE on K-Radar: the variants of Table 4 and the settings of paper and release.
 
     python train.py --config configs/dinorade.py --data ... --workdir ...
     python train.py --config configs/dinorade.py:rc,sedan ...
@@ -6,23 +6,29 @@
 
 The argument is a list of options, at most one of each group:
 
-- variant: `r` radar-only (a RADE-Net with the dual stem), `rc` with camera and without
-  elevation weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50,
-  last stage fine-tuned, in place of DINOv3.
-- preset: `paper` or `official`: the released code with these values, its geometry
-  included. Never what the paper ran: the release's own settings for radar and camera
-  (`params_radcam.py`) are a copy of the radar's and lack keys that its code reads.
-  Without one: the paper's, but with the released attention block in the radar branch
-  and the losses read at the objects' own bins.
+- variant: `r` radar-only (a RADE-Net with the dual stem), `rc` with camera and without elevation
+  weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50, whose last stage is
+  trained, instead of DINOv3.
+- preset: `paper` or `official` (the released code with these values, including its geometry). The
+  paper's models were not trained with `official`: the released settings for radar and camera
+  (`params_radcam.py`) are a copy of the radar-only ones and lack keys that the code reads. The
+  default follows the paper, but with the released attention block in the radar branch and with
+  regression losses at the objects' own bins.
 - sigma: `sigma3`, `sigma0.75`, `adaptive`, `anisotropic`, as in `radenet.py`.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
-What Table 4 reports (Sedan, narrow region, IoU 0.3, AP 3D and BEV): r 61.65 and 66.68,
-rc 69.61 and 74.96, rcw 71.38 and 75.32, rcw_resnet50 68.43 and 72.42. Training there:
-one NVIDIA A30, batch 6, 11 epochs of 17,458 frames.
+Table 4 reports (Sedan, narrow region, IoU 0.3):
 
-The image backbone's weights are not part of a config: they are given to the program
-that trains.
+| variant | AP 3D | AP BEV |
+|---|---|---|
+| r | 61.65 | 66.68 |
+| rc | 69.61 | 74.96 |
+| rcw | 71.38 | 75.32 |
+| rcw_resnet50 | 68.43 | 72.42 |
+
+It was trained on one NVIDIA A30 with batch size 6 for 11 epochs of 17,458 frames.
+
+The weights of the image backbone are not part of a config; `train.py --image-backbone` names them.
 """
 
 import pathlib
@@ -38,7 +44,7 @@ from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
 
 
 def _radenet() -> types.ModuleType:
-    """The config of the radar branch, whose presets hold here too."""
+    """Load the config of the radar branch, whose presets apply here too."""
     return load_module(pathlib.Path(__file__).with_name("radenet.py"))
 
 
@@ -48,7 +54,7 @@ VARIANTS = {
     "rcw": {},
     "rcw_resnet50": {"model.image.kind": "resnet50"},
 }
-"""Fields per row of Table 4, on top of the whole model."""
+"""Fields that each row of Table 4 changes in the whole model."""
 
 PRESETS = {
     "paper": {
@@ -75,13 +81,13 @@ PRESETS = {
         "data.camera.calibration": "common",
     },
 }
-"""Where the paper and the released code differ, beside RADE-Net's own rows."""
+"""Fields in which paper and released code differ, in addition to those of RADE-Net."""
 
 CLASS_SETS = ("all", "sedan")
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
-    """One complete config; see the module's text for `arg`."""
+    """Return the complete config; see the module docstring for `arg`."""
     sigmas = _radenet().SIGMAS
     variant, preset, sigma, classes = parse_options(
         arg, VARIANTS, PRESETS, sigmas, CLASS_SETS
@@ -98,7 +104,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
             config.update_from_flattened_dict(rows)
     if preset == "official":
         config.model.query_grid = _axes(LiftingAxes.official())
-        # The released ResNet sees colours in [0, 1].
+        # The released ResNet gets colors in [0, 1].
         config.model.image.standardize = variant != "rcw_resnet50"
     config.update_from_flattened_dict(VARIANTS[variant])
     if sigma is not None:
@@ -175,7 +181,7 @@ def _add_camera_model(model: ConfigDict) -> None:
 
 
 def _axes(axes: LiftingAxes) -> ConfigDict:
-    """Centers of the radar queries: first and step, for elevation from and to."""
+    """Centers of the radar queries: first and step; for elevation first and last."""
     return ConfigDict(
         {
             # Center of the first query in range and the step, in meters.

@@ -1,14 +1,15 @@
-"""A narrow RADE-Net on a small simulated data set: the whole way in minutes, on a CPU.
+"""A RADE-Net of reduced width on a small simulated dataset, trained in minutes on a CPU.
 
     python train.py --config configs/quickstart.py
 
-Simulates K-Radar folders on a coarser sensor, projects, trains, evaluates on held-out
-sequences and draws. The code is that of the full model; only widths and grid differ.
+Simulates K-Radar folders with a coarser sensor, preprocesses, trains, evaluates on held-out
+sequences and draws figures. The code is that of the full model; only widths and grid differ.
 
-Options: `ablation` for the training of `examples/ablation.py`'s tables, where there are
-many: two fifths of scenes and steps, and input, weights of the losses and parameters as
-in the papers; `short` for a run of two minutes that learns next to nothing, to see that
-everything works.
+Options:
+
+- `ablation`: the training of `examples/ablation.py`, with two fifths of the scenes and steps and
+  with the papers' input, loss weights and parameters.
+- `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
 
 from ml_collections import ConfigDict
@@ -18,13 +19,13 @@ from radejax.simulation.config import default_config
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
-    """One complete config; see the module's text for `arg`."""
+    """Return the complete config; see the module docstring for `arg`."""
     recipe, length = parse_options(arg, ("ablation",), ("short",))
     config = base_config()
     config.simulation = ConfigDict(default_config())
     grid = config.simulation.grid
-    # One frame a sequence: a network learns more from another scene than from the next
-    # tenth of a second. More of the classes that roads have few of, to learn from.
+    # One frame per sequence, as another scene is more informative than the next tenth
+    # of a second. Rare classes are oversampled.
     config.simulation.update(
         train_sequences=640,
         test_sequences=224,
@@ -38,9 +39,9 @@ def get_config(arg: str | None = None) -> ConfigDict:
         widths=(32, 64, 128),
         decoder_width=32,
         num_groups=8,
-        heatmap_prior=0.02,  # saves the first epochs, which push all bins down to here
+        heatmap_prior=0.02,  # about the value that the first epochs would learn
     )
-    config.loss.heatmap_sigma_bins = 1.0  # of bins of 1.2 m
+    config.loss.heatmap_sigma_bins = 1.0  # a bin is 1.2 m long
     config.train.update(
         batch_size=2,
         num_epochs=7,
@@ -51,7 +52,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.evaluation.score_threshold = 0.05
     config.evaluation.protocols = ("kradar_r40", "all_point", "coco101")
     if recipe != "ablation":
-        _teach_more(config)
+        _apply_recipe(config)
     if length == "short":
         config.simulation.update(
             train_sequences=2, test_sequences=1, frames_per_sequence=12
@@ -60,7 +61,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
             batch_size=4,
             num_epochs=2,
             warmup_steps=0,
-            ema_decay=None,  # of so few steps it would be where they began
+            ema_decay=None,  # an average over so few steps would be the initial parameters
             log_every_steps=10,
             checkpoint_every_steps=2,
         )
@@ -68,13 +69,14 @@ def get_config(arg: str | None = None) -> ConfigDict:
     return config
 
 
-def _teach_more(config: ConfigDict) -> None:
-    """What `docs/results.md` has found to help, beside more scenes and steps."""
+def _apply_recipe(config: ConfigDict) -> None:
+    """Apply the settings of `docs/reports/2026-11-24_quickstart_tuning.md`."""
     config.simulation.update(train_sequences=1600, vru_density_scale=5.0)
-    # Noise is at 0.545 with a spread of 0.02: the input as it is is next to constant.
+    # The noise has mean 0.545 and standard deviation 0.02: without scaling, the input is
+    # almost constant.
     config.model.update(input_center=0.545, input_scale=25.0)
     config.loss.heatmap_sigma_bins = 0.75
-    # Finding is harder than boxing; and of boxes, smooth L1 learns from those that are
-    # far off, trucks' most of all, the GWD from those that are nearly right.
+    # Classification is harder than box regression. Smooth L1 is dominated by boxes with
+    # large errors, mostly trucks; the GWD also improves boxes that are nearly right.
     config.loss.weights.update(focal=8.0, gwd=4.0)
     config.train.update(num_epochs=7, ema_decay=0.999)

@@ -1,23 +1,25 @@
-"""A small radar-camera model on simulated radar and images, in minutes on a CPU.
+"""A small radar-camera model on simulated radar and images, trained in minutes on a CPU.
 
     python examples/pretrain_backbone.py --out backbones/small
     python train.py --config configs/quickstart_fusion.py:pretrained \\
         --image-backbone backbones/small
     python train.py --config configs/quickstart_fusion.py:radar
 
-The second trains a narrow DinoRADE with the small image transformer of the first,
-frozen, the third the same model without its camera, on the same simulated data: the
-difference is what the camera adds. `docs/radar_camera.md` has the numbers to expect.
-Without an option the transformer is trained with the rest, from scratch, which is too
-little to learn it by.
+The second command trains a DinoRADE of reduced width with the frozen image transformer of the
+first. The third trains the same model without the camera on the same data: the difference is what
+the camera adds. `docs/results.md` lists the expected numbers. Without an option, the transformer
+is trained from scratch with the rest, for which the dataset is too small.
 
-Options: `radar` for the model without the camera; `silhouettes` for images of the objects
-alone, in the colour of their class and brighter when nearer, a control of what a perfect
-image would give; `pretrained` for an image transformer that stays as it is given, by
-`--image-backbone` (`examples/pretrain_backbone.py` makes one), `resnet50` for a ResNet-50
-of a quarter of the width in its place; `long` for the scenes and the training of
-`configs/quickstart.py` itself, three times what it is without; `short` makes a run of two
-minutes that learns next to nothing, to see that everything works.
+Options:
+
+- `radar`: the model without the camera.
+- `silhouettes`: oracle images, in which every object is a silhouette in the color of its class,
+  brighter when nearer; an upper bound for what a camera can add.
+- `pretrained`: a frozen image transformer from `--image-backbone`
+  (`examples/pretrain_backbone.py` makes one).
+- `resnet50`: a ResNet-50 of a quarter of the width instead of the transformer.
+- `long`: the scenes and schedule of `configs/quickstart.py`, with three times the steps.
+- `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
 
 import pathlib
@@ -30,21 +32,21 @@ from radejax.models.lifting import LiftingAxes
 from radejax.simulation.config import SimulationConfig
 
 
-def _neighbour(name: str) -> types.ModuleType:
-    """Another config of this folder."""
+def _load_neighbor(name: str) -> types.ModuleType:
+    """Load another config of this folder."""
     return load_module(pathlib.Path(__file__).with_name(f"{name}.py"))
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
-    """One complete config; see the module's text for `arg`."""
+    """Return the complete config; see the module docstring for `arg`."""
     sensors, content, length, backbone = parse_options(
         arg, ("radar",), ("silhouettes",), ("short", "long"), ("pretrained", "resnet50")
     )
     options = {None: "ablation", "short": "ablation,short", "long": ""}[length]
-    config = _neighbour("quickstart").get_config(options)
+    config = _load_neighbor("quickstart").get_config(options)
     config.simulation.update(
         output="projection",
-        image_width=640,  # the whole view, squeezed in height: objects are side by side
+        image_width=640,  # reduced in height, as objects stand side by side
         image_height=80,
     )
     if content == "silhouettes":
@@ -54,7 +56,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
         _add_camera(config)
         config.model.image.freeze = backbone is not None
         if backbone == "resnet50":
-            # As many weights as the transformer: half a million.
+            # Half a million parameters, as many as the transformer.
             config.model.image.update(kind="resnet50", resnet_width=16)
     if length == "short":
         config.simulation.update(
@@ -64,7 +66,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
 
 
 def _add_camera(config: ConfigDict) -> None:
-    full = _neighbour("dinorade").get_config()
+    full = _load_neighbor("dinorade").get_config()
     axes = LiftingAxes.of_grid(
         SimulationConfig.from_mapping(config.simulation).make_grid()
     )
@@ -73,7 +75,7 @@ def _add_camera(config: ConfigDict) -> None:
     config.model.image = full.model.image
     config.model.image.update(
         size=(config.simulation.image_height, config.simulation.image_width),
-        freeze=False,  # from scratch: no weights to download
+        freeze=False,  # trained from scratch, without downloads
         hidden_size=128,
         num_layers=4,
         num_heads=4,
@@ -81,7 +83,7 @@ def _add_camera(config: ConfigDict) -> None:
         num_registers=0,
     )
     config.model.fusion = full.model.fusion
-    # Without the necks before the attention and with fewer samples: half the time.
+    # No necks before the attention and fewer sampling points halve the time.
     config.model.fusion.update(num_elevation=4, num_points=2, necks=False)
     config.model.query_grid = ConfigDict(
         {
@@ -89,5 +91,5 @@ def _add_camera(config: ConfigDict) -> None:
             for name in ("range_m", "azimuth_deg", "elevation_deg")
         }
     )
-    # Four segments over the sensor's 36 degrees would pass above and below the cars.
+    # Four segments over the sensor's 36 degrees would lie above and below the cars.
     config.model.query_grid.elevation_deg = (-6.0, 6.0)

@@ -1,4 +1,4 @@
-"""RADE-Net on K-Radar: the rows of Table III, and paper or released settings.
+"""RADE-Net on K-Radar: the variants of Table III and the settings of paper and release.
 
     python train.py --config configs/radenet.py --data ... --workdir ...
     python train.py --config configs/radenet.py:stem,sedan ...
@@ -6,22 +6,32 @@
 
 The argument is a list of options, at most one of each group:
 
-- variant: `base`, `cbam`, `cbam_heads`, `model` (default), `stem`, `expand`; the rows
-  of Table III, from no attention, plain neck and small heads to the wide decoder.
-  `no_cbam` is the full model without attention: the fourth row of the table, see below.
-- preset: `paper` or `official` (what the released code runs, the padded and stretched
-  azimuth axis included). Without one: the paper's, but with the released attention
-  block and the losses read at the objects' own bins.
-- sigma: `sigma3`, `sigma0.75` (bins), `adaptive`, `anisotropic` (metres of the object
-  read as bins); the targets that the papers compare, over what preset or default say.
+- variant: `base`, `cbam`, `cbam_heads`, `model` (default), `stem`, `expand`; the rows of Table III,
+  from no attention, plain neck and small heads to the wide decoder. `no_cbam` is the full model
+  without attention, the fourth row of the table, see below.
+- preset: `paper` or `official` (what the released code runs, including its padded and stretched
+  azimuth axis). The default follows the paper, but with the released attention block and with
+  regression losses at the objects' own bins.
+- sigma: `sigma3`, `sigma0.75` (in bins), `adaptive`, `anisotropic` (from the size of the object);
+  the heatmap targets that the papers compare. It overrides the preset.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
-What Table III reports (Sedan, narrow region, IoU 0.3, AP 3D and BEV): base 57.96 and
-63.98, cbam 55.13 and 62.88, cbam_heads 58.35 and 64.70, model 64.06 and 68.71, stem
-63.47 and 69.05, expand 63.12 and 67.92. Training there: one GPU, batch 10, 10 epochs
-of 17,458 frames. A row of 59.81 and 66.32 has the ticks of `model`; it is read as
-`no_cbam`, as the paper says that attention gains much once neck and heads are complex
-enough, and no other row would show that.
+Table III reports (Sedan, narrow region, IoU 0.3):
+
+| variant | AP 3D | AP BEV |
+|---|---|---|
+| base | 57.96 | 63.98 |
+| cbam | 55.13 | 62.88 |
+| cbam_heads | 58.35 | 64.70 |
+| no_cbam | 59.81 | 66.32 |
+| model | 64.06 | 68.71 |
+| stem | 63.47 | 69.05 |
+| expand | 63.12 | 67.92 |
+
+It was trained on one GPU with batch size 10 for 10 epochs of 17,458 frames. The row of `no_cbam`
+has the same marks as `model` in the paper. It is read as the model without attention, because the
+paper says that attention helps once neck and heads are complex enough, and no other row would show
+that.
 """
 
 from ml_collections import ConfigDict
@@ -40,7 +50,7 @@ VARIANTS = {
     "stem": {"input_stem": True},
     "expand": {"decoder_width": 256},
 }
-"""Fields of `config.model` per row of Table III, on top of the full model."""
+"""Fields of `config.model` that each row of Table III changes in the full model."""
 
 PRESETS = {
     "paper": {
@@ -82,7 +92,7 @@ PRESETS = {
         "evaluation.empty_frames": "class",
     },
 }
-"""Where the paper and the released code differ, one field per row."""
+"""Fields in which the paper and the released code differ."""
 
 SIGMAS = {
     "sigma3": {"heatmap_sigma_mode": "fixed", "heatmap_sigma_bins": 3.0},
@@ -90,20 +100,20 @@ SIGMAS = {
     "adaptive": {"heatmap_sigma_mode": "adaptive"},
     "anisotropic": {"heatmap_sigma_mode": "anisotropic"},
 }
-"""Fields of `config.loss` for the spread of the heatmap's targets."""
+"""Fields of `config.loss` for the Gaussians of the heatmap targets."""
 
 CLASS_SETS = ("all", "sedan")
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
-    """One complete config; see the module's text for `arg`."""
+    """Return the complete config; see the module docstring for `arg`."""
     variant, preset, sigma, classes = parse_options(
         arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS
     )
     config = base_config()
     if preset is not None:
         config.update_from_flattened_dict(PRESETS[preset])
-    # After the preset: the base row has no attention in either world.
+    # The variant comes last, as the base row has no attention with any preset.
     config.model.update(VARIANTS[variant or "model"])
     if sigma is not None:
         config.loss.update(SIGMAS[sigma])

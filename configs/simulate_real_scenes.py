@@ -1,11 +1,11 @@
-"""RADE-Net on simulated frames of K-Radar's own scenes, at the quickstart's size.
+"""RADE-Net on simulated radar frames of K-Radar's own scenes, with the quickstart's sensor.
 
     python train.py --config configs/simulate_real_scenes.py \\
         --config.simulation.scenes=LABELS.zip
 
-LABELS is K-Radar's label revision v2.1, a folder or zip: every 15th frame of all 58
-sequences becomes a simulated radar frame, with K-Radar's split. `docs/simulator.md`
-has the numbers to expect, beside those of a classical detector (CFAR).
+LABELS is K-Radar's label revision v2.1, a folder or zip: every 15th frame of all 58 sequences
+becomes a simulated radar frame, with K-Radar's split. `docs/reports/2026-11-22_simulator.md` lists
+the expected numbers and those of a CFAR detector.
 """
 
 from ml_collections import ConfigDict
@@ -15,7 +15,7 @@ from radejax.simulation.config import default_config
 
 
 def get_config(arg: str | None = None) -> ConfigDict:
-    """One complete config; there are no variants."""
+    """Return the complete config; there are no variants."""
     parse_options(arg)
     config = base_config()
     config.simulation = ConfigDict(default_config())
