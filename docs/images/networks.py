@@ -214,11 +214,13 @@ def _neck_and_heads(
         x + 2.35, y - 2.7, 1.6, 0.8, title="Detections", color=DATA,
         lines=("3 × 3 peaks,", "rotated NMS"),
     )  # fmt: skip
+    bins = _size(net.inputs[0].shape[:3])
+    cropped = [f"cropped to {bins}"] if net.model.crop_output else []
     for title, shape, row in heads:
         y_head = y - 1.35 * row
         head = sheet.block(
-            x + 2.35, y_head, 1.6, 0.62, title=title, lines=[_size(shape.shape)],
-            color=HEADS,
+            x + 2.35, y_head, 1.6, 0.8, title=title, color=HEADS,
+            lines=[_size(shape.shape), *cropped],
         )  # fmt: skip
         fork = x + 1.15
         sheet.arrow(neck.right, (fork, y), (fork, y_head), head.left)

@@ -4,8 +4,8 @@ import json
 
 import jax
 import numpy as np
-import pytest
 import online_training
+import pytest
 from click.testing import CliRunner
 from online_training import train_online
 
