@@ -1,7 +1,7 @@
 """DinoRADE on K-Radar: the variants of Table 4 and the settings of paper and release.
 
     python train.py --config configs/dinorade.py --data ... --workdir ...
-    python train.py --config configs/dinorade.py:rc,sedan ...
+    python train.py --config configs/dinorade.py:rc ...
     python train.py --config configs/dinorade.py:official ...
 
 The argument is a list of options, at most one of each group:
@@ -12,12 +12,12 @@ The argument is a list of options, at most one of each group:
 - preset: `paper` or `official` (the released code with these values, including its geometry). The
   paper's models were not trained with `official`: the released settings for radar and camera
   (`params_radcam.py`) are a copy of the radar-only ones and lack keys that the code reads. The
-  default follows the paper, but with the released attention block in the radar branch and with
-  regression losses at the objects' own bins.
+  default follows the paper, but with the released attention block in the radar branch, with
+  regression losses at the objects' own bins, and with the raw yaw vector in NMS.
 - sigma: `sigma3`, `sigma0.75`, `adaptive`, `anisotropic`, as in `radenet.py`.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
-Table 4 reports (Sedan, narrow region, IoU 0.3):
+Table 4 reports (Sedan AP of the five-class models, narrow region, IoU 0.3):
 
 | variant | AP 3D | AP BEV |
 |---|---|---|

@@ -10,8 +10,8 @@ The argument is a list of options, at most one of each group:
   from no attention, plain neck and small heads to the wide decoder. `no_cbam` is the full model
   without attention, the fourth row of the table, see below.
 - preset: `paper` or `official` (what the released code runs, including its padded and stretched
-  azimuth axis). The default follows the paper, but with the released attention block and with
-  regression losses at the objects' own bins.
+  azimuth axis). The default follows the paper, but with the released attention block, with
+  regression losses at the objects' own bins, and with the raw yaw vector in NMS.
 - sigma: `sigma3`, `sigma0.75` (in bins), `adaptive`, `anisotropic` (from the size of the object);
   the heatmap targets that the papers compare. It overrides the preset.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
@@ -28,7 +28,7 @@ Table III reports (Sedan, narrow region, IoU 0.3):
 | stem | 63.47 | 69.05 |
 | expand | 63.12 | 67.92 |
 
-It was trained on one GPU with batch size 10 for 10 epochs of 17,458 frames. The row of `no_cbam`
+The released code trains on one GPU with batch size 10 for epochs of 17,458 frames. The row of `no_cbam`
 has the same marks as `model` in the paper. It is read as the model without attention, because the
 paper says that attention helps once neck and heads are complex enough, and no other row would show
 that.
