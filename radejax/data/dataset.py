@@ -1,23 +1,25 @@
-"""What a run needs from a dataset: its frames, their radar, images and labels.
+"""What a run needs from a data set: its frames, their radar, images and labels.
 
-`radejax.data.kradar` reads K-Radar; docs/extending.md has another reader. Readers satisfy
-the protocols below and need not inherit from them.
+`radejax.data.kradar` reads K-Radar; docs/extending.md has another reader. Readers derive
+from the two classes below.
 """
 
 from __future__ import annotations
 
 import collections
+import copy
 import dataclasses
 import importlib
 import pathlib
-from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from radejax.core.errors import UserError, require
 from radejax.data.cameras import IMAGE_SIZE, read_left_image
+from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -64,91 +66,115 @@ class Summary:
         return "\n".join(lines)
 
 
-@runtime_checkable
-class LabelledFrame(Protocol):
-    """One frame, a dataclass; to be pickled, as other processes project it.
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LabelledFrame:
+    """One frame; it is pickled, as other processes project it.
 
     Attributes:
-        key: Name that is unique in the data set; of `sequence` and `name`.
-        environment, time, weather: Conditions, by which results are tabulated.
-        is_simulated: Nothing of it was measured.
+        sequence: Number of the sequence.
+        name: Name that is unique in the sequence.
         boxes: x, y, z, l, w, h, yaw in the radar frame: metres, radians.
         classes: Class names of `boxes`.
+        environment, time, weather: Conditions, by which results are tabulated.
         radar_path: File of the radar tensor; None where it is missing.
-        camera_path: Image of the (left) front camera; None where there is none.
+        camera_path: Image of the (left) front camera; None where it is missing.
         camera_calibration_path: Its calibration, or None.
         radar_from_lidar_m: Offset from where the calibration is measured to where boxes
-            are: x, y, z; zeros where the two are the same.
-        radar_from_lidar_z_m: By which the radar itself is higher, whatever z boxes have.
+            are (`p_radar = p_lidar + t`): x, y, z; zeros where the two are the same.
+        radar_from_lidar_z_m: The z of the offset between the sensors as they are
+            mounted, whatever z was added to the boxes.
+        is_simulated: Nothing of the frame was measured.
     """
 
+    sequence: int
+    name: str
+    boxes: Float[np.ndarray, "N 7"]
+    classes: Shaped[np.ndarray, " N"]
+    environment: str = "unknown"
+    time: str = "unknown"
+    weather: str = "unknown"
+    radar_path: pathlib.Path | None = None
+    camera_path: pathlib.Path | None = None
+    camera_calibration_path: pathlib.Path | None = None
+    radar_from_lidar_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radar_from_lidar_z_m: float = 0.0
+    is_simulated: bool = False
+
     @property
-    def key(self) -> str: ...
-    @property
-    def sequence(self) -> int: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def environment(self) -> str: ...
-    @property
-    def time(self) -> str: ...
-    @property
-    def weather(self) -> str: ...
-    @property
-    def is_simulated(self) -> bool: ...
-    @property
-    def boxes(self) -> Float[np.ndarray, "N 7"]: ...
-    @property
-    def classes(self) -> Shaped[np.ndarray, " N"]: ...
-    @property
-    def radar_path(self) -> pathlib.Path | None: ...
-    @property
-    def camera_path(self) -> pathlib.Path | None: ...
-    @property
-    def camera_calibration_path(self) -> pathlib.Path | None: ...
-    @property
-    def radar_from_lidar_m(self) -> tuple[float, float, float]: ...
-    @property
-    def radar_from_lidar_z_m(self) -> float: ...
+    def key(self) -> str:
+        """Name that is unique in a data set: `"1/00033_00001"`."""
+        return f"{self.sequence}/{self.name}"
 
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-        """Projection; seconds of reading are added to "reading"."""
+        """Read the float32 projection; see `tesseract.read_frame`.
+
+        Raises:
+            FileNotFoundError: The frame has no radar file.
+            DataError: It is corrupted, or of another shape than the grid.
+        """
+        if self.radar_path is None:
+            raise FileNotFoundError("no radar tensor in any root")
+        return read_frame(self.radar_path, grid)
 
     def read_calibration(
         self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
-        """Of the camera; `radar_from_lidar_m` stands where no offset is given."""
+        """Read the camera's calibration, with the frame's own offset or another."""
+        assert self.camera_calibration_path is not None  # callers check it
+        return CameraCalibration.from_kradar(
+            self.camera_calibration_path,
+            radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
+        )
 
 
-@runtime_checkable
-class LabelledFrames(Protocol):
-    """Frames in a fixed order.
+FrameSequence = Sequence[LabelledFrame]
+"""A data set or a part of one: where only its frames matter."""
+
+_F = TypeVar("_F", bound=LabelledFrame)
+
+
+class LabelledFrames(Sequence[_F]):
+    """The frames of a data set in a fixed order; a reader adds how they are found.
 
     Attributes:
         grid: Axes of the radar.
-        is_simulated: Nothing of them was measured.
+        is_simulated: The data set is simulated.
     """
 
-    @property
-    def grid(self) -> RadarGrid: ...
-    @property
-    def is_simulated(self) -> bool: ...
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int, /) -> LabelledFrame: ...
-    def __iter__(self) -> Iterator[LabelledFrame]: ...
+    def __init__(
+        self,
+        frames: Sequence[_F],
+        grid: RadarGrid,
+        summary: Summary | None = None,
+        *,
+        is_simulated: bool = False,
+    ) -> None:
+        self.grid, self.is_simulated = grid, is_simulated
+        self._frames, self._summary = frames, summary or Summary()
 
-    def of_split(self, split: str | None, /) -> LabelledFrames:
-        """Those of "train", "test" or another part; `UserError` for none that is."""
+    def __len__(self) -> int:
+        return len(self._frames)
 
-    def without(self, left_out: Collection[str], reason: str) -> LabelledFrames:
-        """All but those of some keys, which `summary` counts for the reason."""
+    def __getitem__(self, index: Any) -> Any:
+        return self._frames[index]
 
     def summary(self) -> Summary:
-        """What was read and left out."""
+        """What was read, skipped, missing and malformed."""
+        return self._summary
 
+    def of_split(self, split: str | None) -> Self:
+        """The frames of "train", "test" or another part; `UserError` for none that is."""
+        raise NotImplementedError
 
-FrameSequence = LabelledFrames | Sequence[LabelledFrame]
-"""Where it does not matter what else a data set can do."""
+    def without(self, left_out: Collection[str], reason: str) -> Self:
+        """Return all frames but those of some keys, which are counted for a reason."""
+        other = copy.copy(self)
+        other._summary = copy.deepcopy(self._summary)
+        other._frames = [frame for frame in self if frame.key not in left_out]
+        counts = other._summary.counts
+        counts[f"frames left out: {reason}"] += len(self) - len(other)
+        return other
+
 
 DATA_SETS: dict[str, str | Callable[..., LabelledFrames]] = {
     "kradar": "radejax.data.kradar:KRadar"

@@ -17,22 +17,8 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.dataset import Summary
-from radejax.data.kradar.conditions import (
-    KRADAR_CONDITIONS,
-    UNKNOWN_CONDITIONS,
-    Conditions,
-)
-from radejax.data.kradar.dataset import (
-    Frame,
-    KRadar,
-    SequenceFolder,
-    as_paths,
-    find_own_labels,
-    find_sequences,
-    read_calibration,
-    read_grid,
-)
-from radejax.data.kradar.labels import normalize_version
+from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
+from radejax.data.kradar.dataset import Frame, KRadar, SequenceFolder, read_calibration
 from radejax.data.tesseract import check_tesseract
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -127,81 +113,47 @@ def check_dataset(
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
-        UserError: There are neither sequence folders nor labels, none of the sequences
-            and weathers asked for, or the labels have another version.
+        UserError: There are no sequence folders or no labels, none of the sequences and
+            weathers asked for, or the labels have another version.
     """
-    paths, version = as_paths(roots), normalize_version(version)
-    folders, grid = find_sequences(paths), read_grid(paths)
-    frames: list[Frame] = []
-    splits: dict[str, str] = {}
-    if folders and labels is None and not find_own_labels(folders, version):
-        summary = Summary()
-        summary.problems.append(("labels missing", f"no {version} info_label/*.txt"))
-    else:
-        data = KRadar(
-            paths,
-            labels,
-            version=version,
-            sequence_numbers=sequence_numbers,
-            weather=weather,
-        )
-        frames, summary = list(data), data.summary()
-        splits = _find_splits(data, summary)
-    groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
-    by_sequence = {number: list(group) for number, group in groups}
+    data = KRadar(
+        roots,
+        labels,
+        version=version,
+        sequence_numbers=sequence_numbers,
+        weather=weather,
+    )
+    summary, splits = data.summary(), _find_splits(data)
+    groups = itertools.groupby(data, key=lambda frame: frame.sequence)
+    frames = {number: list(group) for number, group in groups}
+    folders = data.folders
     if sequence_numbers is not None or weather is not None:
         if not frames:
             raise UserError("no frames of these sequences and weathers")
-        folders = {number: folders[number] for number in by_sequence}
-    is_kradar = grid.shape_drea == RadarGrid.kradar().shape_drea
-    total = sum(len(_tensors(folder)) for folder in folders.values())
+        folders = {number: folders[number] for number in frames}
+    tensors = [
+        (number, path) for number in folders for path in _tensors(folders[number])
+    ]
+    corrupted: collections.Counter[int] = collections.Counter()
+    for number, path in tqdm(tensors, "check", unit="file", disable=not progress):
+        try:
+            check_tesseract(path, shape_drea=data.grid.shape_drea, deep=deep)
+        except (DataError, OSError) as error:
+            summary.problems.append(("tesseract corrupted", str(error)))
+            corrupted[number] += 1
+    is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea
     rows = []
-    with tqdm(total=total, unit="file", desc="check", disable=not progress) as bar:
-        for number, folder in folders.items():
-            own = by_sequence.get(number, [])
-            corrupted = 0
-            for path in _tensors(folder):
-                try:
-                    check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
-                except (DataError, OSError) as error:
-                    summary.problems.append(("tesseract corrupted", str(error)))
-                    corrupted += 1
-                bar.update()
-            published = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
-            conditions = published
-            if own:
-                conditions = Conditions(own[0].environment, own[0].time, own[0].weather)
-            if (
-                conditions != published
-                and published != UNKNOWN_CONDITIONS
-                and is_kradar
-            ):
-                summary.notes.append(
-                    f"sequence {number}: description.txt has {','.join(conditions)}; "
-                    f"K-Radar published {','.join(published)}"
-                )
-            _check_calibration(folder, own, summary)
-            in_split = collections.Counter(splits.get(frame.key) for frame in own)
-            rows.append(
-                {
-                    "sequence": number,
-                    **conditions._asdict(),
-                    "labels": len(own),
-                    "train": in_split["train"],
-                    "test": in_split["test"],
-                    "tesseracts": len(_tensors(folder)),
-                    "tesseracts_missing": sum(f.tesseract_path is None for f in own),
-                    "tesseracts_corrupted": corrupted,
-                    "projections": len(folder.listing("DERA_tesseract")),
-                    "images": len(folder.listing("cam-front")),
-                    "images_missing": sum(frame.camera_path is None for frame in own),
-                    "calibration": "{:g}, {:g}".format(*own[0].radar_from_lidar_m)
-                    if own
-                    else "unknown",
-                }
-            )
-    names = [str(path) for path in paths]
-    return HealthReport(names, version, rows, _count_objects(frames, splits), summary)
+    for number, folder in folders.items():
+        own = frames.get(number, [])
+        _check_calibration(folder, own, summary)
+        if is_kradar:
+            _check_conditions(number, own, summary)
+        row = _row(number, folder, own, splits)
+        rows.append(row | {"tesseracts_corrupted": corrupted[number]})
+    roots = [str(path) for path in data.roots]
+    return HealthReport(
+        roots, data.version, rows, _count_objects(data, splits), summary
+    )
 
 
 def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:
@@ -209,9 +161,38 @@ def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:
     return [path for path in files if path.suffix == ".mat"]
 
 
-def _find_splits(data: KRadar, summary: Summary) -> dict[str, str]:
+def _row(
+    number: int,
+    folder: SequenceFolder,
+    frames: Sequence[Frame],
+    splits: Mapping[str, str],
+) -> dict[str, Any]:
+    """What the tables say of one sequence."""
+    conditions = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)._asdict()
+    calibration = "unknown"
+    if frames:
+        conditions = {name: getattr(frames[0], name) for name in conditions}
+        calibration = "{:g}, {:g}".format(*frames[0].radar_from_lidar_m)
+    in_split = collections.Counter(splits.get(frame.key) for frame in frames)
+    return {
+        "sequence": number,
+        **conditions,
+        "labels": len(frames),
+        "train": in_split["train"],
+        "test": in_split["test"],
+        "projections": len(folder.listing("DERA_tesseract")),
+        "images": len(folder.listing("cam-front")),
+        "images_missing": sum(frame.camera_path is None for frame in frames),
+        "calibration": calibration,
+        "tesseracts": len(_tensors(folder)),
+        "tesseracts_missing": sum(frame.tesseract_path is None for frame in frames),
+    }
+
+
+def _find_splits(data: KRadar) -> dict[str, str]:
     """Split of every frame; what is wrong with the splits is added to the summary."""
     splits: dict[str, str] = {}
+    summary = data.summary()
     for name in ("train", "test"):
         part = data.of_split(name)
         splits |= {frame.key: name for frame in part}
@@ -237,6 +218,18 @@ def _count_objects(frames: Iterable[Frame], splits: Mapping[str, str]) -> Rows:
         | {cls: counts[split, weather][cls] for cls in CLASSES}
         for split, weather in sorted(counts)
     ]
+
+
+def _check_conditions(number: int, frames: Sequence[Frame], summary: Summary) -> None:
+    """Note conditions that are not those that K-Radar published."""
+    published = KRADAR_CONDITIONS.get(number)
+    for frame in frames[:1]:
+        found = frame.environment, frame.time, frame.weather
+        if published is not None and found != published:
+            summary.notes.append(
+                f"sequence {number}: description.txt has {','.join(found)}; "
+                f"K-Radar published {','.join(published)}"
+            )
 
 
 def _check_calibration(

@@ -20,7 +20,7 @@ import os
 import pathlib
 import re
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,7 +30,7 @@ from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, read_json, read_text
 from radejax.core.structures import CLASSES
-from radejax.data.dataset import Summary
+from radejax.data.dataset import LabelledFrame, LabelledFrames, Summary
 from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
     UNKNOWN_CONDITIONS,
@@ -42,18 +42,12 @@ from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     VISIBILITY_FLAGS,
     Label,
-    LabelFile,
     LabelHeader,
     LabelPath,
     normalize_version,
     read_label_file,
 )
-from radejax.data.tesseract import read_frame
-from radejax.geometry.camera import (
-    KRADAR_RADAR_FROM_LIDAR_Z_M,
-    RADAR_FROM_LIDAR_M,
-    CameraCalibration,
-)
+from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M, RADAR_FROM_LIDAR_M
 from radejax.geometry.radar_grid import RadarGrid
 
 _log = logging.getLogger(__name__)
@@ -82,82 +76,30 @@ _SPLITS = ("train", "test")
 _MAX_OFFSET_M = 100.0
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """One labelled frame.
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Frame(LabelledFrame):
+    """One labelled frame of K-Radar.
+
+    Its `name` has the radar and LiDAR frame numbers, such as `"00033_00001"`; its `boxes`
+    are those that the filters of the data set keep.
 
     Attributes:
-        sequence: Number of the sequence.
-        name: Radar and LiDAR frame numbers, such as `"00033_00001"`.
         header: Frame numbers of all sensors and the time stamp.
-        environment, time, weather: Conditions of the sequence.
         labels: Every object of the file, in the LiDAR frame, unfiltered.
-        boxes: float64 x, y, z, l, w, h, yaw in the radar frame, of the objects that the
-            filters of the data set keep.
-        classes: Class names of `boxes`.
         visibility: Visibility flags of `boxes`.
-        radar_from_lidar_m: Offset that was added to LiDAR positions: x, y, z
-            (`p_radar = p_lidar + t`).
         tesseract_path: The 4D radar tensor, None where it is missing.
-        projection_path: A released `.npy` projection, None where there is none.
-        camera_path: Front image (stereo pair), None where it is missing.
-        camera_calibration_path: Calibration of the left front camera, or None.
-        is_simulated: The data set is simulated.
-        radar_from_lidar_z_m: The z of the offset between the sensors as they are
-            mounted, whatever z was added to the boxes.
+        projection_path: A released `.npy` projection, None where there is none;
+            `radar_path` where the tensor is missing.
     """
 
-    sequence: int
-    name: str
     header: LabelHeader
-    environment: str
-    time: str
-    weather: str
     labels: tuple[Label, ...]
-    boxes: Float[np.ndarray, "N 7"]
-    classes: Shaped[np.ndarray, " N"]
     visibility: Shaped[np.ndarray, " N"]
-    radar_from_lidar_m: tuple[float, float, float]
     tesseract_path: pathlib.Path | None
     projection_path: pathlib.Path | None
-    camera_path: pathlib.Path | None
-    camera_calibration_path: pathlib.Path | None
-    is_simulated: bool = False
-    radar_from_lidar_z_m: float = KRADAR_RADAR_FROM_LIDAR_Z_M
-
-    @property
-    def key(self) -> str:
-        """Name that is unique in a data set: `"1/00033_00001"`."""
-        return f"{self.sequence}/{self.name}"
-
-    @property
-    def radar_path(self) -> pathlib.Path | None:
-        """File of the radar: the tensor, or without one the released projection."""
-        return self.tesseract_path or self.projection_path
-
-    def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-        """Read the float32 projection; see `tesseract.read_frame`.
-
-        Raises:
-            FileNotFoundError: The frame has no radar file.
-            DataError: It is corrupted, or of another shape than the grid.
-        """
-        if self.radar_path is None:
-            raise FileNotFoundError("no radar tensor in any root")
-        return read_frame(self.radar_path, grid)
-
-    def read_calibration(
-        self, radar_from_lidar_m: tuple[float, ...] | None = None
-    ) -> CameraCalibration:
-        """Read the camera's calibration, with the frame's own offset or another."""
-        assert self.camera_calibration_path is not None  # callers check it
-        return CameraCalibration.from_kradar(
-            self.camera_calibration_path,
-            radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
-        )
 
 
-class KRadar(Sequence[Frame]):
+class KRadar(LabelledFrames[Frame]):
     """The labelled frames of a K-Radar copy, in the order of sequence and frame.
 
     What is missing or malformed is skipped, counted and listed in `summary()`.
@@ -185,8 +127,8 @@ class KRadar(Sequence[Frame]):
 
     Attributes:
         grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
+        roots: Folders of the sequences.
         folders: Folders of every sequence in the roots, by number.
-        split_folders: Folders in and next to which split files are looked for.
         is_simulated: The simulator wrote one of these folders.
 
     Raises:
@@ -228,13 +170,12 @@ class KRadar(Sequence[Frame]):
         numbers = sequence_numbers
         self._sequence_numbers = None if numbers is None else set(numbers)
 
-        self.roots = as_paths(root)
-        self.folders = find_sequences(self.roots)
-        self.grid = read_grid(self.roots)
-        names = ", ".join(map(str, self.roots))
-        if not self.folders and (self.roots or labels is None):
+        roots = self.roots = _as_paths(root)
+        self.folders = find_sequences(roots)
+        names = ", ".join(map(str, roots))
+        if not self.folders and (roots or labels is None):
             raise UserError(f"no sequence folders (1, 2, ...) in the roots: {names}")
-        self.split_folders = list(self.roots)
+        self._split_folders = list(roots)
         if labels is None:
             self._label_source = "the sequences' own folders"
             self._label_paths = find_own_labels(self.folders, self.version)
@@ -247,15 +188,18 @@ class KRadar(Sequence[Frame]):
         else:
             self._label_source = str(labels)
             self._label_paths = find_labels(pathlib.Path(labels))
-            self.split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
-        self.is_simulated = any(
-            (folder / SIMULATION_MARKER).is_file() for folder in self.split_folders
+            self._split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
+        grid = _read_common(roots, "radar_grid.json", RadarGrid.from_dict)
+        z_m = _read_common(
+            self._split_folders,
+            SIMULATION_MARKER,
+            lambda content: float(content["config"]["radar_from_lidar_m"][2]),
         )
-        self._radar_from_lidar_z_m = read_radar_from_lidar_z(self.split_folders)
-        self._camera_folders = as_paths(camera_calibration)
-        self._camera_folders += [
-            r / name for r in self.roots for name in _CAMERA_FOLDERS
-        ]
+        # K-Radar's own files do not say by how much its radar is below its LiDAR.
+        self._radar_from_lidar_z_m = KRADAR_RADAR_FROM_LIDAR_Z_M if z_m is None else z_m
+        super().__init__([], grid or RadarGrid.kradar(), is_simulated=z_m is not None)
+        self._camera_folders = _as_paths(camera_calibration)
+        self._camera_folders += [r / name for r in roots for name in _CAMERA_FOLDERS]
         self._common_camera = common_camera
         # Shared by the splits of a data set: no label file is read twice.
         self._read_label_file = functools.cache(
@@ -279,24 +223,6 @@ class KRadar(Sequence[Frame]):
         other._read(split)
         return other
 
-    def without(self, left_out: Collection[str], reason: str) -> KRadar:
-        """Return all frames but those of some keys, which are counted for a reason."""
-        other = copy.copy(self)
-        other._summary = copy.deepcopy(self._summary)
-        other._frames = [frame for frame in self if frame.key not in left_out]
-        other.counts[f"frames left out: {reason}"] += len(self) - len(other)
-        return other
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self._frames[index]
-
-    def summary(self) -> Summary:
-        """What was read, skipped, missing and malformed."""
-        return self._summary
-
     @property
     def counts(self) -> collections.Counter[str]:
         """What was read and skipped, by reason: `summary().counts`."""
@@ -311,15 +237,26 @@ class KRadar(Sequence[Frame]):
         """Read the label files of a split and make its frames."""
         self._summary = Summary()
         keys = self._select(split)
-        self._sequences = {
+        sequences = {
             number: self._read_sequence(number)
             for number in sorted({number for number, _ in keys})
         }
         if self._weather is not None:
             number_before, chosen = len(keys), self._weather
-            keys = [k for k in keys if self._sequences[k[0]]["weather"] in chosen]
+            keys = [k for k in keys if sequences[k[0]]["weather"] in chosen]
             self.counts["frames left out by weather"] = number_before - len(keys)
-        self._frames = self._make_frames(self._read_label_files(keys))
+        frames = [self._read_frame(key, sequences[key[0]]) for key in keys]
+        self._frames = [frame for frame in frames if frame is not None]
+        self.counts["frames"] = len(self._frames)
+        no_objects = sum(not len(frame.boxes) for frame in self._frames)
+        self.counts["frames without objects"] = no_objects
+        lines = [text for kind, text in self._summary.problems if kind == "label line"]
+        if lines and not self.counts["objects in the label files"]:
+            raise UserError(
+                f"no object could be read from {self._label_source}: {lines[0]}; give the "
+                "version of these labels: --label-version VERSION, in training "
+                "--config.data.label_version=VERSION, such as v1.0"
+            )
 
     def _select(self, split: PathLike | None) -> list[Key]:
         """Keys of the label files to read, sorted; the others are counted."""
@@ -359,7 +296,7 @@ class KRadar(Sequence[Frame]):
                     f"split {split!r} is neither 'train', 'test', None nor a split file"
                 )
             return set(read_split(split))
-        paths = {name: find_split_file(name, self.split_folders) for name in _SPLITS}
+        paths = {name: find_split_file(name, self._split_folders) for name in _SPLITS}
         entries = {name: set(read_split(path)) for name, path in paths.items() if path}
         if len(entries) == 2 and (both := sorted(entries["train"] & entries["test"])):
             message = (
@@ -385,7 +322,7 @@ class KRadar(Sequence[Frame]):
 
     def _read_sequence(self, number: int) -> dict[str, Any]:
         """Fields that the frames of a sequence share, from its files or by default."""
-        folder = self.folders.get(number, SequenceFolder([]))
+        folder = self.folders.get(number, _NO_FOLDER)
         camera, is_own = find_camera_calibration(
             self._camera_folders, number, common_only=self._common_camera
         )
@@ -417,6 +354,7 @@ class KRadar(Sequence[Frame]):
         return {
             **conditions._asdict(),
             "radar_from_lidar_m": (*calibration[1:], 0.0),
+            "radar_from_lidar_z_m": self._radar_from_lidar_z_m,
             "camera_calibration_path": camera,
         }
 
@@ -430,105 +368,76 @@ class KRadar(Sequence[Frame]):
             self._report(kind, str(error))
             return None
 
-    def _read_label_files(self, keys: list[Key]) -> dict[Key, LabelFile]:
-        """Label files; corrupted ones are reported."""
-        files: dict[Key, LabelFile] = {}
-        for key in keys:
-            try:
-                file = self._read_label_file(self._label_paths[key])
-            except DataError as error:
-                self._report("label file", str(error))
-                continue
-            files[key] = file
-            self._summary.problems += [("label line", text) for text in file.problems]
-            odd = [x for x in file.labels if x.visibility not in VISIBILITY_FLAGS]
-            expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
-            self.counts["objects in the label files"] += len(file.labels)
-            self.counts["disabled objects (no leading *)"] += file.num_unstarred
-            self.counts["objects with an odd availability flag"] += len(odd)
-            self.counts["files named unlike their header"] += key[1] != expected
-        lines = [text for file in files.values() for text in file.problems]
-        if lines and not self.counts["objects in the label files"]:
-            raise UserError(
-                f"no object could be read from {self._label_source}: {lines[0]}; give the "
-                "version of these labels: --label-version VERSION, in training "
-                "--config.data.label_version=VERSION, such as v1.0"
-            )
-        return files
-
-    def _make_frames(self, files: dict[Key, LabelFile]) -> list[Frame]:
-        """Frames with filtered boxes; all boxes of the data set are filtered at once."""
-        labels = [label for file in files.values() for label in file.labels]
-        sizes = np.array([len(file.labels) for file in files.values()], int)
-        shifts = [self._sequences[number]["radar_from_lidar_m"] for number, _ in files]
-        boxes = np.array([label.box for label in labels], np.float64).reshape(-1, 7)
-        boxes[:, :3] += np.repeat(np.reshape(shifts, (-1, 3)), sizes, axis=0)
-        classes = np.array([label.cls for label in labels], dtype=np.str_)
-        flags = np.array([label.visibility for label in labels], dtype=np.str_)
-        kept = np.flatnonzero(self._filter(boxes, classes, flags))
-        ends = np.searchsorted(kept, np.append(0, np.cumsum(sizes)))
-        self.counts["frames"] = len(files)
-        self.counts["frames without objects"] = int((np.diff(ends) == 0).sum())
-        frames = []
-        for (key, file), (start, end) in zip(
-            files.items(), itertools.pairwise(ends), strict=True
-        ):
-            rows = kept[start:end]
-            frames.append(
-                Frame(
-                    key[0],
-                    key[1],
-                    file.header,
-                    labels=tuple(file.labels),
-                    boxes=boxes[rows],
-                    classes=classes[rows],
-                    visibility=flags[rows],
-                    is_simulated=self.is_simulated,
-                    radar_from_lidar_z_m=self._radar_from_lidar_z_m,
-                    **self._sequences[key[0]],
-                    **self._find_files(key, file.header),
-                )
-            )
-        return frames
+    def _read_frame(self, key: Key, sequence: Mapping[str, Any]) -> Frame | None:
+        """A frame with filtered boxes; None, which is reported, for a corrupted file."""
+        try:
+            file = self._read_label_file(self._label_paths[key])
+        except DataError as error:
+            self._report("label file", str(error))
+            return None
+        self._summary.problems += [("label line", text) for text in file.problems]
+        odd = [x for x in file.labels if x.visibility not in VISIBILITY_FLAGS]
+        expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
+        counts = self.counts
+        counts["objects in the label files"] += len(file.labels)
+        counts["disabled objects (no leading *)"] += file.num_unstarred
+        counts["objects with an odd availability flag"] += len(odd)
+        counts["files named unlike their header"] += key[1] != expected
+        labels, boxes = self._filter(file.labels, sequence["radar_from_lidar_m"])
+        return Frame(
+            sequence=key[0],
+            name=key[1],
+            header=file.header,
+            labels=tuple(file.labels),
+            boxes=boxes,
+            classes=np.array([label.cls for label in labels], dtype=np.str_),
+            visibility=np.array([label.visibility for label in labels], dtype=np.str_),
+            is_simulated=self.is_simulated,
+            **sequence,
+            **self._find_files(key, file.header),
+        )
 
     def _filter(
-        self, boxes: np.ndarray, classes: np.ndarray, flags: np.ndarray
-    ) -> np.ndarray:
-        """`[M]` True for the objects to keep; the others are counted by reason."""
-        rules = {"class": np.isin(classes, self.classes)}
-        if self._visibility is not None:
-            rules["visibility"] = np.isin(flags, list(self._visibility))
-        if self._field_of_view:
-            rules["field of view"] = self.grid.in_field_of_view(
-                boxes[:, 0], boxes[:, 1]
-            )
-        is_kept = np.ones(len(classes), bool)
-        for rule, passes in rules.items():
-            self.counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
-            is_kept &= passes
-        self.counts["objects kept"] = int(is_kept.sum())
-        return is_kept
+        self, labels: Sequence[Label], radar_from_lidar_m: tuple[float, ...]
+    ) -> tuple[Sequence[Label], Float[np.ndarray, "N 7"]]:
+        """Objects to keep, and their boxes in the radar frame; others are counted."""
+        flags, counts = self._visibility, self.counts
+        of_class = [label for label in labels if label.cls in self.classes]
+        visible = [x for x in of_class if flags is None or x.visibility in flags]
+        kept = visible
+        boxes = np.array([label.box for label in visible], np.float64).reshape(-1, 7)
+        boxes[:, :3] += radar_from_lidar_m
+        if self._field_of_view and visible:
+            is_inside = self.grid.in_field_of_view(boxes[:, 0], boxes[:, 1])
+            kept = list(itertools.compress(visible, is_inside))
+            boxes = boxes[is_inside]
+        counts["objects left out by class"] += len(labels) - len(of_class)
+        counts["objects left out by visibility"] += len(of_class) - len(visible)
+        counts["objects left out by field of view"] += len(visible) - len(kept)
+        counts["objects kept"] += len(kept)
+        return kept, boxes
 
     def _find_files(self, key: Key, header: LabelHeader) -> dict[str, Any]:
         """Paths of a frame's files, None where they are missing, which is reported."""
-        folder = self.folders.get(key[0], SequenceFolder([]))
+        folder = self.folders.get(key[0], _NO_FOLDER)
         stem = f"tesseract_{header.radar:05d}"
-        paths = {
-            "tesseract_path": folder.find("radar_tesseract", f"{stem}.mat"),
-            "projection_path": folder.find("DERA_tesseract", f"DERA_{stem}.npy"),
-            "camera_path": folder.find(
-                "cam-front", f"cam-front_{header.camera_front:05d}.png"
-            ),
-        }
+        tesseract = folder.find("radar_tesseract", f"{stem}.mat")
+        projection = folder.find("DERA_tesseract", f"DERA_{stem}.npy")
+        camera = folder.find("cam-front", f"cam-front_{header.camera_front:05d}.png")
         if folder.folders:
-            if not (paths["tesseract_path"] or paths["projection_path"]):
+            if not (tesseract or projection):
                 self._report(
                     "tesseract missing",
                     f"{key[0]}/{key[1]}: no radar_tesseract/{stem}.mat in "
                     + ", ".join(map(str, folder.folders)),
                 )
-            self.counts["frames without front image"] += paths["camera_path"] is None
-        return paths
+            self.counts["frames without front image"] += camera is None
+        return {
+            "tesseract_path": tesseract,
+            "projection_path": projection,
+            "radar_path": tesseract or projection,
+            "camera_path": camera,
+        }
 
 
 # Folders -----------------------------------------------------------------------------
@@ -539,25 +448,26 @@ class SequenceFolder:
 
     def __init__(self, folders: Sequence[pathlib.Path]) -> None:
         self.folders = tuple(folders)
-        self._listings: dict[str, dict[str, pathlib.Path]] = {}
+        self.listing = functools.cache(self._list)
 
-    def listing(self, subfolder: str) -> dict[str, pathlib.Path]:
+    def _list(self, subfolder: str) -> dict[str, pathlib.Path]:
         """Files of a subfolder by name; the first root takes precedence."""
-        if subfolder not in self._listings:
-            files: dict[str, pathlib.Path] = {}
-            for folder in self.folders:
-                with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-                    for name in sorted(os.listdir(folder / subfolder)):
-                        files.setdefault(name, folder / subfolder / name)
-            self._listings[subfolder] = files
-        return self._listings[subfolder]
+        files: dict[str, pathlib.Path] = {}
+        for folder in self.folders:
+            with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+                for name in sorted(os.listdir(folder / subfolder)):
+                    files.setdefault(name, folder / subfolder / name)
+        return files
 
     def find(self, subfolder: str, name: str) -> pathlib.Path | None:
         """Path of a file, None where no root has it."""
         return self.listing(subfolder).get(name)
 
 
-def as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
+_NO_FOLDER = SequenceFolder([])
+
+
+def _as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
     """A list of paths from one, several or none."""
     if paths is None:
         return []
@@ -632,38 +542,14 @@ def read_calibration(path: PathLike) -> tuple[int, float, float]:
     )
 
 
-def read_radar_from_lidar_z(folders: Sequence[pathlib.Path]) -> float:
-    """Read z of `p_radar = p_lidar + t` as the sensors are mounted.
-
-    A simulated data set states it; K-Radar's calibration files do not, and its loaders
-    have 0.7 m: the radar is below the LiDAR.
-
-    Raises:
-        DataError: A simulation's file is malformed, or two of them differ.
-    """
-    return _read_common(
-        folders,
-        SIMULATION_MARKER,
-        lambda content: float(content["config"]["radar_from_lidar_m"][2]),
-        KRADAR_RADAR_FROM_LIDAR_Z_M,
-    )
-
-
-def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
-    """Read the sensor axes of a data set: `radar_grid.json` in a root, else K-Radar's.
-
-    Raises:
-        DataError: The file is malformed, or two roots have different axes.
-    """
-    return _read_common(
-        roots, "radar_grid.json", RadarGrid.from_dict, RadarGrid.kradar()
-    )
-
-
 def _read_common(
-    folders: Sequence[pathlib.Path], name: str, read: Callable[[Any], T], default: T
-) -> T:
-    """What the JSON files of a name in these folders say in common."""
+    folders: Sequence[pathlib.Path], name: str, read: Callable[[Any], T]
+) -> T | None:
+    """What the JSON files of a name in these folders say; None where there are none.
+
+    Raises:
+        DataError: A file is malformed, or two of them differ.
+    """
     found: dict[pathlib.Path, T] = {}
     for path in (folder / name for folder in folders):
         if path.is_file():
@@ -674,7 +560,7 @@ def _read_common(
             f"{' and '.join(map(str, found))} differ; data sets of different sensors "
             "cannot be read as one"
         )
-    return next(iter(found.values()), default)
+    return next(iter(found.values()), None)
 
 
 # Label files -------------------------------------------------------------------------

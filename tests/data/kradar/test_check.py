@@ -87,21 +87,6 @@ def test_a_part_that_is_not_there_is_wrong_use_and_no_clean_bill(root):
             check_dataset(root, **part)
 
 
-def test_disk_without_labels(tmp_path):
-    write.write_tesseract(
-        tmp_path / "3/radar_tesseract/tesseract_00001.mat",
-        np.zeros((1, 1, 1, 2), np.float32),
-    )
-    report = check_dataset(tmp_path)
-    assert report.summary.problem_counts() == {
-        "labels missing": 1,
-        "tesseract corrupted": 1,  # not K-Radar's shape
-    }
-    assert report.sequences[0]["weather"] == "normal"
-    with pytest.raises(UserError, match="no sequence folders"):
-        check_dataset(tmp_path / "3")
-
-
 def test_conditions_that_contradict_the_published_ones(root):
     (root / "radar_grid.json").unlink()
     notes = check_dataset(root).summary.notes

@@ -23,6 +23,12 @@ HEADER = (
 )
 
 
+def open_sequence(root, number=1, **options):
+    """A data set of one frame of a sequence."""
+    touch(root / f"{number}/info_label/{LABEL}.txt", HEADER)
+    return KRadar(root, **options)
+
+
 def touch(path: pathlib.Path, text: str = "x") -> pathlib.Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -163,38 +169,35 @@ def test_split_files_and_camera_calibration_are_found(tmp_path):
 
 
 def test_height_of_the_radar_is_kradars_or_the_simulations(tmp_path):
-    a, b = tmp_path / "a", tmp_path / "b"
     text = '{"config": {"radar_from_lidar_m": [-2.54, 0.3, %s]}}'
-    assert dataset.read_radar_from_lidar_z([a]) == 0.7
-    touch(b / "simulation.json", text % 0.2)
-    assert dataset.read_radar_from_lidar_z([a, b]) == 0.2
-    touch(a / "simulation.json", text % 0.7)
+    assert open_sequence(tmp_path / "a")[0].radar_from_lidar_z_m == 0.7
+    touch(tmp_path / "b/simulation.json", text % 0.2)
+    data = open_sequence(tmp_path / "b")
+    assert data[0].radar_from_lidar_z_m == 0.2
+    assert data.is_simulated
+    touch(tmp_path / "a/simulation.json", text % 0.7)
     with pytest.raises(DataError, match=r"a/simulation.json and .* differ"):
-        dataset.read_radar_from_lidar_z([a, b])
-    touch(b / "simulation.json", '{"config": {"radar_from_lidar_m": [1]}}')
+        KRadar([tmp_path / "a", tmp_path / "b"])
+    touch(tmp_path / "b/simulation.json", '{"config": {"radar_from_lidar_m": [1]}}')
     with pytest.raises(DataError, match=r"simulation\.json: corrupted"):
-        dataset.read_radar_from_lidar_z([b])
+        open_sequence(tmp_path / "b")
 
 
 def test_grid_of_the_roots(tmp_path):
     grid = RadarGrid.reduced(num_doppler=4, num_range=8, num_elevation=3, num_azimuth=7)
     a, b = tmp_path / "a", tmp_path / "b"
-    assert dataset.read_grid([a]) == RadarGrid.kradar()
+    assert open_sequence(a).grid == RadarGrid.kradar()
     write.write_grid(a, grid)
-    assert dataset.read_grid([a, b]) == grid
+    open_sequence(b)
+    assert KRadar([a, b]).grid == grid
     write.write_grid(b, dataclasses.replace(grid, fov_range_m=50.0))
     with pytest.raises(DataError, match="data sets of different sensors"):
-        dataset.read_grid([a, b])
-    for text in (
-        '{"range_m": 3}',
-        "[" * 100_000,
-        "9" * 5000,
-        '{"range_m": 1e400}',
-        "1",
-    ):
+        KRadar([a, b])
+    broken = ('{"range_m": 3}', "[" * 100_000, "9" * 5000, '{"range_m": 1e400}', "1")
+    for text in broken:
         touch(b / "radar_grid.json", text)
         with pytest.raises(DataError, match=r"radar_grid\.json"):
-            dataset.read_grid([b])
+            KRadar(b)
 
 
 # Files of a sequence ----------------------------------------------------------------
@@ -242,12 +245,6 @@ def test_readers_accept_what_is_on_the_disks(tmp_path):
     assert read_description(path).environment == "urban"
     path.write_text("1,00033_00001.txt\n2,00034_00002.txt")
     assert read_split(path) == [(1, "00033_00001"), (2, "00034_00002")]
-
-
-def open_sequence(root, number=1):
-    """A data set of one frame of a sequence."""
-    touch(root / f"{number}/info_label/{LABEL}.txt", HEADER)
-    return KRadar(root)
 
 
 def test_own_files_come_first(tmp_path):
