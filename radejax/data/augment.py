@@ -12,9 +12,9 @@ from typing import Any
 
 import chex
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Real
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import UserError
 from radejax.data.projection import LOG_SCALE_DB, decode, encode
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
@@ -35,7 +35,7 @@ class Augmentation:
             sensor to this at the last range.
 
     Raises:
-        UserError: Mirroring a grid that is not symmetric, or a negative strength.
+        UserError: Mirroring a grid that is not symmetric.
     """
 
     grid: RadarGrid
@@ -44,16 +44,9 @@ class Augmentation:
     gain_slope_db: float = 2.0
 
     def __post_init__(self) -> None:
-        probability = self.mirror_probability
-        name = "config.data.mirror_probability"
-        require(0 <= probability <= 1, name, probability, "a number from 0 to 1")
-        for name in ("gain_db", "gain_slope_db"):
-            value = getattr(self, name)
-            is_valid = 0 <= value < np.inf
-            require(is_valid, f"config.data.{name}", value, "a number of at least 0")
         azimuth = self.grid.azimuth_rad
         asymmetry = np.abs(azimuth + azimuth[::-1]).max()
-        if probability and asymmetry > 1e-3 * self.grid.azimuth_step_rad:
+        if self.mirror_probability and asymmetry > 1e-3 * self.grid.azimuth_step_rad:
             raise UserError(
                 f"cannot mirror: azimuths {azimuth[0]:.4f} to {azimuth[-1]:.4f} rad are "
                 "not symmetric; set config.data.mirror_probability to 0"
@@ -79,21 +72,15 @@ def mirror(sample: Sample) -> Sample:
 
     Radial velocity, elevation and range do not change. Padded boxes stay zero.
     """
-    camera = sample.get("camera")
-    image = sample.get("image")
+    camera, image, boxes = sample.get("camera"), sample.get("image"), sample["boxes"]
     return {
         **sample,
         "projection": sample["projection"][:, ::-1],
-        "boxes": mirror_boxes(sample["boxes"]),
+        # y and sin yaw change sign.
+        "boxes": boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype),
         "image": None if image is None else image[:, ::-1],
         "camera": None if camera is None else mirror_camera(camera),
     }
-
-
-def mirror_boxes(boxes: Float[np.ndarray, "*batch 8"]) -> Float[np.ndarray, "*batch 8"]:
-    """Boxes on the other side: y and sin yaw change sign."""
-    chex.assert_axis_dimension(boxes, -1, 8)
-    return boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype)
 
 
 def mirror_camera(camera: Camera) -> Camera:

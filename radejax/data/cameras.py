@@ -12,10 +12,24 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import UInt8
 
-from radejax.core.errors import DataError, require
+from radejax.core.errors import (
+    DataError,
+    Range,
+    check_options,
+    one_of,
+    or_none,
+    several,
+)
 from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
 
 _MAX_SIDE, _MAX_PIXELS = 8192, 1 << 25
+_FINITE: Range = math.isfinite, "a finite number"
+_OPTIONS = {
+    "projection": one_of("raw", "pinhole"),
+    "calibration": one_of("sequence", "common"),
+    "radar_from_lidar_m": or_none(several(_FINITE, "three finite numbers", 3)),
+    "radar_from_lidar_z_m": or_none(_FINITE),
+}
 
 IMAGE_SIZE = (720, 1280)
 """Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
@@ -59,9 +73,7 @@ def read_left_image(
             return np.asarray(image)
     except DataError:
         raise
-    except (
-        Exception
-    ) as error:  # Pillow's decoders raise nearly anything on corrupted files
+    except Exception as error:  # Pillow's decoders raise nearly anything
         raise DataError(f"{path}: corrupted image ({error})") from None
 
 
@@ -94,24 +106,7 @@ class CameraOptions:
     allow_missing: bool = True
 
     def __post_init__(self) -> None:
-        shift, z = self.radar_from_lidar_m, self.radar_from_lidar_z_m
-        is_shift = shift is None or (len(shift) == 3 and all(map(math.isfinite, shift)))
-        for name, is_valid, expected in (
-            ("projection", self.projection in ("raw", "pinhole"), "raw or pinhole"),
-            (
-                "calibration",
-                self.calibration in ("sequence", "common"),
-                "sequence or common",
-            ),
-            ("radar_from_lidar_m", is_shift, "three finite numbers or None"),
-            (
-                "radar_from_lidar_z_m",
-                z is None or math.isfinite(z),
-                "a finite number or None",
-            ),
-        ):
-            field = f"config.data.camera.{name}"
-            require(is_valid, field, getattr(self, name), expected)
+        check_options(vars(self), "config.data.camera", _OPTIONS)
 
     @classmethod
     def from_config(cls, data: Mapping[str, Any]) -> CameraOptions:

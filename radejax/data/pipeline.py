@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import pathlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import chex
 import grain
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, Real
+from jaxtyping import Float, Int, Real
 
 from radejax.core.errors import UserError, require
 from radejax.core.structures import CLASSES, Batch
@@ -25,7 +23,7 @@ from radejax.data.cameras import CameraOptions, no_camera, read_left_image
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.records import Records
 from radejax.geometry.boxes import boxes8_from_7
-from radejax.geometry.camera import Camera, CameraCalibration, stack_cameras
+from radejax.geometry.camera import Camera, stack_cameras
 
 _log = logging.getLogger(__name__)
 
@@ -41,16 +39,15 @@ class CameraInputs:
         image_size: Height and width of the images that the model sees.
         options: That they were made with.
         features: What an image backbone made of the images, in their place, or None.
-        image_paths: Front image of every frame, None where it is missing.
-        feature_keys: Key of each frame's features, None where it has none.
+        sources: Path of every frame's front image, or key of its features; None where
+            there is none.
     """
 
     cameras: tuple[Camera, ...]
     image_size: tuple[int, int]
     options: CameraOptions
     features: Records | None
-    image_paths: tuple[pathlib.Path | None, ...]
-    feature_keys: tuple[str | None, ...]
+    sources: Sequence[Any]
 
     def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
         """Black images `[count, H, W, 3]` uint8, or zero features."""
@@ -60,12 +57,12 @@ class CameraInputs:
 
     def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
         """Image (or features) of one frame; black if it is missing."""
-        key, path = self.feature_keys[index], self.image_paths[index]
-        if self.features is None and path is not None:
-            return read_left_image(path, self.image_size, resize=self.options.resize)
-        if self.features is not None and key is not None:
-            return self.features[key]
-        return self.empty_images(1)[0]
+        source = self.sources[index]
+        if source is None:
+            return self.empty_images(1)[0]
+        if self.features is not None:
+            return self.features[source]
+        return read_left_image(source, self.image_size, resize=self.options.resize)
 
 
 def camera_inputs(
@@ -90,13 +87,12 @@ def camera_inputs(
             not among the features.
         DataError: A calibration file is corrupted.
     """
-    has_image = [frame.camera_path is not None for frame in frames]
-    embedded: Collection[str] = ()
+    sources: list[Any] = [frame.camera_path for frame in frames]
     if features is not None:
-        embedded = features.keys()
-        files = zip(frames, has_image, strict=True)
-        has_image = [frame.key in embedded for frame in frames]
-        if absent := [f.key for f, has in files if has and f.key not in embedded]:
+        keys = features.keys()
+        sources = [frame.key if frame.key in keys else None for frame in frames]
+        with_image = [frame.key for frame in frames if frame.camera_path is not None]
+        if absent := [key for key in with_image if key not in keys]:
             raise UserError(
                 f"{features.folder}: {len(absent)} of {len(frames)} frames have an image "
                 f"that is not embedded, the first is {absent[0]}; embed all of the data: "
@@ -105,16 +101,15 @@ def camera_inputs(
     cameras: list[Camera] = []
     missing: list[str] = []
     known: dict[Any, Camera] = {}
-    for frame, has in zip(frames, has_image, strict=True):
-        if not has or frame.camera_calibration_path is None:
+    for frame, image in zip(frames, sources, strict=True):
+        if image is None or frame.camera_calibration_path is None:
             missing.append(frame.key)
             cameras.append(no_camera(image_size))
             continue
         shift = options.shift(frame.radar_from_lidar_m, frame.radar_from_lidar_z_m)
         source = frame.camera_calibration_path, shift
         if source not in known:
-            calibration = frame.read_calibration(shift)
-            known[source] = _camera(frame, calibration, image_size, options)
+            known[source] = _camera(frame, shift, image_size, options)
         cameras.append(known[source])
     if missing and not options.allow_missing:
         raise UserError(
@@ -128,23 +123,17 @@ def camera_inputs(
             len(missing),
             len(frames),
         )
-    return CameraInputs(
-        tuple(cameras),
-        (*image_size,),
-        options,
-        features,
-        tuple(frame.camera_path for frame in frames),
-        tuple(frame.key if frame.key in embedded else None for frame in frames),
-    )
+    return CameraInputs(tuple(cameras), image_size, options, features, sources)
 
 
 def _camera(
     frame: LabelledFrame,
-    calibration: CameraCalibration,
+    radar_from_lidar_m: tuple[float, ...],
     image_size: tuple[int, int],
     options: CameraOptions,
 ) -> Camera:
     """The camera of one frame, for images of the model's size."""
+    calibration = frame.read_calibration(radar_from_lidar_m)
     height, width = image_size
     if (calibration.height, calibration.width) != (height, width):
         if not options.resize:
@@ -200,17 +189,8 @@ class FrameTable:
     classes: Int[np.ndarray, "F N"]
     images: CameraInputs | None = None
 
-    def __post_init__(self) -> None:
-        chex.assert_shape(self.boxes, (len(self.keys), None, 8))
-        chex.assert_shape(self.classes, self.boxes.shape[:2])
-
     def __len__(self) -> int:
         return len(self.keys)
-
-    @property
-    def is_valid(self) -> Bool[np.ndarray, "F N"]:
-        """True where a row is an object."""
-        return self.classes >= 0
 
 
 def make_table(
@@ -243,12 +223,12 @@ def make_table(
         raise UserError(f"{len(images.cameras)} cameras for {len(frames)} frames")
     class_index = {cls: index for index, cls in enumerate(classes)}
     kept = [[cls in class_index for cls in frame.classes] for frame in frames]
-    largest = max(range(len(frames)), key=lambda i: sum(kept[i]))
-    if sum(kept[largest]) > max_objects:
+    counts = [sum(row) for row in kept]
+    if (most := max(counts)) > max_objects:
         raise UserError(
-            f"frame {frames[largest].key} has {sum(kept[largest])} objects, but "
-            f"config.data.max_objects is {max_objects}; {sum(kept[largest])} would do "
-            f"for all {len(frames)} frames"
+            f"frame {frames[counts.index(most)].key} has {most} objects, but "
+            f"config.data.max_objects is {max_objects}; {most} would do for all "
+            f"{len(frames)} frames"
         )
     shape = (len(frames), max_objects)
     boxes = np.zeros((*shape, 8), np.float32)
@@ -270,9 +250,8 @@ class LoaderOptions:
         seed: Seed of order and augmentation.
         shuffle: A new order every epoch; otherwise the order of the table.
         num_epochs: None repeats without end.
-        drop_remainder: Leave out the last, smaller batch of an epoch.
         pad_remainder: Fill the last, smaller batch of an epoch with empty frames of
-            index -1 instead, so that all processes have as many batches.
+            index -1 instead of leaving it out.
         num_threads: Threads that prepare batches; 0 prepares them in the caller's.
         process_index: This host of several; None asks JAX.
         process_count: Number of hosts; None asks JAX.
@@ -282,17 +261,14 @@ class LoaderOptions:
     seed: int = 0
     shuffle: bool = True
     num_epochs: int | None = None
-    drop_remainder: bool = True
     pad_remainder: bool = False
     num_threads: int = 2
     process_index: int | None = None
     process_count: int | None = None
 
     def __post_init__(self) -> None:
-        size, threads = self.batch_size, self.num_threads
+        size = self.batch_size
         require(size >= 1, "batch_size", size, "an integer of at least 1")
-        name = "config.data.num_threads"
-        require(threads >= 0, name, threads, "an integer of at least 0")
 
 
 def make_loader(
@@ -354,23 +330,18 @@ def _make_order(
     index, count = options.process_index, options.process_count
     if index is None or count is None:
         index, count = jax.process_index(), jax.process_count()
-    batch_size, seed = options.batch_size, options.seed
-    total = num_frames
+    rows, total = options.batch_size * count, num_frames
     if options.pad_remainder:
-        total = -(-num_frames // (batch_size * count)) * batch_size * count
-    elif options.drop_remainder:
-        check_enough(num_frames, batch_size, count)
+        total = -(-num_frames // rows) * rows
+    else:
+        check_enough(num_frames, options.batch_size, count)
     # grain's shuffle in epoch e of seed s is that of epoch e - 1 of seed s + 1.
-    spread = np.random.SeedSequence(seed).generate_state(2)
+    spread = np.random.SeedSequence(options.seed).generate_state(2)
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
     if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
     seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_AddSeed())
-    batches = seeded.batch(
-        batch_size * count,
-        drop_remainder=options.drop_remainder,
-        batch_fn=np.stack,
-    )
+    batches = seeded.batch(rows, drop_remainder=True, batch_fn=np.stack)
     # Of every global batch, its own rows: what is trained on, and in which order, does
     # not depend on the number of processes.
     return batches if count == 1 else batches.map(_Share(index, count))
@@ -403,18 +374,16 @@ class _LoadBatch(grain.transforms.Map):
 
     def __init__(self, table: FrameTable, augment: Augmentation | None) -> None:
         self._table, self._augment = table, augment
-        images = table.images
-        self._no_camera = no_camera(images.image_size if images else (1, 1))
 
     def __repr__(self) -> str:
         return "_LoadBatch()"
 
     def map(self, element: Int[np.ndarray, "B 2"]) -> Batch:
-        cameras: list[Camera] = []
+        images = self._table.images
         batch = self._empty(len(element))
+        cameras = [no_camera(images.image_size)] * len(element) if images else []
         for row, (index, seed) in enumerate(element.tolist()):
             if index >= len(self._table):
-                cameras.append(self._no_camera)
                 continue
             sample = self._sample(index)
             if self._augment is not None:
@@ -424,12 +393,10 @@ class _LoadBatch(grain.transforms.Map):
             batch.classes[row] = self._table.classes[index]
             batch.is_valid[row] = batch.classes[row] >= 0
             batch.frame[row] = index
-            cameras.append(sample["camera"])
-            if batch.image is not None:
+            if images is not None:
                 batch.image[row] = sample["image"]
-        if self._table.images is None:
-            return batch
-        return batch.replace(camera=stack_cameras(cameras))
+                cameras[row] = sample["camera"]
+        return batch.replace(camera=stack_cameras(cameras)) if images else batch
 
     def _sample(self, index: int) -> dict[str, Any]:
         """One frame; image and camera None where they are not asked for."""

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, one_line, require
 from radejax.core.workers import process_pool
-from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.data.projection import ENCODINGS, encode
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -93,27 +93,9 @@ class Records:
             UserError: The folder has other records; names what differs.
         """
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
-        source = json.loads(json.dumps(source))
-        wanted = cls(pathlib.Path(folder), tuple(shape), dtype, source)
-        path = wanted.folder / _DESCRIPTION
-        if path.is_file():
-            found = cls.open(folder).describe()
-            if lines := files.differences(found, wanted.describe(), ""):
-                raise UserError(
-                    f"{folder} has other records: {'; '.join(lines)}; choose another "
-                    "folder, or delete that one"
-                )
-        else:
-            files.write_json(path, wanted.describe())
-        return wanted
-
-    def describe(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return {
-            "shape": list(self.shape),
-            "dtype": self.dtype,
-            "source": dict(self.source),
-        }
+        wanted = {"shape": list(shape), "dtype": dtype, "source": source}
+        files.claim(pathlib.Path(folder) / _DESCRIPTION, wanted, "other records")
+        return cls.open(folder)
 
     @functools.cached_property
     def grid(self) -> RadarGrid:
@@ -253,23 +235,26 @@ def describe_grid(grid: RadarGrid) -> str:
 # Preprocessing -----------------------------------------------------------------------
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(frozen=True)
 class PreprocessReport:
     """What one call of `preprocess` did.
 
     Attributes:
         num_frames: Frames of this shard.
         num_found: Of these, done earlier.
-        num_written: Records that were written.
         skipped: Frames whose radar tensor is missing or corrupted: key to reason.
         seconds: Wall time.
     """
 
     num_frames: int
     num_found: int
-    num_written: int = 0
-    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    seconds: float = 0.0
+    skipped: Mapping[str, str]
+    seconds: float
+
+    @property
+    def num_written(self) -> int:
+        """Records that were written."""
+        return self.num_frames - self.num_found - len(self.skipped)
 
     def to_text(self) -> str:
         """Lines for a terminal."""
@@ -287,10 +272,9 @@ class PreprocessReport:
 
 
 def preprocess(
-    frames: FrameSequence,
+    frames: LabelledFrames,
     folder: str | os.PathLike,
     *,
-    grid: RadarGrid | None = None,
     dtype: str | None = None,
     shard: tuple[int, int] = (0, 1),
     num_workers: int | None = None,
@@ -305,7 +289,6 @@ def preprocess(
         frames: Normally a `KRadar` without a split: records serve every split and label
             revision.
         folder: Folder of the records; made if needed.
-        grid: Sensor axes; None takes those of `frames`.
         dtype: "float16", "uint8" or "float32"; None takes that of the records that
             exist, else "float16".
         shard: `(i, n)` takes every n-th frame from the i-th on, i from 0.
@@ -318,9 +301,6 @@ def preprocess(
             process was killed.
     """
     began, folder = time.perf_counter(), pathlib.Path(folder)
-    grid = grid or getattr(frames, "grid", None)
-    if grid is None:
-        raise UserError("a plain list of frames has no grid: give grid=")
     if not len(frames):
         raise UserError("no frames to preprocess")
     index, count = shard
@@ -328,26 +308,25 @@ def preprocess(
     if dtype is None:
         exists = (folder / _DESCRIPTION).is_file()
         dtype = Records.open(folder).dtype if exists else "float16"
-    records = Records.create(
-        folder, grid.projection_shape, dtype, {"grid": grid.to_dict()}
-    )
+    grid = frames.grid
+    source = {"grid": grid.to_dict()}
+    records = Records.create(folder, grid.projection_shape, dtype, source)
     keys, mine = records.keys(), list(frames)[index::count]
     missing = [frame for frame in mine if frame.key not in keys]
-    report = PreprocessReport(len(mine), len(mine) - len(missing))
     if num_workers is None:
         is_small = len(missing) * math.prod(grid.shape_drea) < _SMALL_JOB_BINS
         num_workers = 0 if is_small else os.cpu_count() or 1
-    bar: dict[str, Any] = {"total": len(missing), "unit": "frame", "desc": "preprocess"}
-    bar["disable"] = not (progress and missing)
     with contextlib.closing(_write_all(records, missing, num_workers)) as results:
-        for key, reason in tqdm(results, **bar):
-            if reason:
-                report.skipped[key] = reason
-            else:
-                report.num_written += 1
-    report.skipped = dict(sorted(report.skipped.items()))
-    report.seconds = time.perf_counter() - began
-    return report
+        bar = tqdm(
+            results,
+            "preprocess",
+            len(missing),
+            unit="frame",
+            disable=not (progress and missing),
+        )
+        skipped = dict(sorted((key, reason) for key, reason in bar if reason))
+    num_found = len(mine) - len(missing)
+    return PreprocessReport(len(mine), num_found, skipped, time.perf_counter() - began)
 
 
 def _write_all(

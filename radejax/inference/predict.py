@@ -75,8 +75,7 @@ def predict_dataset(
         batch_size=rows,
         shuffle=False,
         num_epochs=1,
-        drop_remainder=False,
-        pad_remainder=num_devices > 1,  # one device pads by itself
+        pad_remainder=True,
         process_index=None if count > 1 else 0,
         process_count=None if count > 1 else 1,
     )

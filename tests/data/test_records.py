@@ -19,6 +19,7 @@ import pytest
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.data.dataset import LabelledFrames
 from radejax.data.kradar import KRadar
 from radejax.data.records import Records, open_embeddings, open_projections, preprocess
 from radejax.data.tesseract import project_file
@@ -162,7 +163,8 @@ def test_another_run_writes_what_is_missing(data, folder, copy):
     for frame in (data[1], data[7]):
         records.path(frame.key).unlink()
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*.npy")}
-    report = run(data[2:9], copy, grid=data.grid)
+    part = LabelledFrames(data[2:9], data.grid)
+    report = run(part, copy)
     assert (report.num_frames, report.num_found, report.num_written) == (7, 6, 1)
     assert run(data, copy).num_written == 1
     assert contents(copy) == contents(folder)
@@ -300,14 +302,12 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
     with pytest.raises(UserError, match=r"other records: dtype is 'uint8' there and"):
         run(data, tmp_path, dtype="float16")
     with pytest.raises(UserError, match=r"source\.grid\.azimuth_rad differs"):
-        run(data, tmp_path, grid=RadarGrid.kradar())
+        run(LabelledFrames(data, RadarGrid.kradar()), tmp_path)
 
 
 def test_wrong_arguments(data, tmp_path):
     with pytest.raises(UserError, match="no frames to preprocess"):
-        run([], tmp_path, grid=data.grid)
-    with pytest.raises(UserError, match="a plain list of frames has no grid"):
-        run(list(data), tmp_path)
+        run(LabelledFrames([], data.grid), tmp_path)
     with pytest.raises(UserError, match="dtype is 'int4', expected one of float16"):
         run(data, tmp_path, dtype="int4")
     for shard in ((2, 2), (-1, 2)):
