@@ -250,8 +250,9 @@ class LoaderOptions:
         seed: Seed of order and augmentation.
         shuffle: A new order every epoch; otherwise the order of the table.
         num_epochs: None repeats without end.
+        drop_remainder: Leave out the last, smaller batch of an epoch.
         pad_remainder: Fill the last, smaller batch of an epoch with empty frames of
-            index -1 instead of leaving it out.
+            index -1 instead, so that all processes have as many batches.
         num_threads: Threads that prepare batches; 0 prepares them in the caller's.
         process_index: This host of several; None asks JAX.
         process_count: Number of hosts; None asks JAX.
@@ -261,6 +262,7 @@ class LoaderOptions:
     seed: int = 0
     shuffle: bool = True
     num_epochs: int | None = None
+    drop_remainder: bool = True
     pad_remainder: bool = False
     num_threads: int = 2
     process_index: int | None = None
@@ -333,7 +335,7 @@ def _make_order(
     rows, total = options.batch_size * count, num_frames
     if options.pad_remainder:
         total = -(-num_frames // rows) * rows
-    else:
+    elif options.drop_remainder:
         check_enough(num_frames, options.batch_size, count)
     # grain's shuffle in epoch e of seed s is that of epoch e - 1 of seed s + 1.
     spread = np.random.SeedSequence(options.seed).generate_state(2)
@@ -341,7 +343,9 @@ def _make_order(
     if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
     seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_AddSeed())
-    batches = seeded.batch(rows, drop_remainder=True, batch_fn=np.stack)
+    batches = seeded.batch(
+        rows, drop_remainder=options.drop_remainder, batch_fn=np.stack
+    )
     # Of every global batch, its own rows: what is trained on, and in which order, does
     # not depend on the number of processes.
     return batches if count == 1 else batches.map(_Share(index, count))

@@ -14,6 +14,7 @@ References:
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import math
@@ -22,7 +23,7 @@ import pathlib
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Float, Real
@@ -51,15 +52,12 @@ def read_tesseract(
         FileNotFoundError: There is no such file.
         DataError: The file is truncated, corrupted, or of another shape.
     """
-    with wrap_read_errors(path, "a MATLAB file"), _open(path) as file:
-        return read_array(file, _layout(file, shape_drea))
+    with _opened(path, shape_drea) as (file, layout):
+        return _read_array(file, layout)
 
 
 def project_file(
-    path: str | os.PathLike,
-    *,
-    shape_drea: tuple[int, ...] | None = None,
-    dtype: Any = np.float32,
+    path: str | os.PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
     """`project_tensor` of a file; arguments and errors as in `read_tesseract`.
 
@@ -67,14 +65,11 @@ def project_file(
     and the 260 MB are never held. (A memory map would do the same, but a bad disk sector
     would kill the process instead of raising an error.)
     """
-    with wrap_read_errors(path, "a MATLAB file"), _open(path) as file:
-        layout = _layout(file, shape_drea)
-        is_native = layout.dtype.kind == "f" and layout.dtype.isnative
-        if layout.deflated is None and is_native:
-            columns = _read_columns(file, layout)
-            projection = project_columns(columns, layout.shape, dtype=dtype)
+    with _opened(path, shape_drea) as (file, layout):
+        if layout.deflated is None and layout.dtype.kind == "f":
+            projection = project_columns(_read_columns(file, layout), layout.shape)
         else:
-            projection = project_tensor(read_array(file, layout), dtype=dtype)
+            projection = project_tensor(_read_array(file, layout))
     if not np.isfinite(projection).all():
         raise DataError(f"{path}: corrupted, {VARIABLE} has negative or infinite power")
     return projection
@@ -93,8 +88,8 @@ def check_tesseract(
     if deep:
         project_file(path, shape_drea=shape_drea)
         return
-    with wrap_read_errors(path, "a MATLAB file"), _open(path) as file:
-        _layout(file, shape_drea)
+    with _opened(path, shape_drea):
+        pass
 
 
 def read_projection_npy(
@@ -114,9 +109,6 @@ def read_projection_npy(
         DataError: The file is truncated, corrupted, of another shape or type, or has
             values that are not finite or that no power gives.
     """
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such projection")
     stored = read_npy(path)
     if stored.ndim != 3 or stored.dtype.kind != "f":
         raise DataError(
@@ -155,26 +147,25 @@ def read_frame(
     return project_file(path, shape_drea=grid.shape_drea)
 
 
-def _open(path: str | os.PathLike) -> io.FileIO:
-    """The file, unbuffered."""
-    try:
-        return open(path, "rb", buffering=0)
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such radar tensor") from None
-    except IsADirectoryError:
-        raise DataError(f"{path}: is a folder, expected a MATLAB file") from None
+@contextlib.contextmanager
+def _opened(
+    path: str | os.PathLike, shape_drea: tuple[int, ...] | None
+) -> Iterator[tuple[io.FileIO, Layout]]:
+    """The file, unbuffered, and where its tensor is.
 
-
-def _layout(file: BinaryIO, shape_drea: tuple[int, ...] | None) -> Layout:
-    """Layout of the tensor; `DataError` where its shape is not the demanded one."""
-    layout = find_array(file, VARIABLE)
-    shape, axes = layout.shape, "(Doppler, range, elevation, azimuth)"
-    if len(shape) != 4 or shape != tuple(shape_drea or shape):
-        raise DataError(
-            f"{file.name}: {VARIABLE} has shape {shape}, the sensor's grid demands "
-            f"{shape_drea or 'four axes'} {axes}"
-        )
-    return layout
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: Whatever is wrong with it, in the block too.
+    """
+    with wrap_read_errors(path, "a MATLAB file"), open(path, "rb", buffering=0) as file:
+        layout = _find_array(file)
+        shape, axes = layout.shape, "(Doppler, range, elevation, azimuth)"
+        if len(shape) != 4 or shape != tuple(shape_drea or shape):
+            raise DataError(
+                f"{path}: {VARIABLE} has shape {shape}, the sensor's grid demands "
+                f"{shape_drea or 'four axes'} {axes}"
+            )
+        yield file, layout
 
 
 def _read_columns(
@@ -196,11 +187,8 @@ def _read_columns(
 
 # MATLAB v5 files --------------------------------------------------------------------
 
-_Order = Literal["<", ">"]
-
 _MATRIX, _DEFLATED = 14, 15
 _INT8, _INT32, _UINT32 = 1, 5, 6
-_GLOBAL = 0x0400
 # Classes of arrays and types of stored values, by their number in the file.
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
@@ -226,25 +214,23 @@ class Layout:
     num_bytes: int
 
 
-def find_array(file: BinaryIO, name: str) -> Layout:
-    """Type, shape and place of a variable of a file that is open for reading.
+def _find_array(file: BinaryIO) -> Layout:
+    """Type, shape and place of the tensor in a file that is open for reading.
 
     Raises:
         DataError: The file is not a MATLAB v5 file, is truncated or corrupted, or has
-            no real array of this name.
+            no real array of its name.
     """
     size = os.fstat(file.fileno()).st_size
     file.seek(0)
     header = file.read(128)
-    orders: dict[bytes, _Order] = {b"\0\1IM": "<", b"\1\0MI": ">"}
-    order = orders.get(header[124:])
-    if order is None:
+    if header[124:] != b"\0\1IM":  # of a little-endian machine
         hint = "; save it in v7 or v6" if header.startswith(b"MATLAB 7.3") else ""
         raise DataError(f"{file.name}: not a MATLAB v5 file{hint}")
     names, start = [], 128
     while start + 8 <= size:
         file.seek(start)
-        kind, num_bytes = struct.unpack(f"{order}II", file.read(8))
+        kind, num_bytes = struct.unpack("<II", file.read(8))
         end = start + 8 + num_bytes
         deflated = (start + 8, num_bytes) if kind == _DEFLATED else None
         if deflated:
@@ -255,20 +241,21 @@ def find_array(file: BinaryIO, name: str) -> Layout:
             head = file.read(_HEAD)
         else:
             raise _corrupted(file, f"no variable at byte {start}, but type {kind}")
-        found, layout = _parse(file, head, order, name)
+        name, layout = _parse(file, head)
         if layout:
-            _check_end(
-                file, layout, end if deflated else start + layout.num_bytes, size
-            )
-            begin = 0 if deflated else start
-            offset = begin + layout.offset
+            if size < end:
+                raise DataError(
+                    f"{file.name}: truncated: {size} bytes, an array of shape "
+                    f"{layout.shape} needs {end}"
+                )
+            offset = layout.offset if deflated else start + layout.offset
             return dataclasses.replace(layout, offset=offset, deflated=deflated)
-        names.append(found)
+        names.append(name)
         start = end
-    raise DataError(f"{file.name}: no {name} in it, only {names}")
+    raise DataError(f"{file.name}: no {VARIABLE} in it, only {names}")
 
 
-def read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
+def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
     """The values of a variable, in the type of the file.
 
     Raises:
@@ -292,29 +279,27 @@ def read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
     return values.reshape(layout.shape, order="F")
 
 
-def _parse(
-    file: BinaryIO, head: bytes, order: _Order, name: str
-) -> tuple[str, Layout | None]:
-    """Name of a variable, and its layout if it is the one that is looked for."""
-    kind, num_bytes = struct.unpack_from(f"{order}II", head)
-    flags_kind, flags_size, at, after = _tag(head, 8, order)
-    (flags,) = struct.unpack_from(f"{order}I", head, at)
+def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
+    """Name of a variable, and its layout if it is the tensor."""
+    kind, num_bytes = struct.unpack_from("<II", head)
+    flags_kind, flags_size, at, after = _tag(head, 8)
+    (flags,) = struct.unpack_from("<I", head, at)
     if (kind, flags_kind, flags_size) != (_MATRIX, _UINT32, 8):
         raise _corrupted(file, f"a variable begins with types {kind}, {flags_kind}")
-    dims_kind, dims_size, at, after = _tag(head, after, order)
-    shape = struct.unpack_from(f"{order}{dims_size // 4}i", head, at)
-    name_kind, name_size, at, after = _tag(head, after, order)
-    found = head[at : at + name_size].decode("ascii", "replace")
+    dims_kind, dims_size, at, after = _tag(head, after)
+    shape = struct.unpack_from(f"<{dims_size // 4}i", head, at)
+    name_kind, name_size, at, after = _tag(head, after)
+    name = head[at : at + name_size].decode("ascii", "replace")
     if (dims_kind, dims_size % 4, name_kind) != (_INT32, 0, _INT8):
         raise _corrupted(file, f"shape of type {dims_kind}, name of type {name_kind}")
-    if found != name:
-        return found, None
+    if name != VARIABLE:
+        return name, None
     wanted = np.dtype(_CLASSES.get(flags & 0xFF, np.void))
-    if flags & ~(0xFF | _GLOBAL) or wanted.kind == "V":
+    if flags > 0xFF or wanted.kind == "V":
         raise DataError(
             f"{file.name}: {name} has flags {flags:#x}, expected real numbers"
         )
-    stored_kind, stored_size, at, end = _tag(head, after, order)
+    stored_kind, stored_size, at, end = _tag(head, after)
     stored = np.dtype(_STORED.get(stored_kind, np.void))
     # MATLAB may store floats as smaller integers.
     is_smaller = stored.kind in "iu" and stored.itemsize < wanted.itemsize
@@ -325,24 +310,16 @@ def _parse(
         raise _corrupted(file, f"shape {shape} of {stored}, but {stored_size} bytes")
     if num_bytes + 8 not in (end, at + stored_size):
         raise _corrupted(file, f"{name} has {num_bytes} bytes, its parts {end - 8}")
-    return found, Layout(stored.newbyteorder(order), shape, at, None, num_bytes + 8)
+    return name, Layout(stored, shape, at, None, num_bytes + 8)
 
 
-def _tag(head: bytes, at: int, order: _Order) -> tuple[int, int, int, int]:
+def _tag(head: bytes, at: int) -> tuple[int, int, int, int]:
     """Type, size and begin of an element's content, and where the next element is."""
-    (word,) = struct.unpack_from(f"{order}I", head, at)
+    (word,) = struct.unpack_from("<I", head, at)
     if word >> 16:  # up to four bytes, within the tag
         return word & 0xFFFF, word >> 16, at + 4, at + 8
-    (size,) = struct.unpack_from(f"{order}I", head, at + 4)
+    (size,) = struct.unpack_from("<I", head, at + 4)
     return word, size, at + 8, at + 8 + size + -size % 8
-
-
-def _check_end(file: BinaryIO, layout: Layout, end: int, size: int) -> None:
-    if size < end:
-        raise DataError(
-            f"{file.name}: truncated: {size} bytes, an array of shape {layout.shape} "
-            f"needs {end}"
-        )
 
 
 def _corrupted(file: BinaryIO, what: str) -> DataError:

@@ -75,7 +75,8 @@ def predict_dataset(
         batch_size=rows,
         shuffle=False,
         num_epochs=1,
-        pad_remainder=True,
+        drop_remainder=False,
+        pad_remainder=num_devices > 1,  # one device pads by itself
         process_index=None if count > 1 else 0,
         process_count=None if count > 1 else 1,
     )

@@ -21,8 +21,9 @@ from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.data.dataset import LabelledFrames
 from radejax.data.kradar import KRadar
+from radejax.data.projection import project_tensor
 from radejax.data.records import Records, open_embeddings, open_projections, preprocess
-from radejax.data.tesseract import project_file
+from radejax.data.tesseract import project_file, read_tesseract
 from radejax.geometry.radar_grid import RadarGrid
 
 
@@ -280,7 +281,8 @@ def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path, num_work
 def test_released_projections_are_taken_as_input(root, tmp_path):
     wanted = {}
     for frame in KRadar(root):
-        projection = project_file(frame.tesseract_path, dtype=np.float64)
+        tesseract = read_tesseract(frame.tesseract_path)
+        projection = project_tensor(tesseract, dtype=np.float64)
         folder = root / str(frame.sequence) / "DERA_tesseract"
         folder.mkdir(exist_ok=True)
         name = f"DERA_tesseract_{frame.header.radar:05d}.npy"
