@@ -101,11 +101,7 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
 
     projection = frame.read_projection(grid)
     scene = frame_scene(frame, projection, grid, roi=ROIS.get(roi))
-    if not slices:
-        return draw_frame(scene)
-    figure = draw_slices(projection, grid, ground_truth=scene.ground_truth)
-    figure.suptitle(scene.title)
-    return figure
+    return draw_slices(scene) if slices else draw_frame(scene)
 
 
 @click.command(cls=entry.Command)
@@ -120,28 +116,25 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
 @entry.labelled_frames
 @click.option("--workdir", type=entry.EXISTING, help="Run whose detections are drawn.")
 @entry.max_frames
-@click.option(
-    "--open", "open_it", is_flag=True, help="Open the recording in the viewer."
-)
 def view(
     roots: tuple[pathlib.Path, ...],
     out: pathlib.Path,
     workdir: pathlib.Path | None,
     max_frames: int | None,
-    open_it: bool,
     **part: Any,
 ) -> None:
     """Record a sequence for the rerun viewer (extra "viewer").
 
-    Frames without radar tensor and projection are skipped and counted.
+    Frames without radar tensor and projection are skipped and counted. `rerun five.rrd`
+    opens the recording.
 
-    Example: radejax view data/kradar --sequences 5 --out five.rrd --open
+    Example: radejax view data/kradar --sequences 5 --out five.rrd
     """
     import tqdm
 
     from radejax.data.kradar import KRadar
     from radejax.inference.detector import Detector
-    from radejax.visualize.recordings import open_viewer, write_recording
+    from radejax.visualize.recordings import write_recording
 
     frames = KRadar(roots, visibility=None, **part)
     complete = [frame for frame in frames if frame.radar_path]
@@ -153,8 +146,6 @@ def view(
     detector = None if workdir is None else Detector.from_workdir(workdir)
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
     write_recording(viewer_scenes(bar, frames.grid, detector), out)
-    if open_it:
-        open_viewer(out)
     text = f"{len(shown)} frames written to {out}"
     if lacking := len(frames) - len(complete):
         text += f"; {lacking} without radar tensor or projection skipped"

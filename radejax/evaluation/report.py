@@ -222,7 +222,7 @@ def _draw_curves(
         seen = {title: lines for title, lines in panels.items() if any(lines.values())}
         figure = draw_precision_recall(seen or dict([*panels.items()][:1]))
         path = folder / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
-        save_figure(figure, path, dpi=110)
+        save_figure(figure, path)
 
 
 def _plain(value: Any) -> Any:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -69,7 +67,7 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
     )
 
 
-def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Series of a run's `metrics.jsonl`: name to `(step [N], value [N])`.
 
     An unfinished last line, as an interrupted run leaves it, is ignored.
@@ -78,9 +76,6 @@ def read_metrics(path: str | os.PathLike) -> dict[str, tuple[np.ndarray, np.ndar
         FileNotFoundError: The file does not exist.
         DataError: A line is not a JSON object with a step; names file and line.
     """
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no metrics of a run at {path}")
     series: dict[str, list[tuple[float, float]]] = {}
     *lines, _ = files.read_text(path).split("\n")
     for number, line in enumerate(lines, 1):

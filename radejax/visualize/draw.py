@@ -8,9 +8,8 @@ left, in meters, and every range-azimuth bin covers the ground that it measures.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,13 +24,12 @@ from radejax.core.structures import ROIS
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.camera import draw_camera
-from radejax.visualize.slices import POWER_LABEL, bin_edges, range_azimuth, to_polar
+from radejax.visualize.slices import bin_edges, to_polar
 from radejax.visualize.style import (
     COLOR_MAP,
     ROI_COLOR,
     Label,
     Scene,
-    add_colorbar,
     draw_labels,
     draw_lines,
     draw_tiles,
@@ -42,8 +40,10 @@ from radejax.visualize.style import (
     new_figure,
 )
 
-Extent = Literal["roi", "fov"] | Sequence[float]
-Limits = tuple[float, float] | None
+Extent = tuple[float, float, float, float]
+"""x_min, x_max, y_min, y_max in meters."""
+
+POWER_LABEL = "normalized log power, max over Doppler and elevation"
 
 _OUTSIDE_COLOR = "0.90"
 _BEHIND_M = 2.0  # shown behind the sensor, so that its mark is whole
@@ -58,10 +58,9 @@ def draw_map(
     grid: RadarGrid,
     *,
     ax: Axes | None = None,
-    extent: Extent = "fov",
-    color_limits: Limits = None,
+    extent: Extent | None = None,
+    color_limits: tuple[float, float] | None = None,
     label: str = "",
-    show_colorbar: bool = True,
 ) -> Axes:
     """Draw any range-azimuth map on the ground plane: heatmaps, gates, attention.
 
@@ -69,10 +68,9 @@ def draw_map(
         values: `[R, A]`.
         grid: Grid of the map; padded maps need the padded grid.
         ax: Where to draw; a new figure by default.
-        extent: "fov", or x_min, x_max, y_min, y_max in meters.
+        extent: What to show; by default the field of view.
         color_limits: Limits of the color bar; by default from the values shown.
-        label: Text of the color bar.
-        show_colorbar: Add a color bar.
+        label: Text of the color bar; without one there is no color bar.
 
     Raises:
         UserError: Map and grid differ in shape.
@@ -83,8 +81,8 @@ def draw_map(
             f"map has shape {values.shape}, the grid expects (range, azimuth) = "
             f"{(grid.num_range, grid.num_azimuth)}"
         )
-    x0, x1, y0, y1 = _extent_m(grid, None, extent)
-    ax = _axes_for_extent((x0, x1, y0, y1)) if ax is None else ax
+    x0, x1, y0, y1 = extent = extent or _extent_m(grid, None)
+    ax = _axes_for_extent(extent) if ax is None else ax
     # Range bins outside the figure take time to draw and would set its colors.
     x, y = np.moveaxis(grid.bin_centers_ego(), -1, 0)
     is_shown = ((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)).any(1)
@@ -101,73 +99,62 @@ def draw_map(
     # Seen from above with x ahead, left is left: y grows to the left.
     ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, left [m]", ylabel="x, ahead [m]")
     ax.set_aspect("equal")
-    if show_colorbar:
-        add_colorbar(mesh, ax, label)
+    if label:
+        # As high as the axes, also where equal aspect shrinks them.
+        cax = ax.inset_axes((1.02, 0.0, 0.035, 1.0))
+        ax.figure.colorbar(mesh, cax=cax, label=label)
     return ax
 
 
-def draw_bev(
-    scene: Scene,
-    *,
-    ax: Axes | None = None,
-    extent: Extent = "roi",
-    color_limits: Limits = None,
-    show_labels: bool = True,
-    show_legend: bool = True,
-    show_colorbar: bool = True,
-) -> Axes:
-    """Draw one frame on the ground plane.
+def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -> Axes:
+    """Figure of one frame on the ground plane.
+
+    The region of interest and its surroundings are shown, the field of view without one.
 
     Args:
         scene: The frame.
-        ax: Where to draw; a new figure by default. Its limits and aspect are set.
-        extent: "roi" shows the region of interest and its surroundings (the field of
-            view without one), "fov" the field of view; or x_min, x_max, y_min, y_max
-            in meters.
         color_limits: Limits of the color bar; by default from the values shown.
-        show_labels: Write class and score next to the boxes.
-        show_legend: Explain the lines.
-        show_colorbar: Add a color bar.
 
     Returns:
         The axes; `.figure` is the figure.
     """
-    ax = draw_map(
-        range_azimuth(scene.projection, scene.grid),
-        scene.grid,
-        ax=ax,
-        extent=_extent_m(scene.grid, scene.roi, extent),
-        color_limits=color_limits,
-        label=POWER_LABEL,
-        show_colorbar=show_colorbar,
-    )
-    _draw_over(ax, scene, lambda points: points[..., ::-1], show_labels, show_legend)
+    ax = _draw_ground(scene, color_limits=color_limits, label=POWER_LABEL)
+    if handles := _legend_handles(scene):
+        ax.legend(
+            handles=handles,
+            loc="lower center",
+            bbox_to_anchor=(0.5, 1.0),
+            ncols=len(handles),
+            fontsize=8,
+            frameon=False,
+            handlelength=1.6,
+        )
+    ax.set_title(scene.title, pad=24)
+    return ax
+
+
+def _draw_ground(scene: Scene, **options: Any) -> Axes:
+    """Draw map, region, boxes and sensor, with options of `draw_map`."""
+    extent = _extent_m(scene.grid, scene.roi)
+    ax = draw_map(scene.power, scene.grid, extent=extent, **options)
+    _draw_over(ax, scene, lambda points: points[..., ::-1])
     # The sensor, pointing ahead.
     ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
     return ax
 
 
-def draw_polar(
-    scene: Scene,
-    *,
-    ax: Axes | None = None,
-    show_labels: bool = True,
-) -> Axes:
+def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
     """Draw one frame as the network sees it: range over azimuth, one tile per bin.
 
-    Straight box edges bend here; they are drawn bent. Arguments as in `draw_bev`, which
-    has the legend and the color bar.
+    Straight box edges bend here; they are drawn bent.
     """
-    ax = new_figure(6.0, 5.0).add_axes((0.11, 0.1, 0.74, 0.82)) if ax is None else ax
-    power = range_azimuth(scene.projection, scene.grid)
     horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
     vertical = bin_edges(scene.grid.range_m)
-    draw_tiles(ax, horizontal, vertical, power)
+    draw_tiles(ax, horizontal, vertical, scene.power)
     ax.set_xlim(horizontal[0], horizontal[-1])
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
-    _draw_over(ax, scene, to_polar, show_labels, show_legend=False)
-    return ax
+    _draw_over(ax, scene, to_polar, show_labels=show_labels)
 
 
 def draw_frame(scene: Scene) -> Figure:
@@ -177,16 +164,12 @@ def draw_frame(scene: Scene) -> Figure:
         A figure of 12 by 6.4 inches; write it with `save_figure`.
     """
     figure = new_figure(12.0, 6.4)
-    untitled = dataclasses.replace(scene, title="")
     bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
-    draw_bev(untitled, ax=bev_ax, show_legend=False)
+    _draw_ground(scene, ax=bev_ax, label=POWER_LABEL)
     has_image = scene.image is not None
     height = 0.26 if has_image else 0.77
-    draw_polar(
-        untitled,
-        ax=figure.add_axes((0.57, 0.085, 0.41, height)),
-        show_labels=not has_image,
-    )
+    polar_ax = figure.add_axes((0.57, 0.085, 0.41, height))
+    _draw_polar(polar_ax, scene, show_labels=not has_image)
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
     figure.legend(
@@ -197,8 +180,7 @@ def draw_frame(scene: Scene) -> Figure:
         fontsize=8,  # counts, threshold and the region's name fit
         frameon=False,
     )
-    if scene.title:
-        figure.suptitle(scene.title)
+    figure.suptitle(scene.title)
     return figure
 
 
@@ -218,7 +200,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     height = _ROW_IN * -(-len(scenes) // columns) + _FOOT_IN
     figure = new_figure(width, height)
     # One color scale for all, which the few strongest echoes exceed.
-    values = [range_azimuth(scene.projection, scene.grid).ravel() for scene in scenes]
+    values = [scene.power.ravel() for scene in scenes]
     low, high = np.nanpercentile(np.concatenate(values), _SCENE_PERCENTILES)
     limits = (float(low), float(max(high, low + 1e-3)))
     for index, scene in enumerate(scenes):
@@ -232,13 +214,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
             # Labels are readable on the map; here they would hide the image.
             _draw_view(above, scene, show_labels=False)
         below = figure.add_axes((left, (base + 0.55) / height, across, 4.9 / height))
-        draw_bev(
-            dataclasses.replace(scene, title=""),
-            ax=below,
-            color_limits=limits,
-            show_legend=False,
-            show_colorbar=False,
-        )
+        _draw_ground(scene, ax=below, color_limits=limits)
         if column:
             below.set_ylabel("")
         (above or below).set_title(scene.title, fontsize=11)
@@ -277,16 +253,11 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
     )
 
 
-def _extent_m(
-    grid: RadarGrid, roi: Sequence[float] | None, extent: Extent
-) -> tuple[float, float, float, float]:
-    """x_min, x_max, y_min, y_max of the figure."""
-    if not isinstance(extent, str):
-        x0, x1, y0, y1 = map(float, extent)
-        return x0, x1, y0, y1
+def _extent_m(grid: RadarGrid, roi: Sequence[float] | None) -> Extent:
+    """The region with its surroundings, or the field of view."""
     far = grid.range_m[-1] + grid.range_step_m / 2
     side = far * np.sin(min(grid.fov_azimuth_rad, np.pi / 2))
-    if extent == "fov" or roi is None:
+    if roi is None:
         return -_BEHIND_M, far, -side, side
     _, x1, y0, y1 = roi[:4]
     far = min(far, 1.08 * x1)
@@ -295,7 +266,7 @@ def _extent_m(
     return -_BEHIND_M, far, -half, half
 
 
-def _axes_for_extent(extent: Sequence[float]) -> Axes:
+def _axes_for_extent(extent: Extent) -> Axes:
     """Axes of a new figure that fit an extent, with space for color bar and legend."""
     x0, x1, y0, y1 = extent
     scale = min(5.5 / (x1 - x0), 6.0 / (y1 - y0))
@@ -309,17 +280,15 @@ def _draw_over(
     ax: Axes,
     scene: Scene,
     to_axes: Callable[[np.ndarray], np.ndarray],
-    show_labels: bool,
-    show_legend: bool,
+    show_labels: bool = True,
 ) -> None:
-    """Region of interest, boxes with headings and labels, legend and title.
+    """Region of interest, boxes with headings and labels.
 
     Args:
         ax: Axes of a map; limits and aspect are final.
         scene: The frame.
         to_axes: Ground positions `[..., 2]` to data coordinates.
         show_labels: Write class and score next to the boxes.
-        show_legend: Explain the lines.
     """
     ax.apply_aspect()
     if scene.roi is not None:
@@ -347,19 +316,6 @@ def _draw_over(
         ]
     if show_labels:
         draw_labels(ax, labels)
-    handles = _legend_handles(scene)
-    if show_legend and handles:
-        ax.legend(
-            handles=handles,
-            loc="lower center",
-            bbox_to_anchor=(0.5, 1.0),
-            ncols=len(handles),
-            fontsize=8,
-            frameon=False,
-            handlelength=1.6,
-        )
-    if scene.title:
-        ax.set_title(scene.title, pad=24 if show_legend else 6)
 
 
 def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:

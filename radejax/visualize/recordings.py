@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import os
 import pathlib
-import shutil
 import subprocess
 from collections.abc import Iterable
 from typing import Any
@@ -23,13 +22,7 @@ from matplotlib.figure import Figure
 from radejax.core.errors import UserError
 from radejax.core.files import atomic_path
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize.slices import range_azimuth
 from radejax.visualize.style import COLOR_MAP, Scene, color_limits_of, label_texts
-
-_INSTALL = (
-    "the viewer needs rerun, which is not installed: pip install 'radejax[viewer]' "
-    "(or pip install rerun-sdk)"
-)
 
 
 def animate(
@@ -102,7 +95,10 @@ def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
     try:
         import rerun as rr
     except ImportError as error:
-        raise UserError(_INSTALL) from error
+        raise UserError(
+            "recordings need rerun, which is not installed: pip install "
+            "'radejax[viewer]' (or pip install rerun-sdk)"
+        ) from error
     with atomic_path(path) as temporary:
         stream = rr.RecordingStream("radejax")
         stream.save(temporary, default_blueprint=_blueprint())
@@ -114,18 +110,6 @@ def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
             raise UserError("no frames to record")
         stream.flush()
         del stream  # closes the file before it takes its name
-
-
-def open_viewer(path: str | os.PathLike) -> None:
-    """Open a recording in the rerun viewer and return at once.
-
-    Raises:
-        UserError: The rerun program is not installed.
-    """
-    program = shutil.which("rerun")
-    if program is None:
-        raise UserError(_INSTALL)
-    subprocess.Popen([program, str(path)], start_new_session=True)
 
 
 def ground_mesh(
@@ -171,7 +155,7 @@ def _log_scene(stream: Any, scene: Scene, index: int) -> None:
     if scene.time_s is not None:
         stream.set_time("time", timestamp=scene.time_s)
     stream.log("frame", rr.TextDocument(scene.title))
-    power = range_azimuth(scene.projection, scene.grid).ravel()
+    power = scene.power.ravel()
     low, high = color_limits_of(power)
     colors = COLOR_MAP(np.clip((power - low) / (high - low), 0, 1))[:, :3]
     vertices, triangles = ground_mesh(scene.grid)

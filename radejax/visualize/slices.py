@@ -8,31 +8,20 @@ velocity, never the velocity: figures say so.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from radejax.core.structures import Boxes
 from radejax.geometry.boxes import corners
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.style import (
     GROUND_TRUTH,
-    check_projection,
+    Scene,
     color_limits_of,
     draw_lines,
     draw_tiles,
     footprints,
     new_figure,
 )
-
-POWER_LABEL = "normalized log power, max over Doppler and elevation"
-
-
-def range_azimuth(projection: Any, grid: RadarGrid) -> Float[np.ndarray, "R A"]:
-    """Maximum over all channels, which is that over the whole radar tensor."""
-    return check_projection(projection, grid).max(-1)
 
 
 def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
@@ -47,33 +36,20 @@ def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*poin
     return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
-def draw_slices(
-    projection: Any,
-    grid: RadarGrid,
-    *,
-    range_idx: int | None = None,
-    azimuth_idx: int | None = None,
-    ground_truth: Boxes | None = None,
-) -> Figure:
+def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
     """Figure of three slices on one color scale: azimuth, Doppler, elevation.
 
-    Boxes are outlined where both axes are known. Labels have no Doppler: there a bar at
-    the left edge spans the ranges of each box.
+    Ground truth is outlined where both axes are known. Labels have no Doppler: there a
+    bar at the left edge spans the ranges of each box.
 
     Args:
-        projection: `[R, A, D+E]` normalized log power.
-        grid: Grid of the projection.
+        scene: The frame; predictions, region and image are not drawn.
         range_idx: Range bin of the azimuth-elevation slice; None: maximum.
-        azimuth_idx: Azimuth bin of the range-Doppler slice; None: maximum.
-        ground_truth: Boxes to draw, or None.
     """
-    values = check_projection(projection, grid)
+    grid, values = scene.grid, np.asarray(scene.projection, np.float32)
     doppler, elevation = np.split(values, [grid.num_doppler], -1)
     azimuth_deg, range_m = np.rad2deg(grid.azimuth_rad), grid.range_m
-    at_azimuth, at_range = "max over azimuth", "max over range"
-    if azimuth_idx is not None:
-        doppler = doppler[:, [azimuth_idx]]
-        at_azimuth = f"at {azimuth_deg[azimuth_idx]:.1f}°"
+    at_range = "max over range"
     if range_idx is not None:
         elevation = elevation[[range_idx]]
         at_range = f"at {range_m[range_idx]:.1f} m"
@@ -90,7 +66,7 @@ def draw_slices(
             doppler.max(1),
             (grid.doppler_mps, "Doppler (aliased) [m/s]"),
             distance,
-            f"Range–Doppler (aliased), {at_azimuth}",
+            "Range–Doppler (aliased), max over azimuth",
         ),
         (
             elevation.max(0).T,
@@ -107,9 +83,10 @@ def draw_slices(
         mesh = draw_tiles(ax, *edges, plane, limits)
         ax.set(xlabel=horizontal[1], ylabel=vertical[1], title=title)
         figure.colorbar(mesh, ax=ax, label="normalized log power")
-    if ground_truth is not None:
+    figure.suptitle(scene.title)
+    if scene.ground_truth is not None:
         left, right = axes[1].get_xlim()
-        outlines = _outlines(ground_truth.box, left + 0.02 * (right - left))
+        outlines = _outlines(scene.ground_truth.box, left + 0.02 * (right - left))
         for ax, lines in zip(axes, outlines, strict=True):
             # Most boxes are a few bins.
             draw_lines(ax, lines, GROUND_TRUTH.color, 0.7 * GROUND_TRUTH.width)

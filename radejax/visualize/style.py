@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import os
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -25,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
 from radejax.core.errors import UserError
-from radejax.core.files import atomic_path
+from radejax.core.files import PathLike, atomic_path
 from radejax.core.structures import Boxes
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
@@ -98,7 +97,13 @@ class Scene:
     time_s: float | None = None
 
     def __post_init__(self) -> None:
-        check_projection(self.projection, self.grid)
+        shape = np.shape(self.projection)
+        if shape != self.grid.projection_shape:
+            raise UserError(
+                f"projection has shape {shape}, the grid expects (range, azimuth, "
+                f"Doppler + elevation) = {self.grid.projection_shape}; pass one frame, "
+                "without a batch axis, and the grid that it was recorded on"
+            )
         for style, boxes in self.sets:
             if len(np.unique(boxes.frame)) > 1:
                 raise UserError(
@@ -111,6 +116,11 @@ class Scene:
         """Ground truth and predictions, where given, with their styles."""
         return styled_sets(self.ground_truth, self.predictions)
 
+    @property
+    def power(self) -> Float[np.ndarray, "R A"]:
+        """Maximum over all channels, which is that over the whole radar tensor."""
+        return np.asarray(self.projection, np.float32).max(-1)
+
 
 def styled_sets(
     ground_truth: Boxes | None, predictions: Boxes | None
@@ -118,18 +128,6 @@ def styled_sets(
     """Those of both that are given, with their styles."""
     pairs = (GROUND_TRUTH, ground_truth), (PREDICTION, predictions)
     return [(style, boxes) for style, boxes in pairs if boxes is not None]
-
-
-def check_projection(projection: Any, grid: RadarGrid) -> np.ndarray:
-    """Return the projection as float32; raise `UserError` if it is not the grid's."""
-    values = np.asarray(projection, np.float32)
-    if values.shape != grid.projection_shape:
-        raise UserError(
-            f"projection has shape {values.shape}, the grid expects (range, azimuth, "
-            f"Doppler + elevation) = {grid.projection_shape}; pass one frame, without "
-            "a batch axis, and the grid that it was recorded on"
-        )
-    return values
 
 
 def label_texts(boxes: Boxes) -> list[str]:
@@ -173,12 +171,6 @@ def draw_tiles(
     return ax.pcolormesh(
         edges_x, edges_y, values, cmap=COLOR_MAP, vmin=low, vmax=high, rasterized=True
     )
-
-
-def add_colorbar(mesh: Any, ax: Axes, label: str) -> None:
-    """Add a color bar as high as the axes, also where equal aspect shrinks them."""
-    cax = ax.inset_axes((1.02, 0.0, 0.035, 1.0))
-    ax.figure.colorbar(mesh, cax=cax, label=label)
 
 
 def draw_lines(
@@ -328,15 +320,12 @@ def figure_format(path: pathlib.Path) -> str:
     return suffix
 
 
-def save_figure(
-    figure: Figure, path: str | os.PathLike, **options: Any
-) -> pathlib.Path:
+def save_figure(figure: Figure, path: PathLike) -> pathlib.Path:
     """Write a figure completely or not at all.
 
     Args:
         figure: The figure.
         path: Target; the suffix sets the format. Folders are created.
-        **options: Arguments of `Figure.savefig`, such as `dpi`.
 
     Returns:
         The path written.
@@ -346,7 +335,6 @@ def save_figure(
     """
     path = pathlib.Path(path)
     suffix = figure_format(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format=suffix, **options)
+        figure.savefig(temporary, format=suffix)
     return path
