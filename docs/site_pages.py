@@ -57,7 +57,7 @@ def commands_page() -> str:
     """All commands of `radejax` with their arguments and options."""
     parts = ["# Commands", ""]
     for name, command in commands(main, "radejax"):
-        context = click.Context(command, info_name=name)
+        context = click.Context(command, info_name=name, **command.context_settings)
         parts += [f"## {name}", "", f"`{command.get_usage(context)[7:]}`", ""]
         parts += [re.sub(r"\x08\n", "", command.help or ""), ""]
         rows = [parameter.get_help_record(context) for parameter in command.params]
@@ -123,12 +123,14 @@ def field_comments(source: str) -> dict[str, str]:
             section = f"{sections.get(match[1], match[1])}."
         if match := re.match(r"    (model\.\w+) = ConfigDict", line):
             section = f"{match[1]}."
+        if match := re.match(r'    "(\w+)": \{$', line):
+            section = f"{match[1]}."
+            continue
         if line.lstrip().startswith("# "):
             above.append(line.strip("# "))
             continue
-        if match := re.match(r'\s+(?:"(\w+)":|config\.(\w+) = (?!_))', line):
-            name = f"{section}{match[1]}" if match[1] else match[2]
-            found[name] = " ".join(above).replace("|", "\\|")
+        if match := re.match(r'\s+"(\w+)":', line):
+            found[f"{section}{match[1]}"] = " ".join(above).replace("|", "\\|")
         above = []
     return found
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
@@ -52,14 +53,12 @@ def simulate(
 
     Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
     """
-    from radejax.core.config import load_config
     from radejax.simulation.config import FULL_SIZE, default_config
-    from radejax.simulation.dataset import simulate_dataset
 
     entry.set_up_jax()
     simulation = default_config()
     if config is not None:
-        section = load_config(config).get("simulation")
+        section = radejax.load_config(config).get("simulation")
         if section is None:
             raise UserError(f"{config} has no `simulation` section")
         simulation = dict(section)
@@ -67,7 +66,7 @@ def simulate(
         simulation |= FULL_SIZE
     fields["sequences"] = sequence_numbers
     simulation |= {name: value for name, value in fields.items() if value is not None}
-    simulate_dataset(simulation, out, num_workers=num_workers)
+    radejax.simulate(simulation, out, num_workers=num_workers)
     click.echo(f"simulated dataset in {out}")
 
 
@@ -81,7 +80,7 @@ def data() -> None:
 @entry.labelled_frames
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
-def check(roots: tuple[pathlib.Path, ...], as_json: bool, **options: Any) -> None:
+def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
     """Report what is there, what is missing and what is corrupted.
 
     Exit code 1 if anything is missing or corrupted.
@@ -119,11 +118,10 @@ def _shard(text: str) -> tuple[int, int]:
     type=_shard,
     metavar="I/N",
     default="0/1",
-    show_default=True,
     help="Every N-th frame from the I-th on, for several machines.",
 )
 def preprocess(
-    roots: tuple[pathlib.Path, ...],
+    roots: tuple[str, ...],
     out: pathlib.Path,
     dtype: str | None,
     num_workers: int | None,
@@ -138,9 +136,8 @@ def preprocess(
     Example: radejax preprocess /disk1/kradar --out /fast/records --shard 3/16
     """
     from radejax.data import records
-    from radejax.data.kradar import KRadar
 
-    frames = KRadar(roots, **part)
+    frames = radejax.KRadar(roots, **part)
     click.echo(frames.summary().to_text(), err=True)
     report = records.preprocess(
         frames, out, dtype=dtype, shard=shard, num_workers=num_workers
@@ -166,27 +163,18 @@ def preprocess(
 @click.option(
     "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."
 )
-@entry.labels
-@entry.sequences
-@entry.weather
+@entry.part
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
     default="float32",
-    show_default=True,
     help="Type of the stored embeddings.",
 )
-@click.option(
-    "--batch-size",
-    type=entry.COUNT,
-    default=8,
-    show_default=True,
-    help="Images per call of the backbone.",
-)
+@entry.batch_size(8, "Images per call of the backbone.")
 def embed(
-    roots: tuple[pathlib.Path, ...],
+    roots: tuple[str, ...],
     config: str,
-    image_backbone: pathlib.Path,
+    image_backbone: str,
     out: pathlib.Path,
     dtype: str,
     batch_size: int,
@@ -201,14 +189,12 @@ def embed(
     --image-backbone dinov3-vits16 --out /fast/embeddings
     """
     from radejax import models
-    from radejax.core.config import load_config
-    from radejax.data.kradar import KRadar
     from radejax.inference.predict import embed_dataset
     from radejax.runs.data import located, simulate_missing
     from radejax.weights.image_backbone import load_image_backbone
 
     entry.set_up_jax()
-    settings = load_config(config)
+    settings = radejax.load_config(config)
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
     assert variables is not None  # as there is a path
@@ -220,7 +206,7 @@ def embed(
         model,
         variables,
         settings.model.image,
-        KRadar(roots, version=settings.data.label_version, **part),
+        radejax.KRadar(roots, version=settings.data.label_version, **part),
         out,
         dtype=dtype,
         resize=settings.data.camera.resize,

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+import radejax
 from radejax.cli import entry
 
 
@@ -22,9 +23,7 @@ from radejax.cli import entry
 )
 @click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
 @entry.step
-@entry.labels
-@entry.sequences
-@entry.weather
+@entry.part
 @click.option(
     "--score-threshold", type=float, help="Score threshold. Default: the config's."
 )
@@ -36,21 +35,14 @@ from radejax.cli import entry
     "file_format",
     type=click.Choice(["json", "kitti"]),
     default="json",
-    show_default=True,
     help="kitti: preds/000000.txt as K-Radar's tools write them.",
 )
-@click.option(
-    "--batch-size",
-    type=entry.COUNT,
-    default=8,
-    show_default=True,
-    help="Frames per call of the detector.",
-)
+@entry.batch_size(8, "Frames per call of the detector.")
 @entry.image_backbone
 @entry.json_option
 def detect(
-    roots: tuple[pathlib.Path, ...],
-    source: pathlib.Path,
+    roots: tuple[str, ...],
+    source: str,
     out: pathlib.Path,
     as_json: bool,
     **settings: Any,
@@ -85,13 +77,11 @@ def detect(
     "kind",
     type=click.Choice(["stablehlo", "onnx", "huggingface"]),
     default="stablehlo",
-    show_default=True,
     help="Format of the exported folder.",
 )
 @entry.several(
     "--platforms",
     default=["cpu,cuda,tpu"],
-    show_default=True,
     help="Platforms of the StableHLO program.",
 )
 @entry.image_backbone
@@ -101,21 +91,12 @@ def detect(
     help="Keep the weights of the image transformer. DINOv3's license restricts "
     "redistribution.",
 )
-@click.option(
-    "--batch-size",
-    type=entry.COUNT,
-    default=1,
-    show_default=True,
-    help="Batch size of the ONNX files.",
-)
+@entry.batch_size(1, "Batch size of the ONNX files.")
 @click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
 def export(
-    source: pathlib.Path,
-    out: pathlib.Path,
-    image_backbone: pathlib.Path | None,
-    **settings: Any,
+    source: str, out: pathlib.Path, image_backbone: str | None, **settings: Any
 ) -> None:
     """Export a model as a folder for other programs.
 
@@ -127,10 +108,9 @@ def export(
     Example: radejax export runs/quickstart --out exported
     """
     from radejax.inference import export as exporting
-    from radejax.inference.detector import Detector
 
     entry.set_up_jax()
-    detector = Detector.from_workdir(source, image_backbone=image_backbone)
+    detector = radejax.Detector.from_workdir(source, image_backbone=image_backbone)
     done = exporting.export(detector, out, **settings)
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:

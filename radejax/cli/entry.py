@@ -103,11 +103,10 @@ def set_up_jax() -> None:
     # Orbax logs every step it takes; its errors are raised as well.
     absl_logging.set_verbosity(absl_logging.FATAL)
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read one of theirs
-    home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
-    folder = os.environ.get(
-        "JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(home) / "radejax" / "jax")
-    )
-    jax.config.update("jax_compilation_cache_dir", folder)
+    if jax.config.jax_compilation_cache_dir is None:
+        home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
+        folder = pathlib.Path(home, "radejax", "jax")
+        jax.config.update("jax_compilation_cache_dir", str(folder))
     # Every program: the fifty small ones of a start take a second and 200 kB.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
@@ -141,6 +140,7 @@ class Command(Program):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.context_settings["help_option_names"] = ["-h", "--help"]
+        self.context_settings["show_default"] = True
         text = "Show tracebacks of user errors."
         self.params.append(click.Option(["--debug"], is_flag=True, help=text))
 
@@ -159,7 +159,7 @@ def echo_result(as_json: bool, values: Any, text: str) -> None:
 COUNT = click.IntRange(1)
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
 FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
-EXISTING = click.Path(path_type=pathlib.Path, exists=True)
+EXISTING = click.Path(exists=True)
 
 
 def _step(text: str) -> int | str:
@@ -211,6 +211,16 @@ def together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return decorate
 
 
+def out_file(default: str, meaning: str) -> Callable[[Any], Any]:
+    """An option of the file to write."""
+    return click.option("--out", type=FILE, default=default, help=meaning)
+
+
+def batch_size(default: int, meaning: str) -> Callable[[Any], Any]:
+    """An option of the number of frames at once."""
+    return click.option("--batch-size", type=COUNT, default=default, help=meaning)
+
+
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print the result as JSON."
 )
@@ -230,17 +240,30 @@ weather = several(
     metavar="fog,rain",
     help="Use sequences with this weather only. Default: all.",
 )
+part = together(labels, sequences, weather)
 labelled_frames = together(
-    labels,
     click.option(
         "--label-version",
         "version",
         default="v2.1",
-        show_default=True,
         help="Version of the labels: v1.0, v1.1, v2.0 or v2.1.",
     ),
-    sequences,
-    weather,
+    part,
+)
+beside_data = together(
+    click.option(
+        "--records",
+        help="Folder of preprocessed frames; missing ones are written. Default: in the "
+        "data.",
+    ),
+    click.option(
+        "--embeddings", help="Folder of `radejax embed`, used instead of the images."
+    ),
+    click.option(
+        "--camera-calibration",
+        help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
+        "repository). Default: in the data.",
+    ),
 )
 step = click.option(
     "--checkpoint",
@@ -253,7 +276,8 @@ step = click.option(
 image_backbone = click.option(
     "--image-backbone",
     type=EXISTING,
-    help="Weights of the image backbone, if the model has none.",
+    help="Weights of a frozen image backbone: a DINOv3 folder from Hugging Face or "
+    "torchvision's ResNet-50 file.",
 )
 max_frames = click.option(
     "--max-frames",

@@ -21,18 +21,13 @@ _DATA = together(
     click.option(
         "--split",
         default="test",
-        show_default=True,
         help="train, test, all, validation (of a run), or a split file.",
     ),
     several("--data", help="Roots of K-Radar. Default: those of the run."),
-    click.option("--labels", help="Folder or zip of a label revision."),
     click.option(
         "--label-version", help="Version of the labels. Default: v2.1, or the run's."
     ),
-    several(
-        "--sequences", kind=int, metavar="1,5,58", help="Evaluate these sequences only."
-    ),
-    several("--weather", metavar="fog,rain", help="Evaluate this weather only."),
+    entry.part,
 )
 _SETTINGS = together(
     several(
@@ -113,11 +108,7 @@ _OTHER_DATA = (
 @click.option("--out", help="Output folder. Default: in the workdir.")
 @click.option("--name", "run", help="Name of the run in tables.")
 @_DATA
-@click.option(
-    "--records", help="Preprocessed frames of --data; missing ones are written."
-)
-@click.option("--camera-calibration", help="Folder of camera calibrations of --data.")
-@click.option("--embeddings", help="Folder of `radejax embed` of the images of --data.")
+@entry.beside_data
 @entry.image_backbone
 @click.option(
     "--shuffle-images",
@@ -201,6 +192,8 @@ def compare(
 def _given(options: dict[str, Any]) -> dict[str, Any]:
     """The options that were given; the region "none" as None."""
     given = {name: value for name, value in options.items() if value is not None}
+    if "sequence_numbers" in given:
+        given["sequences"] = given.pop("sequence_numbers")
     if given.get("roi") == "none":
         given["roi"] = None
     return given

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
@@ -23,19 +24,12 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
 @click.argument("name", metavar="[FRAME]", default="")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
 @entry.labelled_frames
-@click.option(
-    "--out",
-    type=entry.FILE,
-    default="overlay.png",
-    show_default=True,
-    help="Image file, or .gif or .mp4 for a sequence.",
-)
+@entry.out_file("overlay.png", "Image file, or .gif or .mp4 for a sequence.")
 @click.option("--slices", is_flag=True, help="Draw slices of the projection.")
 @click.option(
     "--roi",
     type=click.Choice(["narrow", "wide", "none"]),
     default="narrow",
-    show_default=True,
     help="Region of interest to draw.",
 )
 @entry.max_frames
@@ -58,7 +52,6 @@ def overlay(
     """
     import tqdm
 
-    from radejax.data.kradar import KRadar
     from radejax.visualize.recordings import animate
     from radejax.visualize.style import save_figure
 
@@ -67,7 +60,7 @@ def overlay(
         part["sequence_numbers"] = (int(sequence),)
     elif name or not (part["sequence_numbers"] or part["weather"]):
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
-    frames = KRadar(roots, visibility=None, **part)
+    frames = radejax.KRadar(roots, visibility=None, **part)
     if not len(frames):
         raise UserError("no frames of these sequences and weathers")
     found = [
@@ -95,31 +88,23 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
         UserError: It has neither tensor nor projection.
     """
     from radejax.core.structures import ROIS
-    from radejax.runs.figures import frame_scene
-    from radejax.visualize.draw import draw_frame
     from radejax.visualize.slices import draw_slices
 
     projection = frame.read_projection(grid)
-    scene = frame_scene(frame, projection, grid, roi=ROIS.get(roi))
-    return draw_slices(scene) if slices else draw_frame(scene)
+    scene = radejax.frame_scene(frame, projection, grid, roi=ROIS.get(roi))
+    return draw_slices(scene) if slices else radejax.draw_frame(scene)
 
 
 @click.command(cls=entry.Command)
 @entry.roots
-@click.option(
-    "--out",
-    type=entry.FILE,
-    default="recording.rrd",
-    show_default=True,
-    help="File of the recording.",
-)
+@entry.out_file("recording.rrd", "File of the recording.")
 @entry.labelled_frames
 @click.option("--workdir", type=entry.EXISTING, help="Run whose detections are drawn.")
 @entry.max_frames
 def view(
-    roots: tuple[pathlib.Path, ...],
+    roots: tuple[str, ...],
     out: pathlib.Path,
-    workdir: pathlib.Path | None,
+    workdir: str | None,
     max_frames: int | None,
     **part: Any,
 ) -> None:
@@ -132,18 +117,16 @@ def view(
     """
     import tqdm
 
-    from radejax.data.kradar import KRadar
-    from radejax.inference.detector import Detector
     from radejax.visualize.recordings import write_recording
 
-    frames = KRadar(roots, visibility=None, **part)
+    frames = radejax.KRadar(roots, visibility=None, **part)
     complete = [frame for frame in frames if frame.radar_path]
     if not complete:
         raise UserError(
             f"no radar tensor or projection for any of {len(frames)} labelled frames"
         )
     shown = complete[:max_frames]
-    detector = None if workdir is None else Detector.from_workdir(workdir)
+    detector = None if workdir is None else radejax.Detector.from_workdir(workdir)
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
     write_recording(viewer_scenes(bar, frames.grid, detector), out)
     text = f"{len(shown)} frames written to {out}"
@@ -154,34 +137,24 @@ def view(
 
 def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:
     """`Scene` of each frame with radar data, read as it is needed."""
-    from radejax.core.structures import Boxes
-    from radejax.runs.figures import frame_scene
-
     for frame in frames:
         projection, time_s = frame.read_projection(grid), frame.header.timestamp_s
-        scene = frame_scene(frame, projection, grid, time_s=time_s)
+        scene = radejax.frame_scene(frame, projection, grid, time_s=time_s)
         if detector is not None:
             inputs = [projection]
             if detector.takes_camera and scene.camera is not None:
                 inputs += [frame.camera_path, scene.camera]
-            found = Boxes(**detector(*inputs).to_columns())
+            found = radejax.Boxes(**detector(*inputs).to_columns())
             scene = dataclasses.replace(scene, predictions=found)
         yield scene
 
 
 @click.command(cls=entry.Command)
-@click.option(
-    "--out",
-    type=entry.FILE,
-    default="demo.png",
-    show_default=True,
-    help="Image file of the figure.",
-)
+@entry.out_file("demo.png", "Image file of the figure.")
 @click.option(
     "--seed",
     type=click.IntRange(0),
     default=1000,
-    show_default=True,
     help="Seed of the scene; the model was trained on scenes of seed 0.",
 )
 def demo(out: pathlib.Path, seed: int) -> None:
@@ -192,13 +165,8 @@ def demo(out: pathlib.Path, seed: int) -> None:
 
     Example: radejax demo --out demo.png
     """
-    from radejax.core.structures import NARROW_ROI, Boxes
-    from radejax.data.kradar import KRadar
-    from radejax.inference.detector import Detector
-    from radejax.runs.figures import frame_scene
+    from radejax.core.structures import NARROW_ROI
     from radejax.simulation.config import default_config
-    from radejax.simulation.dataset import simulate_dataset
-    from radejax.visualize.draw import draw_frame
     from radejax.visualize.style import figure_format, save_figure
 
     figure_format(out)  # before the frame is simulated
@@ -212,13 +180,12 @@ def demo(out: pathlib.Path, seed: int) -> None:
         "image_height": 720,
     }
     with tempfile.TemporaryDirectory() as folder:
-        simulate_dataset(simulation, folder)
-        frames = KRadar([folder])
+        frames = radejax.KRadar([radejax.simulate(simulation, folder)])
         (frame,) = frames
         projection = frame.read_projection(frames.grid)
-        detector = Detector.from_workdir(MODEL)
-        found = Boxes(**detector(projection).to_columns())
-        scene = frame_scene(
+        detector = radejax.Detector.from_workdir(MODEL)
+        found = radejax.Boxes(**detector(projection).to_columns())
+        scene = radejax.frame_scene(
             frame,
             projection,
             frames.grid,
@@ -227,6 +194,6 @@ def demo(out: pathlib.Path, seed: int) -> None:
             roi=NARROW_ROI,
             title=f"simulated frame, seed {seed}, {frame.weather}",
         )
-    save_figure(draw_frame(scene), out)
+    save_figure(radejax.draw_frame(scene), out)
     num_labelled = len(frame.boxes)
     click.echo(f"{len(found)} boxes found, {num_labelled} labelled objects: see {out}")

@@ -48,31 +48,11 @@ class _Command(entry.Command):
     help="Roots of K-Radar. Without it, configs with a `simulation` section simulate "
     "one under data/.",
 )
-@click.option(
-    "--labels",
-    help="Label revision (folder or zip). Default: those in the sequence folders.",
-)
-@entry.sequences
-@entry.weather
-@click.option(
-    "--records",
-    help="Folder of preprocessed frames; missing ones are written. Default: in the data.",
-)
+@entry.part
+@entry.beside_data
+@entry.image_backbone
 @click.option(
     "--init-from", help="Initial weights: an official .pth file or another workdir."
-)
-@click.option(
-    "--embeddings", help="Folder of `radejax embed`, used instead of the images."
-)
-@click.option(
-    "--image-backbone",
-    help="Weights of the image backbone: a DINOv3 folder from Hugging Face or "
-    "torchvision's ResNet-50 file.",
-)
-@click.option(
-    "--camera-calibration",
-    help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
-    "repository). Default: in the roots.",
 )
 @entry.several(
     "--seeds",

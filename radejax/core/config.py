@@ -8,6 +8,7 @@ data (`DATA_PATHS`) are ignored when a run compares its config.
 from __future__ import annotations
 
 import ast
+import copy
 import difflib
 import importlib.util
 import json
@@ -125,6 +126,213 @@ def without_data_paths(config: ConfigDict) -> dict[str, Any]:
     return {**values, "data": {**values["data"], **empty}}
 
 
+_FIELDS: dict[str, Any] = {
+    # Seed of parameters, order of the data, dropout and augmentation.
+    "seed": 0,
+    # Classes to detect, in the order of the class indices.
+    "classes": CLASSES,
+    "model": {
+        # Architecture: radenet or dinorade.
+        "name": "radenet",
+        # Number of classes; must equal the length of `classes`.
+        "num_classes": len(CLASSES),
+        # Doppler bins of the radar.
+        "doppler_bins": 64,
+        # Elevation bins of the radar.
+        "elevation_bins": 37,
+        # Channels of the encoder levels, finest first.
+        "widths": (128, 256, 512),
+        # Channels of the last decoder stage, neck and heads.
+        "decoder_width": 128,
+        # Groups of every group normalization; must divide every width.
+        "num_groups": 32,
+        # Attention on the skip connections: official (the released block), paper
+        # (attention only), off.
+        "cbam": "official",
+        # Separate convolutions for Doppler and elevation channels at the input.
+        "input_stem": False,
+        # A name of `radejax.models.backbone.BACKBONES`.
+        "backbone": "unet",
+        # dilated, plain, or another name of `radejax.models.heads.NECKS`.
+        "neck": "dilated",
+        # expanded, default, or another name of `radejax.models.heads.HEADS`.
+        "heads": "expanded",
+        # Maps are padded to a multiple of this, itself a multiple of 2 to the power
+        # of the number of encoder levels.
+        "pad_multiple": 8,
+        # Crop the output to the bins of the projection.
+        "crop_output": True,
+        # Dtype of the computation: float32 or bfloat16. Parameters are float32.
+        "dtype": "float32",
+        # Activations that the backward pass recomputes to save memory: none, those
+        # of blocks, or full.
+        "remat": "none",
+        # Confidence of an untrained model, between 0 and 1.
+        "heatmap_prior": 0.5,
+        # Subtracted from the projection.
+        "input_center": 0.0,
+        # Multiplied with the projection after the subtraction; above 0.
+        "input_scale": 1.0,
+    },
+    "loss": {
+        # Standard deviation of the heatmap's targets: fixed, adaptive (with the size
+        # of the box), anisotropic (with its length and width).
+        "heatmap_sigma_mode": "fixed",
+        # Standard deviation of fixed targets in bins; above 0.
+        "heatmap_sigma_bins": 3.0,
+        # Transform of the Wasserstein distance: sqrt, none, log1p.
+        "gwd_transform": "sqrt",
+        # Loss of a distance d: 1 - 1 / (tau + transform(d)); above 0.
+        "gwd_tau": 1.65,
+        # Normalize the yaw vector before the Wasserstein distance.
+        "normalize_yaw": False,
+        # Boxes of the regression losses: center (the objects' own bins) or nms
+        # (predictions that match an object after NMS, with the thresholds of decode).
+        "assignment": "center",
+        # Weight of every loss term, at least 0, by its name in
+        # `radejax.losses.detection.LOSSES`.
+        "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
+        # Divide each term by its own value.
+        "normalize": True,
+        # Height that is added to regressed heights, in meters.
+        "z0_m": 0.0,
+    },
+    "decode": {
+        # Rows of the output per frame; at least 1.
+        "max_detections": 100,
+        # Score threshold, from 0 to 1.
+        "score_threshold": 0.3,
+        # Keep scores equal to the threshold.
+        "threshold_inclusive": True,
+        # IoU above which NMS removes the lower score, from 0 to 1.
+        "nms_iou": 0.3,
+        # Apply NMS to each class separately.
+        "per_class_nms": False,
+        # Boxes with a center outside are removed before NMS: x0, x1, y0, y1, z0, z1.
+        "roi": placeholder(tuple),
+        # Where the length of the regressed yaw vector scales a box: nms, always
+        # (in the results too, as in the released evaluator), never.
+        "raw_yaw": "nms",
+        # Clip sizes to at least 0.01 m.
+        "clip_sizes": True,
+    },
+    "train": {
+        # Frames per step over all devices; at least 1.
+        "batch_size": 10,
+        # Passes over the training data; at least 1.
+        "num_epochs": 10,
+        # Peak learning rate of AdamW; above 0.
+        "learning_rate": 1e-3,
+        # Final learning rate, from 0 to the peak.
+        "final_learning_rate": 1e-4,
+        # cosine (once over the training) or cyclic_cosine (down in one epoch, up in
+        # the next, as released), per step.
+        "schedule": "cosine",
+        # Weight decay on every parameter; at least 0.
+        "weight_decay": 0.01,
+        # Steps of a linear warm-up from 0; fewer than the training has.
+        "warmup_steps": 0,
+        # Largest norm of the gradient, above 0; None: not clipped.
+        "gradient_clip_norm": placeholder(float),
+        # Decay per step of a moving average of the parameters, below 1; None: none.
+        "ema_decay": placeholder(float),
+        # Batches per update of the parameters; at least 1.
+        "gradient_accumulation_steps": 1,
+        # replicated, or fsdp to shard the parameters over the devices.
+        "parameter_sharding": "replicated",
+        # Steps between logged metrics; at least 1.
+        "log_every_steps": 20,
+        # Steps between checkpoints; at least 1.
+        "checkpoint_every_steps": 500,
+        # Newest checkpoints that are kept, at least 1; None: all.
+        "checkpoints_to_keep": 2,
+        # Epochs between evaluations; 0: only after the training.
+        "evaluate_every_epochs": 0,
+        # Metric of the best checkpoint: mean over classes, in the first protocol.
+        "best_metric": "map_3d_iou30",
+        # Consecutive steps with a loss or gradient that is not finite, after which
+        # the run stops.
+        "max_skipped_steps": 20,
+    },
+    "data": {
+        # kradar, another name of `radejax.data.dataset.DATA_SETS`, or module:Class.
+        "format": "kradar",
+        # Folders of the dataset; empty for what `simulation` describes.
+        "roots": (),
+        # Folder or zip of a label revision; None: the labels in the roots.
+        "labels": placeholder(str),
+        # Folder of preprocessed projections; None: in the first root.
+        "records": placeholder(str),
+        # Folder of embedded images (`radejax embed`); None: the images themselves.
+        "embeddings": placeholder(str),
+        # Weights of the frozen image backbone: file or folder.
+        "image_backbone": placeholder(str),
+        # Folder of camera calibrations; None: those in the roots.
+        "camera_calibration": placeholder(str),
+        # v1.0, v1.1, v2.0 or v2.1.
+        "label_version": "v2.1",
+        # Visibility flags of the objects that count: R, L, L1; None: all.
+        "visibility": ("R",),
+        # Count lines of v1.1 without an asterisk as objects, as released.
+        "include_unstarred_v11_labels": False,
+        # Only these sequences, such as (1, 58); empty: all.
+        "sequences": (),
+        # Only these kinds of weather, such as ("fog", "rain"); empty: all.
+        "weather": (),
+        # Sequences of the train split that are held out for validation, by number,
+        # or a fraction of them, such as (0.1,); empty: none.
+        "validation": (),
+        # Seed with which a fraction is drawn; independent of `seed`.
+        "validation_seed": 0,
+        # Padded objects per frame; K-Radar v2.1 has at most 14.
+        "max_objects": 32,
+        # true, or stretched for official checkpoints.
+        "azimuth_mapping": "true",
+        # Threads that prepare batches; 0: the main thread.
+        "num_threads": 2,
+        # Probability of mirroring a frame left to right, from 0 to 1.
+        "mirror_probability": 0.0,
+        # Standard deviation of a random gain in dB; at least 0.
+        "gain_db": 0.0,
+        # Standard deviation of a random gain at the last range in dB; at least 0.
+        "gain_slope_db": 0.0,
+        # Sanity check: shuffles the labels of the training frames with this seed.
+        "label_permutation_seed": placeholder(int),
+    },
+    "evaluation": {
+        # Region of interest: x0, x1, y0, y1, z0, z1 in meters; None: everywhere.
+        "roi": NARROW_ROI,
+        # Evaluation protocols; the first chooses the best checkpoint.
+        "protocols": ("coco101", "all_point", "kradar_r40"),
+        # Excluded frames: protocol (its own rule), class (without the class), frame
+        # (without any object), none.
+        "empty_frames": "protocol",
+        # IoU thresholds, from 0 to below 1.
+        "iou_thresholds": (0.3, 0.5),
+        # Score threshold of all protocols except all_point, from 0 to 1.
+        "score_threshold": 0.3,
+        # Predictions below this score are not stored, from 0 to 1.
+        "min_score": 0.05,
+        # Resamples of sequences for 95 % intervals; 0: no intervals.
+        "bootstrap": 0,
+        # Frames per call of the detector; at least 1.
+        "batch_size": 8,
+        # Figures of frames in a report; at least 0.
+        "num_visualizations": 8,
+    },
+    "logging": {
+        # Figures of fixed frames at every evaluation during training; at least 0.
+        "num_visualizations": 4,
+        # Log to Weights & Biases in addition to TensorBoard.
+        "wandb": False,
+        # Its project.
+        "wandb_project": "radejax",
+        # First and last step of a trace (`--profile`), counted from the start.
+        "profile_steps": (2, 5),
+    },
+}
+
+
 def base_config() -> ConfigDict:
     """A config of RADE-Net with all sections: the paper's training on K-Radar.
 
@@ -133,19 +341,7 @@ def base_config() -> ConfigDict:
     `loss.assignment` ("center"). `configs/radenet.py` has presets for the paper and the
     released code.
     """
-    config = ConfigDict()
-    # Seed of parameters, order of the data, dropout and augmentation.
-    config.seed = 0
-    # Classes to detect, in the order of the class indices.
-    config.classes = CLASSES
-    config.model = _model()
-    config.loss = _loss()
-    config.decode = _decode()
-    config.train = _train()
-    config.data = _data()
-    config.evaluation = _evaluation()
-    config.logging = _logging()
-    return config
+    return ConfigDict(copy.deepcopy(_FIELDS))
 
 
 def override(config: ConfigDict, texts: Mapping[str, str]) -> None:
@@ -196,237 +392,3 @@ def _literal(text: str) -> Any:
         return ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         return words.get(text.strip().lower(), text.strip())
-
-
-def _model() -> ConfigDict:
-    return ConfigDict(
-        {
-            # Architecture: radenet or dinorade.
-            "name": "radenet",
-            # Number of classes; must equal the length of `classes`.
-            "num_classes": len(CLASSES),
-            # Doppler bins of the radar.
-            "doppler_bins": 64,
-            # Elevation bins of the radar.
-            "elevation_bins": 37,
-            # Channels of the encoder levels, finest first.
-            "widths": (128, 256, 512),
-            # Channels of the last decoder stage, neck and heads.
-            "decoder_width": 128,
-            # Groups of every group normalization; must divide every width.
-            "num_groups": 32,
-            # Attention on the skip connections: official (the released block), paper
-            # (attention only), off.
-            "cbam": "official",
-            # Separate convolutions for Doppler and elevation channels at the input.
-            "input_stem": False,
-            # A name of `radejax.models.backbone.BACKBONES`.
-            "backbone": "unet",
-            # dilated, plain, or another name of `radejax.models.heads.NECKS`.
-            "neck": "dilated",
-            # expanded, default, or another name of `radejax.models.heads.HEADS`.
-            "heads": "expanded",
-            # Maps are padded to a multiple of this, itself a multiple of 2 to the power
-            # of the number of encoder levels.
-            "pad_multiple": 8,
-            # Crop the output to the bins of the projection.
-            "crop_output": True,
-            # Dtype of the computation: float32 or bfloat16. Parameters are float32.
-            "dtype": "float32",
-            # Activations that the backward pass recomputes to save memory: none, those
-            # of blocks, or full.
-            "remat": "none",
-            # Confidence of an untrained model, between 0 and 1.
-            "heatmap_prior": 0.5,
-            # Subtracted from the projection.
-            "input_center": 0.0,
-            # Multiplied with the projection after the subtraction; above 0.
-            "input_scale": 1.0,
-        }
-    )
-
-
-def _loss() -> ConfigDict:
-    return ConfigDict(
-        {
-            # Standard deviation of the heatmap's targets: fixed, adaptive (with the size
-            # of the box), anisotropic (with its length and width).
-            "heatmap_sigma_mode": "fixed",
-            # Standard deviation of fixed targets in bins; above 0.
-            "heatmap_sigma_bins": 3.0,
-            # Transform of the Wasserstein distance: sqrt, none, log1p.
-            "gwd_transform": "sqrt",
-            # Loss of a distance d: 1 - 1 / (tau + transform(d)); above 0.
-            "gwd_tau": 1.65,
-            # Normalize the yaw vector before the Wasserstein distance.
-            "normalize_yaw": False,
-            # Boxes of the regression losses: center (the objects' own bins) or nms
-            # (predictions that match an object after NMS, with the thresholds of decode).
-            "assignment": "center",
-            # Weight of every loss term, at least 0, by its name in
-            # `radejax.losses.detection.LOSSES`.
-            "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
-            # Divide each term by its own value.
-            "normalize": True,
-            # Height that is added to regressed heights, in meters.
-            "z0_m": 0.0,
-        }
-    )
-
-
-def _decode() -> ConfigDict:
-    return ConfigDict(
-        {
-            # Rows of the output per frame; at least 1.
-            "max_detections": 100,
-            # Score threshold, from 0 to 1.
-            "score_threshold": 0.3,
-            # Keep scores equal to the threshold.
-            "threshold_inclusive": True,
-            # IoU above which NMS removes the lower score, from 0 to 1.
-            "nms_iou": 0.3,
-            # Apply NMS to each class separately.
-            "per_class_nms": False,
-            # Boxes with a center outside are removed before NMS: x0, x1, y0, y1, z0, z1.
-            "roi": placeholder(tuple),
-            # Where the length of the regressed yaw vector scales a box: nms, always
-            # (in the results too, as in the released evaluator), never.
-            "raw_yaw": "nms",
-            # Clip sizes to at least 0.01 m.
-            "clip_sizes": True,
-        }
-    )
-
-
-def _train() -> ConfigDict:
-    return ConfigDict(
-        {
-            # Frames per step over all devices; at least 1.
-            "batch_size": 10,
-            # Passes over the training data; at least 1.
-            "num_epochs": 10,
-            # Peak learning rate of AdamW; above 0.
-            "learning_rate": 1e-3,
-            # Final learning rate, from 0 to the peak.
-            "final_learning_rate": 1e-4,
-            # cosine (once over the training) or cyclic_cosine (down in one epoch, up in
-            # the next, as released), per step.
-            "schedule": "cosine",
-            # Weight decay on every parameter; at least 0.
-            "weight_decay": 0.01,
-            # Steps of a linear warm-up from 0; fewer than the training has.
-            "warmup_steps": 0,
-            # Largest norm of the gradient, above 0; None: not clipped.
-            "gradient_clip_norm": placeholder(float),
-            # Decay per step of a moving average of the parameters, below 1; None: none.
-            "ema_decay": placeholder(float),
-            # Batches per update of the parameters; at least 1.
-            "gradient_accumulation_steps": 1,
-            # replicated, or fsdp to shard the parameters over the devices.
-            "parameter_sharding": "replicated",
-            # Steps between logged metrics; at least 1.
-            "log_every_steps": 20,
-            # Steps between checkpoints; at least 1.
-            "checkpoint_every_steps": 500,
-            # Newest checkpoints that are kept, at least 1; None: all.
-            "checkpoints_to_keep": 2,
-            # Epochs between evaluations; 0: only after the training.
-            "evaluate_every_epochs": 0,
-            # Metric of the best checkpoint: mean over classes, in the first protocol.
-            "best_metric": "map_3d_iou30",
-            # Consecutive steps with a loss or gradient that is not finite, after which
-            # the run stops.
-            "max_skipped_steps": 20,
-        }
-    )
-
-
-def _data() -> ConfigDict:
-    return ConfigDict(
-        {
-            # kradar, another name of `radejax.data.dataset.DATA_SETS`, or module:Class.
-            "format": "kradar",
-            # Folders of the dataset; empty for what `simulation` describes.
-            "roots": (),
-            # Folder or zip of a label revision; None: the labels in the roots.
-            "labels": placeholder(str),
-            # Folder of preprocessed projections; None: in the first root.
-            "records": placeholder(str),
-            # Folder of embedded images (`radejax embed`); None: the images themselves.
-            "embeddings": placeholder(str),
-            # Weights of the frozen image backbone: file or folder.
-            "image_backbone": placeholder(str),
-            # Folder of camera calibrations; None: those in the roots.
-            "camera_calibration": placeholder(str),
-            # v1.0, v1.1, v2.0 or v2.1.
-            "label_version": "v2.1",
-            # Visibility flags of the objects that count: R, L, L1; None: all.
-            "visibility": ("R",),
-            # Count lines of v1.1 without an asterisk as objects, as released.
-            "include_unstarred_v11_labels": False,
-            # Only these sequences, such as (1, 58); empty: all.
-            "sequences": (),
-            # Only these kinds of weather, such as ("fog", "rain"); empty: all.
-            "weather": (),
-            # Sequences of the train split that are held out for validation, by number,
-            # or a fraction of them, such as (0.1,); empty: none.
-            "validation": (),
-            # Seed with which a fraction is drawn; independent of `seed`.
-            "validation_seed": 0,
-            # Padded objects per frame; K-Radar v2.1 has at most 14.
-            "max_objects": 32,
-            # true, or stretched for official checkpoints.
-            "azimuth_mapping": "true",
-            # Threads that prepare batches; 0: the main thread.
-            "num_threads": 2,
-            # Probability of mirroring a frame left to right, from 0 to 1.
-            "mirror_probability": 0.0,
-            # Standard deviation of a random gain in dB; at least 0.
-            "gain_db": 0.0,
-            # Standard deviation of a random gain at the last range in dB; at least 0.
-            "gain_slope_db": 0.0,
-            # Sanity check: shuffles the labels of the training frames with this seed.
-            "label_permutation_seed": placeholder(int),
-        }
-    )
-
-
-def _evaluation() -> ConfigDict:
-    return ConfigDict(
-        {
-            # Region of interest: x0, x1, y0, y1, z0, z1 in meters; None: everywhere.
-            "roi": NARROW_ROI,
-            # Evaluation protocols; the first chooses the best checkpoint.
-            "protocols": ("coco101", "all_point", "kradar_r40"),
-            # Excluded frames: protocol (its own rule), class (without the class), frame
-            # (without any object), none.
-            "empty_frames": "protocol",
-            # IoU thresholds, from 0 to below 1.
-            "iou_thresholds": (0.3, 0.5),
-            # Score threshold of all protocols except all_point, from 0 to 1.
-            "score_threshold": 0.3,
-            # Predictions below this score are not stored, from 0 to 1.
-            "min_score": 0.05,
-            # Resamples of sequences for 95 % intervals; 0: no intervals.
-            "bootstrap": 0,
-            # Frames per call of the detector; at least 1.
-            "batch_size": 8,
-            # Figures of frames in a report; at least 0.
-            "num_visualizations": 8,
-        }
-    )
-
-
-def _logging() -> ConfigDict:
-    return ConfigDict(
-        {
-            # Figures of fixed frames at every evaluation during training; at least 0.
-            "num_visualizations": 4,
-            # Log to Weights & Biases in addition to TensorBoard.
-            "wandb": False,
-            # Its project.
-            "wandb_project": "radejax",
-            # First and last step of a trace (`--profile`), counted from the start.
-            "profile_steps": (2, 5),
-        }
-    )
