@@ -305,7 +305,7 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     frame = frames[0]
     expected = detector(
         path, [frame.camera_path], [frame.camera_calibration_path]
-    ).to_list(detector.classes)[0]
+    ).to_list()[0]
     name = f"{output_name(path)}.json"
     assert [box["x"] for box in seen[name]] == pytest.approx(
         [box["x"] for box in expected], abs=1e-3

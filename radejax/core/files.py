@@ -109,10 +109,8 @@ def remove_stale(folder: pathlib.Path, prefix: str = "**/.") -> None:
 def _is_running(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # of another user
-        pass
+    except OSError as error:
+        return error.errno == errno.EPERM  # of another user
     return True
 
 
@@ -183,11 +181,10 @@ def read_json(path: PathLike) -> Any:
         FileNotFoundError: There is no such file.
         DataError: The file is not valid JSON.
     """
+    text = read_text(path)
     try:
-        return json.loads(read_text(path))
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
         raise DataError(f"{path} is not valid JSON: {error}") from None
 
 

@@ -8,7 +8,6 @@ ego frame: x forward, y left, z up, metres; yaw counter-clockwise from x, radian
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -111,7 +110,6 @@ class Detections(struct.PyTreeNode):
         is_valid: True where a row is a detection.
         num_truncated: int32 peaks above the score threshold that did not fit in K.
         class_names: Names of the class indices, the detector's; static under `jit`.
-            The methods take others in their place.
     """
 
     boxes: Float[jax.Array, "B K 7"]
@@ -122,16 +120,8 @@ class Detections(struct.PyTreeNode):
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
     def __repr__(self) -> str:
-        """What is found, by class; the shape alone while traced, or of no batch."""
-        valid = self.is_valid
-        is_known = isinstance(valid, Array) and not isinstance(valid, jax.core.Tracer)
-        if not is_known or valid.ndim != 2:
-            return f"Detections(boxes {getattr(self.boxes, 'shape', self.boxes)})"
-        frames, places = valid.shape
-        names = self.to_columns()["cls"].tolist()
-        counts = [f"{n} {cls}" for cls in self.class_names if (n := names.count(cls))]
-        found = ", ".join(counts) or "none"
-        return f"Detections({frames} frames of {places} places: {found})"
+        """The shape alone: padded arrays are long, and traced ones have no values."""
+        return f"Detections(boxes {getattr(self.boxes, 'shape', self.boxes)})"
 
     @property
     def num_clipped(self) -> Int[np.ndarray, " B"]:
@@ -140,47 +130,36 @@ class Detections(struct.PyTreeNode):
         is_clipped = (sizes <= np.float32(MIN_SIZE_M)).any(-1)
         return (is_clipped & np.asarray(self.is_valid)).sum(-1)
 
-    def to_columns(
-        self, classes: Sequence[str] | None = None
-    ) -> dict[str, Shaped[np.ndarray, "N ..."]]:
+    def to_columns(self) -> dict[str, Shaped[np.ndarray, "N ..."]]:
         """The valid rows of all frames as plain columns, as evaluation takes them.
 
         Returns:
             "frame" `[N]` position in the batch, "box" `[N, 7]`, "cls" `[N]` names,
             "score" `[N]`; by frame, then by descending score.
         """
-        names = self.class_names if classes is None else classes
         frame, row = np.nonzero(np.asarray(self.is_valid))
         indices = np.asarray(self.classes)[frame, row]
         return {
             "frame": frame,
             "box": np.asarray(self.boxes, np.float64)[frame, row],
-            "cls": np.asarray(names, object)[indices].astype(str),
+            "cls": np.asarray(self.class_names, object)[indices].astype(str),
             "score": np.asarray(self.scores, np.float64)[frame, row],
         }
 
-    def to_list(
-        self, classes: Sequence[str] | None = None
-    ) -> list[list[dict[str, Any]]]:
+    def to_list(self) -> list[list[dict[str, Any]]]:
         """One list a frame of dictionaries: cls, score and the seven box numbers."""
-        columns = self.to_columns(classes)
         frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
-        for frame, box, cls, score in zip(
-            columns["frame"],
-            columns["box"].tolist(),
-            columns["cls"].tolist(),
-            columns["score"].tolist(),
-            strict=True,
-        ):
+        columns = (column.tolist() for column in self.to_columns().values())
+        for frame, box, cls, score in zip(*columns, strict=True):
             values = dict(zip(BOX_FIELDS, box, strict=True))
             frames[frame].append({"cls": cls, "score": score, **values})
         return frames
 
-    def to_pandas(self, classes: Sequence[str] | None = None) -> Any:
+    def to_pandas(self) -> Any:
         """One row a detection, as a `pandas.DataFrame` (extra "notebook")."""
         import pandas
 
-        columns = self.to_columns(classes)
+        columns = self.to_columns()
         boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
         return pandas.DataFrame({**columns, **boxes})
 

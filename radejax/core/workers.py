@@ -15,9 +15,6 @@ from typing import Any
 
 from radejax.core.errors import UserError
 
-CONTEXT = multiprocessing.get_context("spawn")
-"""How the processes start: shared values for them must come from it."""
-
 Submit = Callable[..., concurrent.futures.Future[Any]]
 
 
@@ -44,8 +41,9 @@ def process_pool(
         UserError: A process was killed or could not start.
     """
     others = multiprocessing.active_children()
+    context = multiprocessing.get_context("spawn")
     pool = concurrent.futures.ProcessPoolExecutor(
-        num_workers, CONTEXT, _start, (start, *arguments)
+        num_workers, context, _start, (start, *arguments)
     )
     try:
         with pool:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import pathlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -117,20 +117,16 @@ def write_kitti(
     return len(truth)
 
 
-def prediction_texts(
-    detections: Detections, classes: Sequence[str] | None = None
-) -> list[str]:
+def prediction_texts(detections: Detections) -> list[str]:
     """One text per frame as K-Radar's tools write predictions, without a final newline.
 
     Args:
         detections: Of a batch; a frame without any gets the line "dummy".
-        classes: Names of the class indices; the detections' own if None.
 
     Raises:
         UserError: K-Radar has no key for a class.
     """
-    columns = detections.to_columns(classes)
-    found = _lines(columns, scored=True)
+    found = _lines(detections.to_columns(), scored=True)
     num_frames = detections.is_valid.shape[0]
     return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
 

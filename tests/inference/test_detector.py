@@ -175,7 +175,7 @@ def test_detections_carry_the_names_of_their_detector(detector, projections):
     found = turned(projections)  # two chunks
     index = int(found.classes[0, 0])
     assert found.to_list()[0][0]["cls"] == names[index]
-    assert found.to_list(CLASSES)[0][0]["cls"] == CLASSES[index]
+    assert found.replace(class_names=CLASSES).to_list()[0][0]["cls"] == CLASSES[index]
     assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]
 
 
