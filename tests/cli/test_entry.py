@@ -62,11 +62,6 @@ def test_defects_keep_their_traceback() -> None:
         raise OSError(errno.EIO, "gone")
 
 
-def test_debug_lets_the_traceback_through() -> None:
-    with pytest.raises(UserError), entry.exit_codes(debug=True):
-        raise UserError("wrong")
-
-
 def test_a_coordinator_that_is_not_reached_is_one_line(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
