@@ -28,6 +28,7 @@ INTERRUPTED = 128 + signal.SIGINT
 
 _WRONG_PATH = (
     FileNotFoundError,
+    FileExistsError,
     NotADirectoryError,
     IsADirectoryError,
     PermissionError,

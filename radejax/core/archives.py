@@ -34,15 +34,6 @@ def wrap_read_errors(where: PathLike, what: str) -> Iterator[None]:
         ) from None
 
 
-@contextlib.contextmanager
-def open_zip(path: PathLike, what: str = "a zip file") -> Iterator[zipfile.ZipFile]:
-    """A zip archive for reading; `DataError` that it is not `what`, where corrupted."""
-    with wrap_read_errors(path, what):
-        archive = zipfile.ZipFile(path)
-    with archive:
-        yield archive
-
-
 def read_member(archive: zipfile.ZipFile, name: str, *, max_bytes: int) -> bytes:
     """Content of a member of an archive; its checksum is verified.
 

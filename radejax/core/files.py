@@ -224,13 +224,10 @@ def claim(
         ignore: Fields that may differ.
 
     Raises:
-        UserError: The folder is another job's; names the fields that differ. Or it is
-            a file.
+        UserError: The folder is another job's; names the fields that differ.
         DataError: The JSON file is corrupted.
     """
     path = pathlib.Path(path)
-    if path.parent.is_file():
-        raise UserError(f"{path.parent} is a file, expected a folder")
     try:
         found = read_object(path)
     except FileNotFoundError:

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from radejax.core.archives import open_zip, read_member
+from radejax.core.archives import read_member
 from radejax.core.errors import DataError, one_line
 from radejax.core.files import PathLike
 
@@ -61,7 +61,7 @@ def read(path: PathLike) -> Any:
             "later: load it there and write it with torch.save"
         )
     try:
-        with open_zip(path, "a torch file") as archive:
+        with zipfile.ZipFile(path) as archive:
             root = archive.namelist()[0].partition("/")[0]
             return _Unpickler(archive, f"{root}/").load()
     except DataError as error:

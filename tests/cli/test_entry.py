@@ -22,6 +22,7 @@ FULL = OSError(errno.ENOSPC, "No space left on device")
         (FileNotFoundError(errno.ENOENT, "No such file", "/x"), 2, "No such file: /x"),
         (FileNotFoundError("no run in x"), 2, "no run in x"),
         (PermissionError(errno.EACCES, "denied", "/root"), 2, "denied: /root"),
+        (FileExistsError(errno.EEXIST, "File exists", "/x"), 2, "File exists: /x"),
         (IsADirectoryError(errno.EISDIR, "a directory", "/x"), 2, "a directory: /x"),
         (READ_ONLY, 2, "Read-only file system: /cdrom/records; name another place (--"),
         (KeyboardInterrupt(), 130, "interrupted\n"),
