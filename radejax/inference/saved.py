@@ -16,7 +16,6 @@ import dataclasses
 import hashlib
 import json
 import logging
-import os
 import pathlib
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -40,7 +39,7 @@ from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
-from radejax.weights.convert import read_content
+from radejax.weights.convert import read_state_dict
 
 _log = logging.getLogger(__name__)
 
@@ -123,8 +122,8 @@ def load_torch(
     """Load official RADE-Net or DinoRADE weights, on the grid of K-Radar.
 
     Args:
-        path_or_state_dict: `.pth`, `.pt`, `.npz` or `.safetensors` file, or a mapping of
-            names to arrays. Names that begin with `rad_backbone.` are DinoRADE's.
+        path_or_state_dict: `.pth`, `.pt` or `.safetensors` file, or a mapping of names
+            to arrays. Names that begin with `rad_backbone.` are DinoRADE's.
         image_backbone: Folder of DINOv3, for a DinoRADE file without its weights.
         **model_overrides: Fields of the model that names and shapes do not determine.
 
@@ -132,22 +131,21 @@ def load_torch(
         UserError: An image backbone is given, and the model is RADE-Net.
         DataError: Tensors are missing, unexpected or of another shape.
     """
-    content = path_or_state_dict
-    if isinstance(content, str | os.PathLike):
-        content, _ = read_content(content)
+    parts = radenet_torch.PART, dinorade_torch.PART
+    tensors, source = read_state_dict(path_or_state_dict, *parts)
     config = base_config()
     config.data.azimuth_mapping = "stretched"
     config.decode.threshold_inclusive = False
-    if dinorade_torch.is_dinorade(content):
+    if any(name.startswith(dinorade_torch.PART) for name in tensors):
         model, variables = dinorade_torch.read(
-            path_or_state_dict, dinov3=image_backbone, **model_overrides
+            tensors, source, image_backbone, **model_overrides
         )
         options = CameraOptions("pinhole", OFFICIAL_OFFSET_M, calibration="common")
         config.data.camera = ConfigDict(dataclasses.asdict(options))
     elif image_backbone is not None:
         raise UserError("image_backbone is given, but the model is RADE-Net")
     else:
-        model, variables = radenet_torch.read(path_or_state_dict, **model_overrides)
+        model, variables = radenet_torch.read(tensors, source, **model_overrides)
     config.model = ConfigDict(model)
     config.classes = CLASSES[: config.model.num_classes]
     return SavedModel(config, RadarGrid.kradar(), variables)

@@ -29,7 +29,7 @@ import numpy as np
 import safetensors.numpy
 
 from radejax import models
-from radejax.core.archives import read_npz, read_safetensors
+from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.models.lifting import ReferencePoints
@@ -182,15 +182,13 @@ def shapes_of(variables: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 # Files -------------------------------------------------------------------------------
 
 
-def read_state_dict(
-    content_or_path: Mapping[str, Any] | PathLike, part: str
-) -> tuple[dict[str, Any], str]:
+def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], str]:
     """The state dict in a file or checkpoint, without prefixes of its names.
 
     Args:
         content_or_path: Tensors by name, or a checkpoint that holds them under one key;
-            or a file: `.pth`, `.pt` (read without torch), `.npz` or `.safetensors`.
-        part: Start of one of its names, "backbone."; what precedes it, such as
+            or a file: `.pth`, `.pt` (read without torch) or `.safetensors`.
+        *parts: Start of one of its names, "backbone."; what precedes it, such as
             "module.", is taken off all names.
 
     Returns:
@@ -200,19 +198,14 @@ def read_state_dict(
         FileNotFoundError: There is no such file.
         DataError: The file is corrupted, or has no such state dict or several.
     """
-    content, source = read_content(content_or_path)
-    found = state_dicts(content, part)
-    if len(found) != 1:
-        raise DataError(
-            f"{source}: expected one state dict with tensors {part}*, found {len(found)}"
-        )
-    return found[0], source
-
-
-def state_dicts(content: Any, part: str) -> list[dict[str, Any]]:
-    """State dicts with such a part, without prefixes: the content, or directly in it."""
-    start, found = re.compile(rf"((?:.*\.)?){re.escape(part)}"), []
+    content, source = content_or_path, "state dict"
+    if isinstance(content, str | os.PathLike):
+        path, source = pathlib.Path(content), str(content)
+        is_torch = path.suffix != ".safetensors"
+        content = torch_file.read(path) if is_torch else read_safetensors(path)
+    start = re.compile(rf"((?:.*\.)?)(?:{'|'.join(map(re.escape, parts))})")
     inside = content.values() if isinstance(content, Mapping) else ()
+    found = []
     for mapping in (content, *inside):
         if not isinstance(mapping, Mapping):
             continue
@@ -220,20 +213,16 @@ def state_dicts(content: Any, part: str) -> list[dict[str, Any]]:
         if match := next(filter(None, matches), None):
             tensors = {k: v for k, v in mapping.items() if hasattr(v, "shape")}
             found.append({str(k).removeprefix(match[1]): v for k, v in tensors.items()})
-    return found
-
-
-def read_content(content_or_path: Any) -> tuple[Any, str]:
-    """Content as it is, and what error messages call it; see `read_state_dict`."""
-    if not isinstance(content_or_path, str | os.PathLike):
-        return content_or_path, "state dict"
-    path = pathlib.Path(content_or_path)
-    readers = {".npz": read_npz, ".safetensors": read_safetensors}
-    return readers.get(path.suffix, torch_file.read)(path), str(path)
+    if len(found) != 1:
+        raise DataError(
+            f"{source}: expected one state dict with tensors {'* or '.join(parts)}*, "
+            f"found {len(found)}"
+        )
+    return found[0], source
 
 
 def write_state_dict(path: PathLike, tensors: Mapping[str, np.ndarray]) -> None:
-    """Writes tensors by name: `.pth` or `.pt` by torch, `.safetensors`, or `.npz`.
+    """Writes tensors by name: `.safetensors`, or `.pth` or `.pt` by torch.
 
     Raises:
         UserError: The ending is another, or torch is not installed.
@@ -241,8 +230,6 @@ def write_state_dict(path: PathLike, tensors: Mapping[str, np.ndarray]) -> None:
     path = pathlib.Path(path)
     if path.suffix == ".safetensors":
         path.write_bytes(safetensors.numpy.save(dict(tensors)))
-    elif path.suffix == ".npz":
-        np.savez(path, **tensors)  # type: ignore[arg-type]
     elif path.suffix in (".pth", ".pt"):
         try:
             import torch
@@ -253,9 +240,7 @@ def write_state_dict(path: PathLike, tensors: Mapping[str, np.ndarray]) -> None:
             ) from None
         torch.save({name: torch.from_numpy(x) for name, x in tensors.items()}, path)
     else:
-        raise UserError(
-            f"{path}: unknown ending; available: .pth, .pt, .safetensors, .npz"
-        )
+        raise UserError(f"{path}: unknown ending; available: .pth, .pt, .safetensors")
 
 
 def to_numpy(tensor: Any) -> np.ndarray:

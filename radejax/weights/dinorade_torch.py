@@ -20,18 +20,16 @@ from radejax.weights import dinov3_hf, radenet_torch
 from radejax.weights.convert import (
     from_torch,
     read_state_dict,
-    state_dicts,
     to_numpy,
     variable_shapes,
 )
-from radejax.weights.image_backbone import check_same_vit, resnet_names
+from radejax.weights.image_backbone import resnet_names
 
 PART = "rad_backbone."
 """Start of names by which a state dict of DinoRADE is recognized."""
 
-# In models without CBAM as well; built by the released code and never called; of DINOv3's
-# pretraining.
-_UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\.|.*\.mask_token$"
+# In models without CBAM as well; built by the released code and never called.
+_UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\."
 
 
 def load(
@@ -62,56 +60,61 @@ def load(
         UserError: An override is unknown or impossible.
         DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
-    config, variables = read(state_dict_or_path, dinov3=dinov3, **model_overrides)
+    tensors, source = read_state_dict(state_dict_or_path, PART)
+    config, variables = read(tensors, source, dinov3, **model_overrides)
     return cast(DinoRade, models.build(config)), variables
 
 
 def read(
-    state_dict_or_path: Mapping[str, Any] | PathLike,
-    *,
+    tensors: Mapping[str, Any],
+    source: str,
     dinov3: PathLike | None = None,
     **model_overrides: Any,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`config.model` and variables from an official checkpoint; see `load`."""
-    tensors, source = read_state_dict(state_dict_or_path, PART)
+    """`config.model` and variables from tensors by official name; see `load`."""
     tensors = without_lora(tensors)
     config = load_config("dinorade:official").model.to_dict()
     fusion = config["fusion"]
-    radenet_torch.check_overrides(model_overrides, config | fusion)
     of_fusion = {k: v for k, v in model_overrides.items() if k in fusion}
     of_radar = {k: v for k, v in model_overrides.items() if k not in fusion}
     config |= radenet_torch.infer_config(tensors, source, of_radar, "rad_")
     fusion |= infer_fusion(tensors, of_fusion)
     names = radenet_torch.module_names(len(config["widths"]), config["heads"], "rad_")
-    names |= fusion_names()
+    names |= fusion_names() | CAMERA_NECK
+    backbone = None
     is_resnet = any(n.startswith("image_backbone.frozen_layers.") for n in tensors)
     if is_resnet and dinov3 is None:
         # The released code feeds its ResNet colors in [0, 1].
         config["image"] |= {"kind": "resnet50", "standardize": False}
         names |= image_branch_names()
+        shapes = variable_shapes(models.build(config))
     else:
-        names |= CAMERA_NECK | dinov3_hf.module_names(IMAGE_BACKBONE)
-        tensors = dinov3_hf.with_prefix_tokens(_plain_backbone(tensors), IMAGE_BACKBONE)
-    if dinov3 is not None:
-        vit, backbone = dinov3_hf.load(dinov3)
-        config["image"] |= dinov3_hf.image_fields(vit)
+        fields, backbone = _transformer(tensors, source, dinov3)
+        config["image"] |= fields
         tensors = {k: v for k, v in tensors.items() if not k.startswith(IMAGE_BACKBONE)}
-    elif config["image"]["kind"] == "vit":
-        config["image"] |= _infer_vit(tensors, source)
-    model = models.build(config)
-    shapes = variable_shapes(model)
-    if not any(name.startswith(IMAGE_BACKBONE) for name in tensors):
+        shapes = variable_shapes(models.build(config))
         shapes = {k: s for k, s in shapes.items() if f"/{IMAGE_BACKBONE}/" not in k}
     variables = from_torch(names, shapes, tensors, source, _UNUSED)
-    if dinov3 is not None:
-        check_same_vit(vit, model.vit, dinov3)
-        variables["params"][IMAGE_BACKBONE] = backbone["params"]
+    if backbone is not None:
+        variables["params"][IMAGE_BACKBONE] = backbone
     return config, variables
 
 
-def is_dinorade(content: Any) -> bool:
-    """Whether a state dict, or a checkpoint that holds one, is DinoRADE's."""
-    return bool(state_dicts(content, PART))
+def _transformer(
+    tensors: Mapping[str, Any], source: str, dinov3: PathLike | None
+) -> tuple[dict[str, Any], Mapping[str, Any] | None]:
+    """Fields and parameters of the image transformer of a folder or the checkpoint."""
+    if dinov3 is not None:
+        vit, variables = dinov3_hf.load(dinov3)
+        return dinov3_hf.image_fields(vit), variables["params"]
+    # What PEFT and transformers put before the backbone's own names.
+    start = re.compile(rf"{IMAGE_BACKBONE}\.(base_model\.model\.)?(model\.)?")
+    own = {start.sub("", k): v for k, v in tensors.items() if start.match(k)}
+    if not own:
+        return {}, None
+    vit = dinov3_hf.model_from_tensors(own, source)
+    params = dinov3_hf.to_params(vit, own, f"{IMAGE_BACKBONE} of {source}")
+    return dinov3_hf.image_fields(vit), params
 
 
 def infer_fusion(
@@ -130,46 +133,18 @@ def infer_fusion(
     return fields | dict(overrides)
 
 
-def _infer_vit(tensors: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Fields of `config.model.image` that the backbone's tensors show, if it has any."""
-    start = f"{IMAGE_BACKBONE}."
-    shapes = {
-        name.removeprefix(start): tuple(value.shape)
-        for name, value in tensors.items()
-        if name.startswith(start)
-    }
-    if not shapes:
-        return {}
-    try:
-        hidden, _, patch, _ = shapes["embeddings.patch_embeddings.weight"]
-        mlp_dim, _ = shapes["layer.0.mlp.up_proj.weight"]
-        _, prefix, _ = shapes["embeddings.cls_token"]
-    except (KeyError, ValueError):
-        raise DataError(
-            f"{source}: {start}* are not the tensors of a DINOv3 ViT"
-        ) from None
-    layers = {name.split(".")[1] for name in shapes if name.startswith("layer.")}
-    return {
-        "hidden_size": hidden,
-        "num_layers": len(layers),
-        "num_heads": hidden // 64,  # all DINOv3 models have heads of 64 channels
-        "mlp_dim": mlp_dim,
-        "patch_size": patch,
-        "num_registers": prefix - 1,
-        "gated_mlp": "layer.0.mlp.gate_proj.weight" in shapes,
-    }
-
-
 # Names -------------------------------------------------------------------------------
 
-CAMERA_NECK = {"image_neck/proj": "image_neck.channel_proj"}
-for _ours, _theirs in (
-    ("up_1", "fpn_layer1"),
-    ("up_2", "fpn_layer2"),
-    ("refine", "refine"),
-):
-    CAMERA_NECK[f"image_neck/{_ours}"] = f"image_neck.{_theirs}.0"
-    CAMERA_NECK[f"image_neck/{_ours}_norm"] = f"image_neck.{_theirs}.1"
+CAMERA_NECK = {
+    "image_neck/proj": "image_neck.channel_proj",
+    "image_neck/up_1": "image_neck.fpn_layer1.0",
+    "image_neck/up_1_norm": "image_neck.fpn_layer1.1",
+    "image_neck/up_2": "image_neck.fpn_layer2.0",
+    "image_neck/up_2_norm": "image_neck.fpn_layer2.1",
+    "image_neck/refine": "image_neck.refine.0",
+    "image_neck/refine_norm": "image_neck.refine.1",
+}
+"""Torch's module by module of ours, of the neck of a transformer."""
 
 
 def fusion_names() -> dict[str, str]:
@@ -195,33 +170,25 @@ def image_branch_names() -> dict[str, str]:
     return names | {"image_neck/proj": "image_backbone.projection"}
 
 
-def _plain_backbone(tensors: Mapping[str, Any]) -> dict[str, Any]:
-    """Without what PEFT and transformers put before the backbone's own names."""
-    start = re.compile(r"image_backbone\.(base_model\.model\.)?(model\.)?")
-    return {
-        start.sub("image_backbone.", name): value for name, value in tensors.items()
-    }
-
-
 def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
     """Adds low-rank adapters (PEFT) to the weights they adapt.
 
     The released settings have rank and alpha 16, hence a factor of 1; they also never
     train them, which leaves B at zero.
     """
-    merged: dict[str, Any] = {}
-    pairs: dict[str, dict[str, Any]] = {}
-    for name, value in tensors.items():
-        if match := re.match(r"(.*)\.lora_([AB])\.[^.]+\.weight$", name):
-            pairs.setdefault(match[1], {})[match[2]] = to_numpy(value)
-        else:
-            merged[name.replace(".base_layer.", ".")] = value
-    for name, pair in pairs.items():
-        weight = f"{name}.weight"
+    merged = {
+        name.replace(".base_layer.", "."): value
+        for name, value in tensors.items()
+        if ".lora_" not in name
+    }
+    for module in {n.partition(".lora_")[0] for n in tensors if ".lora_" in n}:
+        weight = f"{module}.weight"
+        halves = [f"{module}.lora_{half}.default.weight" for half in "BA"]
         try:
-            merged[weight] = to_numpy(merged[weight]) + pair["B"] @ pair["A"]
+            up, down = (to_numpy(tensors[name]) for name in halves)
+            merged[weight] = to_numpy(merged[weight]) + up @ down
         except (KeyError, ValueError):
             raise DataError(
-                f"{name}: expected an adapter of two halves and the weight they fit"
+                f"{module}: expected an adapter of two halves and the weight they fit"
             ) from None
     return merged

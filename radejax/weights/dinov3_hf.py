@@ -6,7 +6,7 @@ yourself, and keep them out of checkpoints that are published.
 
 from __future__ import annotations
 
-import dataclasses
+import contextlib
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -18,7 +18,7 @@ import safetensors.numpy
 
 from radejax.core import files
 from radejax.core.archives import read_safetensors
-from radejax.core.errors import UserError, require
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
 from radejax.weights.convert import from_torch, shapes_of, to_numpy, to_torch
@@ -34,36 +34,44 @@ _FIELDS = {
     "patch_size": "patch_size",
     "num_register_tokens": "num_registers",
     "use_gated_mlp": "gated_mlp",
-    "layerscale_value": "layer_scale",
 }
 """Our name of each field of Hugging Face's config."""
 
 
 def _constants(gated_mlp: bool) -> dict[str, Any]:
-    """Fields that are the same in all published models, or follow from the MLP."""
+    """Fields that are the same in all published models of DinoRADE's size."""
     return {
+        "model_type": "dinov3_vit",
         "rope_theta": 100.0,
         "layer_norm_eps": 1e-5,
+        "query_bias": True,
+        "key_bias": False,
+        "value_bias": True,
         "proj_bias": True,
         "mlp_bias": True,
+        "use_gated_mlp": gated_mlp,
         "hidden_act": "silu" if gated_mlp else "gelu",
     }
 
 
-_LAYER_NAMES = {
-    "norm_1": "norm1",
-    "norm_2": "norm2",
-    "scale_1": "layer_scale1.lambda1",
-    "scale_2": "layer_scale2.lambda1",
-    "query": "attention.q_proj",
-    "key": "attention.k_proj",
-    "value": "attention.v_proj",
-    "out": "attention.o_proj",
-    "up": "mlp.up_proj",
-    "gate": "mlp.gate_proj",
-    "down": "mlp.down_proj",
+_CLASS, _REGISTERS = "embeddings.cls_token", "embeddings.register_tokens"
+_NAMES = {
+    "prefix_tokens": _CLASS,
+    "patch_embed": "embeddings.patch_embeddings",
+    "norm": "norm",
+    "layers/norm_1": "layer.{}.norm1",
+    "layers/norm_2": "layer.{}.norm2",
+    "layers/scale_1": "layer.{}.layer_scale1.lambda1",
+    "layers/scale_2": "layer.{}.layer_scale2.lambda1",
+    "layers/query": "layer.{}.attention.q_proj",
+    "layers/key": "layer.{}.attention.k_proj",
+    "layers/value": "layer.{}.attention.v_proj",
+    "layers/out": "layer.{}.attention.o_proj",
+    "layers/up": "layer.{}.mlp.up_proj",
+    "layers/gate": "layer.{}.mlp.gate_proj",
+    "layers/down": "layer.{}.mlp.down_proj",
 }
-_TOKENS = ("embeddings.cls_token", "embeddings.register_tokens")
+"""Hugging Face's module by module of ours, for `convert`."""
 
 
 def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
@@ -109,10 +117,8 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
-    biases = zip(("query", "key", "value"), model.qkv_bias, strict=True)
-    config |= {f"{name}_bias": bias for name, bias in biases}
     config |= _constants(model.gated_mlp)
-    config |= {"model_type": "dinov3_vit", "architectures": ["DINOv3ViTModel"]}
+    config |= {"architectures": ["DINOv3ViTModel"], "layerscale_value": 1.0}
     files.write_json(folder / CONFIG_FILE, config)
     content = safetensors.numpy.save(to_tensors(model, params), {"format": "pt"})
     with files.atomic_write(folder / WEIGHTS_FILE) as file:
@@ -126,59 +132,41 @@ def model_from_config(config: Mapping[str, Any]) -> ViT:
         UserError: It is not a DINOv3 ViT, a field is missing, of a wrong type, out of
             range or not supported.
     """
-    kind = config.get("model_type")
-    require(kind == "dinov3_vit", "model_type", kind, "'dinov3_vit'")
     constants = _constants(config.get("use_gated_mlp") is True)
-    if missing := sorted({*_FIELDS, *constants} - set(config)):
-        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
-    defaults = {field.name: field.default for field in dataclasses.fields(ViT)}
-    fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
-    for theirs, ours in _FIELDS.items():
-        value, kind = fields[ours], type(defaults[ours])
-        fits = type(value) is kind
-        if kind is float:
-            fits = type(value) in (int, float) and 0 < value < float("inf")
-        require(fits, theirs, value, f"{kind.__name__}, such as {defaults[ours]}")
     for name, value in constants.items():
-        require(config[name] == value, name, config[name], f"{value!r}")
-    fields["qkv_bias"] = tuple(
-        bool(config.get(f"{name}_bias", default))
-        for name, default in (("query", True), ("key", False), ("value", True))
+        require(config.get(name) == value, name, config.get(name), f"{value!r}")
+    if missing := sorted(set(_FIELDS) - set(config)):
+        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
+    return ViT(**{ours: config[theirs] for theirs, ours in _FIELDS.items()})
+
+
+def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
+    """The model that DINOv3 tensors by name are of.
+
+    Raises:
+        DataError: They are not those of a DINOv3 ViT.
+    """
+    try:
+        hidden, _, patch, _ = tensors["embeddings.patch_embeddings.weight"].shape
+        mlp_dim, _ = tensors["layer.0.mlp.up_proj.weight"].shape
+        _, num_registers, _ = tensors["embeddings.register_tokens"].shape
+    except (KeyError, ValueError):
+        raise DataError(f"{source}: not the tensors of a DINOv3 ViT") from None
+    layers = {name.split(".")[1] for name in tensors if name.startswith("layer.")}
+    return ViT(
+        hidden_size=hidden,
+        num_layers=len(layers),
+        num_heads=hidden // 64,  # all DINOv3 models have heads of 64 channels
+        mlp_dim=mlp_dim,
+        patch_size=patch,
+        num_registers=num_registers,
+        gated_mlp="layer.0.mlp.gate_proj.weight" in tensors,
     )
-    return ViT(**fields)  # checks ranges
 
 
 def image_fields(model: ViT) -> dict[str, Any]:
     """Fields of `config.model.image` that a backbone has."""
-    names = ["hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size"]
-    names += ["num_registers", "gated_mlp"]
-    return {name: getattr(model, name) for name in names}
-
-
-def module_names(part: str = "") -> dict[str, str]:
-    """Hugging Face's module by module of ours, for `convert`.
-
-    Args:
-        part: Of a detector that the model is: "image_backbone".
-    """
-    names = {"prefix_tokens": _TOKENS[0], "norm": "norm"}
-    names["patch_embed"] = "embeddings.patch_embeddings"
-    names |= {f"layers/{ours}": f"layer.{{}}.{x}" for ours, x in _LAYER_NAMES.items()}
-    return {
-        f"{part}/{k}".strip("/"): f"{part}.{v}".strip(".") for k, v in names.items()
-    }
-
-
-def with_prefix_tokens(tensors: Mapping[str, Any], part: str = "") -> dict[str, Any]:
-    """With the register tokens behind the class token, as one tensor."""
-    first, second = (f"{part}.{name}".strip(".") for name in _TOKENS)
-    if not {first, second} <= set(tensors):
-        return dict(tensors)
-    tokens = [to_numpy(tensors[name]) for name in (first, second)]
-    rest = {name: value for name, value in tensors.items() if name != second}
-    if [x.ndim for x in tokens] != [3, 3] or tokens[0].shape[2] != tokens[1].shape[2]:
-        return rest  # which `from_torch` refuses
-    return rest | {first: np.concatenate(tokens, 1)}
+    return {name: getattr(model, name) for name in _FIELDS.values()}
 
 
 def to_params(
@@ -191,12 +179,14 @@ def to_params(
     """
     # transformers 5 saves some models with a prefix.
     tensors = {name.removeprefix("model."): t for name, t in tensors.items()}
-    tensors = with_prefix_tokens(tensors)
+    # Where one is missing or of another shape, `from_torch` says so.
+    with contextlib.suppress(KeyError, ValueError):
+        tokens = [to_numpy(tensors[name]) for name in (_CLASS, _REGISTERS)]
+        tensors[_CLASS] = np.concatenate(tokens, 1)
+        del tensors[_REGISTERS]
     # The mask token is used in pretraining only.
     ignored = r"embeddings\.mask_token$"
-    return from_torch(module_names(), _shapes(model), tensors, source, ignored)[
-        "params"
-    ]
+    return from_torch(_NAMES, _shapes(model), tensors, source, ignored)["params"]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -204,11 +194,11 @@ def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     size, params = model.patch_size, dict(params)
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
-    tensors = to_torch(module_names(), {"params": params | {"patch_embed": patches}})
-    tokens = tensors[_TOKENS[0]]
-    tensors[_TOKENS[0]] = np.ascontiguousarray(tokens[:, :1])
+    tensors = to_torch(_NAMES, {"params": params | {"patch_embed": patches}})
+    tokens = tensors[_CLASS]
+    tensors[_CLASS] = np.ascontiguousarray(tokens[:, :1])
     if model.num_registers:
-        tensors[_TOKENS[1]] = np.ascontiguousarray(tokens[:, 1:])
+        tensors[_REGISTERS] = np.ascontiguousarray(tokens[:, 1:])
     mask = np.zeros((1, 1, model.hidden_size), np.float32)
     return tensors | {"embeddings.mask_token": mask}
 

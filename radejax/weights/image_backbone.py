@@ -5,7 +5,6 @@ torch is not needed.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Mapping
 from typing import Any
@@ -15,11 +14,9 @@ import jax
 import numpy as np
 
 from radejax import models
-from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, differences
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.models.vit import ViT
 from radejax.weights import dinov3_hf
 from radejax.weights.convert import (
     from_torch,
@@ -29,9 +26,6 @@ from radejax.weights.convert import (
     variable_shapes,
     write_state_dict,
 )
-
-# Fields of a ViT that are not its weights' own.
-_FREE_FIELDS = ("attention", "dtype", "remat", "layer_scale", "parent", "name")
 
 
 def load_image_backbone(
@@ -73,10 +67,12 @@ def load_image_backbone(
             "which has no camera"
         )
     if model.vit is None:
-        part = load_resnet(path, model.resnet_width)
+        part = load_resnet(path, model)
     else:
         vit, variables = dinov3_hf.load(path)
-        check_same_vit(vit, model.vit, path)
+        theirs, ours = map(dinov3_hf.image_fields, (vit, model.vit))
+        if lines := differences(theirs, ours, "config.model.image"):
+            raise UserError(f"{path}: another backbone: {'; '.join(lines)}")
         part = {"params": {IMAGE_BACKBONE: variables["params"]}}
     if embeddings_sha256 is not None:
         params = dict(part["params"])
@@ -100,14 +96,6 @@ def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
             f"embeddings are from: its weights have sha256 {found[:12]}, theirs "
             f"{sha256[:12]}"
         )
-
-
-def check_same_vit(found: ViT, configured: ViT, source: PathLike) -> None:
-    """`UserError` unless a backbone's weights are those of the configured one."""
-    names = [f.name for f in dataclasses.fields(ViT) if f.name not in _FREE_FIELDS]
-    ours, theirs = ({n: getattr(vit, n) for n in names} for vit in (configured, found))
-    if lines := differences(theirs, ours, "config.model.image"):
-        raise UserError(f"{source}: another backbone: {'; '.join(lines)}")
 
 
 def check_fits(
@@ -164,13 +152,13 @@ def resnet_names(
 
 
 def load_resnet(
-    state_dict_or_path: Mapping[str, Any] | PathLike, width: int = 64
+    state_dict_or_path: Mapping[str, Any] | PathLike, model: nn.Module
 ) -> dict[str, Any]:
     """Variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 
     Args:
         state_dict_or_path: The file, or its tensors by name.
-        width: Channels of the stem; torchvision's have 64.
+        model: A `DinoRade` with a ResNet.
 
     Returns:
         `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}`,
@@ -184,12 +172,10 @@ def load_resnet(
     """
     tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
     names = resnet_names()
-    config = load_config("dinorade:rcw_resnet50").model
-    config.image.resnet_width = width
     has_last = any(name.startswith("layer4.") for name in tensors)
     shapes = {
         path: shape
-        for path, shape in variable_shapes(models.build(config)).items()
+        for path, shape in variable_shapes(model).items()
         if path.partition("/")[2].rpartition("/")[0] in names
         and (has_last or "/image_neck/" not in path)
     }

@@ -53,20 +53,18 @@ def load(
         UserError: An override is no field of the model or impossible.
         DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
-    config, variables = read(state_dict_or_path, **model_overrides)
+    tensors, source = read_state_dict(state_dict_or_path, PART)
+    config, variables = read(tensors, source, **model_overrides)
     return cast(RadeNet, models.build(config)), variables
 
 
 def read(
-    state_dict_or_path: StateDict | PathLike, **model_overrides: Any
+    tensors: StateDict, source: str, **model_overrides: Any
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`config.model` and variables from an official checkpoint; see `load`."""
-    tensors, source = read_state_dict(state_dict_or_path, PART)
+    """`config.model` and variables from tensors by official name; see `load`."""
     config = load_config("radenet:official").model.to_dict()
-    check_overrides(model_overrides, config)
     config |= infer_config(tensors, source, model_overrides)
-    model = models.build(config)
-    shapes = variable_shapes(model)
+    shapes = variable_shapes(models.build(config))
     names = module_names(len(config["widths"]), config["heads"])
     return config, from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
@@ -175,12 +173,6 @@ def infer_config(
     return fields
 
 
-def check_overrides(overrides: Mapping[str, Any], known: Mapping[str, Any]) -> None:
-    """`UserError` for names that are no field of the model."""
-    if unknown := sorted(set(overrides) - set(known)):
-        raise UserError(f"unknown model fields {unknown}; available: {sorted(known)}")
-
-
 # Names -------------------------------------------------------------------------------
 
 
@@ -192,9 +184,29 @@ def module_names(levels: int, heads: str, prefix: str = "") -> dict[str, str]:
         heads: Kind, "expanded" or "default".
         prefix: Of "backbone" and "neck": "rad_" in DinoRADE.
     """
-    names = backbone_names(levels, f"{prefix}backbone")
+    unet = f"{prefix}backbone"
+    names = {"backbone/start": f"{unet}.start_conv"}
+    for part in ("doppler", "elevation", "mix"):
+        conv = f"{unet}.transform_input.{part}_conv"
+        names |= _norm_conv(f"backbone/stem/{part}", conv, "0", "1")
+    for i in (1, 2):
+        conv = f"{unet}.bottleneck.conv{i}"
+        names |= double_conv_names(f"backbone/bottleneck_{i}", conv)
+    for i in range(1, levels + 1):
+        for part in ("encoder", "decoder"):
+            block = f"{unet}.{part}_block_{i}"
+            names |= double_conv_names(f"backbone/{part}_{i}", block)
+        names |= cbam_names(f"backbone/cbam_{i}", f"{unet}.cbam_{i}")
+        names[f"backbone/upsample_{i}"] = f"{unet}.upsample_{i}.upsample"
     names |= neck_names("neck", f"{prefix}neck.neck")
-    return names | head_names(3 if heads == "expanded" else 1)
+    count = 3 if heads == "expanded" else 1
+    for ours, theirs in (("heatmap", "heatmap_head.head"), ("box", "reg_head.head")):
+        # Convolution, normalization and activation each take a number.
+        for i in range(count):
+            block = f"heads/{ours}/conv_{i + 1}"
+            names |= _norm_conv(block, f"head.{theirs}", str(3 * i), str(3 * i + 1))
+        names[f"heads/{ours}/out"] = f"head.{theirs}.{3 * count}"
+    return names
 
 
 def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
@@ -233,24 +245,6 @@ def cbam_names(ours: str, theirs: str) -> dict[str, str]:
     return names
 
 
-def backbone_names(levels: int, theirs: str = "backbone") -> dict[str, str]:
-    """The U-Net."""
-    names = {"backbone/start": f"{theirs}.start_conv"}
-    for part in ("doppler", "elevation", "mix"):
-        conv = f"{theirs}.transform_input.{part}_conv"
-        names |= _norm_conv(f"backbone/stem/{part}", conv, "0", "1")
-    for i in (1, 2):
-        conv = f"{theirs}.bottleneck.conv{i}"
-        names |= double_conv_names(f"backbone/bottleneck_{i}", conv)
-    for i in range(1, levels + 1):
-        for part in ("encoder", "decoder"):
-            conv = f"{theirs}.{part}_block_{i}"
-            names |= double_conv_names(f"backbone/{part}_{i}", conv)
-        names |= cbam_names(f"backbone/cbam_{i}", f"{theirs}.cbam_{i}")
-        names[f"backbone/upsample_{i}"] = f"{theirs}.upsample_{i}.upsample"
-    return names
-
-
 def neck_names(ours: str, theirs: str) -> dict[str, str]:
     """A neck of either kind; the plain one has `conv`, the dilated `conv_1`, `conv_2`."""
     names: dict[str, str] = {}
@@ -259,16 +253,4 @@ def neck_names(ours: str, theirs: str) -> dict[str, str]:
         names |= _norm_conv(block, conv, "conv", "gn")
         names |= _norm_conv(f"{block}/conv_1", f"{conv}.conv1", "conv", "gn")
         names[f"{block}/conv_2"] = f"{conv}.conv2"
-    return names
-
-
-def head_names(convs: int) -> dict[str, str]:
-    """Both heads, of some convolutions before the last."""
-    names: dict[str, str] = {}
-    for ours, theirs in (("heatmap", "heatmap_head.head"), ("box", "reg_head.head")):
-        # Convolution, normalization and activation each take a number.
-        for i in range(convs):
-            block = f"heads/{ours}/conv_{i + 1}"
-            names |= _norm_conv(block, f"head.{theirs}", str(3 * i), str(3 * i + 1))
-        names[f"heads/{ours}/out"] = f"head.{theirs}.{3 * convs}"
     return names

@@ -128,5 +128,5 @@ READERS |= {
         "a*",
         20,
     )
-    for suffix in (".pth", ".npz", ".safetensors")
+    for suffix in (".pth", ".safetensors")
 }

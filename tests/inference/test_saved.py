@@ -46,7 +46,7 @@ def _write_torch(path, **changes):
 
 
 def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
-    path = tmp_path / "best.npz"
+    path = tmp_path / "best.safetensors"
     config = _write_torch(path)
     loaded = load_model(path)
     assert loaded.config.data.azimuth_mapping == "stretched"

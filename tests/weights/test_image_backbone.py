@@ -22,7 +22,7 @@ def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
         "params": {"image_backbone": TRUNK, "image_neck": STAGE},
         "batch_stats": {"image_neck": STAGE},
     }
-    monkeypatch.setattr(image_backbone, "load_resnet", lambda path, width: part)
+    monkeypatch.setattr(image_backbone, "load_resnet", lambda path, model: part)
     return build(load_config(f"{CONFIG}:rcw_resnet50").model)
 
 

@@ -8,12 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax import models
+from radejax.core.archives import read_safetensors
+from radejax.core.config import load_config
 from radejax.core.errors import DataError, UserError
 from radejax.models.image import ResNetNeck, ResNetTrunk
-from radejax.weights.convert import read_content, write_state_dict
+from radejax.weights import torch_file
+from radejax.weights.convert import write_state_dict
 from radejax.weights.image_backbone import load_resnet, save_resnet
 
 from ..torch_files import write_pth
+
+MODEL = models.build(load_config("dinorade:rcw_resnet50").model)
 
 
 def torchvision_shapes():
@@ -59,7 +65,7 @@ def tensors():
 
 
 def test_every_tensor_finds_its_place(tensors):
-    loaded = load_resnet(tensors)
+    loaded = load_resnet(tensors, MODEL)
     trunk, neck = ResNetTrunk(), ResNetNeck()
     image = jnp.zeros((1, 32, 32, 3))
     expected = jax.eval_shape(trunk.init, jax.random.key(0), image)["params"]
@@ -114,7 +120,7 @@ def test_features_equal_torch(tensors):
             x = block(x, f"layer{stage}.{i}", 2 if stage > 1 and i == 0 else 1)
         if stage == 3:
             third = x
-    loaded = load_resnet(tensors)
+    loaded = load_resnet(tensors, MODEL)
     image = image.transpose(0, 2, 3, 1)
     features = jax.jit(ResNetTrunk().apply)(
         {"params": loaded["params"]["image_backbone"]}, image
@@ -140,11 +146,11 @@ def test_files_and_their_problems(tensors, tmp_path):
     broken["avgpool.weight"] = np.zeros(2, np.float32)
     write_pth(path, broken)
     with pytest.raises(DataError) as error:
-        load_resnet(path)
+        load_resnet(path, MODEL)
     assert "resnet50.pth does not fit, 2 problems: missing layer3.5.bn2" in str(error)
     assert "unexpected avgpool.weight" in str(error)
     with pytest.raises(FileNotFoundError):
-        load_resnet(tmp_path / "nothing.pth")
+        load_resnet(tmp_path / "nothing.pth", MODEL)
 
 
 def test_a_trunk_by_itself_is_written_and_read(tmp_path):
@@ -157,17 +163,17 @@ def test_a_trunk_by_itself_is_written_and_read(tmp_path):
     )
     path = tmp_path / "resnet50.safetensors"
     save_resnet(params, path)
-    loaded = load_resnet(path, width=4)
+    loaded = load_resnet(path, MODEL.clone(resnet_width=4))
     assert loaded.keys() == {"params"}
     chex.assert_trees_all_equal(loaded["params"], {"image_backbone": params})
     # Its names are torchvision's: what another program would look for.
-    names = set(read_content(path)[0])
+    names = set(read_safetensors(path))
     expected = {
         n for n in torchvision_shapes() if n.split(".")[0] not in ("layer4", "fc")
     }
     assert names == {n for n in expected if not n.endswith("num_batches_tracked")}
     with pytest.raises(DataError, match=r"conv1.weight is float32.4, 3, 7, 7., expect"):
-        load_resnet(path)
+        load_resnet(path, MODEL)
 
 
 def test_torch_writes_what_it_reads_or_says_that_it_is_missing(tmp_path):
@@ -178,4 +184,4 @@ def test_torch_writes_what_it_reads_or_says_that_it_is_missing(tmp_path):
             write_state_dict(path, tensors)
         return
     write_state_dict(path, tensors)
-    np.testing.assert_array_equal(read_content(path)[0]["a"], tensors["a"])
+    np.testing.assert_array_equal(torch_file.read(path)["a"], tensors["a"])
