@@ -30,10 +30,8 @@ import jax.numpy as jnp
 from radejax import models
 from radejax.core.config import load_config
 from radejax.core.structures import Batch
-from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.detector import detect
-from radejax.inference.export import CAMERA_SHAPES
+from radejax.inference.detector import detect, placeholder
 from radejax.simulation.radar import tensor
 from radejax.training.step import create_state, make_optimizer, make_train_step
 
@@ -65,9 +63,7 @@ def batch_of(model, grid, size, max_objects=16):
     rows = size, max_objects
     image = camera = None
     if models.has_camera(model):
-        image = shape_of(size, *model.image_size, 3, dtype=jnp.uint8)
-        fields = {name: shape_of(size, *s) for name, s in CAMERA_SHAPES.items()}
-        camera = Camera(**fields, is_valid=shape_of(size, dtype=jnp.bool_))
+        image, camera = jax.eval_shape(lambda: placeholder(size, model))
     return Batch(
         projection=shape_of(size, *grid.projection_shape, dtype=jnp.float16),
         boxes=shape_of(*rows, 8),

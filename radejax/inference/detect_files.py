@@ -10,7 +10,7 @@ import dataclasses
 import json
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -60,14 +60,14 @@ def find_frames(
     if not found:
         names = ", ".join(map(str, paths))
         raise UserError(f"no frames in {names}: looked for {' and '.join(PATTERNS)}")
-    folders = sorted({_sequence(path) for path in found})
+    folders = {_sequence(path) for path in found}
     if sequence_numbers:
         wanted = {str(number) for number in sequence_numbers}
-        folders = [f for f in folders if f.name.lstrip("0") in wanted]
+        folders = {f for f in folders if f.name.lstrip("0") in wanted}
     if weather:
         check_weather(weather)
-        conditions = {f: read_description(f / "description.txt") for f in folders}
-        folders = [f for f in folders if conditions[f].weather in weather]
+        descriptions = {f: read_description(f / "description.txt") for f in folders}
+        folders = {f for f in folders if descriptions[f].weather in weather}
     frames = {
         (_sequence(path), path.stem.removeprefix("DERA_")): path
         for path in sorted(found, key=lambda path: (path.suffix == ".npy", path))
@@ -186,43 +186,39 @@ def detect_files(
         labels = labels or data.labels
         known = front_images(frames, detector, labels, data.label_version)
     out.mkdir(parents=True, exist_ok=True)
+    keys = [frame_key(path) for path in frames]
+    names = [f"{output_name(path)}.json" for path in frames]
     if file_format == "kitti":
-        names = list(map(frame_key, frames))
-        table = {"frame": list(range(len(frames))), "name": names}
+        names = [f"preds/{number:06d}.txt" for number in range(len(frames))]
+        table = {"frame": list(range(len(frames))), "name": keys}
         files.write_json(out / "frames.json", table)
-    chunks = [frames[i : i + batch_size] for i in range(0, len(frames), batch_size)]
-    count = {"frames": 0, "boxes": 0, "clipped": 0}
-    inputs: list[Any] = chunks
+    batches = [slice(i, i + batch_size) for i in range(0, len(frames), batch_size)]
+    inputs: list[Any] = [frames[batch] for batch in batches]
     if known:
-        images = {path: known.get(path.absolute(), (None, None)) for path in frames}
-        inputs = [(c, *zip(*map(images.get, c), strict=True)) for c in chunks]
+        images = [known.get(path.absolute(), (None, None)) for path in frames]
+        inputs = [(frames[b], *zip(*images[b], strict=True)) for b in batches]
     found = detector.stream(inputs, **settings)
+    count = {"frames": len(frames), "boxes": 0, "clipped": 0}
     with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:
-        for chunk, detections in zip(chunks, found, strict=True):
-            for name, text in _as_files(
-                chunk, count["frames"], detections, file_format
-            ):
+        for batch, detections in zip(batches, found, strict=True):
+            texts = _texts(keys[batch], detections, file_format)
+            for name, text in zip(names[batch], texts, strict=True):
                 files.write_text(out / name, text)
             count["boxes"] += int(np.asarray(detections.is_valid).sum())
             count["clipped"] += int(detections.num_clipped.sum())
-            count["frames"] += len(chunk)
-            bar.update(len(chunk))
+            bar.update(len(texts))
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
     return count
 
 
-def _as_files(
-    chunk: Sequence[pathlib.Path], first: int, detections: Detections, file_format: str
-) -> Iterator[tuple[str, str]]:
-    """Names and texts of the files of a batch whose first frame has this number."""
+def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> list[str]:
+    """Contents of the files of some frames."""
     if file_format == "kitti":
-        for number, text in enumerate(kitti.prediction_texts(detections), first):
-            yield f"preds/{number:06d}.txt", f"{text}\n"
-        return
-    for path, boxes in zip(chunk, detections.to_list(), strict=True):
-        named = [{"frame": frame_key(path), **box} for box in boxes]
-        yield f"{output_name(path)}.json", json.dumps(named, indent=2) + "\n"
+        return [f"{text}\n" for text in kitti.prediction_texts(detections)]
+    frames = zip(keys, detections.to_list(), strict=True)
+    named = [[{"frame": key, **box} for box in boxes] for key, boxes in frames]
+    return [json.dumps(boxes, indent=2) + "\n" for boxes in named]
 
 
 def frame_key(path: pathlib.Path) -> str:

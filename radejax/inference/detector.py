@@ -29,6 +29,7 @@ from radejax.data.tesseract import read_frame
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
+    RADAR_FROM_LIDAR_M,
     Camera,
     CameraCalibration,
     stack_cameras,
@@ -45,10 +46,11 @@ SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
 
 Frames = Array | PathLike | Sequence[Array | PathLike]
 Images = Array | Sequence[Array | PathLike | None]
-Calibration = CameraCalibration | Camera | PathLike
-Calibrations = Calibration | Sequence[Calibration | None]
+Calibration = CameraCalibration | PathLike
+Calibrations = Camera | Calibration | Sequence[Camera | Calibration | None]
 
 _PATH = (str, os.PathLike)
+_KRADAR_FROM_LIDAR_M = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
 
 
 def detect(
@@ -60,8 +62,6 @@ def detect(
     image: Real[Array, "B _ _ _"] | None = None,
     camera: Any = None,
     settings: Mapping[str, Array] | None = None,
-    *,
-    is_tesseract: bool = False,
 ) -> Detections:
     """From a batch of radar tensors to detections; pure, to be jitted.
 
@@ -70,13 +70,12 @@ def detect(
         grid: Of its maps, see `models.map_grid`.
         options: Keyword arguments of `radejax.detection.decode.decode`.
         variables: Of the model.
-        frames: Projections as they are stored, or tesseracts.
+        frames: Projections as they are stored, or tesseracts, linear power.
         image: Of a radar-camera model, or None for the radar only.
         camera: Likewise.
         settings: Options that replace those in `options`, of `SETTINGS`, traced.
-        is_tesseract: `frames` are tesseracts, linear power.
     """
-    if is_tesseract:
+    if frames.ndim == 5:
         frames = project_jax(frames)
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
     maps: Any = model.apply(variables, *inputs, train=False)
@@ -148,11 +147,7 @@ class Detector:
         self.num_radar_only = self.num_invalid_frames = 0
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
-        self._run = jax.jit(
-            self.detect_function(),
-            static_argnames="is_tesseract",
-            out_shardings=self.replicated,
-        )
+        self._run = jax.jit(self.detect_function(), out_shardings=self.replicated)
 
     @classmethod
     def from_workdir(
@@ -253,17 +248,14 @@ class Detector:
         """
         inputs: Any
         if isinstance(frames, Batch):  # checked when it was made
-            is_tesseract = False
             inputs = frames.projection, frames.image, frames.camera
         else:
-            radar, is_tesseract = radar_batch(frames, self.grid)
+            radar = radar_batch(frames, self.grid)
             image, camera, num_radar_only = camera_batch(
                 image, camera, len(radar), self.model, self.camera_options
             )
             inputs = radar, image, camera
-            num_invalid = count_invalid(
-                radar, is_tesseract, warn=not self.num_invalid_frames
-            )
+            num_invalid = count_invalid(radar, warn=not self.num_invalid_frames)
             with self._lock:
                 self.num_invalid_frames += num_invalid
                 self.num_radar_only += num_radar_only
@@ -275,17 +267,17 @@ class Detector:
         largest = self._batch_sizes[-1]
         for start in range(0, len(inputs[0]), largest):
             chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], inputs)
-            parts.append(self._detect(chunk, settings, is_tesseract))
+            parts.append(self._detect(chunk, settings))
         if len(parts) == 1:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def _detect(self, inputs: Any, settings: Any, is_tesseract: bool) -> Detections:
+    def _detect(self, inputs: Any, settings: Any) -> Detections:
         """Detections of at most the largest batch size."""
         count = inputs[0].shape[0]
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
-        found = self._run(self.variables, *inputs, settings, is_tesseract=is_tesseract)
+        found = self._run(self.variables, *inputs, settings)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # Devices that share cores miss each other where batches pile up.
             jax.block_until_ready(found)
@@ -302,26 +294,21 @@ class Detector:
                 camera.
             **settings: Keyword arguments of `__call__`.
         """
-        pending = None
+        started: list[Detections] = []
         for item in frames:
-            started = self(*(item if isinstance(item, tuple) else (item,)), **settings)
-            if pending is not None:
-                yield pending
-            pending = started
-        if pending is not None:
-            yield pending
+            inputs = item if isinstance(item, tuple) else (item,)
+            started.append(self(*inputs, **settings))
+            if len(started) > 1:
+                yield started.pop(0)
+        yield from started
 
-    def warmup(self, batch_size: int = 1, *, tesseract: bool = False) -> Detector:
-        """Compile for a batch size, so that the first call is fast.
+    def warmup(self, batch_size: int = 1) -> Detector:
+        """Compile for a batch size of projections, so that the first call is fast.
 
         A radar-camera model is compiled for frames with images.
-
-        Args:
-            batch_size: Of the calls to come.
-            tesseract: They pass tesseracts, not projections.
         """
-        shape = self.grid.shape_drea if tesseract else self.grid.projection_shape
-        inputs: tuple[Any, ...] = (np.zeros((batch_size, *shape), np.float32),)
+        shape = (batch_size, *self.grid.projection_shape)
+        inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
         if self.takes_camera:
             images, camera = placeholder(batch_size, self.model)
             inputs += images, camera.replace(is_valid=np.ones(batch_size, bool))
@@ -350,16 +337,14 @@ class Detector:
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
     """Repeat the last frame up to a batch size."""
-    if x.shape[0] == size:
-        return x
-    xp: Any = np if isinstance(x, np.ndarray) else jnp
-    return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0], 0)])
+    count = x.shape[0]
+    return x if count == size else x[np.minimum(np.arange(size), count - 1)]
 
 
 # Inputs ------------------------------------------------------------------------------
 
 
-def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bool]:
+def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     """Radar frames as one array with a leading axis of B.
 
     Args:
@@ -368,7 +353,7 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bo
         grid: Axes of the sensor.
 
     Returns:
-        `[B, R, A, D+E]` or `[B, D, R, E, A]`, and whether they are tesseracts.
+        `[B, R, A, D+E]` or `[B, D, R, E, A]`.
 
     Raises:
         UserError: The shape is of neither, or there is no frame.
@@ -386,11 +371,10 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bo
         )
     shape = tuple(np.shape(frames))
     projection, tesseract = grid.projection_shape, grid.shape_drea
-    for expected, is_tesseract in ((projection, False), (tesseract, True)):
-        if shape == expected:
-            return frames[None], is_tesseract
-        if shape[1:] == expected and shape[0]:
-            return frames, is_tesseract
+    if shape in (projection, tesseract):
+        return frames[None]
+    if shape[1:] in (projection, tesseract) and shape[0]:
+        return frames
     raise UserError(
         f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
         f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
@@ -401,9 +385,7 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> tuple[Real[Any, "B ..."], bo
 _MAX_DECIBELS = 300.0
 
 
-def count_invalid(
-    frames: Real[Any, "B ..."], is_tesseract: bool, *, warn: bool = True
-) -> int:
+def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:
     """Number of frames whose values are not a linear power, or a level of a projection.
 
     Decibels are neither: noise alone spans more than they do, with bins below 1. Arrays
@@ -413,8 +395,9 @@ def count_invalid(
         return 0
     axes = tuple(range(1, frames.ndim))
     low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
-    limit = np.finfo(np.float32).max if is_tesseract else MAX_LEVEL
-    lowest = 0.0 if is_tesseract else -MAX_LEVEL
+    lowest, limit = -MAX_LEVEL, MAX_LEVEL
+    if frames.ndim == 5:
+        lowest, limit = 0.0, float(np.finfo(np.float32).max)
     is_decibels = (low > 1.0) & (high <= _MAX_DECIBELS)
     count = int((~((low >= lowest) & (high <= limit)) | is_decibels).sum())
     if count and warn:
@@ -465,12 +448,11 @@ def camera_batch(
     if image is not None:
         images, has_image = _images(image, model, options.resize)
         cameras = _cameras(camera, num_frames, model, options)
-        for what, count in (
-            ("images", len(images)),
-            ("cameras", len(cameras.is_valid)),
-        ):
-            if count != num_frames:
-                raise UserError(f"{count} {what} for {num_frames} frames")
+        given = len(images), len(cameras.is_valid)
+        if given != (num_frames, num_frames):
+            raise UserError(
+                f"{given[0]} images and {given[1]} cameras for {num_frames} frames"
+            )
         has_image = has_image & np.asarray(cameras.is_valid, bool)
         cameras = cameras.replace(is_valid=has_image)
     num_missing = int((~has_image).sum())
@@ -498,9 +480,9 @@ def _images(
             else one
             for one in image
         ]
-        black = np.zeros(sizes[0], np.uint8)
-        like = next((np.asarray(one) for one in images if one is not None), black)
-        empty = np.zeros_like(like)
+        empty = np.zeros(sizes[0], np.uint8)
+        if has_image.any():
+            empty = np.zeros_like(np.asarray(images[has_image.argmax()]))
         image = np.stack([empty if one is None else one for one in images])
     else:
         image = image[None] if np.ndim(image) == 3 else image
@@ -529,22 +511,16 @@ def _cameras(
     )
 
 
-def _one_camera(camera: Any, options: CameraOptions) -> Camera:
-    if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 0:
+def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
+    if isinstance(camera, Camera):
         return camera
-    z_m = None
-    if isinstance(camera, _PATH):
-        camera = CameraCalibration.from_kradar(pathlib.Path(camera))
-        z_m = KRADAR_RADAR_FROM_LIDAR_Z_M
     if not isinstance(camera, CameraCalibration):
-        raise UserError(
-            f"camera is a {type(camera).__name__}, expected a CameraCalibration, a "
-            "Camera, the path of a cam_*.yml file of K-Radar or None, one for all frames "
-            "or one per frame"
+        camera = CameraCalibration.from_kradar(
+            pathlib.Path(camera), radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
         )
     own_m = camera.radar_from_lidar_m
-    shift_m = options.shift(own_m, own_m[2] if z_m is None else z_m)
-    camera = dataclasses.replace(camera, radar_from_lidar_m=np.array(shift_m))
+    shift_m = np.array(options.shift(own_m, own_m[2]))
+    camera = dataclasses.replace(camera, radar_from_lidar_m=shift_m)
     return camera.camera(options.projection)
 
 

@@ -23,7 +23,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
-from radejax.inference.detector import SETTINGS, Detector
+from radejax.inference.detector import SETTINGS, Detector, placeholder
 from radejax.inference.saved import save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
 
@@ -31,15 +31,6 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
 FORMATS = ("stablehlo", "onnx", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
-
-CAMERA_SHAPES = {
-    "cam_from_ego": (3, 4),
-    "intrinsics": (4,),
-    "distortion": (5,),
-    "max_radius": (),
-    "size_px": (2,),
-}
-"""Float fields of `radejax.geometry.camera.Camera`, beside the bool `is_valid`."""
 
 CHUNK_SIZE = 1024
 """Queries at once of the deformable attention in ONNX files, unless the config says."""
@@ -59,17 +50,15 @@ tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
   files
 - Use: `radejax.Detector.from_workdir(folder)`
 - Left out: {left_out}
-
-{origin}
+- {origin}
 """
 _LEFT_OUT = (
     "the frozen DINOv3 weights, whose license restricts redistribution: download them "
     "from their owner and pass `image_backbone=FOLDER`"
 )
-_SIMULATED = "Trained on simulated data only: no use on frames of a real radar."
+_SIMULATED = "Trained on simulated data only: no use on frames of a real radar"
 _MEASURED = (
-    "Before publishing, check the license of the data that the weights were trained on\n"
-    "(K-Radar: CC BY-NC-ND)."
+    "Check the license of the training data before publishing (K-Radar: CC BY-NC-ND)"
 )
 
 
@@ -164,13 +153,13 @@ def _exported(
     if not detector.takes_camera:
         return variables, (projection,)
     model = detector.model
-    image = _array(batch, *model.image_size, 3, dtype=jnp.uint8)
+    image, camera = jax.tree.map(
+        lambda x: _array(batch, *x.shape[1:], dtype=x.dtype), placeholder(1, model)
+    )
     if not (with_backbone or model.vit is None):
         variables["params"].pop(IMAGE_BACKBONE, None)
         image = _array(batch, *model.feature_shape)
-    camera = {name: _array(batch, *s) for name, s in CAMERA_SHAPES.items()}
-    camera["is_valid"] = _array(batch, dtype=jnp.bool_)
-    return variables, (projection, image, camera)
+    return variables, (projection, image, vars(camera))
 
 
 def _detect(

@@ -39,18 +39,15 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     folder = pathlib.Path(folder)
     config = json.loads((folder / "config.json").read_text())
     data = {name: read_file(folder / name, x) for name, x in config["sha256"].items()}
-    config = config["config"]["decode"]
     run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)
     weights = jax.device_put(read_weights(data["model.safetensors"]), device)
+    decode = config["config"]["decode"]
+    defaults = {name: decode[name] for name in ("score_threshold", "nms_iou")}
+    defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
 
-    def detect(*inputs, score_threshold=None, nms_iou=None, roi=None):
-        score = (
-            config["score_threshold"] if score_threshold is None else score_threshold
-        )
-        iou = config["nms_iou"] if nms_iou is None else nms_iou
-        roi = config.get("roi") if roi is None else roi
-        roi = [-np.inf, np.inf] * 3 if roi is None else roi
-        settings = np.float32(score), np.float32(iou), np.asarray(roi, np.float32)
+    def detect(*inputs, **settings):
+        values = {**defaults, **settings}.values()
+        settings = [np.asarray(value, np.float32) for value in values]
         # Copies: on CPU device_put shares memory, which the caller may refill.
         own = jax.tree.map(np.array, inputs)
         return run(weights, jax.device_put(own, device), *settings)

@@ -59,12 +59,10 @@ def predict_dataset(
         UserError: There are no frames.
         distributed.Stopped: `should_stop` returned True.
     """
-    if not len(frames):
-        raise UserError("no frames to detect objects in")
     table = make_table(
         records,
         frames,
-        max_objects=max(len(frame.boxes) for frame in frames) or 1,
+        max_objects=max([1, *(len(frame.boxes) for frame in frames)]),
         classes=detector.classes,
         images=images,
     )
@@ -77,8 +75,8 @@ def predict_dataset(
         num_epochs=1,
         drop_remainder=False,
         pad_remainder=num_devices > 1,  # one device pads by itself
-        process_index=None if count > 1 else 0,
-        process_count=None if count > 1 else 1,
+        process_index=jax.process_index() % count,
+        process_count=count,
     )
     detector = detector.replace(batch_sizes=(rows,))
     gather = jax.jit(lambda x: x, out_shardings=detector.replicated)
@@ -117,7 +115,6 @@ def embed_dataset(
     dtype: str = "float32",
     resize: bool = False,
     batch_size: int = 8,
-    num_threads: int = 2,
     progress: bool = True,
 ) -> dict[str, int]:
     """Write the backbone's features of every front image that has none yet.
@@ -132,7 +129,6 @@ def embed_dataset(
             half the size.
         resize: Resize images of another size than the model's.
         batch_size: Images at once.
-        num_threads: Threads that read images.
         progress: Show a progress bar.
 
     Returns:
@@ -163,12 +159,9 @@ def embed_dataset(
         grain.MapDataset.source(images)
         .map(read)
         .batch(batch_size)
-        .to_iter_dataset(
-            grain.ReadOptions(num_threads, prefetch_buffer_size=num_threads)
-        )
+        .to_iter_dataset(grain.ReadOptions(2, prefetch_buffer_size=2))
     )
-    bar = tqdm.tqdm(total=len(images), unit="frame", desc="embed", disable=not progress)
-    with bar:
+    with tqdm.tqdm(total=len(images), desc="embed", disable=not progress) as bar:
         for i, batch in enumerate(batches):
             empty = [(0, batch_size - len(batch)), (0, 0), (0, 0), (0, 0)]
             features = np.asarray(embed(params, np.pad(batch, empty))).astype(dtype)

@@ -180,18 +180,17 @@ def save_model(
     """
     folder = pathlib.Path(folder)
     variables = {name: dict(tree) for name, tree in saved.variables.items()}
-    image = saved.config.model.get("image")
+    params, image = variables["params"], saved.config.model.get("image")
     is_vit = image is not None and image.kind == "vit"
-    removed = None
     if is_vit and not with_backbone:
-        removed = variables["params"].pop(IMAGE_BACKBONE, None)
-    if removed and not image.freeze:
-        raise UserError(
-            "the image backbone was fine-tuned, so its weights are required. If it "
-            "started from DINOv3, its license restricts redistribution; otherwise pass "
-            "--with-backbone"
-        )
-    is_incomplete = is_vit and IMAGE_BACKBONE not in variables["params"]
+        if IMAGE_BACKBONE in params and not image.freeze:
+            raise UserError(
+                "the image backbone was fine-tuned, so its weights are required. If it "
+                "started from DINOv3, its license restricts redistribution; otherwise "
+                "pass --with-backbone"
+            )
+        params.pop(IMAGE_BACKBONE, None)
+    is_incomplete = is_vit and IMAGE_BACKBONE not in params
     arrays = {
         name: np.ascontiguousarray(value, np.float16 if half else None)
         for name, value in traverse_util.flatten_dict(variables, sep="/").items()
@@ -282,42 +281,33 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
 
 
 def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
-    """The same with the weights of its image backbone, where they are available."""
-    params = saved.variables["params"]
+    """The same with the weights of its image backbone, where they are available.
+
+    In this order: what is given, what the run was trained with, what it started from.
+    """
+    params, data = saved.variables["params"], saved.config.data
     is_complete = IMAGE_BACKBONE in params
     if "image" not in saved.config.model or (is_complete and given is None):
         return saved
-    source, part = _find_backbone(saved, given)
-    if IMAGE_BACKBONE not in part:
+    source, start = given or data.image_backbone, saved.run.get("init_from")
+    part: Any = {"params": {}}
+    if given is not None or (source and pathlib.Path(source).exists()):
+        part = image_backbone.load_image_backbone(source, saved.model)
+    elif start and pathlib.Path(start).exists() and not data.embeddings:
+        source, part = start, _fitting_variables(start, saved.config.model)
+    if IMAGE_BACKBONE not in part["params"]:
+        if source is not None:
+            _log.warning(
+                "image backbone weights not found at %s; the model accepts embedded "
+                "images only",
+                source,
+            )
         return saved
-    backbone, sha256 = part[IMAGE_BACKBONE], saved.run.get(FROZEN_BACKBONE)
+    backbone, sha256 = part["params"][IMAGE_BACKBONE], saved.run.get(FROZEN_BACKBONE)
     if sha256 is not None:
         image_backbone.check_same_backbone(backbone, sha256, source)
     params = {**params, IMAGE_BACKBONE: backbone}
     return dataclasses.replace(saved, variables={**saved.variables, "params": params})
-
-
-def _find_backbone(
-    saved: SavedModel, given: PathLike | None
-) -> tuple[PathLike, Mapping[str, Any]]:
-    """Where the weights of an image backbone are, and parameters with them if any.
-
-    In this order: what is given, what the run was trained with, what it started from.
-    """
-    data, start = saved.config.data, saved.run.get("init_from")
-    source = given or data.image_backbone
-    if given is not None or (source and pathlib.Path(source).exists()):
-        part = image_backbone.load_image_backbone(source, saved.model)
-        return source, part["params"] if part else {}
-    if source is not None:
-        _log.warning(
-            "image backbone weights not found at %s; the model accepts embedded images "
-            "only",
-            source,
-        )
-    if start and pathlib.Path(start).exists() and not data.embeddings:
-        return start, _fitting_variables(start, saved.config.model)["params"]
-    return "", {}
 
 
 # Weights that a training starts from -------------------------------------------------
@@ -366,10 +356,10 @@ def starting_weights(
             image_backbone_path, model, embeddings_sha256
         )
     if models.has_camera(model) and model.freeze:
-        digest = embeddings_sha256
-        if digest is None:
-            given: Any = variables if pretrained is None else pretrained
-            digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
+        given: Any = variables if pretrained is None else pretrained
+        digest = embeddings_sha256 or image_backbone.weights_sha256(
+            given["params"][IMAGE_BACKBONE]
+        )
     return StartingWeights(variables, pretrained, digest)
 
 

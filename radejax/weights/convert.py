@@ -85,8 +85,7 @@ def from_torch(
         ours = to_our_layout(path, value)
         if ours.ndim == 4 and len(shape) == 2:  # a 1x1 convolution, or patches
             ours = ours.reshape(-1, ours.shape[-1])
-        is_number = value.dtype.kind in "biuf" or value.dtype.name == "bfloat16"
-        if ours.shape != shape or not is_number:
+        if ours.shape != shape:
             expected = to_torch_layout(path, np.broadcast_to(0, shape)).shape
             problems.append(
                 f"{name} is {value.dtype}{value.shape}, expected {expected}"

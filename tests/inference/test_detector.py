@@ -10,7 +10,6 @@ from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import write
 from radejax.data.projection import project_tensor
 from radejax.evaluation.kitti import prediction_texts
-from radejax.weights import dinorade_torch
 
 from .. import small_models as small
 
@@ -51,6 +50,12 @@ def test_tesseracts_projections_and_files_agree(
     write.write_tesseract(path, tesseracts[0])
     _equal(detector(path), expected)
     _equal(detector([path, path]), detector(projections[[0, 0]]))
+    _equal(detector(list(projections[:2])), detector(projections[:2]))
+    _equal(detector(tuple(tesseracts[:2])), detector(projections[:2]))
+    with pytest.raises(UserError, match="the list is empty"):
+        detector([])
+    with pytest.raises(ValueError, match="must have the same shape"):
+        detector([projections[0], projections[0, :8]])
 
 
 def test_any_batch_size_runs_in_the_compiled_sizes(detector, projections):
@@ -107,13 +112,6 @@ def test_detections_as_columns_lists_and_text(detector, projections):
     assert prediction_texts(nothing) == ["dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"]
 
 
-def test_official_state_dicts_are_told_apart():
-    weight = np.zeros(3, np.float32)
-    nested = {"epoch": 1, "model": {"module.rad_backbone.conv.weight": weight}}
-    assert dinorade_torch.is_dinorade(nested)
-    assert not dinorade_torch.is_dinorade({"model": {"backbone.conv.weight": weight}})
-
-
 def test_a_wrong_shape_names_what_was_expected(detector):
     with pytest.raises(
         UserError, match=r"\[3, 16, 14, 6\]; expected projections .*\[B, 16, 14, 5\]"
@@ -144,16 +142,6 @@ def test_memory_of_the_caller_may_be_refilled(detector, projections):
         taken = detector.put(ring)
         ring[:] = 0.0
         np.testing.assert_array_equal(taken, projections[:count])
-
-
-def test_lists_of_arrays(detector, tesseracts, projections):
-    expected = detector(projections[:2])
-    _equal(detector(list(projections[:2])), expected)
-    _equal(detector(tuple(tesseracts[:2])), expected)
-    with pytest.raises(UserError, match="the list is empty"):
-        detector([])
-    with pytest.raises(ValueError, match="must have the same shape"):
-        detector([projections[0], projections[0, :8]])
 
 
 def test_region_of_decode_options_holds_where_none_is_given(detector, projections):
@@ -215,19 +203,9 @@ def test_arguments_by_name_and_wrong_ones():
     for wrong, message in (
         ({"roi": "middle"}, "roi is 'middle', expected narrow, wide or x0"),
         ({"roi": (0, 1)}, r"roi is \(0, 1\), expected narrow"),
-        (
-            {"batch_sizes": (0,)},
-            r"batch_sizes is \(0,\), expected integers of at least",
-        ),
+        ({"batch_sizes": (0,)}, r"batch_sizes is \(0,\), expected integers of"),
         ({"batch_sizes": ()}, r"batch_sizes is \(\), expected"),
-        (
-            {"score_threshold": float("nan")},
-            "score_threshold is nan, expected a number",
-        ),
-        (
-            {"nms_iou": 1.5},
-            r"config\.decode\.nms_iou is 1\.5, expected a number of at least 0",
-        ),
+        ({"nms_iou": 1.5}, r"config\.decode\.nms_iou is 1\.5, expected a number"),
     ):
         with pytest.raises(UserError, match=message):
             small.detector(**wrong)

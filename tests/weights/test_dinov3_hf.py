@@ -56,7 +56,9 @@ def test_a_folder_that_is_written_is_the_one_that_was_read(
     assert again == model
     chex.assert_trees_all_equal(found["params"], variables["params"])
     written = safetensors.numpy.load_file(tmp_path / "written" / "model.safetensors")
-    if not changes:  # by the names and in the shapes of transformers
+    if changes:
+        assert written["layer.2.mlp.gate_proj.weight"].shape == (192, 96)
+    else:  # by the names and in the shapes of transformers
         tensors = dict(tensors) | {"embeddings.mask_token": np.zeros((1, 1, 96))}
         chex.assert_trees_all_equal(written, tensors)
 
@@ -120,41 +122,7 @@ def test_names_of_transformers_5_in_memory(tensors, make):
     chex.assert_trees_all_equal(dinov3_hf.to_params(model, prefixed), plain)
 
 
-def test_larger_models_have_a_gated_mlp(make):
-    config = make.TINY_CONFIG | {"use_gated_mlp": True, "hidden_act": "silu"}
-    shapes = dict(make.TINY_SHAPES)
-    for i in range(3):
-        shapes[f"layer.{i}.mlp.gate_proj.weight"] = (192, 96)
-        shapes[f"layer.{i}.mlp.gate_proj.bias"] = (192,)
-    model = dinov3_hf.model_from_config(config)
-    params = dinov3_hf.to_params(
-        model, {k: make.seeded_tensor(k, s) for k, s in shapes.items()}
-    )
-    expected = jax.eval_shape(model.init, jax.random.key(0), np.zeros((1, 32, 32, 3)))
-    chex.assert_trees_all_equal_shapes(params, expected["params"])
-
-
-def test_all_problems_are_listed_at_once(folder, tensors):
-    broken = dict(tensors)
-    del broken["layer.1.norm1.bias"]
-    del broken["norm.weight"]
-    broken["layer.0.mlp.up_proj.bias"] = np.zeros(7, np.float32)
-    broken["classifier.weight"] = np.zeros((2, 2), np.float32)
-    safetensors.numpy.save_file(broken, folder / "model.safetensors")
-    with pytest.raises(
-        DataError,
-        match=r"4 problems: .*missing layer.1.norm1.bias; missing norm.weight",
-    ):
-        dinov3_hf.load(folder)
-    with pytest.raises(DataError, match=r"unexpected classifier.weight"):
-        dinov3_hf.load(folder)
-    with pytest.raises(
-        DataError, match=r"layer.0.mlp.up_proj.bias is float32\(7,\), expected \(192,\)"
-    ):
-        dinov3_hf.load(folder)
-
-
-def test_incomplete_or_damaged_folders(folder, tmp_path):
+def test_incomplete_or_corrupted_folders(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"config.json and model.safetensors"):
         dinov3_hf.load(tmp_path / "nowhere")
     weights = folder / "model.safetensors"
@@ -167,6 +135,9 @@ def test_incomplete_or_damaged_folders(folder, tmp_path):
     shutil.copy(__file__, folder / "config.json")
     weights.write_bytes(b"")
     with pytest.raises(DataError, match="is not valid JSON"):
+        dinov3_hf.load(folder)
+    (folder / "config.json").write_text("[1]")
+    with pytest.raises(DataError, match=r"config.json: expected a JSON object"):
         dinov3_hf.load(folder)
 
 
@@ -206,9 +177,3 @@ def test_another_number_of_layers_is_refused(make, tensors, count, message):
     model = dinov3_hf.model_from_config(make.TINY_CONFIG | {"num_hidden_layers": count})
     with pytest.raises(DataError, match=f"x does not fit, .*{message}"):
         dinov3_hf.to_params(model, tensors, "x")
-
-
-def test_a_config_that_is_no_object(folder):
-    (folder / "config.json").write_text("[1]")
-    with pytest.raises(DataError, match=r"config.json: expected a JSON object"):
-        dinov3_hf.load(folder)

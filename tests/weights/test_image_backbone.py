@@ -1,7 +1,5 @@
 """What radar-camera runs take from files, in place of real weights."""
 
-import pathlib
-
 import flax.linen as nn
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from radejax.core.errors import UserError
 from radejax.models import build
 from radejax.weights import dinov3_hf, image_backbone
 
-CONFIG = pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py"
 TRUNK = {"stem": np.arange(3.0)}
 STAGE = {"block": np.arange(2.0)}
 
@@ -23,7 +20,7 @@ def resnet(monkeypatch: pytest.MonkeyPatch) -> nn.Module:
         "batch_stats": {"image_neck": STAGE},
     }
     monkeypatch.setattr(image_backbone, "load_resnet", lambda path, model: part)
-    return build(load_config(f"{CONFIG}:rcw_resnet50").model)
+    return build(load_config("dinorade:rcw_resnet50").model)
 
 
 def test_embeddings_leave_the_last_stage_to_load(resnet):
@@ -44,12 +41,12 @@ def test_embeddings_of_other_weights_are_refused(resnet):
 
 
 def test_embeddings_stand_for_all_of_a_transformer():
-    model = build(load_config(str(CONFIG)).model)
+    model = build(load_config("dinorade").model)
     assert image_backbone.load_image_backbone(None, model, "0" * 64) is None
 
 
 def test_weights_of_another_transformer_are_refused(monkeypatch):
-    model = build(load_config(str(CONFIG)).model)
+    model = build(load_config("dinorade").model)
     found = model.vit.clone(num_registers=3)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
     with pytest.raises(UserError, match="num_registers is 3 there and 4 here"):
