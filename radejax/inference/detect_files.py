@@ -57,9 +57,6 @@ def find_frames(
             found.add(path)
         for pattern in PATTERNS:
             found.update(path.rglob(pattern))
-    if not found:
-        names = ", ".join(map(str, paths))
-        raise UserError(f"no frames in {names}: looked for {' and '.join(PATTERNS)}")
     folders = {_sequence(path) for path in found}
     if sequence_numbers:
         wanted = {str(number) for number in sequence_numbers}
@@ -74,8 +71,10 @@ def find_frames(
         if _sequence(path) in folders
     }
     if not frames:
-        asked = [*(sequence_numbers or ()), *(weather or ())]
-        raise UserError(f"no frames of {', '.join(map(str, asked))} in these folders")
+        asked = map(str, [*paths, *(sequence_numbers or ()), *(weather or ())])
+        raise UserError(
+            f"no frames for {', '.join(asked)}: looked for {' and '.join(PATTERNS)}"
+        )
     return sorted(frames.values())
 
 

@@ -344,6 +344,14 @@ def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]
 # Inputs ------------------------------------------------------------------------------
 
 
+def _read_paths(given: Any, read: Callable[[pathlib.Path], np.ndarray]) -> Any:
+    """An array as it is; a path, or a list with paths, as a list of arrays and None."""
+    if not isinstance(given, str | os.PathLike | Sequence):
+        return given
+    entries = [given] if isinstance(given, _PATH) else given
+    return [read(pathlib.Path(x)) if isinstance(x, _PATH) else x for x in entries]
+
+
 def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     """Radar frames as one array with a leading axis of B.
 
@@ -358,17 +366,11 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     Raises:
         UserError: The shape is of neither, or there is no frame.
     """
-    if isinstance(frames, _PATH):
-        frames = [frames]
-    if isinstance(frames, Sequence):
+    frames = _read_paths(frames, lambda path: read_frame(path, grid))
+    if isinstance(frames, list):
         if not frames:
             raise UserError("no frames: the list is empty")
-        frames = np.stack(
-            [
-                read_frame(pathlib.Path(x), grid) if isinstance(x, _PATH) else x
-                for x in frames
-            ]
-        )
+        frames = np.stack(frames)
     shape = tuple(np.shape(frames))
     projection, tesseract = grid.projection_shape, grid.shape_drea
     if shape in (projection, tesseract):
@@ -470,20 +472,15 @@ def _images(
 ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
     """Images as one array, and which of them are not None."""
     sizes = ((*model.image_size, 3), model.feature_shape)
-    if isinstance(image, _PATH):
-        image = [image]
-    if isinstance(image, Sequence):
+    image = _read_paths(
+        image, lambda path: read_left_image(path, model.image_size, resize=resize)
+    )
+    if isinstance(image, list):
         has_image = np.array([one is not None for one in image])
-        images = [
-            read_left_image(pathlib.Path(one), model.image_size, resize=resize)
-            if isinstance(one, _PATH)
-            else one
-            for one in image
-        ]
         empty = np.zeros(sizes[0], np.uint8)
         if has_image.any():
-            empty = np.zeros_like(np.asarray(images[has_image.argmax()]))
-        image = np.stack([empty if one is None else one for one in images])
+            empty = np.zeros_like(np.asarray(image[has_image.argmax()]))
+        image = np.stack([empty if one is None else one for one in image])
     else:
         image = image[None] if np.ndim(image) == 3 else image
         has_image = np.ones(len(image), bool)

@@ -30,7 +30,7 @@ import radejax
 from radejax import models
 from radejax.core import files
 from radejax.core.config import base_config, without_data_paths
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES
 from radejax.data.cameras import CameraOptions
@@ -236,11 +236,8 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
         config = ConfigDict(content["config"], convert_dict=True)
         saved = SavedModel(config, RadarGrid.from_dict(content["grid"]), variables)
         image_backbone.check_fits(saved.model, variables, weights)
-        if len(config.classes) != config.model.num_classes:
-            raise DataError(
-                f"{len(config.classes)} classes, expected {config.model.num_classes} "
-                "(config.model.num_classes)"
-            )
+        names, count = config.classes, config.model.num_classes
+        require(len(names) == count, "config.classes", names, f"{count} classes")
         return saved
     # What a config that was edited by hand makes ConfigDict and the constructors raise.
     except (ValueError, KeyError, TypeError, AttributeError) as error:

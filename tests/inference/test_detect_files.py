@@ -38,7 +38,7 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_every_frame_is_found_once_and_its_projection_preferred(root):
+def test_every_frame_is_found_once_and_its_projection_preferred(root, monkeypatch):
     found = [path.relative_to(root).as_posix() for path in find_frames([root])]
     assert sorted(found) == [
         "5/DERA_tesseract/DERA_tesseract_00034.npy",
@@ -46,15 +46,13 @@ def test_every_frame_is_found_once_and_its_projection_preferred(root):
         "6/radar_tesseract/tesseract_00033.mat",
     ]
     assert find_frames([root, root / "5"]) == find_frames([root])
+    monkeypatch.chdir(root)
+    assert len(find_frames([root, "."])) == 3
 
 
 def test_names_of_results_are_unique_among_sequences(root):
-    names = [output_name(path) for path in find_frames([root])]
-    assert sorted(names) == [
-        "5_00033",
-        "5_00034",
-        "6_00033",
-    ]
+    names = {output_name(path) for path in find_frames([root])}
+    assert names == {"5_00033", "5_00034", "6_00033"}
 
 
 def test_a_part_of_the_frames(root):
@@ -62,20 +60,15 @@ def test_a_part_of_the_frames(root):
         (root / sequence / "description.txt").write_text(f"urban,day,{weather}\n")
     assert [output_name(p) for p in find_frames([root], (6, 9))] == ["6_00033"]
     assert len(find_frames([root], weather=("fog",))) == 2
-    with pytest.raises(UserError, match="no frames of 5, rain in these folders"):
+    with pytest.raises(UserError, match=r"no frames for .*, 5, rain: looked for"):
         find_frames([root], (5,), ("rain",))
 
 
 def test_nothing_found_and_nothing_there(tmp_path):
-    with pytest.raises(UserError, match=r"no frames in .* looked for tesseract_\*"):
+    with pytest.raises(UserError, match=r"no frames for .*: looked for tesseract_\*"):
         find_frames([tmp_path])
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
         find_frames([tmp_path / "gone"])
-
-
-def test_a_folder_named_twice_is_one(root, monkeypatch):
-    monkeypatch.chdir(root)
-    assert len(find_frames([root, "."])) == 3
 
 
 def test_boxes_of_an_exported_folder(tmp_path):

@@ -65,6 +65,17 @@ def _run_elsewhere(folder, arrays):
         return dict(found)
 
 
+def _camera_inputs(detector, count, *, embedded):
+    """Arguments of a detector with a camera, and the arrays by the names of ONNX."""
+    projection, image = small.projections(count), small.images(count)
+    camera = stack_cameras([small.calibration().camera()] * count)
+    if embedded:
+        image = detector.model.apply(detector.variables, image, method="embed")
+    arrays = {"projection": projection, "image": np.asarray(image)}
+    arrays |= {f"camera_{name}": array for name, array in vars(camera).items()}
+    return (projection, arrays["image"], camera), arrays
+
+
 def _check(found, suffix, expected):
     is_valid = np.asarray(expected.is_valid)
     assert is_valid.any()
@@ -110,18 +121,14 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
 @pytest.mark.parametrize("with_backbone", [True, False])
 def test_a_radar_camera_model_too(with_backbone, tmp_path):
     detector = small.detector("camera")
-    projection, image = small.projections(3), small.images(3)
-    camera = stack_cameras([small.calibration().camera()] * 3)
+    inputs, arrays = _camera_inputs(detector, 3, embedded=not with_backbone)
     folder = tmp_path / "exported"
     done = export.export(detector, folder, with_backbone=with_backbone)
     assert bool(done["left_out"]) is not with_backbone
-    if not with_backbone:
-        image = detector.model.apply(detector.variables, image, method="embed")
-    arrays = {"projection": projection, "image": np.asarray(image)}
-    arrays |= {f"camera_{k}": v for k, v in vars(camera).items()}
     found = _run_elsewhere(folder, arrays)
-    _check(found, "3", detector(projection, image, camera))
-    _check(found, "1", detector(projection[:1], image[:1], small.calibration()))
+    _check(found, "3", detector(*inputs))
+    first = jax.tree.map(lambda x: x[:1], inputs)
+    _check(found, "1", detector(*first))
 
 
 def test_huggingface_files_name_what_is_left_out(tmp_path):
@@ -158,15 +165,10 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     pytest.importorskip("jax2onnx")
     runtime = pytest.importorskip("onnxruntime")
     detector, count = small.detector(kind), 2
-    arguments: list[Any] = [small.projections(count)]
+    arguments: tuple[Any, ...] = (small.projections(count),)
     inputs = {"projection": arguments[0]}
     if kind == "camera":
-        camera = stack_cameras([small.calibration().camera()] * count)
-        image = small.images(count)
-        image = detector.model.apply(detector.variables, image, method="embed")
-        arguments += [np.asarray(image), camera]
-        inputs |= {"image": arguments[1]}
-        inputs |= {f"camera_{name}": array for name, array in vars(camera).items()}
+        arguments, inputs = _camera_inputs(detector, count, embedded=True)
     export.export(detector, tmp_path, kind="onnx", batch_size=count)
 
     def run(file, feed):

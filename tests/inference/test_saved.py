@@ -241,7 +241,7 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path):
     config = content["config"]
     for change, message in (
         ({"format": "other"}, "format is 'other'"),
-        ({"config": {**config, "classes": ["Sedan"]}}, "1 classes, expected 5"),
+        ({"config": {**config, "classes": ["Sedan"]}}, "expected 5 classes"),
         ({"config": {**config, "model": {**config["model"], "neck": "x"}}}, "neck is"),
         ({"config": {**config, "model": 3}}, "config.json: "),
         ({"config": {"a.b": 1}}, "dots in field names"),
