@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, Num
 
 from radejax.core.errors import POSITIVE, Range, check_options, one_of
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.detection.decode import find_peaks, suppress
+from radejax.detection.decode import DecodeOptions, find_peaks, suppress
 from radejax.detection.nms import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
@@ -25,32 +25,14 @@ Scalar = Num[jax.Array, ""]
 Maps = Float[jax.Array, "B R A C"]
 Boxes8 = Float[jax.Array, "B N 8"]
 Mask = Bool[jax.Array, "B N"]
-FrameMask = Bool[jax.Array, " B"] | None
 
-
-class NmsAssignment(NamedTuple):
-    """Which predicted boxes are compared with an object where NMS chooses them.
-
-    Attributes:
-        max_peaks: Peaks that enter NMS.
-        score_threshold: Peaks must score above it.
-        nms_iou: Overlap that suppresses.
-        match_iou: A box has an object where they overlap more than this.
-        threshold_inclusive: Peaks that score exactly the threshold count too.
-        per_class: Only boxes of the same class suppress each other.
-    """
-
-    max_peaks: int = 128
-    score_threshold: float = 0.3
-    nms_iou: float = 0.3
-    match_iou: float = 0.0
-    threshold_inclusive: bool = False
-    per_class: bool = False
+_MAX_PEAKS = 128
+"""Peaks that enter NMS where NMS chooses the boxes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LossOptions:
-    """Options of `detection_loss`: the fields of `config.loss`, and `nms`.
+    """Options of `detection_loss`: the fields of `config.loss`, and `decoding`.
 
     Attributes:
         heatmap_sigma_mode: Target shape, see `gaussian_heatmap`.
@@ -66,7 +48,8 @@ class LossOptions:
         normalize: Divide each loss by its own value, held constant: gradients have the
             ratio `weights`, the total is constant, losses of 0 add nothing.
         z0_m: Sensor height, added to the regressed z.
-        nms: Which predicted boxes have an object, for "nms".
+        decoding: Thresholds of peaks and of NMS, for "nms": the boxes that are compared
+            with objects are those that decoding would find.
 
     Raises:
         UserError: A value is out of range.
@@ -83,7 +66,7 @@ class LossOptions:
     )
     normalize: bool = True
     z0_m: float = 0.0
-    nms: NmsAssignment = NmsAssignment()  # noqa: RUF009, immutable
+    decoding: DecodeOptions = DecodeOptions()  # noqa: RUF009, immutable
 
     def __post_init__(self) -> None:
         names = ", ".join(LOSSES)
@@ -109,12 +92,7 @@ def _are_weights(weights: Mapping[str, float]) -> bool:
 
 
 def detection_loss(
-    maps: DetectionMaps,
-    batch: Batch,
-    grid: RadarGrid,
-    *,
-    is_frame_valid: FrameMask = None,
-    **options: Any,
+    maps: DetectionMaps, batch: Batch, grid: RadarGrid, **options: Any
 ) -> tuple[Float[jax.Array, ""], dict[str, Scalar]]:
     """Weighted sum of the losses that `weights` names, and its terms; in float32.
 
@@ -125,7 +103,6 @@ def detection_loss(
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
         batch: Ground truth: `boxes`, `classes`, `is_valid` are read.
         grid: The grid of the maps (padded where they are).
-        is_frame_valid: `[B]` bool, False for frames that only fill up a batch.
         **options: Fields of `LossOptions`.
 
     Returns:
@@ -156,8 +133,6 @@ def detection_loss(
             f"got {shape}"
         )
     is_valid = jnp.asarray(batch.is_valid)
-    if is_frame_valid is not None:
-        is_valid &= is_frame_valid[:, None]
     # Padding rows may hold anything; NaN times 0 would reach the gradients.
     boxes = jnp.where(is_valid[..., None], batch.boxes.astype(jnp.float32), 0.0)
     target = gaussian_heatmap(
@@ -172,7 +147,7 @@ def detection_loss(
     assign = (
         _at_centers
         if chosen.assignment == "center"
-        else partial(_after_nms, chosen.nms)
+        else partial(_after_nms, chosen.decoding)
     )
     predicted, expected, is_matched = assign(maps, boxes, is_valid, grid, chosen.z0_m)
     row = is_matched[..., None]
@@ -183,7 +158,6 @@ def detection_loss(
         jnp.where(row, predicted, 1.0),
         jnp.where(row, expected, 1.0),
         is_matched,
-        is_frame_valid,
     )
     terms = {name: LOSSES[name](pairs, chosen) for name in chosen.weights}
     total = _weighted_sum(terms, chosen.weights, chosen.normalize)
@@ -205,7 +179,6 @@ class Pairs(NamedTuple):
         predicted: `[B, N, 8]` predicted boxes; N objects, or peaks after NMS.
         expected: `[B, N, 8]` their objects.
         is_matched: `[B, N]` where a predicted box has an object.
-        is_frame_valid: `[B]` False for frames that only fill up a batch; None for all.
     """
 
     logits: Maps
@@ -213,21 +186,16 @@ class Pairs(NamedTuple):
     predicted: Boxes8
     expected: Boxes8
     is_matched: Mask
-    is_frame_valid: FrameMask
 
     def mean(self, values: Float[jax.Array, "B N"]) -> Float[jax.Array, ""]:
         """Mean of `[B, N]` values over the matched boxes of a frame, then over frames."""
         total = jnp.sum(jnp.where(self.is_matched, values, 0.0), axis=1)
-        per_frame = total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1)
-        if self.is_frame_valid is None:
-            return jnp.mean(per_frame)
-        num_frames = jnp.sum(self.is_frame_valid, dtype=jnp.float32)
-        return jnp.sum(per_frame * self.is_frame_valid) / jnp.maximum(num_frames, 1.0)
+        return jnp.mean(total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1))
 
 
 def _focal(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
     del options
-    return focal_loss(pairs.logits, pairs.target, is_frame_valid=pairs.is_frame_valid)
+    return focal_loss(pairs.logits, pairs.target)
 
 
 def _gwd(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
@@ -304,7 +272,7 @@ def _at_centers(
 
 
 def _after_nms(
-    nms: NmsAssignment,
+    decoding: DecodeOptions,
     maps: DetectionMaps,
     boxes: Boxes8,
     is_valid: Mask,
@@ -316,13 +284,13 @@ def _after_nms(
     peaks = find_peaks(
         jax.lax.stop_gradient(maps),
         grid,
-        max_peaks=nms.max_peaks,
-        score_threshold=nms.score_threshold,
-        threshold_inclusive=nms.threshold_inclusive,
+        max_peaks=_MAX_PEAKS,
+        score_threshold=decoding.score_threshold,
+        threshold_inclusive=decoding.threshold_inclusive,
         z0_m=z0_m,
     )
-    keep = suppress(peaks, nms.nms_iou, per_class=nms.per_class)
-    match = jax.vmap(partial(match_boxes, iou_threshold=nms.match_iou))
+    keep = suppress(peaks, decoding.nms_iou, per_class=decoding.per_class_nms)
+    match = jax.vmap(match_boxes)
     object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
     expected = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, object_idx)
     return _boxes_at(maps, peaks.bins, grid, z0_m), expected, is_matched

@@ -97,11 +97,7 @@ def gaussian_heatmap(
 
 
 def focal_loss(
-    logits: Maps,
-    target: Maps,
-    alpha: float = 2,
-    gamma: float = 4,
-    is_frame_valid: Bool[jax.Array, " B"] | None = None,
+    logits: Maps, target: Maps, alpha: float = 2, gamma: float = 4
 ) -> Float[jax.Array, ""]:
     """Center-point focal loss of a batch of heatmaps, averaged over positive bins.
 
@@ -115,7 +111,6 @@ def focal_loss(
         target: `[B, R, A, C]` in [0, 1], from `gaussian_heatmap`.
         alpha: Exponent on the error of the prediction.
         gamma: Exponent that spares bins near a center.
-        is_frame_valid: `[B]` bool, False for frames that only fill up a batch.
 
     Returns:
         Scalar float32.
@@ -132,19 +127,9 @@ def focal_loss(
         0.3466
     """
     chex.assert_equal_shape([logits, target])
-    if is_frame_valid is not None:
-        chex.assert_shape(is_frame_valid, logits.shape[:1])
     loss = focal_loss_per_bin(logits, target, alpha, gamma)
-    is_positive = target >= 1
-    num_bins = jnp.asarray(loss.size, jnp.float32)
-    if is_frame_valid is not None:
-        is_counted = is_frame_valid.reshape((-1,) + (1,) * (loss.ndim - 1))
-        loss = jnp.where(is_counted, loss, 0.0)
-        is_positive &= is_counted
-        num_frames = jnp.sum(is_frame_valid, dtype=jnp.float32)
-        num_bins = jnp.maximum(num_frames * (loss.size // loss.shape[0]), 1.0)
-    num_positive = jnp.sum(is_positive, dtype=jnp.float32)
-    return jnp.sum(loss) / jnp.where(num_positive > 0, num_positive, num_bins)
+    num_positive = jnp.sum(target >= 1, dtype=jnp.float32)
+    return jnp.sum(loss) / jnp.where(num_positive > 0, num_positive, loss.size)
 
 
 def focal_loss_per_bin(

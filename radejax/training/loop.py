@@ -18,8 +18,8 @@ from ml_collections import ConfigDict
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import NmsAssignment
 from radejax.training import distributed
 from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
 from radejax.training.metric_logger import MetricLogger, Scores
@@ -231,14 +231,7 @@ def loss_options(config: ConfigDict) -> dict[str, Any]:
 
     Boxes that "nms" compares with objects are those that decoding would find.
     """
-    decode = config.decode
-    nms = NmsAssignment(
-        score_threshold=decode.score_threshold,
-        threshold_inclusive=decode.threshold_inclusive,
-        nms_iou=decode.nms_iou,
-        per_class=decode.per_class_nms,
-    )
-    return {**config.loss.to_dict(), "nms": nms}
+    return {**config.loss.to_dict(), "decoding": DecodeOptions(**config.decode)}
 
 
 def _empty_batch(loader: Any) -> Batch:

@@ -8,13 +8,9 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import (
-    LOSSES,
-    LossOptions,
-    NmsAssignment,
-    detection_loss,
-)
+from radejax.losses.detection import LOSSES, LossOptions, detection_loss
 from radejax.losses.focal import gaussian_heatmap
 from radejax.losses.gwd import gwd_loss
 
@@ -192,35 +188,20 @@ def small_scene(rng, counts=(0, 1, 3), rows=4):
 
 
 @partial(jax.jit, static_argnames="options")
-def _loss_and_grad(maps, batch, is_frame_valid, numbers, options):
+def _loss_and_grad(maps, batch, options):
+    chosen = {k: dict(v) if k == "weights" else v for k, v in options}
+
     def loss(maps):
-        score_threshold, nms_iou = numbers
-        chosen = dict(options)
-        if "weights" in chosen:
-            chosen["weights"] = dict(chosen["weights"])
-        return detection_loss(
-            maps,
-            batch,
-            GRID,
-            is_frame_valid=is_frame_valid,
-            nms=NmsAssignment(score_threshold=score_threshold, nms_iou=nms_iou),
-            **chosen,
-        )
+        return detection_loss(maps, batch, GRID, **chosen)
 
     return jax.value_and_grad(loss, has_aux=True)(maps)
 
 
-def loss_and_grad(maps, batch, is_frame_valid=None, **options):
+def loss_and_grad(maps, batch, **options):
     """Compiled once per shape and set of options, not once per test."""
-    defaults = {"score_threshold": 0.3, "nms_iou": 0.3}
-    numbers = tuple(options.pop(name, value) for name, value in defaults.items())
-    if is_frame_valid is None:
-        is_frame_valid = jnp.ones(len(batch.boxes), bool)
     if "weights" in options:
         options["weights"] = tuple(options["weights"].items())
-    return _loss_and_grad(
-        maps, batch, is_frame_valid, numbers, tuple(sorted(options.items()))
-    )
+    return _loss_and_grad(maps, batch, tuple(sorted(options.items())))
 
 
 def naive_regression(maps, batch, transform="sqrt", z0_m=0.0):
@@ -320,41 +301,6 @@ def test_perfect_boxes_give_finite_gradients():
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
 
 
-def test_frames_that_fill_up_a_batch_do_not_count():
-    maps, batch = small_scene(np.random.default_rng(4), counts=(2, 3, 4))
-    is_frame_valid = jnp.array([True, True, False])
-    (_, parts), grad = loss_and_grad(maps, batch, is_frame_valid)
-    first = jax.tree.map(lambda x: x[:2], (maps, batch))
-    (_, alone), alone_grad = loss_and_grad(*first)
-    for name in alone:
-        np.testing.assert_allclose(parts[name], alone[name], rtol=1e-6, err_msg=name)
-    for found, wanted in zip(
-        jax.tree.leaves(grad), jax.tree.leaves(alone_grad), strict=True
-    ):
-        np.testing.assert_allclose(found[:2], wanted, rtol=1e-5, atol=1e-8)
-        np.testing.assert_array_equal(found[2], 0)
-
-
-def test_what_fills_up_a_batch_does_not_matter_to_nms_matching():
-    is_frame_valid = jnp.array([True, True, False])
-    maps, batch = scene_with_peaks()
-    others = small_scene(np.random.default_rng(4), counts=(2, 3, 4))
-
-    def with_last_of_others(x, y):
-        return x.at[2].set(y[2])
-
-    results = [
-        loss_and_grad(*scene, is_frame_valid, assignment="nms")
-        for scene in (
-            (maps, batch),
-            jax.tree.map(with_last_of_others, (maps, batch), others),
-        )
-    ]
-    assert int(results[0][0][1]["num_matched"]) > 0
-    jax.tree.map(np.testing.assert_array_equal, *results)
-    assert not np.asarray(results[0][1].box_params[2]).any()
-
-
 def test_bfloat16_maps_are_compared_in_float32():
     maps, batch = small_scene(np.random.default_rng(5))
     low = jax.tree.map(lambda x: x.astype(jnp.bfloat16), maps)
@@ -418,26 +364,30 @@ def test_nms_matching_by_hand():
 
 def test_nms_matching_without_a_peak_has_no_regression_loss():
     maps, batch = scene_with_peaks()
-    (_, parts), _ = loss_and_grad(maps, batch, assignment="nms", score_threshold=0.99)
+    decoding = DecodeOptions(score_threshold=0.99)
+    (_, parts), _ = loss_and_grad(maps, batch, assignment="nms", decoding=decoding)
     assert parts["gwd"] == parts["smooth_l1"] == parts["num_matched"] == 0
 
 
 def test_suppressed_peaks_are_not_matched():
     maps, batch = scene_with_peaks()
     wide = maps.replace(box_params=maps.box_params.at[..., 3:5].set(30.0))
-    (_, parts), _ = loss_and_grad(wide, batch, assignment="nms", nms_iou=0.3)
-    (_, every), _ = loss_and_grad(wide, batch, assignment="nms", nms_iou=1.1)
-    assert int(parts["num_matched"]) < int(every["num_matched"])
+    matched = [
+        loss_and_grad(
+            wide, batch, assignment="nms", decoding=DecodeOptions(nms_iou=iou)
+        )[0][1]["num_matched"]
+        for iou in (0.3, 1.0)
+    ]
+    assert matched[0] < matched[1]
 
 
 @pytest.mark.parametrize(
     ("changes", "num_matched"),
     [
-        ({}, 0),
-        ({"threshold_inclusive": True}, 2),
-        ({"score_threshold": 0.4}, 2),
-        ({"score_threshold": 0.4, "nms_iou": 0.05}, 1),
-        ({"score_threshold": 0.4, "nms_iou": 0.05, "per_class": True}, 2),
+        ({"threshold_inclusive": False}, 0),
+        ({}, 2),
+        ({"nms_iou": 0.05}, 1),
+        ({"nms_iou": 0.05, "per_class_nms": True}, 2),
     ],
 )
 def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
@@ -451,11 +401,9 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     for array in (params, boxes):
         array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
     batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))
-    nms = NmsAssignment(**{"score_threshold": 0.5, **changes})
+    decoding = DecodeOptions(score_threshold=0.5, **changes)
     maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
-    _, parts = jax.jit(
-        lambda maps: detection_loss(maps, batch, GRID, assignment="nms", nms=nms)
-    )(maps)
+    _, parts = detection_loss(maps, batch, GRID, assignment="nms", decoding=decoding)
     assert int(parts["num_matched"]) == num_matched
 
 

@@ -194,21 +194,6 @@ def test_exponents(alpha, gamma):
     np.testing.assert_allclose(loss, expected, rtol=2e-5)
 
 
-@pytest.mark.parametrize("has_positive", [True, False])
-def test_frames_that_fill_up_a_batch_do_not_count(has_positive):
-    rng = np.random.default_rng(3)
-    p, target = rng.uniform(0.01, 0.99, (2, 3, 6, 5, 3)).astype(np.float32)
-    target[:, 0, 0, 0] = 1 if has_positive else 0.5
-    is_frame_valid = jnp.array([True, True, False])
-    loss = F.focal_loss(logit(p), jnp.asarray(target), is_frame_valid=is_frame_valid)
-    alone = F.focal_loss(logit(p[:2]), jnp.asarray(target[:2]))
-    np.testing.assert_allclose(loss, alone, rtol=1e-6)
-    none = F.focal_loss(
-        logit(p), jnp.asarray(target), is_frame_valid=jnp.zeros(3, bool)
-    )
-    assert none == 0
-
-
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 def test_saturated_logits_stay_finite(dtype):
     x = jnp.array([-200.0, -30, -14, 0, 14, 30, 200], dtype)

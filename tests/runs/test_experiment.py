@@ -15,8 +15,8 @@ from radejax.cli.train import train
 from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
+from radejax.detection.decode import DecodeOptions
 from radejax.inference.saved import StartingWeights
-from radejax.losses.detection import NmsAssignment
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -57,10 +57,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     assert not (tmp_path / "run" / "evaluation").exists()
     assert "radejax detect" in caplog.text
     # What NMS chooses for the loss is what decoding finds.
-    expected = NmsAssignment(
-        score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False, per_class=False
-    )
-    assert loop.loss_options(config)["nms"] == expected
+    assert loop.loss_options(config)["decoding"] == DecodeOptions(**config.decode)
 
 
 def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
