@@ -129,7 +129,8 @@ def focal_loss(
     chex.assert_equal_shape([logits, target])
     loss = focal_loss_per_bin(logits, target, alpha, gamma)
     num_positive = jnp.sum(target >= 1, dtype=jnp.float32)
-    return jnp.sum(loss) / jnp.where(num_positive > 0, num_positive, loss.size)
+    num_bins = jnp.float32(loss.size)
+    return jnp.sum(loss) / jnp.where(num_positive > 0, num_positive, num_bins)
 
 
 def focal_loss_per_bin(

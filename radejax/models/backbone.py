@@ -7,6 +7,7 @@ References:
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -129,22 +130,14 @@ class InputStem(nn.Module):
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
-        def block(features: int, size: int, name: str) -> ConvGNSiLU:
-            return ConvGNSiLU(
-                features,
-                self.num_groups,
-                size,
-                use_bias=False,
-                dtype=self.dtype,
-                name=name,
-            )
-
-        doppler = block(self.features, 1, "doppler")(x[..., : self.doppler_bins])
-        elevation = block(self.features // 2, 1, "elevation")(
-            x[..., self.doppler_bins :]
+        block = functools.partial(
+            ConvGNSiLU, num_groups=self.num_groups, use_bias=False, dtype=self.dtype
         )
+        doppler, elevation = jnp.split(x, [self.doppler_bins], -1)
+        doppler = block(self.features, size=1, name="doppler")(doppler)
+        elevation = block(self.features // 2, size=1, name="elevation")(elevation)
         mixed = jnp.concatenate([doppler, elevation], -1)
-        return block(self.features, 3, "mix")(mixed)
+        return block(self.features, name="mix")(mixed)
 
 
 class Backbone(nn.Module):
@@ -177,41 +170,28 @@ class Backbone(nn.Module):
     @nn.compact
     def __call__(self, x: Features) -> Features:
         wrap = nn.remat if self.remat else lambda module: module
-        double_conv, attention = wrap(DoubleConvResidual), wrap(CBAM)
-
-        def block(features: int, name: str) -> nn.Module:
-            return double_conv(features, self.num_groups, dtype=self.dtype, name=name)
-
-        x = self._start(x)
+        shared: dict[str, Any] = {"num_groups": self.num_groups, "dtype": self.dtype}
+        block = functools.partial(wrap(DoubleConvResidual), **shared)
+        if self.input_stem:
+            stem = InputStem(self.widths[0], self.doppler_bins, **shared, name="stem")
+            x = stem(x)
+        else:
+            x = Conv(self.widths[0], dtype=self.dtype, name="start")(x)
         skips = []
         for i, width in enumerate(self.widths, 1):
-            x = block(width, f"encoder_{i}")(x)
+            x = block(width, name=f"encoder_{i}")(x)
             skips.append(x)
             x = max_pool(x)
         for i in (1, 2):
-            x = block(self.widths[-1], f"bottleneck_{i}")(x)
+            x = block(self.widths[-1], name=f"bottleneck_{i}")(x)
         decoder_widths = (*self.widths[-2::-1], self.decoder_width)
         for i, width in enumerate(decoder_widths, 1):
             skip = skips.pop()
             x = Upsample(x.shape[-1], dtype=self.dtype, name=f"upsample_{i}")(x)
             if self.cbam is not None:
-                skip = attention(
-                    self.cbam, self.num_groups, dtype=self.dtype, name=f"cbam_{i}"
-                )(skip)
-            x = block(width, f"decoder_{i}")(jnp.concatenate([x, skip], -1))
+                skip = wrap(CBAM)(self.cbam, **shared, name=f"cbam_{i}")(skip)
+            x = block(width, name=f"decoder_{i}")(jnp.concatenate([x, skip], -1))
         return x
-
-    def _start(self, x: Features) -> Features:
-        width = self.widths[0]
-        if self.input_stem:
-            return InputStem(
-                width,
-                self.doppler_bins,
-                self.num_groups,
-                dtype=self.dtype,
-                name="stem",
-            )(x)
-        return Conv(width, dtype=self.dtype, name="start")(x)
 
 
 BACKBONES: dict[str, type[Backbone]] = {"unet": Backbone}

@@ -50,7 +50,7 @@ def conv2d(
         AssertionError: Channels of map and kernel differ.
     """
     chex.assert_shape(kernel, (None, None, x.shape[-1], None))
-    return _conv2d(x, kernel, dilation)
+    return plain_conv2d(x, kernel, dilation)
 
 
 def product(
@@ -65,14 +65,17 @@ def product(
     return flat.reshape(*x.shape[:-1], kernel.shape[-1])
 
 
-def _conv2d(x: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:
+def plain_conv2d(
+    x: jax.Array, kernel: jax.Array, dilation: int = 1, stride: int = 1
+) -> jax.Array:
+    """Convolution of any stride, padded by half the kernel's size, by XLA alone."""
     if kernel.shape[:2] == (1, 1):
         return product(x, kernel[0, 0])
     padding = dilation * (kernel.shape[0] // 2)
     return jax.lax.conv_general_dilated(
         x,
         kernel,
-        window_strides=(1, 1),
+        window_strides=(stride, stride),
         padding=((padding, padding),) * 2,
         rhs_dilation=(dilation, dilation),
         dimension_numbers=_DIMENSION_NUMBERS,
@@ -80,12 +83,12 @@ def _conv2d(x: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:
 
 
 def _forward(x: jax.Array, kernel: jax.Array, dilation: int) -> tuple:
-    return _conv2d(x, kernel, dilation), (x, kernel)
+    return plain_conv2d(x, kernel, dilation), (x, kernel)
 
 
 def _backward(dilation: int, saved: tuple, grad: jax.Array) -> tuple:
     x, kernel = saved
-    (grad_x,) = jax.vjp(lambda x: _conv2d(x, kernel, dilation), x)[1](grad)
+    (grad_x,) = jax.vjp(lambda x: plain_conv2d(x, kernel, dilation), x)[1](grad)
     plain = functools.partial(_kernel_gradient, kernel.shape[0], dilation)
     size, _, *channels = kernel.shape
     is_small = (
@@ -108,7 +111,7 @@ def _kernel_gradient(
     grad: Float[jax.Array, "B R A F"],
 ) -> Float[jax.Array, "{size} {size} C F"]:
     kernel = jnp.zeros((size, size, x.shape[-1], grad.shape[-1]), x.dtype)
-    return jax.vjp(lambda k: _conv2d(x, k, dilation), kernel)[1](grad)[0]
+    return jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1](grad)[0]
 
 
 def blocked_kernel_gradient(

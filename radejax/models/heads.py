@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -161,18 +162,12 @@ class Heads(nn.Module):
 
     @nn.compact
     def __call__(self, x: Map) -> DetectionMaps:
-        def head(features: int, bias: float, name: str) -> Head:
-            return HEADS[self.kind](
-                features,
-                self.num_groups,
-                self.dtype,
-                self.remat,
-                bias,
-                name=name,
-            )
-
-        prior_logit = math.log(self.heatmap_prior / (1.0 - self.heatmap_prior))
-        return DetectionMaps(
-            heatmap_logits=head(self.num_classes, prior_logit, "heatmap")(x),
-            box_params=head(NUM_BOX_PARAMS, 0.0, "box")(x),
+        head = functools.partial(
+            HEADS[self.kind],
+            num_groups=self.num_groups,
+            dtype=self.dtype,
+            remat=self.remat,
         )
+        logit = math.log(self.heatmap_prior / (1.0 - self.heatmap_prior))
+        heatmap = head(self.num_classes, initial_bias=logit, name="heatmap")
+        return DetectionMaps(heatmap(x), head(NUM_BOX_PARAMS, name="box")(x))

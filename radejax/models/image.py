@@ -21,11 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from radejax.models.convolution import conv2d, product
+from radejax.models.convolution import conv2d, plain_conv2d, product
 from radejax.models.layers import Conv, Dense, uniform_fan_in
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
+Tokens = Float[jax.Array, "B h w C"]
+HasImage = Bool[jax.Array, " B"]
+Mask = Bool[jax.Array, "B 1 1 1"] | None
+
+_IMAGENET = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
+"""Mean and standard deviation of the colours."""
 
 
 def normalize(
@@ -47,10 +51,7 @@ def normalize(
     scaled = image.astype(jnp.float32) / 255.0
     if not standardize:
         return scaled
-    mean, std = (
-        np.array(v, np.float32).reshape(1, 1, 1, 3)
-        for v in (IMAGENET_MEAN, IMAGENET_STD)
-    )
+    mean, std = _IMAGENET.reshape(2, 1, 1, 1, 3)
     return (scaled - mean) / std
 
 
@@ -86,20 +87,14 @@ class TransposedConv(nn.Module):
         kernel = kernel[_PHASE_TAPS][:, :, _PHASE_TAPS]  # phase, tap, phase, tap, C, C'
         kernel = kernel.transpose(1, 3, 4, 0, 2, 5).reshape(4 * channels, -1)
         x = jnp.pad(x.astype(self.dtype), ((0, 0), (1, 1), (1, 1), (0, 0)))
+        corners = np.ndindex(2, 2)
         x = jnp.concatenate(
-            [
-                x[:, i : i + height + 1, j : j + width + 1]
-                for i in (0, 1)
-                for j in (0, 1)
-            ],
-            -1,
+            [x[:, i : i + height + 1, j : j + width + 1] for i, j in corners], -1
         )
         y = product(x, kernel.astype(self.dtype))
         y = y.reshape(b, height + 1, width + 1, 2, 2, self.features)
         rows = [
-            jnp.stack(
-                [y[:, i : i + height, j : j + width, i, j] for j in (0, 1)], axis=3
-            )
+            jnp.stack([y[:, i : i + height, j : j + width, i, j] for j in (0, 1)], 3)
             for i in (0, 1)
         ]  # [B, H, W, 2, C'] each
         y = jnp.stack(rows, 2)  # [B, H, 2, W, 2, C']
@@ -123,11 +118,7 @@ class CameraNeck(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        tokens: Float[jax.Array, "B h w C"],
-        has_image: Bool[jax.Array, " B"],
-        *,
-        train: bool = False,
+        self, tokens: Tokens, has_image: HasImage, *, train: bool = False
     ) -> Float[jax.Array, "B 4*h 4*w {self.features}"]:
         """Runs the neck.
 
@@ -145,14 +136,12 @@ class CameraNeck(nn.Module):
         ]
         for layer in layers:
             x = layer(x)
-            x = batch_norm(f"{layer.name}_norm", self.dtype, train)(
-                x, mask=counted_frames(has_image)
-            )
-            x = nn.relu(x)
+            norm = batch_norm(f"{layer.name}_norm", self.dtype, train)
+            x = nn.relu(norm(x, mask=counted_frames(has_image)))
         return x
 
 
-def counted_frames(has_image: Bool[jax.Array, " B"]) -> Bool[jax.Array, "B 1 1 1"]:
+def counted_frames(has_image: HasImage) -> Bool[jax.Array, "B 1 1 1"]:
     """Mask of the frames that enter batch statistics.
 
     A batch without any image must not divide by zero; its map is not used.
@@ -230,22 +219,11 @@ class StridedConv(nn.Module):
         x, kernel = jnp.asarray(x, self.dtype), jnp.asarray(kernel, self.dtype)
         if self.size == 1 or self.stride == 1:
             return conv2d(x, kernel)
-        return jax.lax.conv_general_dilated(
-            x,
-            kernel,
-            window_strides=(self.stride, self.stride),
-            padding=((self.size // 2,) * 2,) * 2,
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
+        return plain_conv2d(x, kernel, stride=self.stride)
 
 
 def _normalized(
-    x: jax.Array,
-    name: str,
-    frozen: bool,
-    dtype: Any,
-    train: bool,
-    mask: jax.Array | None = None,
+    x: jax.Array, name: str, frozen: bool, dtype: Any, train: bool, mask: Mask = None
 ) -> jax.Array:
     if frozen:
         return FrozenBatchNorm(dtype, name=name)(x)
@@ -271,10 +249,7 @@ class Bottleneck(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        x: Float[jax.Array, "B H W C"],
-        train: bool,
-        mask: Bool[jax.Array, "B 1 1 1"] | None = None,
+        self, x: Float[jax.Array, "B H W C"], train: bool, mask: Mask = None
     ) -> Float[jax.Array, "B h w {4*self.features}"]:
         def block(x: jax.Array, features: int, size: int, stride: int, name: str):
             x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
@@ -348,11 +323,7 @@ class ResNetNeck(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        x: Float[jax.Array, "B h w C"],
-        has_image: Bool[jax.Array, " B"],
-        *,
-        train: bool = False,
+        self, x: Tokens, has_image: HasImage, *, train: bool = False
     ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
         """As `CameraNeck`: frames without an image do not enter the statistics."""
         mask = counted_frames(has_image)

@@ -154,13 +154,8 @@ class RadeNet(nn.Module):
             # Before the cast: bfloat16 has steps of 0.7 dB at the noise's 0.545.
             projection = projection.astype(jnp.float32) - self.input_center
             projection = projection * self.input_scale
-        _, r, a, _ = projection.shape
-        padding = (
-            (0, 0),
-            (0, -r % self.pad_multiple),
-            (0, -a % self.pad_multiple),
-            (0, 0),
-        )
+        r, a = (-n % self.pad_multiple for n in projection.shape[1:3])
+        padding = ((0, 0), (0, r), (0, a), (0, 0))
         return jnp.pad(projection.astype(self.dtype), padding)
 
     def _features(self, padded: Projection) -> Map:

@@ -24,6 +24,8 @@ from radejax.core.errors import SIZE, check_options, integer, one_of, require
 
 AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
 
+Tokens = Float[jax.Array, "B T C"]
+PerHead = Float[jax.Array, "B T heads D"]
 Rope = tuple[Float[jax.Array, "patches D"], Float[jax.Array, "patches D"]]
 """Cosines and sines of the rotary embedding, D channels of a head."""
 
@@ -148,18 +150,14 @@ class Block(nn.Module):
     dtype: Any
 
     @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B T C"], rope: Rope
-    ) -> tuple[Float[jax.Array, "B T C"], None]:
+    def __call__(self, x: Tokens, rope: Rope) -> tuple[Tokens, None]:
         y = _layer_norm(self.dtype, "norm_1")(x)
         x = x + self._scale("scale_1", x) * self._attend(y, rope)
         y = _layer_norm(self.dtype, "norm_2")(x)
         x = x + self._scale("scale_2", x) * self._mlp(y)
         return x, None
 
-    def _attend(
-        self, x: Float[jax.Array, "B T C"], rope: Rope
-    ) -> Float[jax.Array, "B T C"]:
+    def _attend(self, x: Tokens, rope: Rope) -> Tokens:
         b, t, c = x.shape
         query, key, value = (
             self._dense(c, name, use_bias=bias)(x).reshape(b, t, self.num_heads, -1)
@@ -170,7 +168,7 @@ class Block(nn.Module):
         y = attend(query, key, value, self.attention).reshape(b, t, c)
         return self._dense(c, "out")(y)
 
-    def _mlp(self, x: Float[jax.Array, "B T C"]) -> Float[jax.Array, "B T C"]:
+    def _mlp(self, x: Tokens) -> Tokens:
         y = self._dense(self.mlp_dim, "up")(x)
         if self.gated_mlp:
             y = nn.silu(self._dense(self.mlp_dim, "gate")(x)) * y
@@ -178,18 +176,10 @@ class Block(nn.Module):
             y = nn.gelu(y, approximate=False)
         return self._dense(x.shape[-1], "down")(y)
 
-    def _dense(self, features: int, name: str, *, use_bias: bool = True) -> nn.Dense:
-        return nn.Dense(
-            features,
-            use_bias=use_bias,
-            kernel_init=_INIT,
-            dtype=self.dtype,
-            name=name,
-        )
+    def _dense(self, features: int, name: str, use_bias: bool = True) -> nn.Dense:
+        return nn.Dense(features, use_bias, self.dtype, kernel_init=_INIT, name=name)
 
-    def _scale(
-        self, name: str, x: Float[jax.Array, "B T C"]
-    ) -> Float[jax.Array, "1 1 C"]:
+    def _scale(self, name: str, x: Tokens) -> Float[jax.Array, "1 1 C"]:
         init = nn.initializers.constant(self.layer_scale)
         scale = self.param(name, init, (x.shape[-1],)).astype(self.dtype)
         return scale[None, None]
@@ -230,21 +220,14 @@ def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) 
         by_row = jnp.asarray(function(axis_angles(rows)), jnp.float32)
         by_column = jnp.asarray(function(axis_angles(columns)), jnp.float32)
         shape = (rows, columns, head_dim // 4)
-        half = jnp.concatenate(
-            [
-                jnp.broadcast_to(by_row[:, None], shape),
-                jnp.broadcast_to(by_column[None], shape),
-            ],
-            -1,
-        )
+        axes = by_row[:, None], by_column[None]
+        half = jnp.concatenate([jnp.broadcast_to(a, shape) for a in axes], -1)
         return jnp.concatenate([half, half], -1).reshape(rows * columns, head_dim)
 
     return table(np.cos), table(np.sin)
 
 
-def rotate(
-    x: Float[jax.Array, "B T heads D"], rope: Rope, num_prefix: int
-) -> Float[jax.Array, "B T heads D"]:
+def rotate(x: PerHead, rope: Rope, num_prefix: int) -> PerHead:
     """Turns the patch tokens; the prefix stays."""
     prefix, patches = x[:, :num_prefix], x[:, num_prefix:]
     cos, sin = (a[None, :, None].astype(jnp.float32) for a in rope)
@@ -258,11 +241,8 @@ def rotate(
 
 
 def attend(
-    query: Float[jax.Array, "B T heads D"],
-    key: Float[jax.Array, "B T heads D"],
-    value: Float[jax.Array, "B T heads D"],
-    kind: AttentionKind = "auto",
-) -> Float[jax.Array, "B T heads D"]:
+    query: PerHead, key: PerHead, value: PerHead, kind: AttentionKind = "auto"
+) -> PerHead:
     """Softmax attention, without mask.
 
     "blocked" takes one head and a block of queries at a time: scores stay in cache,
@@ -286,11 +266,7 @@ def attend(
     return plain(query, key, value, implementation=kind)
 
 
-def _attend_blocked(
-    query: Float[jax.Array, "B T heads D"],
-    key: Float[jax.Array, "B T heads D"],
-    value: Float[jax.Array, "B T heads D"],
-) -> Float[jax.Array, "B T heads D"]:
+def _attend_blocked(query: PerHead, key: PerHead, value: PerHead) -> PerHead:
     b, t, heads, d = query.shape
     block = min(_BLOCK, t)
     padding = ((0, 0), (0, -t % block), (0, 0), (0, 0))
