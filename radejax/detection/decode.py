@@ -224,9 +224,8 @@ def find_peaks(
     best = best.reshape(best.shape[0], -1)  # [B, R * A]
     top, flat = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
     is_valid = top > 0
-    at = jax.vmap(lambda values, flat: values[flat])
-    classes = jnp.argmax(at(_flat_bins(scores), flat), -1)  # the first of equals
-    params = at(_flat_bins(maps.box_params), flat).astype(jnp.float32)
+    classes = jnp.argmax(_rows_at(_flat_bins(scores), flat), -1)  # the first of equals
+    params = _rows_at(_flat_bins(maps.box_params), flat).astype(jnp.float32)
     bins = jnp.stack([flat // num_azimuth, flat % num_azimuth], -1)
     return Peaks(
         bins=bins,
@@ -236,6 +235,10 @@ def find_peaks(
         is_valid=is_valid,
         num_found=jnp.sum(best > 0, axis=-1, dtype=jnp.int32),
     )
+
+
+_rows_at = jax.vmap(lambda rows, indices: rows[indices])
+"""Rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
 
 
 def _with_raw_footprint(boxes: Boxes8) -> Boxes8:
@@ -286,16 +289,14 @@ def _compact(
 ) -> Detections:
     """The kept peaks moved to the front, in order, as K rows."""
     order = jnp.argsort(~keep, axis=-1, stable=True)[:, :max_detections]
-    at = jax.vmap(lambda values, order: values[order])
-    is_valid = at(keep, order)
+    is_valid = _rows_at(keep, order)
+    boxes = _rows_at(peaks.boxes, order)
     num_kept = jnp.sum(keep, axis=-1, dtype=jnp.int32)
     num_entered = jnp.sum(peaks.is_valid, axis=-1, dtype=jnp.int32)
     return Detections(
-        boxes=jnp.where(
-            is_valid[..., None], boxes7_from_8(at(peaks.boxes, order)), 0.0
-        ),
-        scores=jnp.where(is_valid, at(peaks.scores, order), 0.0),
-        classes=jnp.where(is_valid, at(peaks.classes, order), -1),
+        boxes=jnp.where(is_valid[..., None], boxes7_from_8(boxes), 0.0),
+        scores=jnp.where(is_valid, _rows_at(peaks.scores, order), 0.0),
+        classes=jnp.where(is_valid, _rows_at(peaks.classes, order), -1),
         is_valid=is_valid,
         num_truncated=peaks.num_found
         - num_entered

@@ -97,8 +97,6 @@ def match_boxes(
     is_predicted: Bool[jax.Array, " K"],
     objects: Float[jax.Array, "N _"],
     is_object: Bool[jax.Array, " N"],
-    *,
-    iou_threshold: Threshold = 0.0,
 ) -> tuple[Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
     """Match each prediction with the object it overlaps most on the ground plane.
 
@@ -107,7 +105,6 @@ def match_boxes(
         is_predicted: `[K]` bool, False for padding.
         objects: `[N, 7]` or `[N, 8]` boxes.
         is_object: `[N]` bool, False for padding.
-        iou_threshold: Only overlaps strictly greater count.
 
     Returns:
         `[K]` int32 row of the object, 0 without one, and `[K]` bool, True where there is
@@ -127,6 +124,5 @@ def match_boxes(
     chex.assert_shape(is_predicted, predicted.shape[:1])
     chex.assert_shape(is_object, objects.shape[:1])
     iou = bev_iou(predicted, objects)  # [K, N]
-    allowed = is_predicted[:, None] & is_object[None, :] & (iou > iou_threshold)
-    iou = jnp.where(allowed, iou, 0.0)
+    iou = jnp.where(is_predicted[:, None] & is_object[None, :], iou, 0.0)
     return jnp.argmax(iou, axis=1).astype(jnp.int32), jnp.max(iou, axis=1) > 0

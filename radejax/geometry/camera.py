@@ -206,13 +206,8 @@ class CameraCalibration(ArrayValues):
     radar_from_lidar_m: Float[np.ndarray, "3"] = RADAR_FROM_LIDAR_M  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        shapes = {
-            "intrinsics": (4,),
-            "distortion": (5,),
-            "rotation": (3, 3),
-            "translation_m": (3,),
-            "radar_from_lidar_m": (3,),
-        }
+        shapes = {"intrinsics": (4,), "distortion": (5,), "rotation": (3, 3)}
+        shapes |= dict.fromkeys(("translation_m", "radar_from_lidar_m"), (3,))
         for name, shape in shapes.items():
             value = self.freeze(name)
             is_fine = value.shape == shape and bool((np.abs(value) <= _MAX_VALUE).all())
@@ -267,17 +262,10 @@ class CameraCalibration(ArrayValues):
             DataError: A line is not `key: number`, a key is missing or a value is not
                 possible; names the file.
         """
-        path = pathlib.Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"camera calibration {path} does not exist")
-        values = _read_numbers(path)
+        values = _read_numbers(pathlib.Path(path))
         if missing := [key for key in _KEYS if key not in values]:
             raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
         yaw, pitch, roll = (values[key] for key in _ANGLES)
-        size = {
-            "width": int(values.get("img_size_w", 1280)),
-            "height": int(values.get("img_size_h", 720)),
-        }
         try:
             return cls.from_angles(
                 intrinsics=[values[key] for key in _PINHOLE],
@@ -286,7 +274,9 @@ class CameraCalibration(ArrayValues):
                 pitch_deg=pitch,
                 roll_deg=roll,
                 translation_m=[values[key] for key in _SHIFTS],
-                **(size | fields),
+                width=int(values.get("img_size_w", 1280)),
+                height=int(values.get("img_size_h", 720)),
+                **fields,
             )
         except ValueError as error:
             raise DataError(f"{path}: {error}") from None
@@ -359,25 +349,21 @@ class CameraCalibration(ArrayValues):
         return inside.all(-1) & (depth_m > 0)
 
     def project_boxes(
-        self,
-        boxes: Real[np.ndarray, "N 7"],
-        image: ImageKind = "raw",
-        near_m: float = 0.1,
+        self, boxes: Real[np.ndarray, "N 7"], near_m: float = 0.1
     ) -> tuple[Float[np.ndarray, "N 12 2 2"], Bool[np.ndarray, "N 12"]]:
-        """Edges of boxes as line segments on the image, for drawing.
+        """Edges of boxes as line segments on the raw image, for drawing.
 
         Edges that pass behind the camera are cut at the near plane.
 
         Args:
             boxes: `[N, 7]` x, y, z, l, w, h, yaw in the ego frame, full extents.
-            image: Kind of image to draw on.
             near_m: Smallest depth that is drawn.
 
         Returns:
-            Segments `[N, 12, 2, 2]` in pixels (edge, end, u and v; straight lines also
-            on the raw image), and `[N, 12]` bool, False for edges out of sight.
+            Segments `[N, 12, 2, 2]` in pixels of the raw image (edge, end, u and v; straight
+            lines all the same), and `[N, 12]` bool, False for edges out of sight.
         """
-        camera = self.camera(image)
+        camera = self.camera()
         corners_cam = to_camera(corners(np.asarray(boxes, np.float64)), camera)
         ends = corners_cam[:, _BOX_EDGES]  # [N, 12, 2, 3]
         depth = ends[..., 2]

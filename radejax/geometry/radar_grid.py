@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import chex
 import jax
@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, Real
 
-from radejax.geometry.boxes import as_floats
+from radejax.core.errors import require
+from radejax.geometry.boxes import array_module, as_floats
 
 _AXES = ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps")
 _MAX_VALUE = 10_000.0  # far beyond the axes of any radar
@@ -169,19 +170,18 @@ class RadarGrid(ArrayValues):
         """
         num_range = -(-self.num_range // multiple) * multiple
         num_azimuth = -(-self.num_azimuth // multiple) * multiple
+        kinds = get_args(AzimuthMapping)
+        known = azimuth_mapping in kinds
+        require(known, "azimuth_mapping", azimuth_mapping, " or ".join(kinds))
         if azimuth_mapping == "true":
             range_m = self.range_m[0] + self.range_step_m * np.arange(num_range)
             azimuth = self.azimuth_rad[0] + self.azimuth_step_rad * np.arange(
                 num_azimuth
             )
-        elif azimuth_mapping == "stretched":
+        else:
             range_m = np.linspace(self.range_m[0], self.fov_range_m, num_range)
             azimuth = np.linspace(
                 self.azimuth_rad[0], self.azimuth_rad[-1], num_azimuth
-            )
-        else:
-            raise ValueError(
-                f"azimuth_mapping must be 'true' or 'stretched', got {azimuth_mapping!r}"
             )
         return dataclasses.replace(self, range_m=range_m, azimuth_rad=azimuth)
 
@@ -273,11 +273,11 @@ class RadarGrid(ArrayValues):
         Returns:
             `[..., 2]` int32 range and azimuth indices.
         """
-        xp, x_m, y_m = as_floats(x_m, y_m)
-        nearest = xp.round(self.ego_to_bin(x_m, y_m))
-        range_idx = xp.clip(nearest[..., 0], 0, self.num_range - 1)
-        azimuth_idx = xp.clip(nearest[..., 1], 0, self.num_azimuth - 1)
-        return xp.stack([range_idx, azimuth_idx], -1).astype(xp.int32)
+        bins = self.ego_to_bin(x_m, y_m)
+        xp = array_module(bins)
+        last = xp.asarray([self.num_range - 1, self.num_azimuth - 1], bins.dtype)
+        last = xp.broadcast_to(last, bins.shape)
+        return xp.clip(xp.round(bins), 0, last).astype(xp.int32)
 
     def bin_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
         """`[R, A, 2]` float64 x and y of every range-azimuth bin center, meters."""

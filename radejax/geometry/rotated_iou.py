@@ -146,14 +146,8 @@ def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
         raise ValueError(f"boxes must be [..., 7] or [..., 8], got {boxes.shape}")
     x, y, length, breadth = (boxes[..., i] for i in (0, 1, 3, 4))
     if width == 7:
-        return (
-            x,
-            y,
-            xp.maximum(length, 0),
-            xp.maximum(breadth, 0),
-            xp.sin(boxes[..., 6]),
-            xp.cos(boxes[..., 6]),
-        )
+        sin, cos = xp.sin(boxes[..., 6]), xp.cos(boxes[..., 6])
+        return x, y, xp.maximum(length, 0), xp.maximum(breadth, 0), sin, cos
     scale = xp.sqrt(boxes[..., 6] ** 2 + boxes[..., 7] ** 2)
     divisor = xp.where(scale > 0, scale, 1)
     sin = boxes[..., 6] / divisor

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from radejax.core.errors import require
 from radejax.core.structures import Array
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -160,17 +161,15 @@ def _sigmas(
     boxes: Float[jax.Array, "*objects _"], sigma_mode: str, sigma_bins: float
 ) -> tuple[PerObject, PerObject]:
     """Standard deviations along range and azimuth, in bins: `[..., N]` each."""
+    modes = get_args(SigmaMode)
+    require(sigma_mode in modes, "sigma_mode", sigma_mode, f"one of {modes}")
     length, width = boxes[..., 3], boxes[..., 4]
     if sigma_mode == "fixed":
         along_range = along_azimuth = jnp.full_like(length, sigma_bins)
     elif sigma_mode == "adaptive":
         along_range = along_azimuth = 0.3 * jnp.maximum(length, width)
-    elif sigma_mode == "anisotropic":
-        along_range, along_azimuth = length / 6, width / 6
     else:
-        raise ValueError(
-            f"sigma_mode must be one of {get_args(SigmaMode)}, got {sigma_mode!r}"
-        )
+        along_range, along_azimuth = length / 6, width / 6
     return jnp.maximum(along_range, _MIN_SIGMA), jnp.maximum(along_azimuth, _MIN_SIGMA)
 
 

@@ -29,13 +29,16 @@ References:
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from radejax.core.errors import require
+
 Transform = Literal["none", "sqrt", "log1p"]
+_TRANSFORMS = get_args(Transform)
 Boxes8 = Float[jax.Array, "*#pairs 8"]
 PerPair = Float[jax.Array, "*pairs"]
 Entry = Float[jax.Array, "*batch"]
@@ -100,6 +103,7 @@ def gwd_loss(
         >>> round(float(loss(car, car)), 4), round(float(loss(car, car.at[0].add(3))), 4)
         (0.3939, 0.7849)
     """
+    require(transform in _TRANSFORMS, "transform", transform, f"one of {_TRANSFORMS}")
     distance = gwd(a, b)
     if transform == "sqrt":
         # d grows with the square of the error, so d / sqrt(d) has a finite limit;
@@ -107,10 +111,6 @@ def gwd_loss(
         distance = jnp.sqrt(distance + _SMOOTHING_M**2) - _SMOOTHING_M
     elif transform == "log1p":
         distance = jnp.log1p(distance)
-    elif transform != "none":
-        raise ValueError(
-            f"transform must be 'none', 'sqrt' or 'log1p', got {transform!r}"
-        )
     return 1 - 1 / (tau + distance)
 
 

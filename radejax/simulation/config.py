@@ -140,7 +140,7 @@ class SimulationConfig:
         Raises:
             UserError: A field is unknown or out of its range.
         """
-        values = dict(plain(values))
+        values = plain(values)
         fields = {field.name: field for field in dataclasses.fields(cls)}
         for name in values:
             require(name in fields, "config.simulation field", name, ", ".join(fields))
@@ -173,11 +173,11 @@ class SimulationConfig:
         """The radar's axes."""
         if self.grid == "kradar":
             return RadarGrid.kradar()
-        is_mapping = isinstance(self.grid, Mapping)
+        fields: Any = self.grid
+        is_mapping = isinstance(fields, Mapping)
         self._require(is_mapping, "grid", "'kradar' or arguments of RadarGrid.reduced")
-        assert isinstance(self.grid, Mapping)
         try:
-            return RadarGrid.reduced(**self.grid)
+            return RadarGrid.reduced(**fields)
         except (TypeError, ValueError) as error:
             raise UserError(f"config.simulation.grid: {error}") from None
 
@@ -204,13 +204,9 @@ class SimulationConfig:
 
 def default_config() -> dict[str, Any]:
     """Fields and defaults of `SimulationConfig` as fresh plain values."""
-    return plain(dataclasses.asdict(SimulationConfig()))
+    return dataclasses.asdict(SimulationConfig())
 
 
-def plain(config: Any) -> Any:
-    """ConfigDicts and other mappings as dictionaries, recursively."""
-    if hasattr(config, "to_dict"):
-        config = config.to_dict()
-    if isinstance(config, Mapping):
-        return {str(key): plain(value) for key, value in config.items()}
-    return config
+def plain(config: Any) -> dict[str, Any]:
+    """A ConfigDict or another mapping as a dictionary."""
+    return config.to_dict() if hasattr(config, "to_dict") else dict(config)

@@ -10,13 +10,14 @@ from __future__ import annotations
 import collections
 import contextlib
 import functools
+import itertools
 import json
 import logging
 import os
 import pathlib
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from typing import IO, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -173,12 +174,12 @@ def _write_frames(
     total = sum(len(source.frames(n)) for n in source.numbers)
     if num_workers is None:
         num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
-    is_whole = config.output == "tesseract"
-    settings: Any = {
-        "grid": config.make_grid(),
-        "parameters": config.make_parameters(),
-        "output": "rows" if is_whole else "projection",
-    }
+    compute = functools.partial(
+        tensor.simulate,
+        grid=config.make_grid(),
+        parameters=config.make_parameters(),
+        output="rows" if config.output == "tesseract" else "projection",
+    )
     with (
         tqdm(
             total=total, unit="frame", desc="simulate", disable=not progress
@@ -189,9 +190,7 @@ def _write_frames(
         last: tuple[Any, ...] | None = None
         for number, spec, given, labels in frames:
             # The device computes this frame while the one before is written.
-            output = tensor.simulate(
-                given.scatterers, given.noise_power, given.key, **settings
-            )
+            output = compute(given.scatterers, given.noise_power, given.key)
             if last:
                 _write_frame(root, config, *last)
                 progress_bar.update()
@@ -260,7 +259,8 @@ class _Scenes:
             name = f"cam-front_{camera_idx:05d}.png"
             path = self._root / str(number) / "cam-front" / name
             with files.atomic_write(path) as file:
-                write_png(file, renderer.render(frame))
+                image = Image.fromarray(renderer.render(frame))
+                image.save(file, format="PNG", compress_level=1)  # fast, not small
         given = simulator.radar_input(frame)
         labels = simulator.labels(
             frame, given, config.radar_from_lidar_m, config.label_distance_m
@@ -274,13 +274,11 @@ class _Scenes:
         pair = _cameras(config)
         if not pair:
             return simulator, None
-        return simulator, CameraRenderer(
-            sequence,
-            pair,
-            config.seed,
-            cover_lens=config.cover_lens,
-            mode=config.camera_mode,
+        cover_lens, mode = config.cover_lens, config.camera_mode
+        renderer = CameraRenderer(
+            sequence, pair, config.seed, cover_lens=cover_lens, mode=mode
         )
+        return simulator, renderer
 
 
 @contextlib.contextmanager
@@ -301,20 +299,15 @@ def _prepared(
 def _by_workers(
     submit: Submit, missing: Sequence[tuple[int, FrameSpec]], num_ahead: int
 ) -> Iterator[_Prepared]:
-    waiting: collections.deque[tuple[int, FrameSpec, Any]] = collections.deque()
-    for number, spec in missing:
-        waiting.append((number, spec, submit(_prepare_in_worker, number, spec)))
-        if len(waiting) > num_ahead:
-            yield _received(*waiting.popleft())
+    started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
+    waiting = collections.deque(itertools.islice(started, num_ahead))
     while waiting:
-        yield _received(*waiting.popleft())
-
-
-def _received(number: int, spec: FrameSpec, future: Any) -> _Prepared:
-    path = pathlib.Path(future.result())
-    given, labels = pickle.loads(path.read_bytes())
-    path.unlink()
-    return number, spec, given, labels
+        frame, future = waiting.popleft()
+        waiting.extend(itertools.islice(started, 1))
+        path = pathlib.Path(future.result())
+        given, labels = pickle.loads(path.read_bytes())
+        path.unlink()
+        yield (*frame, given, labels)
 
 
 _scenes: Any = None
@@ -333,8 +326,3 @@ def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
     path = root / f".{number}_{spec.name}.tmp"
     path.write_bytes(pickle.dumps(scenes.prepare(number, spec)))
     return str(path)
-
-
-def write_png(file: IO[bytes], image: np.ndarray) -> None:
-    """PNG, fast rather than small."""
-    Image.fromarray(image).save(file, format="PNG", compress_level=1)

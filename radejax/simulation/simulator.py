@@ -118,7 +118,7 @@ class SequenceSimulator:
         bounce = propagation.bounce(
             found.position_m,
             sequence.ground_m,
-            propagation.SURFACES[sequence.weather],
+            propagation.WEATHERS[sequence.weather].surface,
             self.parameters.wavelength_m,
         )
         bounce = np.where(is_mirrored, bounce, 1.0)
@@ -135,18 +135,17 @@ class SequenceSimulator:
         output: Literal["tesseract", "projection"] = "projection",
     ) -> Float[np.ndarray, "..."]:
         """The 4D radar tensor `[D, R, E, A]` or the projection `[R, A, D+E]`."""
-        result = np.asarray(
-            tensor.simulate(
-                given.scatterers,
-                given.noise_power,
-                given.key,
-                grid=self.grid,
-                parameters=self.parameters,
-                output="rows" if output == "tesseract" else "projection",
-            )
-        )
         is_whole = output == "tesseract"
-        return result.transpose(tensor.TESSERACT_OF_ROWS) if is_whole else result
+        result = tensor.simulate(
+            given.scatterers,
+            given.noise_power,
+            given.key,
+            grid=self.grid,
+            parameters=self.parameters,
+            output="rows" if is_whole else "projection",
+        )
+        rows = np.asarray(result)
+        return rows.transpose(tensor.TESSERACT_OF_ROWS) if is_whole else rows
 
     def is_radar_visible(
         self, frame: SceneFrame, given: RadarInput

@@ -1,7 +1,7 @@
 """Weather before and on the camera: haze, falling rain and snow, a covered lens.
 
 The second paper counts, of K-Radar's 35,000 front images, 7,500 partly, 4,800 heavily
-and 4,900 fully covered ones, all in bad weather. `COVER` reproduces these numbers when
+and 4,900 fully covered ones, all in bad weather. `AIR` reproduces these numbers when
 every sequence of K-Radar is simulated.
 
 References:
@@ -27,6 +27,7 @@ class Air:
         is_snow: Flakes instead of streaks.
         wetness: Shine of the road, 0 to 1.
         white: Snow on the ground, 0 to 1.
+        cover: Probabilities of `LEVELS`.
     """
 
     extinction_per_m: float
@@ -34,30 +35,20 @@ class Air:
     is_snow: bool = False
     wetness: float = 0.0
     white: float = 0.0
+    cover: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
 
 AIR = {
     "normal": Air(0.0008),
     "overcast": Air(0.0015),
-    "fog": Air(0.03),
-    "rain": Air(0.006, 900.0, False, 1.0),
-    "sleet": Air(0.01, 1100.0, True, 0.7, 0.25),
-    "lightsnow": Air(0.006, 700.0, True, 0.2, 0.5),
-    "heavysnow": Air(0.02, 2600.0, True, 0.0, 0.85),
+    "fog": Air(0.03, cover=(0.50, 0.35, 0.10, 0.05)),
+    "rain": Air(0.006, 900.0, False, 1.0, cover=(0.17, 0.46, 0.22, 0.15)),
+    "sleet": Air(0.01, 1100.0, True, 0.7, 0.25, (0.12, 0.27, 0.28, 0.33)),
+    "lightsnow": Air(0.006, 700.0, True, 0.2, 0.5, (0.30, 0.40, 0.18, 0.12)),
+    "heavysnow": Air(0.02, 2600.0, True, 0.0, 0.85, (0.06, 0.30, 0.29, 0.35)),
 }
 
 LEVELS = ("clear", "partial", "heavy", "full")
-
-COVER = {
-    "normal": (1.0, 0.0, 0.0, 0.0),
-    "overcast": (1.0, 0.0, 0.0, 0.0),
-    "fog": (0.50, 0.35, 0.10, 0.05),
-    "rain": (0.17, 0.46, 0.22, 0.15),
-    "sleet": (0.12, 0.27, 0.28, 0.33),
-    "lightsnow": (0.30, 0.40, 0.18, 0.12),
-    "heavysnow": (0.06, 0.30, 0.29, 0.35),
-}
-"""Probabilities of `LEVELS` per weather."""
 
 BLOCK_FRAMES = 50
 """A lens stays as it is for this long: until a wiper or the wind changes it."""
@@ -66,7 +57,7 @@ BLOCK_FRAMES = 50
 def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
     """State of the lens in one frame, one of `LEVELS`; constant over blocks of frames."""
     rng = np.random.default_rng([seed, sequence, frame // BLOCK_FRAMES, 13])
-    return LEVELS[rng.choice(4, p=COVER[weather])]
+    return LEVELS[rng.choice(4, p=AIR[weather].cover)]
 
 
 def haze(

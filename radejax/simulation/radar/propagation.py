@@ -40,6 +40,24 @@ from radejax.simulation.radar.tensor import RadarParameters
 
 
 @dataclasses.dataclass(frozen=True)
+class Surface:
+    """What covers the road.
+
+    Attributes:
+        permittivity: Relative, complex.
+        roughness_m: Standard deviation of height.
+    """
+
+    permittivity: complex
+    roughness_m: float
+
+
+_DRY = Surface(3.2 - 0.1j, 0.0008)
+_WET = Surface(7.6 - 12.6j, 0.0004)
+_SNOW = Surface(1.6 - 0.01j, 0.004)
+
+
+@dataclasses.dataclass(frozen=True)
 class Weather:
     """How one kind of weather changes what the radar receives.
 
@@ -48,22 +66,25 @@ class Weather:
         radome_db: Loss by water or snow on the sensor, there and back.
         backscatter_db: Cross-section of the falling particles in dB of m2 per m3.
         spread_mps: Standard deviation of the particles' radial velocities.
+        surface: Of the road. Our choice: values of the usual order, a film of water that
+            fills the asphalt's pores in rain and sleet, loose snow.
     """
 
     attenuation_db_per_km: float
     radome_db: float
     backscatter_db: float
     spread_mps: float
+    surface: Surface
 
 
 WEATHERS = {
-    "normal": Weather(0.0, 0.0, -90.0, 1.0),
-    "overcast": Weather(0.0, 0.0, -90.0, 1.0),
-    "fog": Weather(0.5, 0.5, -65.0, 0.5),
-    "rain": Weather(6.0, 2.0, -36.0, 1.0),
-    "sleet": Weather(8.0, 3.0, -37.0, 0.8),
-    "lightsnow": Weather(1.0, 1.0, -50.0, 0.6),
-    "heavysnow": Weather(4.0, 3.0, -43.0, 0.8),
+    "normal": Weather(0.0, 0.0, -90.0, 1.0, _DRY),
+    "overcast": Weather(0.0, 0.0, -90.0, 1.0, _DRY),
+    "fog": Weather(0.5, 0.5, -65.0, 0.5, _DRY),
+    "rain": Weather(6.0, 2.0, -36.0, 1.0, _WET),
+    "sleet": Weather(8.0, 3.0, -37.0, 0.8, _WET),
+    "lightsnow": Weather(1.0, 1.0, -50.0, 0.6, _SNOW),
+    "heavysnow": Weather(4.0, 3.0, -43.0, 0.8, _SNOW),
 }
 """K-Radar's seven weathers."""
 
@@ -111,55 +132,21 @@ def noise_profile(
     return (noise + clutter[:, None] * share[None]).astype(np.float32)
 
 
-@dataclasses.dataclass(frozen=True)
-class Surface:
-    """What covers the road.
-
-    Attributes:
-        permittivity: Relative, complex.
-        roughness_m: Standard deviation of height.
-    """
-
-    permittivity: complex
-    roughness_m: float
-
-
-_DRY = Surface(3.2 - 0.1j, 0.0008)
-_WET = Surface(7.6 - 12.6j, 0.0004)
-_SNOW = Surface(1.6 - 0.01j, 0.004)
-
-SURFACES = {
-    "normal": _DRY,
-    "overcast": _DRY,
-    "fog": _DRY,
-    "rain": _WET,
-    "sleet": _WET,
-    "lightsnow": _SNOW,
-    "heavysnow": _SNOW,
-}
-"""Surface per weather. Our choice: values of the usual order, a film of water that fills
-the asphalt's pores in rain and sleet, loose snow."""
-
-
 def reflection(
     sine: float | Float[np.ndarray, "*targets"],
     surface: Surface,
     wavelength_m: float,
-    *,
-    vertical: bool = False,
 ) -> Inexact[Any, "*targets"]:
-    """Complex reflection coefficient of the mean field.
+    """Complex reflection coefficient of the mean field, horizontally polarized.
 
     Args:
         sine: Sine of the grazing angle.
         surface: What reflects.
         wavelength_m: Wavelength.
-        vertical: Polarisation; the coefficient is -1 at grazing incidence for both.
     """
     sine = np.asarray(sine, float)
     root = np.sqrt(surface.permittivity - (1.0 - sine**2))
-    first = surface.permittivity * sine if vertical else sine
-    fresnel = (first - root) / (first + root)
+    fresnel = (sine - root) / (sine + root)
     rough = 2.0 * np.pi * surface.roughness_m * sine / wavelength_m
     return fresnel * np.exp(-2.0 * rough**2)
 

@@ -11,9 +11,9 @@ from radejax.simulation.radar.propagation import WEATHERS
 
 
 def test_every_weather_has_air_and_cover():
-    assert set(lens.AIR) == set(lens.COVER) == set(WEATHERS)
-    for probabilities in lens.COVER.values():
-        assert sum(probabilities) == pytest.approx(1.0)
+    assert set(lens.AIR) == set(WEATHERS)
+    for air in lens.AIR.values():
+        assert sum(air.cover) == pytest.approx(1.0)
 
 
 def test_covered_frames_of_all_of_kradar_are_as_many_as_counted(shared):
@@ -24,7 +24,7 @@ def test_covered_frames_of_all_of_kradar_are_as_many_as_counted(shared):
         for row in csv.DictReader(file):
             frames, number = int(row["label_files"]), int(row["seq"])
             weather = KRADAR_CONDITIONS[number].weather
-            for level, share in zip(lens.LEVELS, lens.COVER[weather], strict=True):
+            for level, share in zip(lens.LEVELS, lens.AIR[weather].cover, strict=True):
                 expected[level] += share * frames
             for start in range(0, frames, lens.BLOCK_FRAMES):
                 level = lens.cover_level(0, number, start, weather)
