@@ -262,7 +262,10 @@ class CameraCalibration(ArrayValues):
             DataError: A line is not `key: number`, a key is missing or a value is not
                 possible; names the file.
         """
-        values = _read_numbers(pathlib.Path(path))
+        path = pathlib.Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"camera calibration {path} does not exist")
+        values = _read_numbers(path)
         if missing := [key for key in _KEYS if key not in values]:
             raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
         yaw, pitch, roll = (values[key] for key in _ANGLES)

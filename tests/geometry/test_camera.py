@@ -42,17 +42,10 @@ def test_a_camera_that_looks_ahead_by_hand():
     np.testing.assert_allclose(depth, [10, 10, 10, -5], atol=1e-12)
     # Left is towards smaller u, up towards smaller v.
     np.testing.assert_allclose(pixels[:3], [[50, 40], [40, 40], [50, 25]], atol=1e-12)
-    np.testing.assert_array_equal(
-        camera.in_image(pixels, depth), [True, True, True, False]
-    )
-
-
-def test_image_borders_belong_to_the_left_and_top():
-    camera = forward_camera()
-    pixels = np.array([[0, 0], [-1e-9, 0], [99.999, 79.999], [100, 0], [0, 80]])
-    np.testing.assert_array_equal(
-        camera.in_image(pixels, np.ones(5)), [True, False, True, False, False]
-    )
+    assert camera.in_image(pixels, depth).tolist() == [True, True, True, False]
+    borders = np.array([[0, 0], [-1e-9, 0], [99.999, 79.999], [100, 0], [0, 80]])
+    inside = camera.in_image(borders, np.ones(5))
+    assert inside.tolist() == [True, False, True, False, False]
 
 
 def test_lidar_points_are_ego_points_minus_the_shift():
@@ -188,12 +181,6 @@ def test_batches_of_cameras_under_jit(image):
         expected, expected_depth = calibration.project_ego(points[i], image)
         np.testing.assert_allclose(pixels[i], expected, atol=2e-4)
         np.testing.assert_allclose(depth[i], expected_depth, rtol=1e-6)
-
-
-def test_calibrations_compare_by_value():
-    assert forward_camera() == forward_camera()
-    assert hash(forward_camera()) == hash(forward_camera())
-    assert forward_camera() != forward_camera(yaw_deg=89.0)
 
 
 @pytest.mark.wrong_types

@@ -73,20 +73,6 @@ def test_gradients_equal_those_of_plain_convolution(shape, features, size, dilat
     chex.assert_trees_all_close(actual, gradients(plain), atol=2e-3, rtol=1e-4)
 
 
-def test_blocked_kernel_gradient_is_the_sum_over_bins():
-    x, grad = arrays((2, 37, 31, 2), (2, 37, 31, 3))
-    expected = np.zeros((3, 3, 2, 3))
-    padded = np.pad(x, ((0, 0), (2, 2), (2, 2), (0, 0))).astype(np.float64)
-    for i in range(3):
-        for j in range(3):
-            shifted = padded[:, 2 * i : 2 * i + 37, 2 * j : 2 * j + 31]
-            expected[i, j] = np.einsum("brac,brad->cd", shifted, grad)
-    actual = blocked_kernel_gradient(
-        jnp.asarray(x), jnp.asarray(grad), size=3, dilation=2
-    )
-    np.testing.assert_allclose(actual, expected, atol=5e-4)
-
-
 def test_blocked_kernel_gradient_accumulates_bfloat16_in_float32():
     x, grad = arrays((1, 64, 64, 2), (1, 64, 64, 2))
     ours = [jnp.asarray(v, jnp.bfloat16) for v in (x, grad)]
@@ -97,14 +83,3 @@ def test_blocked_kernel_gradient_accumulates_bfloat16_in_float32():
     np.testing.assert_allclose(
         actual.astype(jnp.float32), expected, rtol=5e-3, atol=1e-2
     )
-
-
-def test_vmap_over_kernels_and_gradient_inside():
-    x, kernels = map(jnp.asarray, arrays((1, 9, 8, 2), (3, 3, 3, 2, 2)))
-
-    def loss(kernel):
-        return jnp.square(conv2d(x, kernel)).sum()
-
-    batched = jax.vmap(jax.grad(loss))(kernels)
-    single = jnp.stack([jax.grad(loss)(k) for k in kernels])
-    chex.assert_trees_all_close(batched, single, rtol=1e-4, atol=1e-3)

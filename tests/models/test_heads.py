@@ -39,34 +39,6 @@ def test_dilated_neck_sees_farther():
     assert reach("plain") <= 3 < reach("dilated") <= 9
 
 
-def test_kinds_have_their_blocks():
-    def blocks(kind):
-        x = jnp.zeros((1, 8, 8, 16))
-        return NECKS[kind](8).init(jax.random.key(0), x)["params"]
-
-    assert set(blocks("plain")["block_3"]) == {"conv", "norm"}
-    assert set(blocks("dilated")["block_3"]) == {"conv_1", "conv_2", "norm"}
-
-
-def params_of(**fields):
-    heads = Heads(num_classes=5, **fields)
-    return heads.init(jax.random.key(0), jnp.zeros((1, 4, 4, 128)))["params"]
-
-
-def test_expanded_heads_keep_the_width_three_times():
-    params = params_of(kind="expanded")
-    shapes = [params["box"][f"conv_{i}"]["conv"]["kernel"].shape for i in (1, 2, 3)]
-    assert shapes == [(3, 3, 128, 128)] * 3
-    assert params["box"]["out"]["kernel"].shape == (1, 1, 128, 8)
-    assert params["heatmap"]["out"]["kernel"].shape == (1, 1, 128, 5)
-
-
-def test_default_heads_have_one_convolution_to_64():
-    params = params_of(kind="default")
-    assert set(params["heatmap"]) == {"conv_1", "out"}
-    assert params["heatmap"]["conv_1"]["conv"]["kernel"].shape == (3, 3, 128, 64)
-
-
 @pytest.mark.parametrize("prior", [0.5, 0.01])
 def test_untrained_confidence_is_near_the_prior(prior):
     heads = Heads(num_classes=5, heatmap_prior=prior)

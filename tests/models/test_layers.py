@@ -18,17 +18,9 @@ from radejax.models.layers import (
 from radejax.weights.radenet_torch import double_conv_names
 
 
-def strip(names, ours, theirs):
-    """Names below a module instead of from the top."""
-    return {
-        k.removeprefix(f"{ours}/"): v.removeprefix(f"{theirs}.")
-        for k, v in names.items()
-    }
-
-
 def test_double_conv_residual_equals_official(module_case, run_like_torch):
     x, expected = module_case("double_conv_residual")
-    names = strip(double_conv_names("m", "m"), "m", "m")
+    names = {k[2:]: v[2:] for k, v in double_conv_names("m", "m").items()}
     actual = run_like_torch(DoubleConvResidual(64, 32), names, x)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.errors import UserError
 from radejax.models import vit
 from radejax.models.vit import ViT
 
@@ -146,8 +145,3 @@ def test_bfloat16_stays_close():
 def test_images_of_a_wrong_shape_are_refused(shape):
     with pytest.raises(AssertionError, match="expected"):
         ViT(**TINY).init(jax.random.key(0), jnp.zeros(shape))
-
-
-def test_heads_need_a_multiple_of_four_channels():
-    with pytest.raises(UserError, match=r"hidden_size is 12, .* 4 channels .* 2 heads"):
-        vit.ViT(hidden_size=12, num_heads=2)

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import logging
 import multiprocessing
 import os
 import socket
@@ -19,7 +18,9 @@ from radejax.data.kradar import KRadar, read_labels
 from radejax.data.pipeline import camera_inputs
 from radejax.simulation import dataset
 from radejax.simulation.camera.renderer import stereo_calibration
+from radejax.simulation.config import SimulationConfig
 from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.simulator import make_source
 
 
 def small_config(**changes):
@@ -128,15 +129,6 @@ class TestRepeating:
         )
         assert digests(again) == digests(tree)
 
-    def test_another_seed_gives_other_bytes(self, tree, tmp_path):
-        config = small_config(
-            seed=1, train_sequences=1, test_sequences=0, frames_per_sequence=1
-        )
-        other = simulate_dataset(config, tmp_path / "other", progress=False)
-        label = next((other / "1" / "info_label_v2_1").iterdir())
-        mine = sorted((tree / "1" / "info_label_v2_1").iterdir())[0]
-        assert label.read_bytes() != mine.read_bytes()
-
     def test_resumes_after_an_interruption_with_the_same_bytes(
         self, tree, tmp_path, monkeypatch
     ):
@@ -215,21 +207,11 @@ class TestWrongUse:
 
 
 @pytest.mark.parametrize("output", ["tesseract", "projection"])
-def test_size_is_told_before_the_first_frame(output, tmp_path, caplog):
-    config = small_config(output=output, train_sequences=1, frames_per_sequence=1)
-    log = logging.getLogger("radejax.simulation.dataset")
-    log.addHandler(caplog.handler)
-    log.setLevel(logging.INFO)
-    try:
-        root = simulate_dataset(config, tmp_path / "data", progress=False)
-    finally:
-        log.removeHandler(caplog.handler)
-        log.setLevel(logging.NOTSET)
-    (line,) = set(caplog.messages)
-    assert line.startswith(f"{root}: 2 frames, about ")
-    size = sum(
-        p.stat().st_size
-        for p in root.rglob("*")
-        if p.suffix in (".mat", ".npy", ".png")
-    )
-    assert float(line.split()[-2]) * 1e9 == pytest.approx(size, rel=0.2)
+def test_expected_size_is_that_of_the_files(output, tmp_path):
+    values = small_config(output=output, train_sequences=1, frames_per_sequence=1)
+    config = SimulationConfig.from_mapping(values)
+    num_frames, expected = dataset.expected_size(config, make_source(config))
+    root = simulate_dataset(values, tmp_path / "data", progress=False)
+    files = [p for p in root.rglob("*") if p.suffix in (".mat", ".npy", ".png")]
+    assert num_frames == 2
+    assert expected == pytest.approx(sum(p.stat().st_size for p in files), rel=0.2)

@@ -22,19 +22,20 @@ SIZES = {
 }
 
 
-def make_frame(boxes, cls, velocity=None, *, ego=(0.0, 0.0), time_s=0.0, tracks=None):
+def make_frame(boxes, cls, velocity=None, *, time_s=0.0, tracks=None, reflectors=None):
     boxes = np.asarray(boxes, float).reshape(-1, 7)
-    count = len(boxes)
-    empty = np.zeros(0)
+    count, empty = len(boxes), np.zeros(0)
+    if reflectors is None:
+        reflectors = Reflectors(np.zeros((0, 3)), empty, empty, empty.astype(int))
     return SceneFrame(
         boxes=boxes,
         velocity_mps=np.zeros((count, 2)) if velocity is None else np.array(velocity),
         cls=np.array([CLASSES.index(c) for c in cls], int),
         track=np.arange(count) if tracks is None else np.array(tracks),
         track_id=np.arange(count),
-        ego_velocity_mps=np.array(ego, float),
-        reflectors=Reflectors(np.zeros((0, 3)), empty, empty, empty.astype(int)),
-        reflector_idx=empty.astype(int),
+        ego_velocity_mps=np.zeros(2),
+        reflectors=reflectors,
+        reflector_idx=np.arange(len(reflectors.kind)),
         index=0,
         time_s=time_s,
         ego_along_m=0.0,
@@ -164,26 +165,6 @@ class TestMotion:
         assert np.abs(found.velocity_mps).max() == 0.0
 
 
-def frame_with(boxes=(), reflectors=None):
-    boxes = np.asarray(boxes, float).reshape(-1, 7)
-    count, empty = len(boxes), np.zeros(0)
-    if reflectors is None:
-        reflectors = Reflectors(np.zeros((0, 3)), empty, empty, empty.astype(int))
-    return SceneFrame(
-        boxes=boxes,
-        velocity_mps=np.zeros((count, 2)),
-        cls=np.zeros(count, int),
-        track=np.arange(count),
-        track_id=np.arange(count),
-        ego_velocity_mps=np.zeros(2),
-        reflectors=reflectors,
-        reflector_idx=np.arange(len(reflectors.kind)),
-        index=0,
-        time_s=0.0,
-        ego_along_m=0.0,
-    )
-
-
 def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
     reflectors = Reflectors(
         np.array([[20.0, 0.1, 0.0], [20.0, 12.0, 0.0]]),
@@ -191,20 +172,15 @@ def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
         np.array([np.pi, np.pi / 2]),  # facing us; parallel to the road
         np.full(2, REFLECTOR_KINDS.index("wall")),
     )
-    parameters = RadarParameters(pattern_exponent=0.0)
     free = scattering.scatter_surroundings(
-        frame_with(reflectors=reflectors), np.zeros(2), parameters
+        make_frame([], [], reflectors=reflectors), np.zeros(2), PARAMETERS
     )
     assert free.power[0] > 5.0 * free.power[1]
     truck = [10.0, 0.0, 0.0, 8.0, 2.5, 3.0, 0.0]
-    hidden = scattering.scatter_surroundings(
-        frame_with([truck], reflectors), np.zeros(2), parameters
-    )
+    frame = make_frame([truck], ["Bus or Truck"], reflectors=reflectors)
+    hidden = scattering.scatter_surroundings(frame, np.zeros(2), PARAMETERS)
     loss = 10 * np.log10(hidden.power / free.power)
     np.testing.assert_allclose(loss, [scattering.OCCLUDED_DB, 0.0], atol=1e-9)
-
-
-PARAMETERS = RadarParameters(pattern_exponent=0.0)
 
 
 class TestGhosts:
