@@ -72,12 +72,9 @@ class SpatialAttention(nn.Module):
     @nn.compact
     def __call__(self, x: Map) -> Float[jax.Array, "B R A 1"]:
         mean = x.mean(-1, dtype=jnp.float32).astype(self.dtype)
-        pooled = [x.max(-1), mean]
-        if self.mean_first:
-            pooled.reverse()
-        return nn.sigmoid(
-            Conv(1, 7, dtype=self.dtype, name="conv")(jnp.stack(pooled, -1))
-        )
+        pooled = [mean, x.max(-1)] if self.mean_first else [x.max(-1), mean]
+        conv = Conv(1, 7, dtype=self.dtype, name="conv")
+        return nn.sigmoid(conv(jnp.stack(pooled, -1)))
 
 
 class CBAM(nn.Module):

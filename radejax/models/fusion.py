@@ -121,21 +121,10 @@ class Fusion(nn.Module):
         def per_bin(x: Real[Array, "_ R A ..."]) -> Real[jax.Array, "_ bins ..."]:
             return jnp.asarray(x).reshape(x.shape[0], r * a, *x.shape[3:])
 
-        attention = DeformableAttention(
-            c,
-            self.num_heads,
-            self.num_points,
-            chunk_size=self.chunk_size,
-            dtype=self.dtype,
-            name="attention",
-        )
-        seen = attention(
-            per_bin(radar),
-            per_bin(scale),
-            per_bin(reference.points),
-            per_bin(mean),
-            camera,
-        ).reshape(b, r, a, c)
+        counts = self.num_heads, self.num_points, self.chunk_size
+        attention = DeformableAttention(c, *counts, self.dtype, name="attention")
+        queries = map(per_bin, (radar, scale, reference.points, mean))
+        seen = attention(*queries, camera).reshape(b, r, a, c)
         share = self._camera_share(radar, seen)
         share = share * self._has_camera(reference, mean).astype(share.dtype)
         self.sow("intermediates", "camera_share", share.mean(-1))

@@ -129,14 +129,10 @@ class CameraNeck(nn.Module):
                 (collection "batch_stats").
         """
         x = Dense(self.features, dtype=self.dtype, name="proj")(tokens)
-        layers = [
-            TransposedConv(self.features, dtype=self.dtype, name="up_1"),
-            TransposedConv(self.features, dtype=self.dtype, name="up_2"),
-            Conv(self.features, dtype=self.dtype, name="refine"),
-        ]
-        for layer in layers:
-            x = layer(x)
-            norm = batch_norm(f"{layer.name}_norm", self.dtype, train)
+        layers: dict[str, Any] = {"up_1": TransposedConv, "up_2": TransposedConv}
+        for name, layer in (layers | {"refine": Conv}).items():
+            x = layer(self.features, dtype=self.dtype, name=name)(x)
+            norm = batch_norm(f"{name}_norm", self.dtype, train)
             x = nn.relu(norm(x, mask=counted_frames(has_image)))
         return x
 

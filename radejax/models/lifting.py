@@ -152,15 +152,14 @@ def reference_points(
     # Small products in the program, no constant of millions of numbers.
     make_centers = LiftingAxes.centers_ego if on_host else _centers_in_program
     centers: Any = make_centers(axes, num_range, num_azimuth)
-    centers = xp.broadcast_to(
-        centers[None], (np.shape(camera.max_radius) or (1,)) + centers.shape
-    )
     if not is_batch:
         camera = jax.tree.map(lambda x: xp.asarray(x)[None], camera)
-    offset = _OFFICIAL_DEPTH_OFFSET_M if out_of_view == "official" else 0.0
+    centers = xp.broadcast_to(centers[None], (*camera.max_radius.shape, *centers.shape))
+    is_official = out_of_view == "official"
+    offset = _OFFICIAL_DEPTH_OFFSET_M if is_official else 0.0
     pixels, depth = project(centers, camera, depth_offset_m=offset)
     width, height = (camera.size_px[:, i, None, None, None] for i in (0, 1))
-    margin = MARGIN_PX if out_of_view == "official" else 0.0
+    margin = MARGIN_PX if is_official else 0.0
     u, v = pixels[..., 0], pixels[..., 1]
     is_valid = (depth > 0) & (u >= margin) & (u < width - margin)
     is_valid = is_valid & (v >= 0) & (v < height)
