@@ -242,12 +242,9 @@ def test_encoded_boxes_come_back():
 
 def test_what_k_cuts_off_is_counted():
     logits, params, _, _ = scattered(num=10)
-    maps = maps_of(logits, params)
     counts = {}
     for k, pre_nms in ((16, None), (6, None), (4, None), (6, 6), (6, 10)):
-        found = decode(
-            maps, GRID, max_detections=k, score_threshold=0.3, pre_nms=pre_nms
-        )
+        found = decode_scene(logits, params, max_detections=k, pre_nms=pre_nms)
         counts[k, pre_nms] = int(found.num_truncated[0])
         assert int(found.is_valid[0].sum()) == min(k, 10)
         assert found.boxes.shape == (1, k, 7)
@@ -303,21 +300,19 @@ def overlapping_classes():
     logits[0, 10, 5, 0], logits[0, 10, 7, 1] = 2, 1
     params = np.zeros((1, 20, 12, 8), np.float32)
     params[..., 3:5], params[..., 5], params[..., 7] = 60, 2, 1
-    return maps_of(logits, params)
+    return logits, params
 
 
 def test_nms_across_classes_or_per_class():
-    run = partial(
-        decode, overlapping_classes(), GRID, max_detections=4, score_threshold=0.3
-    )
+    run = partial(decode_scene, *overlapping_classes(), max_detections=4)
     assert run().is_valid[0].tolist() == [True, False, False, False]
     assert run(per_class_nms=True).classes[0].tolist() == [0, 1, -1, -1]
 
 
 def test_length_of_the_yaw_vector_scales_boxes_in_nms_only_as_released():
-    maps = overlapping_classes()
-    maps = maps.replace(box_params=maps.box_params.at[..., 7].set(0.1))
-    run = partial(decode, maps, GRID, max_detections=4, score_threshold=0.3)
+    logits, params = overlapping_classes()
+    params[..., 7] = 0.1
+    run = partial(decode_scene, logits, params)
     released, plain = run(), run(raw_yaw="never")
     assert int(released.is_valid.sum()) == 2
     assert int(plain.is_valid.sum()) == 1
@@ -447,17 +442,9 @@ def test_wrong_shapes_are_refused():
 def test_a_size_is_never_negative(raw_yaw):
     logits = jnp.full((2, 20, 12, C), -9.0)
     logits = logits.at[0, [5, 15], [3, 9], 1].set(2.0).at[1, 5, 3, 0].set(2.0)
-    params = (
-        jnp.ones((2, 20, 12, 8))
-        .at[0, 5, 3]
-        .set(jnp.array([0, 0, 0, -0.2, 1.5, 0, 0, 0]))
-    )
-
-    def run(**options):
-        settings = {"max_detections": 4, "score_threshold": 0.3, "raw_yaw": raw_yaw}
-        maps = DetectionMaps(logits, params)
-        return decode(maps, grid=GRID, **settings, **options)
-
+    shrunk = jnp.array([0, 0, 0, -0.2, 1.5, 0, 0, 0])
+    params = jnp.ones((2, 20, 12, 8)).at[0, 5, 3].set(shrunk)
+    run = partial(decode_scene, logits, params, raw_yaw=raw_yaw)
     found, released = run(), run(clip_sizes=False)
     least = np.float32(0.01)
     width = 1.5 if raw_yaw == "nms" else least  # the yaw vector's length is 0

@@ -72,19 +72,12 @@ def test_reference_sampling_and_gradients(case_of):
     @jax.jit
     def run(value, locations, weights, cotangent):
         out, pull = jax.vjp(
-            lambda *a: plain_samples(a[0], sizes, *a[1:]),
-            value,
-            locations,
-            weights,
+            lambda value, *a: plain_samples(value, sizes, *a), value, locations, weights
         )
         return out, pull(cotangent)
 
-    out, (grad_value, grad_locations, grad_weights) = run(
-        case["value"],
-        case["sampling_locations"],
-        case["attention_weights"],
-        case["cotangent"],
-    )
+    names = ("value", "sampling_locations", "attention_weights", "cotangent")
+    out, (grad_value, grad_locations, grad_weights) = run(*(case[n] for n in names))
     np.testing.assert_allclose(out, case["output"], atol=1e-5)
     np.testing.assert_allclose(grad_value, case["grad_value"], atol=1e-5)
     np.testing.assert_allclose(grad_weights, case["grad_weights"], atol=1e-5)
@@ -140,14 +133,8 @@ def test_initial_offsets_form_rings(shared, features, heads, points):
     file = np.load(shared / "fixtures" / "deform_attn" / "deform_attn.npz")
     expected = file[f"initial_bias__d{features}_l1_h{heads}_p{points}"]
     module = DeformableAttention(features, heads, points)
-    params = jax.jit(module.init)(
-        jax.random.key(0),
-        jnp.zeros((1, 1, features)),
-        jnp.zeros((1, 1, 1)),
-        jnp.zeros((1, 1, 1, 2)),
-        jnp.zeros((1, 1, 1)),
-        jnp.zeros((1, 2, 2, features)),
-    )["params"]
+    shapes = (1, 1, features), (1, 1, 1), (1, 1, 1, 2), (1, 1, 1), (1, 2, 2, features)
+    params = jax.jit(module.init)(jax.random.key(0), *map(jnp.zeros, shapes))["params"]
     np.testing.assert_allclose(params["sampling_offsets"]["bias"], expected, atol=1e-5)
     for name in ("sampling_offsets", "attention_weights"):
         assert not params[name]["kernel"].any()

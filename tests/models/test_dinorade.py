@@ -67,14 +67,8 @@ def test_shapes_and_parts():
     chex.assert_shape(maps.heatmap_logits, (B, R, A, 2))
     chex.assert_shape(maps.box_params, (B, R, A, 8))
     chex.assert_tree_all_finite(maps)
-    assert set(variables["params"]) == {
-        "backbone",
-        "neck",
-        "heads",
-        "image_backbone",
-        "image_neck",
-        "image_fusion",
-    }
+    radar, image = {"backbone", "neck", "heads"}, ("backbone", "neck", "fusion")
+    assert set(variables["params"]) == radar | {f"image_{name}" for name in image}
 
 
 def test_radar_parts_have_the_names_of_radenet():

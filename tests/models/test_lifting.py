@@ -72,9 +72,10 @@ def check_official(reference, index, points, is_valid):
 
 def test_released_reference_points(golden):
     file = np.load(golden / "dinorade_geometry.npz")
-    calibration = official_calibration(golden)
-    axes = LiftingAxes.official()
-    camera = calibration.camera("pinhole")
+    axes, camera = (
+        LiftingAxes.official(),
+        official_calibration(golden).camera("pinhole"),
+    )
     on_host = lifting.reference_points(camera, axes, 256, 112, "official")
     chex.assert_shape(on_host.points, (1, 256, 112, 10, 2))
     assert on_host.points.dtype == np.float32

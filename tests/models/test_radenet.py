@@ -153,11 +153,6 @@ def test_build_takes_a_config_dict(small):
     assert model == models.build(small)
 
 
-def test_build_names_unknown_fields(small):
-    with pytest.raises(UserError, match=r"config.model.width is not a field"):
-        models.build(small | {"width": 3})
-
-
 def test_every_field_is_required(small):
     for field in set(small) - {"name"}:
         with pytest.raises(UserError, match=rf"config.model.{field} is missing"):
