@@ -12,7 +12,7 @@ import pathlib
 import numpy as np
 
 from radejax.evaluation import PROTOCOLS, EvaluationSet, mean_ap
-from radejax.evaluation.tables import Table, number
+from radejax.evaluation.report import Table, number
 
 
 def load(folder: pathlib.Path) -> tuple[EvaluationSet, np.ndarray]:

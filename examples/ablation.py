@@ -50,10 +50,15 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.evaluation import bootstrap
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
-from radejax.evaluation.results import repair_sizes
+from radejax.evaluation.report import rendered
+from radejax.evaluation.results import (
+    interval,
+    repair_sizes,
+    resample,
+    sequence_weights,
+)
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.config import plain
@@ -221,12 +226,10 @@ def resampled(
     data = EvaluationSet(truth, found, classes=classes, frames=frames, roi=roi)
     sequence, result = np.asarray(frames["sequence"]), {}
     for condition, mask in conditions(work, frames).items():
-        weights = bootstrap.sequence_weights(
-            sequence[mask], resamples=resamples, seed=0
-        )
+        weights = sequence_weights(sequence[mask], resamples=resamples, seed=0)
         weights = np.concatenate([np.ones_like(weights[:1]), weights])
         cut = config.evaluation.score_threshold
-        aps = bootstrap.resample(
+        aps = resample(
             data.of_frames(mask), weights, "all_point", "bev", 0.3, score_threshold=cut
         )
         result[condition] = aps.astype(np.float32)
@@ -285,7 +288,7 @@ class Comparer:
             return {}
         ap_a, ap_b = (self.mean(name, seeds, condition) for name in (a, b))
         gaps = (ap_a - ap_b)[:, (*CLASSES, "mean").index(cls)]
-        low, high = bootstrap.interval(gaps[1:])
+        low, high = interval(gaps[1:])
         return {"difference": float(gaps[0]), "low": low, "high": high}
 
     def claims(self) -> Iterator[dict[str, Any]]:
@@ -313,9 +316,9 @@ def write_tables(
     path = work.out / f"table_{table}"
     files.write_json(path.with_suffix(".json"), content)
     for suffix, style in ((".md", "markdown"), (".tex", "latex")):
-        text = "\n".join(t.render(style) for t in made)
+        text = rendered(made, style, is_simulated=True)
         files.write_text(path.with_suffix(suffix), text)
-    click.echo("\n".join(t.render() for t in (made[0], made[-1])))
+    click.echo(rendered([made[0], made[-1]], is_simulated=True))
     click.echo(f"written to {path}.md, .tex and .json")
 
 

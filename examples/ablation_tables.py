@@ -8,7 +8,7 @@ from typing import Any
 from ablation_studies import Study
 
 from radejax.core.structures import CLASSES
-from radejax.evaluation.tables import Table, number
+from radejax.evaluation.report import Table, number
 
 
 def interval_text(row: Mapping[str, Any]) -> str:
@@ -51,7 +51,4 @@ def tables(study: Study, rows: list[dict], claims: list[dict]) -> list[Table]:
         for claim in claims
     ]
     head = ["Claim", "A", "B", "Class", "A - B", "Seeds", "Verdict"]
-    return [
-        table.marked(is_simulated=True)
-        for table in [*result, Table(f"{study.title}: claims", head, body)]
-    ]
+    return [*result, Table(f"{study.title}: claims", head, body)]

@@ -24,7 +24,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
 from radejax.evaluation.matching import Pairs, match_free, ranges
 from radejax.evaluation.protocols import pooled_curve
-from radejax.evaluation.tables import Table, number
+from radejax.evaluation.report import Table, number
 from radejax.geometry.rotated_iou import bev_iou
 
 DISTANCES_M = (
@@ -55,14 +55,9 @@ def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float
     """All-point AP of one class in percent."""
     chosen = np.flatnonzero(data.pred.cls == cls)
     order = chosen[np.argsort(-data.pred.score[chosen], kind="stable")]
-    curve = pooled_curve(
-        score=data.pred.score[order],
-        is_tp=match[order] >= 0,
-        weight=np.ones(order.size),
-        num_gt=int((data.gt.cls == cls).sum()),
-        curve="all_point",
-    )
-    return curve.ap
+    num_gt = int((data.gt.cls == cls).sum())
+    score, is_tp = data.pred.score[order], match[order] >= 0
+    return pooled_curve(score, is_tp, np.ones(order.size), num_gt, "all_point").ap
 
 
 def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,8 +145,7 @@ def main(report: pathlib.Path, within: tuple[float, ...]) -> None:
         title = f"centers within {farthest:g} m: median errors, fraction of overlapping boxes"
         rows = list(error_rows(data, matched(data, farthest)))
         for table in (ap_table(data, within), Table(title, head, rows)):
-            made = table.marked(is_simulated=data.is_simulated)
-            click.echo(made.render())
+            click.echo(table.render(is_simulated=data.is_simulated))
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import KRadar
 from radejax.data.projection import decode
 from radejax.data.records import Records, open_projections
-from radejax.evaluation.files import tables_from_frames
+from radejax.evaluation.boxes import tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions
 from radejax.simulation.radar.tensor import RadarParameters

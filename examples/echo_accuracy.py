@@ -24,7 +24,7 @@ from radejax.cli import entry
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.evaluation.boxes import in_roi
-from radejax.evaluation.tables import Table, number
+from radejax.evaluation.report import Table, number
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
 from radejax.simulation.simulator import SequenceSimulator, make_source
@@ -110,7 +110,7 @@ def table(config: SimulationConfig, cls: str) -> Table:
         )
     title = f"echo position of class {cls}, {config.make_grid().num_range} range bins"
     head = ["Distance", "Objects", "Echo - center m", "Range m", "Azimuth m"]
-    return Table(title, [*head, "IoU > 0.3"], rows).marked(is_simulated=True)
+    return Table(title, [*head, "IoU > 0.3"], rows)
 
 
 @click.command()
@@ -140,7 +140,8 @@ def main(
         values |= {"seed": seed, "train_sequences": scenes, "test_sequences": 0}
         values |= {"frames_per_sequence": 1, "vru_density_scale": 5.0}
         values |= FULL_SIZE if full_size else {}
-        click.echo(table(SimulationConfig.from_mapping(values), cls).render())
+        found = table(SimulationConfig.from_mapping(values), cls)
+        click.echo(found.render(is_simulated=True))
 
 
 if __name__ == "__main__":

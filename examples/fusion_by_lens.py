@@ -22,10 +22,11 @@ from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.kradar.dataset import SIMULATION_MARKER as MARKER
-from radejax.evaluation import bootstrap
+from radejax.evaluation.boxes import frame_keys
+from radejax.evaluation.comparison import compare
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files import Source, frame_keys, load
-from radejax.evaluation.results import repair_sizes
+from radejax.evaluation.files import Source, load
+from radejax.evaluation.results import interval, repair_sizes, sequence_weights
 from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_name, data_of_run
 from radejax.runs.figures import average_shares, frame_shares, mean_share
@@ -95,7 +96,7 @@ def share_rows(share, sequence, groups, resamples):
         groups: `[F]` masks by condition.
         resamples: Number of resamples of sequences, for 95 % intervals.
     """
-    counts = bootstrap.sequence_weights(sequence, resamples=resamples, seed=0)
+    counts = sequence_weights(sequence, resamples=resamples, seed=0)
     counts = np.concatenate([np.ones((1, len(share))), counts])
     counts[:, np.isnan(share)] = 0.0
     share = np.nan_to_num(share)
@@ -107,7 +108,7 @@ def share_rows(share, sequence, groups, resamples):
     for name, values in means.items():
         row = {"condition": name, "frames": int(counts[0, groups[name]].sum())}
         for what, sample in (("share", values), ("difference", values - means["all"])):
-            low, high = bootstrap.interval(sample[1:])
+            low, high = interval(sample[1:])
             row |= {what: float(sample[0]), f"{what} low": low, f"{what} high": high}
         yield row
 
@@ -119,7 +120,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
         evaluation_set(report, tuple(config.classes), tuple(options.roi), chosen)
         for report in reports
     )
-    found = bootstrap.compare(
+    found = compare(
         radar[0],
         fusion[0],
         radar[1],

@@ -16,7 +16,7 @@ import click
 
 from radejax.cli import entry
 from radejax.core.config import load_config
-from radejax.evaluation import bootstrap, tables
+from radejax.evaluation.comparison import compare, comparison_table
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
 from radejax.evaluation.results import repair_sizes
@@ -44,7 +44,7 @@ def compared(config, radar, fusion, resamples):
         settings = {"classes": tuple(config.classes), "frames": frames}
         roi = tuple(config.evaluation.roi)
         sets.append(EvaluationSet(truth, found, roi=roi, **settings))
-    return bootstrap.compare(
+    return compare(
         *sets,
         frames["sequence"],
         protocol_names=("all_point",),
@@ -76,8 +76,8 @@ def main(workdir, options, seed, resamples):
             folder = pathlib.Path(workdir) / kind
             folders.append(experiment.run(config, name="silhouettes", workdir=folder))
         rows = compared(config, *folders, resamples)
-        table = tables.comparison(rows, "radar", "radar and silhouettes")
-        click.echo(table.marked(is_simulated=True).render())
+        table = comparison_table(rows, "radar", "radar and silhouettes")
+        click.echo(table.render(is_simulated=True))
         click.echo(
             f"gain of +{MIN_GAIN:g} in the mean: {'yes' if is_met(rows) else 'no'}"
         )

@@ -78,11 +78,9 @@ _SETTINGS = together(
 _FILES = together(
     _DATA,
     click.option(
-        "--ground-truth", help="Ground-truth file, or folder of a report or of a run."
-    ),
-    click.option(
-        "--frames",
-        help="Frame table of --ground-truth. Default: frames.json next to it.",
+        "--ground-truth",
+        help="Ground-truth file with frames.json next to it, or folder of a report or of a "
+        "run.",
     ),
     click.option(
         "--z-offset",
@@ -160,7 +158,7 @@ def score(
 
     Example: radejax score found.json --data /data/kradar --out results
     """
-    from radejax.evaluation.report import evaluate_files
+    from radejax.evaluation.files import evaluate_files
 
     path = pathlib.Path(predictions)
     folder = out or path.with_name(f"{path.stem}_evaluation")
@@ -182,7 +180,7 @@ def compare(
 
     Example: radejax compare runs/a/evaluation runs/b/evaluation
     """
-    from radejax.evaluation.report import compare_files
+    from radejax.evaluation.comparison import compare_files
 
     source, settings = _source_and_settings(options, bootstrap=2000)
     text, rows = compare_files(runs, out, source, settings)

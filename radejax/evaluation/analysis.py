@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from radejax.evaluation import protocols
 from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.results import condition_masks
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
@@ -40,8 +40,8 @@ def matched_objects(
         >>> matched_objects(data, "bev", 0.5).tolist()
         [0]
     """
-    match = data.match(protocols.PROTOCOLS[protocols.RECOMMENDED], space, iou)
-    assert isinstance(match, np.ndarray)  # the recommended protocol is not K-Radar's
+    match = data.match("plain", "free", space, iou)
+    assert isinstance(match, np.ndarray)  # K-Radar's rule alone gives something else
     return match
 
 
@@ -109,13 +109,7 @@ def _numbers(
     order = order[in_pred[order]]
     score, is_tp = data.score[order], match[order] >= 0
     num_gt = int((in_gt & (data.gt.cls == cls)).sum())
-    curve = protocols.pooled_curve(
-        score=score,
-        is_tp=is_tp,
-        weight=np.ones_like(order),
-        num_gt=num_gt,
-        curve="all_point",
-    )
+    curve = pooled_curve(score, is_tp, np.ones_like(order), num_gt, "all_point")
     above = score > OPERATING_SCORE
     num_det, found = int(above.sum()), int(is_tp[above].sum())
     return {

@@ -1,14 +1,20 @@
-"""Tables of ground truth, predictions and frames: column arrays, checked once."""
+"""Tables of ground truth, predictions and frames: column arrays, checked once.
+
+A frame is named by its id in the frame table (an integer) or by its key "sequence/name",
+such as "1/00033_00001" (K-Radar's label file, with or without .txt).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Real, Shaped
 from numpy.typing import ArrayLike
 
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import PathLike, atomic_write
 from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS, Boxes
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
@@ -70,10 +76,9 @@ def roi_name(roi: Roi) -> str:
         >>> roi_name("narrow"), roi_name(None), roi_name([0, 72, -6, 6, -2, 6])
         ('narrow', 'none', '0,72,-6,6,-2,6')
     """
-    if roi is None or isinstance(roi, str):
-        return roi or "none"
     bounds = roi_bounds(roi)
-    assert bounds is not None  # only None has none
+    if bounds is None:
+        return "none"
     names: dict[tuple[float, ...], str] = {value: name for name, value in ROIS.items()}
     return names.get(bounds) or ",".join(f"{value:g}" for value in bounds)
 
@@ -215,6 +220,54 @@ def take(table: AnyColumns, rows: Shaped[np.ndarray, " K"]) -> Columns:
     return {name: np.asarray(column)[rows] for name, column in table.items()}
 
 
+def tables_from_frames(
+    frames: Iterable[Any], split: str | None = None
+) -> tuple[Columns, Columns]:
+    """Ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
+
+    Args:
+        frames: Objects with sequence, name, weather, environment, time, is_simulated,
+            boxes `[N, 7]` (radar frame) and classes `[N]` (names).
+        split: Of the dataset, for the frame table: "train", "test", "all" or a split
+            file; None where it is not known.
+
+    Returns:
+        Ground-truth columns and frame columns; the frame id is the position.
+    """
+    frames = list(frames)
+    counts = [len(frame.boxes) for frame in frames]
+    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
+    cls = [str(name) for frame in frames for name in frame.classes]
+    ground_truth = {
+        "frame": np.repeat(np.arange(len(frames)), counts),
+        "box": np.concatenate(box) if box else np.zeros((0, 7)),
+        "cls": np.array(cls, dtype=str),
+    }
+    table = {"frame": np.arange(len(frames))}
+    for column in ("sequence", "name", "weather", "environment", "time"):
+        table[column] = np.array([getattr(frame, column) for frame in frames])
+    table["simulated"] = np.array([frame.is_simulated for frame in frames], bool)
+    if split is not None:
+        table["split"] = np.full(len(frames), str(split))
+    return ground_truth, table
+
+
+def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
+    """Write boxes as columns in a .npz file; `files.read_table` reads them.
+
+    Frames are written by key where the frame table has names, which survives another
+    selection or order of frames, and by id otherwise.
+    """
+    columns = {
+        name: column for name, column in vars(boxes).items() if column is not None
+    }
+    if "name" in frames:
+        position = frame_positions(boxes.frame, frame_ids(frames), str(path))
+        columns["frame"] = np.array(frame_keys(frames), dtype=str)[position]
+    with atomic_write(path) as file:
+        np.savez_compressed(file, **columns)
+
+
 # Frames by name -----------------------------------------------------------------------
 
 
@@ -226,19 +279,14 @@ def frame_keys(frames: Columns) -> list[str]:
         ['5/00012_00001']
     """
     if "name" not in frames:
-        return [str(frame) for frame in np.asarray(frames["frame"]).tolist()]
-    names = [_without_suffix(name) for name in np.asarray(frames["name"]).tolist()]
+        return [str(frame) for frame in frames["frame"]]
+    names = [str(name).removesuffix(".txt") for name in frames["name"]]
     if "sequence" not in frames:
         return names
-    sequences = np.asarray(frames["sequence"]).tolist()
     return [
         name if "/" in name else f"{sequence}/{name}"
-        for name, sequence in zip(names, sequences, strict=True)
+        for name, sequence in zip(names, frames["sequence"], strict=True)
     ]
-
-
-def _without_suffix(name: object) -> str:
-    return str(name).removesuffix(".txt")
 
 
 def with_ids(
@@ -265,7 +313,7 @@ def with_ids(
     named = np.asarray(table["frame"])
     if named.dtype.kind in "iu" or not named.size:
         return {**table, "frame": named.astype(np.int64)}
-    names = [_without_suffix(name) for name in named.tolist()]
+    names = [str(name).removesuffix(".txt") for name in named]
     known: dict[str, int] = {}
     if frames is not None:
         ids = np.asarray(frames["frame"]).tolist()

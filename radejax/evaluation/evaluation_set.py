@@ -28,52 +28,38 @@ MAX_PAIRS = 1_000_000
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """One average precision and everything that it depends on.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Result(Curve):
+    """One average precision, its curve, and everything that it depends on.
 
     Attributes:
         cls: Class name; in reports also "mean", over the classes that occur.
         space: "bev" or "3d".
         iou: IoU threshold; a match needs more.
-        ap: Average precision, 0 to 100. Without any object of the class it is NaN, except
-            in K-Radar's protocols, which define it as 0; see `is_defined`.
-        num_gt: Objects of the class in the frames that take part.
-        num_det: Predictions of the class in those frames above the score threshold.
         protocol: Name of the protocol.
         num_frames: Frames that take part.
         score_threshold: Predictions need a score above this.
         empty_frames: Frames that were ignored: "class", "frame" or "none".
         roi: Name of the region of interest.
         label_version: Label revision of the ground truth, if known.
-        precision: Precision along the curve (K-Radar: after making it monotone).
-        recall: Recall along the curve.
-        score: Score threshold along the curve, descending.
         is_simulated: Whether the frames are simulated.
-        kind: "all", or the column of the frame table that `condition` is a value of.
-        condition: "all", or for example a weather.
-        low: Lower end of the 95 % bootstrap interval, or None.
+        condition: "all", or a weather.
+        low: Lower end of the 95 % bootstrap interval; None if it was not computed, NaN if
+            the class does not occur.
         high: Upper end.
     """
 
     cls: str
     space: str
     iou: float
-    ap: float
-    num_gt: int
-    num_det: int
     protocol: str
     num_frames: int
     score_threshold: float
     empty_frames: str
     roi: str
     label_version: str | None
-    precision: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
-    recall: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
-    score: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
-    is_simulated: bool = False
-    kind: str = "all"
-    condition: str = "all"
+    is_simulated: bool
+    condition: str
     low: float | None = None
     high: float | None = None
 
@@ -128,6 +114,8 @@ class EvaluationSet:
             order, with positions in `frame` and in `classes` as their frame and cls.
         pred: Predictions of the classes inside the region, likewise.
         score: Scores of `pred`.
+        ground_truth: All objects as given.
+        predictions: All predictions as given.
         left_out: Counts of boxes that do not take part, by reason.
         roi: Name of the region.
         label_version: Label revision or None.
@@ -153,11 +141,12 @@ class EvaluationSet:
         self.label_version = label_version
         truth = boxes.read_boxes(ground_truth, "ground truth", scored=False)
         found = boxes.read_boxes(predictions, "predictions", scored=True)
+        self.ground_truth, self.predictions = truth, found
         if frames is None:
             frames = {"frame": np.union1d(truth.frame, found.frame)}
         self.frame = boxes.frame_ids(frames)
         self.is_simulated = bool(np.any(frames.get("simulated", False)))
-        self._roi, self._tables = roi, (truth, found)
+        self._roi = roi
         self.left_out: dict[str, int] = {}
         self.gt, _ = self._select(truth, "ground truth")
         self.pred, self._pred_row = self._select(found, "predictions")
@@ -201,16 +190,12 @@ class EvaluationSet:
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
-    @property
-    def predictions(self) -> Boxes:
-        """The predictions as given."""
-        return self._tables[1]
-
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """The set of some frames, for many evaluations of a condition."""
         ids = self.frame[is_chosen]
+        tables = self.ground_truth, self.predictions
         return EvaluationSet(
-            *(table.take(np.isin(table.frame, ids)) for table in self._tables),
+            *(table.take(np.isin(table.frame, ids)) for table in tables),
             classes=self.classes,
             frames={"frame": ids, "simulated": np.full(ids.size, self.is_simulated)},
             roi=self._roi,
@@ -228,9 +213,9 @@ class EvaluationSet:
 
     def overlap(self, geometry: str, space: str) -> Float[np.ndarray, " P"]:
         """IoU of the candidate pairs under a protocol's geometry."""
-        return self._once(self._overlaps, geometry)[SPACES.index(space)]
+        return self._once(self._overlap, geometry)[SPACES.index(space)]
 
-    def _overlaps(self, geometry: str) -> Float[np.ndarray, "2 P"]:
+    def _overlap(self, geometry: str) -> Float[np.ndarray, "2 P"]:
         """BEV and 3D IoU of the candidate pairs, of one intersection each."""
         truth, found = self.gt.box, self.pred.box
         if geometry != "plain":
@@ -256,11 +241,8 @@ class EvaluationSet:
         # The original stores overlaps in single and compares them in double precision.
         return values.astype(np.float32).astype(np.float64)
 
-    def match(self, protocol: Protocol, space: str, iou: float) -> Matches:
+    def match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
         """Matches of all frames and classes: `KradarMatches` or each one's object or -1."""
-        return self._match_by(protocol.geometry, protocol.matching, space, iou)
-
-    def _match_by(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
         if geometry == "swapped_lw_z_top" and space == "bev":
             geometry = "swapped_lw"  # z plays no part
         return self._once(self._match, geometry, rule, space, iou)
@@ -294,7 +276,7 @@ class EvaluationSet:
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
         curves: bool = True,
-        condition: tuple[str, str] = ("all", "all"),
+        condition: str = "all",
     ) -> list[Result]:
         """Results in one protocol, over all frames or over weighted ones.
 
@@ -306,7 +288,7 @@ class EvaluationSet:
             spaces: As in `evaluate`.
             weights: bool or int weight of every frame; a condition is a mask.
             curves: Keep the precision, recall and score arrays.
-            condition: Kind and condition that the weights stand for.
+            condition: Weather that the weights stand for.
         """
         chosen = protocols.get_protocol(protocol)
         empty_frames = chosen.resolve_empty_frames(empty_frames)
@@ -339,8 +321,7 @@ class EvaluationSet:
                 roi=self.roi,
                 label_version=self.label_version,
                 is_simulated=self.is_simulated,
-                kind=condition[0],
-                condition=condition[1],
+                condition=condition,
                 **(vars(curve) | dropped),
             )
             results.append(result)
@@ -369,8 +350,8 @@ class EvaluationSet:
     ) -> Curve:
         """Curve and AP of one class over weighted frames."""
         # Protocols that match alike share their rankings.
-        rule = protocol.geometry, protocol.matching
-        ranked = self._once(self._ranking, *rule, space, iou, score_threshold, cls)
+        matching_terms = protocol.geometry, protocol.matching, space, iou
+        ranked = self._once(self._ranking, *matching_terms, score_threshold, cls)
         num_gt = int(weight @ self.gt_count[:, cls])
         if protocol.matching == "kradar":
             matched, events, detections = (
@@ -381,11 +362,7 @@ class EvaluationSet:
             )
         ((score, frame, is_tp),) = ranked
         return protocols.pooled_curve(
-            score=score,
-            is_tp=is_tp,
-            weight=weight[frame],
-            num_gt=num_gt,
-            curve=protocol.curve,
+            score, is_tp, weight[frame], num_gt, protocol.curve
         )
 
     def _ranking(
@@ -403,7 +380,7 @@ class EvaluationSet:
         protocols the counts that they add instead: to the matches of the first pass, to
         the true positives of the second, and to the predictions.
         """
-        match = self._match_by(geometry, rule, space, iou)
+        match = self.match(geometry, rule, space, iou)
         mine = self.by_score[cls]
         if isinstance(match, matching.KradarMatches):
             counted = [

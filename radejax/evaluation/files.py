@@ -1,18 +1,15 @@
-"""Ground truth, predictions and frames from files, and the files that are written.
+"""Ground truth, predictions and frames from files, and their report: `radejax score`.
 
 Formats: .npz (reports), .json with a list of records (what `radejax detect` writes, one
 file or a folder of them), and folders in K-Radar's KITTI layout (`evaluation.kitti`). A
-table has the columns frame, cls, box and, for predictions, score. A frame is named by its
-id in the frame table (an integer) or by its key "sequence/name", such as
-"1/00033_00001" (K-Radar's label file, with or without .txt).
+table has the columns frame, cls, box and, for predictions, score.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import pathlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,14 +21,18 @@ from radejax.core.files import PathLike
 from radejax.core.structures import BOX_FIELDS
 from radejax.data.kradar import KRadar
 from radejax.evaluation.boxes import (
-    AnyColumns,
     Columns,
     frame_ids,
-    frame_keys,
+    tables_from_frames,
     take,
     with_ids,
 )
 from radejax.evaluation.kitti import read_kitti
+from radejax.evaluation.report import Report, write_report
+from radejax.evaluation.results import EvaluationOptions
+
+LOW_SCORE = 0.1
+"""Predictions stored from a higher score on are too few for AP without a threshold."""
 
 # Tables -------------------------------------------------------------------------------
 
@@ -118,74 +119,6 @@ def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
         yield frame, cls, box, score
 
 
-def write_table(
-    path: PathLike, table: AnyColumns, frames: Columns | None = None
-) -> None:
-    """Write columns as .npz, or as .json records; `read_table` gives the same back.
-
-    Args:
-        path: The file; its suffix chooses the format. It is written whole or not at all.
-        table: Columns frame, box, cls and, for predictions, score.
-        frames: Frame table; with it frames are written by key, which survives another
-            selection or order of frames, and without it by id.
-    """
-    path = pathlib.Path(path)
-    frame = np.asarray(table["frame"], np.int64)
-    if frames is not None:
-        ids = np.asarray(frames["frame"]).tolist()
-        keys = dict(zip(ids, frame_keys(frames), strict=True))
-        frame = np.array([keys[i] for i in frame.tolist()], dtype=str)
-    columns = {
-        "frame": frame,
-        "cls": np.asarray(table["cls"], dtype=str),
-        "box": np.asarray(table["box"], np.float64).reshape(-1, 7),
-    }
-    if "score" in table:
-        columns["score"] = np.asarray(table["score"], np.float64)
-    if path.suffix == ".npz":
-        with files.atomic_write(path) as file:
-            # NumPy's signature has `allow_pickle`, which no column is named.
-            np.savez_compressed(file, **columns)  # type: ignore[arg-type]
-    elif path.suffix == ".json":
-        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        records = [dict(zip(columns, row, strict=True)) for row in rows]
-        files.write_text(path, json.dumps(records))
-    else:
-        raise UserError(f"{path}: cannot write '{path.suffix}'; known: .npz, .json")
-
-
-def tables_from_frames(
-    frames: Iterable[Any], split: str | None = None
-) -> tuple[Columns, Columns]:
-    """Ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
-
-    Args:
-        frames: Objects with sequence, name, weather, environment, time, is_simulated,
-            boxes `[N, 7]` (radar frame) and classes `[N]` (names).
-        split: Of the dataset, for the frame table: "train", "test", "all" or a split
-            file; None where it is not known.
-
-    Returns:
-        Ground-truth columns and frame columns; the frame id is the position.
-    """
-    frames = list(frames)
-    counts = [len(frame.boxes) for frame in frames]
-    box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
-    cls = [str(name) for frame in frames for name in frame.classes]
-    ground_truth = {
-        "frame": np.repeat(np.arange(len(frames)), counts),
-        "box": np.concatenate(box) if box else np.zeros((0, 7)),
-        "cls": np.array(cls, dtype=str),
-    }
-    table = {"frame": np.arange(len(frames))}
-    for column in ("sequence", "name", "weather", "environment", "time"):
-        table[column] = np.array([getattr(frame, column) for frame in frames])
-    table["simulated"] = np.array([frame.is_simulated for frame in frames], bool)
-    if split is not None:
-        table["split"] = np.full(len(frames), str(split))
-    return ground_truth, table
-
-
 # Predictions with their ground truth --------------------------------------------------
 
 
@@ -198,9 +131,8 @@ class Source:
         labels: Folder or zip of a label revision.
         label_version: v1.0, v1.1, v2.0 or v2.1.
         split: "train", "test", a split file, or "all" for every frame.
-        ground_truth: File of ground truth instead, or the folder of a report or a run.
-        frames: JSON file of the frame table (columns) for `ground_truth`; by default the
-            `frames.json` in the same folder.
+        ground_truth: File of ground truth instead, or the folder of a report or a run;
+            `frames.json` in the same folder is its frame table.
         sequences: Only frames of these; all if empty.
         weather: Likewise.
         z_offset_m: Added to the z of predictions.
@@ -212,7 +144,6 @@ class Source:
     label_version: str = "v2.1"
     split: str = "test"
     ground_truth: str | None = None
-    frames: str | None = None
     sequences: tuple[int, ...] = ()
     weather: tuple[str, ...] = ()
     z_offset_m: float = 0.0
@@ -280,9 +211,8 @@ def _load_ground_truth(
         truth = pathlib.Path(source.ground_truth)
         of_report = (truth / "ground_truth.npz", truth / "evaluation/ground_truth.npz")
         truth = next((place for place in of_report if place.is_file()), truth)
-        table = pathlib.Path(source.frames or truth.with_name("frames.json"))
-        has_frames = source.frames is not None or table.is_file()
-        frames = _read_frames(table) if has_frames else None
+        table = truth.with_name("frames.json")
+        frames = _read_frames(table) if table.is_file() else None
         return read_table(truth, frames, scored=False), frames, {}
     if source.data or source.labels:
         data = KRadar(
@@ -304,9 +234,9 @@ def _load_ground_truth(
 
 
 def stored_from(path: PathLike) -> float:
-    """Score from which on predictions were stored, as the report of a run says; or 0."""
+    """Score from which on predictions were stored, as their report says; or 0."""
     path = pathlib.Path(path)
-    if not (path / "source.json").is_file() or not (path / "metrics.json").is_file():
+    if not (path / "metrics.json").is_file():
         return 0.0
     return float(files.read_json(path / "metrics.json")["options"]["min_score"])
 
@@ -322,3 +252,35 @@ def _read_frames(path: PathLike) -> Columns:
     except (TypeError, ValueError) as error:
         raise DataError(f"{path} is no table of frames: {error}") from None
     return columns
+
+
+# The report ---------------------------------------------------------------------------
+
+
+def evaluate_files(
+    path: PathLike,
+    out_dir: PathLike,
+    source: Source,
+    options: EvaluationOptions,
+    *,
+    run: str = "radejax",
+) -> Report:
+    """Evaluate predictions in files and write the report; see `load` for errors."""
+    truth, found, frames, left_out = load(path, source, options.classes)
+    warnings, low = [], stored_from(path)
+    if low > max(LOW_SCORE, options.score_threshold):
+        warnings.append(
+            f"{path} has predictions from score {low:g} on only, and every number is of "
+            "these; `radejax evaluate` with --min-score stores lower ones"
+        )
+    options = dataclasses.replace(options, min_score=max(low, options.min_score))
+    return write_report(
+        truth,
+        found,
+        frames,
+        out_dir,
+        options,
+        run=run,
+        left_out=left_out,
+        warnings=warnings,
+    )

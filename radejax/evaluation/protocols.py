@@ -67,7 +67,8 @@ RECOMMENDED = "all_point"
 
 
 def _kradar(name: str, geometry: Geometry, curve: CurveKind, summary: str) -> Protocol:
-    return Protocol(name, geometry, "kradar", curve, "frame", f"K-Radar's {summary}")
+    summary = f"K-Radar's evaluation, {summary}"
+    return Protocol(name, geometry, "kradar", curve, "frame", summary)
 
 
 def _radenet(curve: CurveKind, summary: str) -> Protocol:
@@ -76,24 +77,9 @@ def _radenet(curve: CurveKind, summary: str) -> Protocol:
 
 
 _ALL = (
-    _kradar(
-        "kradar_r40",
-        "swapped_lw",
-        "r40",
-        "revised evaluation as published (length and width swapped)",
-    ),
-    _kradar(
-        "kradar_r40_corrected",
-        "rounded",
-        "r40",
-        "revised evaluation with the yaw right",
-    ),
-    _kradar(
-        "kradar_r11",
-        "swapped_lw_z_top",
-        "r11",
-        "older evaluation: 11 of 41 samples, z as the top of a box",
-    ),
+    _kradar("kradar_r40", "swapped_lw", "r40", "revised, length and width swapped"),
+    _kradar("kradar_r40_corrected", "rounded", "r40", "revised, with the yaw right"),
+    _kradar("kradar_r11", "swapped_lw_z_top", "r11", "older, z as the top of a box"),
     _radenet("voc11", "11 recall levels"),
     _radenet("recall41", "41 recall levels"),
     _radenet("coco101", "101 recall levels (RADE-Net, DinoRADE)"),
@@ -133,19 +119,19 @@ class Curve:
     Attributes:
         ap: Average precision, 0 to 100; NaN where no object exists, except that
             K-Radar's protocols give 0 then.
-        num_gt: Objects counted.
-        num_det: Predictions counted.
+        num_gt: Objects in the frames that take part.
+        num_det: Predictions in those frames above the score threshold.
         precision: Precision at each sample (K-Radar: made monotone; others: raw).
         recall: Recall at each sample.
-        score: Score threshold of each sample.
+        score: Score threshold of each sample, descending.
     """
 
     ap: float
     num_gt: int
     num_det: int
-    precision: Float[np.ndarray, " K"]
-    recall: Float[np.ndarray, " K"]
-    score: Float[np.ndarray, " K"]
+    precision: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    recall: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+    score: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
 
 
 def score_thresholds(
@@ -244,7 +230,6 @@ def _sum_at_least(
 
 
 def pooled_curve(
-    *,
     score: Float[np.ndarray, " M"],
     is_tp: Bool[np.ndarray, " M"],
     weight: Real[np.ndarray, " M"],
@@ -262,8 +247,7 @@ def pooled_curve(
 
     Examples:
         >>> score, is_tp = np.array([0.9, 0.8, 0.6]), np.array([True, False, True])
-        >>> round(pooled_curve(
-        ...     score=score, is_tp=is_tp, weight=np.ones(3), num_gt=2, curve="all_point").ap, 2)
+        >>> round(pooled_curve(score, is_tp, np.ones(3), 2, "all_point").ap, 2)
         83.33
     """
     counts = weight > 0  # a frame left out must not leave a point at recall 0 either

@@ -1,36 +1,45 @@
-"""The report of an evaluation: console text, JSON, CSV, Markdown, LaTeX, figures."""
+"""The report of an evaluation: console text, JSON, CSV, Markdown, LaTeX, figures.
+
+The numbers of the result tables of the RADE-Net and DinoRADE papers are in
+`published.csv`, one line per class, space and IoU threshold of a printed row, in the
+order of the papers: average precisions in percent, "-" where a paper prints that, nothing
+where its table has no such column. Values of 0.99 (1/101, the lower bound of the protocol)
+are kept as printed. A difference to a published row is printed only where protocol,
+labels, region and split agree. Results of simulated frames are not printed next to them.
+
+References:
+    RADE-Net: Leitgeb et al., "RADE-Net: Robust Attention Network for Radar-Only Object
+    Detection in Adverse Weather", tables I to III.
+    DinoRADE: Leitgeb et al., arXiv:2604.08074, tables 1 to 4.
+"""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import importlib.resources
 import itertools
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from tabulate import tabulate
 
 from radejax.core import files
-from radejax.core.errors import UserError
 from radejax.core.files import PathLike
-from radejax.evaluation import analysis, bootstrap, protocols, tables
-from radejax.evaluation.boxes import Columns
-from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result
-from radejax.evaluation.files import Source, load, stored_from, write_table
+from radejax.data.kradar.conditions import WEATHERS
+from radejax.evaluation import analysis, protocols
+from radejax.evaluation.boxes import Columns, roi_name, write_boxes
+from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.results import (
     EvaluationOptions,
-    compute_results,
     condition_masks,
     evaluate_tables,
     exclusion_counts,
-    repair_sizes,
     to_row,
     why_no_intervals,
 )
-
-LOW_SCORE = 0.1
-"""Predictions stored from a higher score on are too few for AP without a threshold."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +80,7 @@ def write_report(
             weather, environment, time, simulated and split.
         out_dir: Folder of the report; files in it are replaced when all are written.
         options: What to compute.
-        run: Name of the run in tables.
+        run: Name of the run in
         left_out: Counts of what loading skipped, by reason.
         warnings: Of loading, to be printed.
         draw_frame: Called with (frame id, path of a figure to write) for each of the
@@ -108,7 +117,7 @@ def write_report(
         "box_errors": analysis.box_errors(data, iou),
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
-    metrics = _plain(metrics)
+    metrics = plain(metrics)
     text = _console_text(metrics, results, options)
     built = _tables(metrics, results, options)
     with files.swapped_in(out_dir) as folder:
@@ -118,17 +127,15 @@ def write_report(
         files.write_json(folder / "frames.json", columns)
         files.write_text(folder / "report.txt", text)
         for name, style in (("tables.md", "markdown"), ("tables.tex", "latex")):
-            content = "\n".join(table.render(style) for table in built)
+            content = rendered(built, style, is_simulated=data.is_simulated)
             files.write_text(folder / name, content)
         with open(folder / "metrics.csv", "w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, list(metrics["ap"][0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(metrics["ap"])
-        keys = frames if "name" in frames else None
         # With repaired sizes, so that the stored predictions can be evaluated again.
-        repaired, _ = repair_sizes(predictions, options.invalid_sizes)
-        write_table(folder / "predictions.npz", repaired, keys)
-        write_table(folder / "ground_truth.npz", ground_truth, keys)
+        write_boxes(folder / "predictions.npz", data.predictions, frames)
+        write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
         if options.plots:
             _draw_curves(data, frames, options, folder)
         if draw_frame is not None:
@@ -149,41 +156,39 @@ def _split(frames: Columns) -> str | None:
 
 def _tables(
     metrics: Mapping[str, Any], results: list[Result], options: EvaluationOptions
-) -> list[tables.Table]:
+) -> list[Table]:
     """Those of the papers, then every protocol and IoU threshold, then details."""
-    table, ious = tables.index(results), options.iou_thresholds
+    by_key, ious = index(results), options.iou_thresholds
     built = []
     if not metrics["is_simulated"]:
-        runs = {metrics["run"]: table}
-        built = tables.paper_tables(runs, options, metrics["split"])
-    for space, iou in itertools.product(tables.SPACE_TITLES, ious):
-        built.append(tables.by_protocol(table, options, space, iou))
+        built += paper_tables(metrics["run"], by_key, options, metrics["split"])
+    for space, iou in itertools.product(SPACE_TITLES, ious):
+        built.append(by_protocol(by_key, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, ious):
-        built.append(tables.class_by_weather(table, options, protocol, iou))
-    built += tables.detail_tables(metrics)
-    return [each.marked(is_simulated=metrics["is_simulated"]) for each in built]
+        built.append(class_by_weather(by_key, options, protocol, iou))
+    return built + detail_tables(metrics)
 
 
 def _console_text(
     metrics: Mapping[str, Any], results: list[Result], options: EvaluationOptions
 ) -> str:
     """The most important tables, on one screen."""
-    table, iou = tables.index(results), options.iou_thresholds[0]
+    by_key, iou = index(results), options.iou_thresholds[0]
     # Two thresholds of the first protocol, one of the others.
     first, *others = options.main_protocols
     shown = [(first, level) for level in options.iou_thresholds[:2]]
     shown += [(protocol, iou) for protocol in others]
-    built = [tables.class_by_weather(table, options, *terms) for terms in shown]
-    built += [tables.by_protocol(table, options, space, iou) for space in ("3d", "bev")]
-    built.append(tables.subset_table(metrics["subsets"], "distance"))
-    built.append(tables.error_table(metrics["box_errors"]))
+    built = [class_by_weather(by_key, options, *terms) for terms in shown]
+    built += [by_protocol(by_key, options, space, iou) for space in SPACE_TITLES]
+    built.append(subset_table(metrics["subsets"], "distance"))
+    built.append(error_table(metrics["box_errors"]))
     kind = "simulated " if metrics["is_simulated"] else ""
     parts = [
         f"{metrics['run']}: {metrics['num_frames']} {kind}frames, "
         f"{metrics['num_ground_truth']} objects, {metrics['num_predictions']} predictions,"
         f" score above {options.min_score:g}\n",
         *(f"WARNING: {line}\n" for line in metrics["warnings"]),
-        *(each.marked(is_simulated=metrics["is_simulated"]).render() for each in built),
+        rendered(built, is_simulated=metrics["is_simulated"]),
         f"Intervals: {metrics['intervals']}\n",
         "Not part of the numbers, or kept with a remark:",
         *(f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()),
@@ -205,7 +210,7 @@ def _draw_curves(
     protocol, iou = protocols.RECOMMENDED, options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
     masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
-    for space in SPACES:
+    for space in SPACE_TITLES:
         panels: dict[str, dict[str, Any]] = {}
         for name, mask in masks.items():
             for result in data.results(
@@ -225,127 +230,388 @@ def _draw_curves(
         save_figure(figure, path)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Values that strict JSON can hold: NaN becomes null."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     is_number = not isinstance(value, float) or np.isfinite(value)
     return value if is_number else None
 
 
-# Predictions in files -----------------------------------------------------------------
+# Tables -------------------------------------------------------------------------------
+
+TITLES = {"all": "Total"} | {
+    name: name.replace("snow", " snow").title() for name in WEATHERS
+}
+SPACE_TITLES = {"3d": "3D", "bev": "BEV"}
+"""Titles of the spaces, in the order of the papers."""
+
+STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
+Results = Mapping[tuple[str, str, str, str, float], Result]
+"""Results by protocol, condition, class, space and IoU threshold."""
 
 
-def evaluate_files(
-    path: PathLike,
-    out_dir: PathLike,
-    source: Source,
-    options: EvaluationOptions,
-    *,
-    run: str = "radejax",
-) -> Report:
-    """Evaluate predictions in files and write the report; see `load` for errors."""
-    truth, found, frames, left_out = load(path, source, options.classes)
-    warnings, low = [], stored_from(path)
-    if low > max(LOW_SCORE, options.score_threshold):
-        warnings.append(
-            f"{path} has predictions from score {low:g} on only, and every number is of "
-            "these; `radejax evaluate` with --min-score stores lower ones"
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table ready to be rendered.
+
+    Attributes:
+        title: One line that says what the numbers are.
+        header: `[K]` column titles.
+        rows: Rows of `K` strings or counts.
+    """
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str | int]]
+
+    def render(self, style: str = "text", *, is_simulated: bool = False) -> str:
+        """As "text", "markdown" or "latex" (a tabular; the title is a comment)."""
+        align = ["left", *["right"] * (len(self.header) - 1)]
+        body = tabulate(
+            self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
-    options = dataclasses.replace(options, min_score=max(low, options.min_score))
-    return write_report(
-        truth,
-        found,
-        frames,
-        out_dir,
-        options,
-        run=run,
-        left_out=left_out,
-        warnings=warnings,
+        title = f"Simulated data: {self.title}" if is_simulated else self.title
+        if style == "latex":
+            return f"% {title}\n{body}\n"
+        title = f"**{title}**" if style == "markdown" else title
+        return f"{title}\n\n{body}\n"
+
+
+def rendered(
+    tables: Sequence[Table], style: str = "text", *, is_simulated: bool
+) -> str:
+    """Several tables, one below the other."""
+    return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
+
+
+def index(results: Sequence[Result]) -> Results:
+    """Results by their key."""
+    return {result.key: result for result in results}
+
+
+def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
+    """A value as the papers print it; `-` for one that does not exist."""
+    if value is None or value != value:
+        return "-"
+    return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
+
+
+def numbers(values: Iterable[float | None], **options: Any) -> list[str]:
+    """Values as entries of a table, see `number`."""
+    return [number(value, **options) for value in values]
+
+
+def ap_of(results: Results, *key: Any) -> float | None:
+    """AP of a key; None where the class does not occur or nothing was computed."""
+    result = results.get(key)
+    return None if result is None else result.ap_or_none
+
+
+def terms_of(results: Results, protocol: str) -> str:
+    """Protocol with its score threshold, empty-frame rule, label version and region."""
+    found = next(r for r in results.values() if r.protocol == protocol)
+    return ", ".join(found.metric.split("/")[1:])
+
+
+def class_by_weather(
+    results: Results, options: EvaluationOptions, protocol: str, iou: float
+) -> Table:
+    """Classes by total and weathers in one protocol, "3D / BEV" in each entry."""
+    conditions = dict.fromkeys(key[1] for key in results)
+    body = []
+    for cls in (*options.classes, "mean"):
+        pairs = (
+            [ap_of(results, protocol, name, cls, space, iou) for space in SPACE_TITLES]
+            for name in conditions
+        )
+        body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
+    return Table(
+        f"AP 3D / BEV at IoU {iou:g}, {terms_of(results, protocol)}",
+        ["Class", *(TITLES.get(name, name) for name in conditions)],
+        body,
     )
 
 
-def compare_files(
-    paths: Sequence[PathLike],
-    out_dir: PathLike | None,
-    source: Source,
-    options: EvaluationOptions,
-) -> tuple[str, list[dict[str, Any]]]:
-    """Compare runs on the same frames: each with the first, and all in Table III.
+def by_protocol(
+    results: Results, options: EvaluationOptions, space: str, iou: float
+) -> Table:
+    """Protocols by classes, all weathers, with intervals over sequences if there are."""
+    classes = (*options.classes, "mean")
+    body = []
+    for name in options.protocols:
+        found = (results.get((name, "all", cls, space, iou)) for cls in classes)
+        body.append([name, *map(_with_interval, found)])
+    title = f"AP {SPACE_TITLES[space]} at IoU {iou:g} in every protocol, all weathers"
+    if any(result.low is not None for result in results.values()):
+        title += f", 95 % intervals of {options.bootstrap} resamples of sequences"
+    return Table(title, ["Protocol", *classes], body)
+
+
+def _with_interval(result: Result | None) -> str:
+    """AP, and its interval if there is one, such as "61.05 [50.1, 70.2]"."""
+    if result is None or result.ap_or_none is None or result.low is None:
+        return number(None if result is None else result.ap_or_none)
+    low, high = numbers((result.low, result.high), digits=1)
+    return f"{number(result.ap)} [{low}, {high}]"
+
+
+# Behind the APs -----------------------------------------------------------------------
+
+
+def detail_tables(metrics: Mapping[str, Any]) -> list[Table]:
+    """Every table of what lies behind the APs, from the content of metrics.json."""
+    kinds = [kind for kind in metrics["subsets"] if kind != "protocol"]
+    header = ["Frame", "Name", "Sequence", "Missed", "False", "Found"]
+    worst = [
+        [entry.get(name.lower(), "") for name in header]
+        for entry in metrics["worst_frames"]
+    ]
+    return [
+        *(subset_table(metrics["subsets"], kind) for kind in kinds),
+        error_table(metrics["box_errors"]),
+        Table("Frames with the most mistakes", header, worst),
+    ]
+
+
+def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
+    """AP, precision and recall per subset and class that has boxes."""
+    return Table(
+        f"By {kind}, {subsets['protocol']}",
+        [kind.capitalize(), "Class", "AP", "Precision", "Recall", "Objects"],
+        [
+            [
+                entry[kind],
+                entry["cls"],
+                *numbers(entry[name] for name in ("ap", "precision", "recall")),
+                entry["num_gt"],
+            ]
+            for entry in subsets[kind]
+            if entry["num_gt"] or entry["num_det"]
+        ],
+    )
+
+
+def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
+    """Median errors of matched boxes, and how many headings are reversed."""
+    any_class = next(iter(errors.values()))
+    names = [key.removesuffix("_median") for key in any_class if "_median" in key]
+    body: list[list[str | int]] = []
+    for cls, found in errors.items():
+        medians = (
+            number(found[f"{name}_median"], digits=2 if name.endswith("_m") else 1)
+            for name in names
+        )
+        body.append([cls, int(found["count"]), *medians, number(found["reversed"])])
+    titles = [name.replace("_", " ").capitalize() for name in names]
+    return Table(
+        "Median errors of matched boxes (all scores); reversed: heading off by more"
+        " than 90 deg",
+        ["Class", "Matches", *titles, "Reversed"],
+        body,
+    )
+
+
+# Published rows -----------------------------------------------------------------------
+
+CONDITIONS = ("all", *WEATHERS)
+
+Cell = tuple[str, str, str, float]
+"""Condition, class, space and IoU threshold."""
+
+Place = dict[str, Any]
+"""Some of the four by name, as keywords of a layout; the others are the usual ones."""
+
+SPACES: list[Place] = [{"space": space} for space in SPACE_TITLES]
+_USUAL: Place = {"condition": "all", "cls": "Sedan", "space": "3d", "iou": 0.3}
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedRow:
+    """One row of a published table.
+
+    Attributes:
+        paper: "RADE-Net" or "DinoRADE".
+        table: Number of the table as printed.
+        method: Name of the row; in ablations what the row ticks.
+        modality: L lidar, C camera, R radar.
+        label_version: K-Radar label revision.
+        protocol: Evaluation protocol as far as known.
+        note: What a reader should know.
+        values: APs as printed; the class "mean" is the paper's mAP.
+    """
+
+    paper: str
+    table: str
+    method: str
+    modality: str
+    label_version: str
+    protocol: str
+    note: str
+    values: dict[Cell, str]
+
+    @property
+    def source(self) -> str:
+        """Paper and table."""
+        return f"{self.paper}, Table {self.table}"
+
+    def differences(
+        self,
+        cells: Sequence[Cell],
+        ours: Sequence[float | None],
+        options: EvaluationOptions,
+        split: str | None,
+    ) -> list[str]:
+        """Our APs minus the printed ones; "-" where there is none to compare with.
+
+        A mean is compared only with one over the same classes.
+        """
+        is_comparable = (
+            options.paper_protocol == self.protocol
+            and options.label_version == self.label_version
+            and roi_name(options.roi) == "narrow"
+            and split == "test"
+        )
+        classes = {cls for _, cls, *_ in self.values} - {"mean"}
+        differences = []
+        for cell, ap in zip(cells, ours, strict=True):
+            printed = self.values.get(cell, "-")
+            is_same = cell[1] != "mean" or classes == set(options.classes)
+            if not (is_comparable and is_same) or ap is None or printed == "-":
+                differences.append("-")
+            else:
+                differences.append(number(ap - float(printed), signed=True))
+        return differences
+
+
+def _read() -> tuple[PublishedRow, ...]:
+    """The rows of `published.csv`."""
+    names = [field.name for field in dataclasses.fields(PublishedRow)][:-1]
+    text = importlib.resources.files(__package__) / "published.csv"
+    rows: dict[tuple[str, ...], PublishedRow] = {}
+    for line in csv.DictReader(text.read_text(encoding="utf-8").splitlines()):
+        fields = {name: line[name] for name in names}
+        row = rows.setdefault(tuple(fields.values()), PublishedRow(**fields, values={}))
+        for condition in filter(line.get, CONDITIONS):
+            cell = condition, line["cls"], line["space"], float(line["iou"])
+            row.values[cell] = line[condition]
+    return tuple(rows.values())
+
+
+PUBLISHED = _read()
+"""All rows of all result tables of both papers."""
+
+
+# A run in the layouts of the papers ---------------------------------------------------
+
+
+def paper_tables(
+    run: str, results: Results, options: EvaluationOptions, split: str | None
+) -> list[Table]:
+    """All tables that the results allow, in the order of the papers.
 
     Args:
-        paths: Predictions or report folders, at least two; the first is run A.
-        out_dir: Where to write comparison.txt and comparison.json, or None.
-        source: Ground truth, unless the paths bring their own.
-        options: Classes, protocols, IoU thresholds, region, score threshold and number
-            of resamples of sequences (`bootstrap`).
-
-    Returns:
-        The tables as text, and the fields of all comparisons (B is the second run first).
-
-    Raises:
-        UserError: Fewer than two runs, or runs on different frames or ground truth.
+        run: Name of the run.
+        results: Of frames that are not simulated.
+        options: Of the evaluation.
+        split: Split of the frames, None if it is not known.
     """
-    if len(paths) < 2:
-        raise UserError("a comparison needs at least two runs")
-    if options.bootstrap < 1:
-        raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
-    # What one run has not stored must not count for another one.
-    threshold = max(options.score_threshold, *map(stored_from, paths))
-    options = dataclasses.replace(
-        options, score_threshold=threshold, min_score=threshold
-    )
-    usual = (protocols.RECOMMENDED, "kradar_r40")
-    names = [str(path) for path in paths]
-    (first, _), *others = loaded = [_load_run(path, source, options) for path in paths]
-    is_simulated = any(data.is_simulated for data, _ in loaded)
-    built, rows = [], []
-    for name, (data, sequence) in zip(names[1:], others, strict=True):
-        found = bootstrap.compare(
-            first,
-            data,
-            sequence,
-            protocol_names=[p for p in usual if p in options.protocols]
-            or options.protocols[:1],
-            iou_thresholds=options.iou_thresholds[:1],
-            score_threshold=threshold,
-            resamples=options.bootstrap,
-        )
-        built.append(tables.comparison(found, names[0], name))
-        rows += [_plain(dataclasses.asdict(row)) for row in found]
-    if "Sedan" in options.classes:
-        shown = dataclasses.replace(
-            options, protocols=(options.paper_protocol,), iou_thresholds=(0.3, 0.5)
-        )
-        results = {
-            name: tables.index(compute_results(data, shown, {}))
-            for name, (data, _) in zip(names, loaded, strict=True)
-        }
-        built.append(tables.ablations(results, shown, is_simulated=is_simulated))
-    text = "\n".join(
-        table.marked(is_simulated=is_simulated).render() for table in built
-    )
-    if out_dir is not None:
-        content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
-        files.write_text(pathlib.Path(out_dir) / "comparison.txt", text)
-        files.write_json(pathlib.Path(out_dir) / "comparison.json", content)
-    return text, rows
+    if 0.3 not in options.iou_thresholds:
+        return []
+    classes = [{"cls": cls} for cls in (*options.classes, "mean")]
+    conditions = [{"condition": name} for name in CONDITIONS]
+    layouts: list[
+        tuple[str, Sequence[str], Sequence[Place], Sequence[Place], str | None]
+    ] = [
+        (
+            "Sedan by weather at IoU 0.3 (layout of Table I)",
+            ["RADE-Net, Table I", "DinoRADE, Table 1"],
+            SPACES,
+            conditions,
+            split,
+        ),
+        (
+            "Classes by weather at IoU 0.3 (layout of Table II)",
+            ["RADE-Net, Table II", "DinoRADE, Table 2"],
+            classes,
+            _crossed(conditions, SPACES),
+            split,
+        ),
+        (
+            "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
+            ["DinoRADE, Table 3"],
+            [{"condition": "all"}],
+            _crossed(classes, SPACES),
+            split,
+        ),
+        (
+            "Ablations, Sedan (layout of Table III)",
+            ["RADE-Net, Table III", "DinoRADE, Table 4"],
+            [{"cls": "Sedan"}],
+            _crossed([{"iou": 0.3}, {"iou": 0.5}], SPACES),
+            None,
+        ),
+    ]
+    if "Sedan" not in options.classes:
+        layouts = layouts[1:3]
+    return [_layout(*layout, run, results, options) for layout in layouts]
 
 
-def _load_run(
-    path: PathLike, source: Source, options: EvaluationOptions
-) -> tuple[EvaluationSet, np.ndarray]:
-    """A run ready to be compared, and the sequence of each of its frames."""
-    truth, found, frames, _ = load(path, source, options.classes)
-    if "sequence" not in frames:
-        raise UserError(
-            f"{path}: a comparison resamples sequences, and the frame table has no column "
-            "sequence: give --data or --labels"
-        )
-    found, _ = repair_sizes(found, options.invalid_sizes)
-    data = EvaluationSet(
-        truth, found, classes=options.classes, frames=frames, roi=options.roi
-    )
-    return data, np.asarray(frames["sequence"])
+def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
+    return [{**one, **other} for one in outer for other in inner]
+
+
+def _layout(
+    title: str,
+    sources: Sequence[str],
+    groups: Sequence[Place],
+    columns: Sequence[Place],
+    split: str | None,
+    run: str,
+    results: Results,
+    options: EvaluationOptions,
+) -> Table:
+    """Published rows, each with the difference to it where there is one, then ours.
+
+    Args:
+        title: Of the table.
+        sources: Papers and tables whose rows to print.
+        groups: What the rows of each group are of.
+        columns: What the columns are of.
+        split: Split of the frames; None for no differences.
+        run: Name of the run.
+        results: Of the run.
+        options: Of the evaluation.
+    """
+    body: list[list[str]] = []
+    for group in groups:
+        places = [{**_USUAL, **group, **column} for column in columns]
+        cells = [(p["condition"], p["cls"], p["space"], p["iou"]) for p in places]
+        of, printed = _name(group), []
+        compared = [ap_of(results, options.paper_protocol, *cell) for cell in cells]
+        for row in PUBLISHED:
+            values = [row.values.get(cell, "-") for cell in cells]
+            # Both papers copy the same rows.
+            is_repeated = [row.method, *values] in printed
+            if row.source not in sources or set(values) == {"-"} or is_repeated:
+                continue
+            printed.append([row.method, *values])
+            terms = f"{row.protocol}, labels={row.label_version}"
+            name = f"{row.method} ({row.modality})"
+            body.append([name, of, row.source, terms, *values])
+            gaps = row.differences(cells, compared, options, split)
+            if set(gaps) != {"-"}:
+                same = "same protocol, labels, region, split"
+                body.append(["difference", of, row.source, same, *gaps])
+        for protocol in options.main_protocols:
+            aps = [ap_of(results, protocol, *cell) for cell in cells]
+            body.append([run, of, "", terms_of(results, protocol), *numbers(aps)])
+    return Table(title, ["Method", "Of", "Source", "Terms", *map(_name, columns)], body)
+
+
+def _name(place: Place) -> str:
+    """Title of what a group or a column is of, such as "Light Snow BEV"."""
+    names = {0.3: "IoU 0.3", 0.5: "IoU 0.5"} | TITLES | SPACE_TITLES
+    return " ".join(str(names.get(value, value)) for value in place.values())

@@ -1,4 +1,10 @@
-"""All numbers of an evaluation: protocols, conditions, classes, spaces, IoU thresholds."""
+"""All numbers of an evaluation: protocols, conditions, classes, spaces, IoU thresholds.
+
+Confidence intervals resample whole sequences: frames of one sequence show the same few
+cars, so they are not independent; sequences are. A resample draws as many sequences as
+there are, with replacement, and every frame counts as often as its sequence was drawn,
+which all protocols handle exactly.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from ml_collections import ConfigDict
 
 from radejax.core.errors import (
@@ -21,19 +27,12 @@ from radejax.core.errors import (
 )
 from radejax.core.structures import CLASSES, MIN_SIZE_M
 from radejax.data.kradar.conditions import WEATHERS
-from radejax.evaluation import bootstrap, protocols
+from radejax.evaluation import protocols
 from radejax.evaluation.boxes import AnyColumns, Columns, Roi, roi_bounds
 from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 
-ENVIRONMENTS = (
-    "urban highway countryside alleyway parkinglots shoulder mountain university"
-)
-ORDER = {
-    "weather": WEATHERS,
-    "environment": tuple(ENVIRONMENTS.split()),
-    "time": ("day", "night"),
-}
-"""K-Radar's conditions in the order of its papers."""
+LEVEL = 0.95
+"""Of all intervals."""
 
 _RANGES = {
     "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
@@ -169,6 +168,20 @@ def evaluate_tables(
         UserError: Wrong options or missing columns.
         DataError: A bad row; names the table, frame and row.
     """
+    data = make_set(ground_truth, predictions, frames, options)
+    weathers = condition_masks(frames, "weather") if per_weather else {}
+    has_intervals = why_no_intervals(frames, options) is None
+    sequence = np.asarray(frames["sequence"]) if has_intervals else None
+    return data, compute_results(data, options, weathers, sequence)
+
+
+def make_set(
+    ground_truth: Columns,
+    predictions: Columns,
+    frames: Columns,
+    options: EvaluationOptions,
+) -> EvaluationSet:
+    """The evaluation set of these options; predicted sizes are repaired and counted."""
     predictions, num_invalid = repair_sizes(predictions, options.invalid_sizes)
     sizes = np.asarray(predictions["box"], np.float64).reshape(-1, 7)[:, 3:6]
     is_clipped = ((sizes > 1e-6) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1)
@@ -184,10 +197,7 @@ def evaluate_tables(
         "predictions: size not positive, kept as false positives": num_invalid,
         f"predictions: size clipped to {MIN_SIZE_M} m, kept": int(is_clipped.sum()),
     }
-    weathers = condition_masks(frames, "weather") if per_weather else {}
-    has_intervals = why_no_intervals(frames, options) is None
-    sequence = np.asarray(frames["sequence"]) if has_intervals else None
-    return data, compute_results(data, options, weathers, sequence)
+    return data
 
 
 def compute_results(
@@ -205,12 +215,13 @@ def compute_results(
     rows = []
     everything = {"all": np.ones(data.frame.size, bool)}
     for condition, mask in (everything | dict(weathers)).items():
-        is_all = condition == "all"
-        has_interval = options.protocols if is_all else options.main_protocols
+        has_interval = (
+            options.protocols if condition == "all" else options.main_protocols
+        )
         part, weights = data, None
         if sequence is not None and np.unique(sequence[mask]).size > 1:
             part = data if mask.all() else data.of_frames(mask)
-            weights = bootstrap.sequence_weights(
+            weights = sequence_weights(
                 sequence[mask], resamples=options.bootstrap, seed=0
             )
         for protocol in options.protocols:
@@ -220,7 +231,7 @@ def compute_results(
                 iou_thresholds=options.iou_thresholds,
                 weights=mask,
                 curves=False,
-                condition=("all" if is_all else "weather", condition),
+                condition=condition,
                 **settings,
             )
             for start in range(0, len(results), len(data.classes)):
@@ -228,12 +239,10 @@ def compute_results(
                 group.append(_mean(group))
                 if weights is not None and protocol in has_interval:
                     metric = protocol, group[0].space, group[0].iou
-                    samples = bootstrap.resample(part, weights, *metric, **settings)
-                    pairs = zip(group, map(bootstrap.interval, samples.T), strict=True)
+                    samples = resample(part, weights, *metric, **settings)
+                    pairs = zip(group, map(interval, samples.T), strict=True)
                     group = [
                         dataclasses.replace(row, low=low, high=high)
-                        if row.is_defined
-                        else row
                         for row, (low, high) in pairs
                     ]
                 rows += group
@@ -253,13 +262,75 @@ def _mean(group: Sequence[Result]) -> Result:
     )
 
 
+def sequence_weights(
+    sequence: Shaped[np.ndarray, " F"], *, resamples: int, seed: int
+) -> Int[np.ndarray, "B F"]:
+    """How often each frame counts in each resample; int16.
+
+    Args:
+        sequence: Sequence of every frame.
+        resamples: Number of resamples B.
+        seed: Of the drawing; the same seed draws the same sequences.
+
+    Raises:
+        UserError: Fewer than two sequences: there is nothing to resample.
+    """
+    names, inverse = np.unique(sequence, return_inverse=True)
+    if names.size < 2:
+        raise UserError(
+            f"intervals need at least 2 sequences to resample, found {names.size}"
+        )
+    rng = np.random.default_rng(seed)
+    drawn = rng.multinomial(names.size, np.full(names.size, 1 / names.size), resamples)
+    return drawn.astype(np.int16)[:, inverse]
+
+
+def resample(
+    data: EvaluationSet,
+    weights: Int[np.ndarray, "B F"],
+    protocol: str,
+    space: str,
+    iou: float,
+    *,
+    empty_frames: str = "protocol",
+    score_threshold: float = 0.0,
+) -> Float[np.ndarray, "B _"]:
+    """`[B, C + 1]` AP of every class, then their mean, in every resample.
+
+    NaN where a resample has no object of a class; the mean is over classes that occur.
+    """
+    chosen = protocols.get_protocol(protocol)
+    empty_frames = chosen.resolve_empty_frames(empty_frames)
+    ap = np.full((len(weights), len(data.classes) + 1), np.nan)
+    for row, weight in enumerate(weights):
+        by_class = data.frame_weights(empty_frames, weight)
+        for cls in range(len(data.classes)):
+            curve = data.curve(
+                chosen, space, iou, float(score_threshold), cls, by_class[:, cls]
+            )
+            if curve.num_gt:
+                ap[row, cls] = curve.ap
+        present = ap[row, ~np.isnan(ap[row])]
+        ap[row, -1] = present.mean() if present.size else np.nan
+    return ap
+
+
+def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:
+    """95 % percentile interval of the samples that are defined; NaN if none is."""
+    samples = samples[~np.isnan(samples)]
+    if not samples.size:
+        return float("nan"), float("nan")
+    low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)
+
+
 def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray, " F"]]:
-    """Masks of frames by value of a column of the frame table, K-Radar's values first."""
+    """Masks of frames by value of a column of the frame table, K-Radar's weathers first."""
     if kind not in frames:
         return {}
     column = np.asarray(frames[kind]).astype(str)
     present = np.unique(column).tolist()
-    ordered = dict.fromkeys((*ORDER[kind], *present))
+    ordered = dict.fromkeys((*WEATHERS, *present))
     return {name: column == name for name in ordered if name in present}
 
 
@@ -312,25 +383,15 @@ def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
     return {**predictions, "box": box}, int(is_invalid.sum())
 
 
-def to_row(result: Result) -> Mapping[str, Any]:
+def to_row(result: Result) -> dict[str, Any]:
     """A row of metrics.json and metrics.csv."""
+    others = ["ap", "precision", "recall", "score", "low", "high", "is_simulated"]
+    terms = {name: value for name, value in vars(result).items() if name not in others}
     return {
         "name": f"{result.cls}/{result.condition}/{result.metric}",
-        "protocol": result.protocol,
-        "kind": result.kind,
-        "condition": result.condition,
-        "cls": result.cls,
-        "space": result.space,
-        "iou": result.iou,
+        **terms,
         "ap": result.ap_or_none,
         "ap_low": result.low,
         "ap_high": result.high,
-        "ap_official": None if np.isnan(result.ap) else result.ap,
-        "num_gt": result.num_gt,
-        "num_det": result.num_det,
-        "num_frames": result.num_frames,
-        "score_threshold": result.score_threshold,
-        "empty_frames": result.empty_frames,
-        "roi": result.roi,
-        "label_version": result.label_version,
+        "ap_official": result.ap,
     }

@@ -23,8 +23,7 @@ from radejax.core.structures import Boxes
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import require_images
 from radejax.data.projection import decode
-from radejax.evaluation.boxes import Columns, roi_bounds
-from radejax.evaluation.files import tables_from_frames
+from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector, check_backbone

@@ -7,7 +7,7 @@ import pytest
 
 from radejax.core import files
 from radejax.core.config import load_module
-from radejax.evaluation import files as predictions
+from radejax.evaluation.boxes import frame_keys, read_boxes, write_boxes
 from radejax.evaluation.files import Source
 
 HERE = pathlib.Path(__file__).parent
@@ -49,16 +49,39 @@ def kradar_fixture(shared):
     return ground_truth, predictions, frames
 
 
+@pytest.fixture(scope="session")
+def write_table():
+    """Function (path, table, frames) that writes a table as .npz or .json records."""
+
+    def write(path, table, frames):
+        if path.suffix == ".npz":
+            boxes = read_boxes(table, path.name, scored="score" in table)
+            return write_boxes(path, boxes, frames)
+        keys = frame_keys(frames) if "name" in frames else frames["frame"].tolist()
+        frame = [keys[i] for i in table["frame"]]
+        columns = {name: column.tolist() for name, column in table.items()}
+        columns["frame"] = frame
+        rows = zip(*columns.values(), strict=True)
+        return files.write_json(
+            path, [dict(zip(columns, r, strict=True)) for r in rows]
+        )
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def stored_scene(random_scene):
+    """Ground truth, predictions, frames of `stored`."""
+    return random_scene(8, num_frames=30, num_objects=90)
+
+
 @pytest.fixture
-def stored(random_scene, tmp_path):
+def stored(stored_scene, write_table, tmp_path):
     """Folder with predictions, ground truth and frames as files, and their `Source`."""
-    truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
-    predictions.write_table(tmp_path / "found.json", found, frames)
-    predictions.write_table(tmp_path / "truth.npz", truth, frames)
+    truth, found, frames = stored_scene
+    write_table(tmp_path / "found.json", found, frames)
+    write_table(tmp_path / "truth.npz", truth, frames)
     files.write_json(
         tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
     )
-    source = Source(
-        ground_truth=str(tmp_path / "truth.npz"), frames=str(tmp_path / "frames.json")
-    )
-    return tmp_path, source
+    return tmp_path, Source(ground_truth=str(tmp_path / "truth.npz"))

@@ -3,9 +3,10 @@ import re
 import numpy as np
 import pytest
 
-from radejax.evaluation import analysis, report
+from radejax.evaluation import analysis
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.files import Source, load, write_table
+from radejax.evaluation.files import Source, load
+from radejax.evaluation.report import write_report
 from radejax.evaluation.results import EvaluationOptions
 
 CLASSES = ("Sedan", "Bus or Truck")
@@ -166,16 +167,11 @@ def test_a_correction_takes_the_warning_away(tmp_path):
     truth, found = _scene()
     wrong = _moved(_moved(found, 6, np.rad2deg), 2, lambda z: z + 0.7)
     frames, options = {"frame": truth["frame"]}, EvaluationOptions(plots=False)
-    made = report.write_report(truth, wrong, frames, tmp_path, options)
+    made = write_report(truth, wrong, frames, tmp_path, options)
     assert len(made.metrics["warnings"]) == made.text.count("WARNING: ") == 2
-    write_table(tmp_path / "found.npz", wrong)
-    write_table(tmp_path / "truth.npz", truth)
-    source = Source(
-        ground_truth=str(tmp_path / "truth.npz"), z_offset_m=-0.7, yaw_degrees=True
-    )
-    right = load(tmp_path / "found.npz", source, CLASSES)[1]
+    right = load(tmp_path, Source(z_offset_m=-0.7, yaw_degrees=True), CLASSES)[1]
     np.testing.assert_allclose(right["box"], found["box"])
-    made = report.write_report(truth, right, frames, tmp_path, options)
+    made = write_report(truth, right, frames, tmp_path, options)
     assert made.metrics["warnings"] == []
 
 

@@ -1,13 +1,15 @@
 import dataclasses
 import json
+import shutil
 import types
 
 import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation import boxes, files
+from radejax.evaluation import boxes, files, kitti
 from radejax.evaluation.files import Source
+from radejax.evaluation.results import EvaluationOptions
 
 
 def test_ground_truth_has_to_come_from_somewhere(stored):
@@ -26,10 +28,35 @@ def test_ground_truth_has_to_come_from_somewhere(stored):
         files.load(folder / "found.json", source, ("Sedan",))
 
 
-def test_ground_truth_by_id_without_a_frame_table(random_scene, tmp_path):
-    truth, found, _ = random_scene(8)
-    files.write_table(tmp_path / "found.npz", found)
-    files.write_table(tmp_path / "truth.npz", truth)
+def test_every_way_in_gives_the_same_numbers(stored, stored_scene):
+    folder, source = stored
+    options = EvaluationOptions(
+        roi=None, plots=False, protocols=("all_point", "kradar_r40")
+    )
+
+    def aps(path, source, protocol=None, condition="all"):
+        made = files.evaluate_files(path, folder / f"{path.name}_out", source, options)
+        return [
+            row.ap_or_none
+            for row in made.results
+            if row.condition == condition and protocol in (None, row.protocol)
+        ]
+
+    one = aps(folder / "found.json", source)
+    # A report brings everything that is needed to repeat it.
+    assert aps(folder / "found.json_out", Source()) == one
+    kitti.write_kitti(folder / "kitti", *stored_scene)
+    in_fog = "kradar_r40", "fog"
+    expected = aps(folder / "found.json", source, *in_fog)
+    assert aps(folder / "kitti", Source(), *in_fog) == expected != []
+    assert aps(folder / "kitti", source, *in_fog) == expected
+
+
+def test_ground_truth_by_id_without_a_frame_table(random_scene, write_table, tmp_path):
+    truth, found, frames = random_scene(8)
+    ids = {"frame": frames["frame"]}
+    write_table(tmp_path / "found.npz", found, ids)
+    write_table(tmp_path / "truth.npz", truth, ids)
     source = Source(ground_truth=str(tmp_path / "truth.npz"))
     _, _, frames, _ = files.load(tmp_path / "found.npz", source, ("Sedan",))
     both = np.union1d(truth["frame"], found["frame"])
@@ -39,14 +66,12 @@ def test_ground_truth_by_id_without_a_frame_table(random_scene, tmp_path):
 def test_ground_truth_of_a_report(stored):
     folder, source = stored
     expected = files.load(folder / "found.json", source, ("Sedan",))
-    beside = dataclasses.replace(source, frames=None)
-    truth = files.read_table(folder / "truth.npz", expected[2], scored=False)
     report = folder / "run" / "evaluation"
     report.mkdir(parents=True)
-    files.write_table(report / "ground_truth.npz", truth, expected[2])
-    (report / "frames.json").write_bytes((folder / "frames.json").read_bytes())
-    for place in (folder / "truth.npz", report, report.parent):
-        other = dataclasses.replace(beside, ground_truth=str(place))
+    shutil.copy(folder / "truth.npz", report / "ground_truth.npz")
+    shutil.copy(folder / "frames.json", report)
+    for place in (report, report.parent):
+        other = dataclasses.replace(source, ground_truth=str(place))
         found = files.load(folder / "found.json", other, ("Sedan",))
         for a, b in zip(found[:3], expected[:3], strict=True):
             assert a.keys() == b.keys()
@@ -98,11 +123,11 @@ def test_tables_from_frames():
     empty = types.SimpleNamespace(
         **{**vars(frame), "boxes": np.zeros((0, 7)), "classes": [], "weather": "rain"}
     )
-    truth, table = files.tables_from_frames([empty, frame])
+    truth, table = boxes.tables_from_frames([empty, frame])
     assert truth["frame"].tolist() == [1, 1]
     assert truth["cls"].tolist() == ["Sedan", "Bicycle"]
     assert table["weather"].tolist() == ["rain", "fog"]
-    none, _ = files.tables_from_frames([])
+    none, _ = boxes.tables_from_frames([])
     assert none["box"].shape == (0, 7)
 
 
@@ -121,29 +146,22 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize("suffix", ["npz", "json"])
 @pytest.mark.parametrize("by_key", [True, False])
-def test_round_trip_is_exact(tmp_path, scene, suffix, by_key):
+def test_round_trip_is_exact(tmp_path, scene, write_table, suffix, by_key):
     truth, found, frames = scene
-    for name, table, scored in (("p", found, True), ("t", truth, False)):
-        path = tmp_path / f"{name}.{suffix}"
-        files.write_table(path, table, frames if by_key else None)
+    written_with = frames if by_key else {"frame": frames["frame"]}
+    nothing = {k: v[:0] for k, v in found.items()}
+    for table, scored in ((found, True), (truth, False), (nothing, True)):
+        path = tmp_path / f"table.{suffix}"
+        write_table(path, table, written_with)
         read = files.read_table(path, frames, scored=scored)
         assert_same(read, table)
-    assert sorted(p.name for p in tmp_path.iterdir()) == [f"p.{suffix}", f"t.{suffix}"]
-
-
-@pytest.mark.parametrize("suffix", ["npz", "json"])
-def test_empty_tables(tmp_path, scene, suffix):
-    nothing = {k: v[:0] for k, v in scene[1].items()}
-    path = tmp_path / f"p.{suffix}"
-    files.write_table(path, nothing, scene[2])
-    read = files.read_table(path, scene[2])
     assert read["box"].shape == (0, 7)
     assert read["frame"].dtype == np.int64
 
 
-def test_keys_survive_another_selection_of_frames(tmp_path, scene):
+def test_keys_survive_another_selection_of_frames(tmp_path, scene, write_table):
     _, found, frames = scene
-    files.write_table(tmp_path / "p.json", found, frames)
+    write_table(tmp_path / "p.json", found, frames)
     shifted = {**frames, "frame": frames["frame"] + 1000}
     read = files.read_table(tmp_path / "p.json", shifted)
     np.testing.assert_array_equal(read["frame"], found["frame"] + 1000)
@@ -209,5 +227,3 @@ def test_wrong_files_are_named(tmp_path):
     raises("a.json", named, "row 0: frame '1/b', expected one of .*, such as '1/a'")
     with pytest.raises(DataError, match="such as None"):
         files.read_table(tmp_path / "a.json")
-    with pytest.raises(UserError, match=r"cannot write '\.txt'"):
-        files.write_table(tmp_path / "b.txt", {"frame": [], "box": [], "cls": []})

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation import evaluate, files, kitti
+from radejax.evaluation import evaluate, kitti
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -106,10 +106,10 @@ def test_errors(tmp_path, scene):
         kitti.read_kitti(tmp_path / "0.0")
 
 
-def test_a_reports_own_files_are_written(tmp_path, scene):
+def test_a_reports_own_files_are_written(tmp_path, scene, write_table):
     truth, found, frames = scene
     for name, table in (("truth", truth), ("found", found)):
-        files.write_table(tmp_path / f"{name}.npz", table, frames)
+        write_table(tmp_path / f"{name}.npz", table, frames)
     by_key = [dict(np.load(tmp_path / f"{name}.npz")) for name in ("truth", "found")]
     assert by_key[0]["frame"].dtype.kind == "U"
     count = kitti.write_kitti(tmp_path / "by_key", *by_key, frames)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, DiskFullError
-from radejax.evaluation import evaluate, report, results, tables
+from radejax.evaluation import evaluate, report
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.results import EvaluationOptions
@@ -94,7 +94,7 @@ def test_json_and_csv_hold_the_numbers_of_evaluate(written, scene):
 
 
 def test_means_are_over_classes_that_occur(written):
-    table = tables.index(written[0].results)
+    table = report.index(written[0].results)
     for protocol in PROTOCOLS:
         for condition in ("all", "fog"):
             present = [
@@ -123,23 +123,6 @@ def test_tables_stand_beside_the_published_rows(written):
     assert count == text.count("**") / 2 > 5
     assert latex.count(r"\toprule") == latex.count(r"\end{tabular}") == count
     assert re.search("% AP .* kradar_r40, score>0, skip=frame", latex)
-
-
-def test_what_was_left_out_is_counted(scene):
-    truth, found, frames = scene
-    data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
-    counts = results.exclusion_counts(data, EvaluationOptions(score_threshold=0.3))
-    kept = len(data.gt) + counts["ground truth: center outside the region of interest"]
-    assert kept == len(truth["frame"])
-    above, empty = data.pred.score > 0.3, ~np.isin(np.arange(30), data.gt.frame)
-    used = data.results("coco101", score_threshold=0.3, spaces="3d")
-    assert list(counts.values())[-4:] == [
-        (~above).sum(),
-        empty.sum(),
-        (empty[data.pred.frame] & above).sum(),
-        above.sum() - sum(result.num_det for result in used),
-    ]
-    assert "predictions: score not above 0.3 (counted by all_point)" in counts
 
 
 def test_sizes_of_an_untrained_network(scene, tmp_path):
@@ -187,14 +170,6 @@ def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
     assert len(list((out / "worst_frames").iterdir())) <= 3  # of this evaluation alone
 
 
-def test_conditions_are_in_the_papers_order():
-    frames = {"frame": [0] * 4, "weather": ["sleet", "martian", "normal", "fog"]}
-    masks = results.condition_masks(frames, "weather")
-    assert list(masks) == ["normal", "fog", "sleet", "martian"]
-    assert masks["fog"].tolist() == [False, False, False, True]
-    assert results.condition_masks(frames, "time") == {}
-
-
 def test_frames_with_ids_only(scene, tmp_path):
     truth, found, frames = scene
     only = {"frame": frames["frame"]}
@@ -229,12 +204,12 @@ def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
         "precision_recall_bev_iou30.png",
     ]
     assert list(drawn[0]) == [
-        f"{cls}, all_point, bev, IoU 0.3" for cls in ("Sedan", "Bus or Truck")
+        f"{cls}, all_point, 3d, IoU 0.3" for cls in ("Sedan", "Bus or Truck")
     ]
-    lines = drawn[0]["Sedan, all_point, bev, IoU 0.3"]
+    lines = drawn[0]["Sedan, all_point, 3d, IoU 0.3"]
     assert [name.split(",")[0] for name in lines] == ["all", "normal", "fog", "rain"]
     data = EvaluationSet(*scene[:2], frames=scene[2])
-    whole = data.results("all_point", iou_thresholds=0.3, spaces="bev")[0]
+    whole = data.results("all_point", iou_thresholds=0.3, spaces="3d")[0]
     np.testing.assert_array_equal(lines[f"all, AP {whole.ap:.1f}"][0], whole.recall)
 
 

@@ -7,10 +7,12 @@ import pytest
 
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import KRadar
-from radejax.evaluation import report, tables
-from radejax.evaluation.files import Source, tables_from_frames
+from radejax.evaluation import report
+from radejax.evaluation.boxes import tables_from_frames
+from radejax.evaluation.comparison import compare_files
+from radejax.evaluation.files import Source, evaluate_files
+from radejax.evaluation.report import PUBLISHED
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
-from radejax.evaluation.tables import PUBLISHED
 
 
 def printed(source, method=None, *, iou=0.3):
@@ -63,7 +65,7 @@ def test_rows_that_two_tables_share_agree():
     for method in ("TED-S", "MixedFusion", "RTNH", "DPFT", "EchoFusion"):
         one = printed("RADE-Net, Table I", method)
         other = printed("DinoRADE, Table 1", method)
-        for condition in tables.CONDITIONS:
+        for condition in report.CONDITIONS:
             assert one(condition=condition) == other(condition=condition)
     rade, dino = (printed("DinoRADE, Table 3", m) for m in ("RADE-Net", "DinoRADE"))
     two, weather = printed("RADE-Net, Table II"), printed("DinoRADE, Table 2")
@@ -85,7 +87,7 @@ def test_means_are_means_of_their_classes(source, method):
     """A slip in copying a number would show here."""
     value = printed(source, method)
     for space in ("3d", "bev"):
-        for condition in tables.CONDITIONS:
+        for condition in report.CONDITIONS:
             if (source, condition) == ("RADE-Net, Table II", "sleet"):
                 continue  # printed 18.52 and 21.53, its classes give 18.49 and 21.35
             values = [value(cls, space, condition) for cls in CLASSES]
@@ -122,7 +124,7 @@ def _tables(real, split="test", **changes):
     """Rows of Tables I, II, DinoRADE's 3 and III."""
     options = dataclasses.replace(AS_PAPERS, **changes)
     _, results = evaluate_tables(*real, options)
-    built = tables.paper_tables({"mine": tables.index(results)}, options, split)
+    built = report.paper_tables("mine", report.index(results), options, split)
     return [table.rows for table in built]
 
 
@@ -194,8 +196,8 @@ def test_simulated_frames_have_no_published_row_anywhere(random_scene, tmp_path)
     assert all(row["name"].endswith("/simulated") for row in made.metrics["ap"])
     assert "30 simulated frames" in made.text
     # A report that is evaluated or compared again still says so.
-    again = report.evaluate_files(tmp_path, tmp_path / "b", Source(), options)
+    again = evaluate_files(tmp_path, tmp_path / "b", Source(), options)
     assert again.metrics["is_simulated"]
-    text, _ = report.compare_files([tmp_path, tmp_path / "b"], None, Source(), options)
-    assert text.count("Simulated data: ") == 2
+    text, _ = compare_files([tmp_path, tmp_path / "b"], None, Source(), options)
+    assert text.count("Simulated data: ") == 1
     assert "RADE-Net" not in text

@@ -36,7 +36,9 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     assert "Sedan from" in capsys.readouterr().out
     assert (tmp_path / "report.txt").read_text() == report.text
     metrics = json.loads((tmp_path / "metrics.json").read_text())
-    sedan = next(r for r in metrics["ap"] if r["cls"] == "Sedan" and r["kind"] == "all")
+    sedan = next(
+        r for r in metrics["ap"] if r["cls"] == "Sedan" and r["condition"] == "all"
+    )
     assert sedan["num_det"] > 0
     assert 0.0 < sedan["ap"] < 95.0
 

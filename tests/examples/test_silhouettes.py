@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from radejax.core.config import load_module
 from radejax.core.structures import CLASSES
+from radejax.evaluation.comparison import Comparison
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import EvaluationOptions
 from radejax.runs import experiment
@@ -60,11 +61,8 @@ def test_both_runs_see_the_same_scenes_and_the_gain_decides(
 
 
 def test_a_gain_that_chance_explains_does_not_meet_the_bar() -> None:
-    row = dict.fromkeys(
-        [field.name for field in dataclasses.fields(silhouettes.bootstrap.Comparison)]
-    )
+    row = dict.fromkeys([field.name for field in dataclasses.fields(Comparison)])
     row |= {"cls": "mean", "difference": 9.0, "low": -0.5}
-    comparison = silhouettes.bootstrap.Comparison
-    assert not silhouettes.is_met([comparison(**row)])
-    assert silhouettes.is_met([comparison(**row | {"low": 0.5})])
-    assert not silhouettes.is_met([comparison(**row | {"low": 0.5, "difference": 2.9})])
+    assert not silhouettes.is_met([Comparison(**row)])
+    assert silhouettes.is_met([Comparison(**row | {"low": 0.5})])
+    assert not silhouettes.is_met([Comparison(**row | {"low": 0.5, "difference": 2.9})])

@@ -9,7 +9,7 @@ import pytest
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
-from radejax.evaluation.files import Source, write_table
+from radejax.evaluation.files import Source
 from radejax.evaluation.files import load as load_tables
 from radejax.inference.detect_files import (
     detect_files,
@@ -99,11 +99,9 @@ def test_boxes_of_an_exported_folder(tmp_path):
         "sequence": [7, 7],
         "name": ["00002_00011", "00001_00010"],
     }
-    truth = {k: v[:0] for k, v in detector(frames).to_columns().items()}
-    write_table(tmp_path / "truth.json", truth)
+    files.write_json(tmp_path / "truth.json", [])
     files.write_json(tmp_path / "frames.json", table)
-    paths = {k: str(tmp_path / f"{k}.json") for k in ("frames", "truth")}
-    source = Source(ground_truth=paths["truth"], frames=paths["frames"])
+    source = Source(ground_truth=str(tmp_path / "truth.json"))
     _, found, *_ = load_tables(out, source, detector.classes)
     counts = np.bincount(found["frame"], minlength=6).tolist()
     assert counts == [0, 0, 0, 0, len(expected[2]), len(expected[1])]

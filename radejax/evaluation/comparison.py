@@ -1,86 +1,40 @@
-"""Confidence intervals and comparisons by resampling whole sequences.
+"""Comparisons of runs on the same frames: `radejax compare`.
 
-Frames of one sequence show the same few cars, so they are not independent; sequences
-are. A resample draws as many sequences as there are, with replacement, and every frame
-counts as often as its sequence was drawn, which all protocols handle exactly.
+Both runs of a comparison see the same resampled sequences, see `evaluation.results`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import pathlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 
+from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.core.files import PathLike
 from radejax.evaluation import protocols
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
-
-LEVEL = 0.95
-
-
-def sequence_weights(
-    sequence: Shaped[np.ndarray, " F"], *, resamples: int, seed: int
-) -> Int[np.ndarray, "B F"]:
-    """How often each frame counts in each resample; int16.
-
-    Args:
-        sequence: Sequence of every frame.
-        resamples: Number of resamples B.
-        seed: Of the drawing; the same seed draws the same sequences.
-
-    Raises:
-        UserError: Fewer than two sequences: there is nothing to resample.
-    """
-    names, inverse = np.unique(np.asarray(sequence), return_inverse=True)
-    if names.size < 2:
-        raise UserError(
-            f"intervals need at least 2 sequences to resample, found {names.size}"
-        )
-    rng = np.random.default_rng(seed)
-    drawn = rng.multinomial(names.size, np.full(names.size, 1 / names.size), resamples)
-    return drawn.astype(np.int16)[:, inverse]
-
-
-def resample(
-    data: EvaluationSet,
-    weights: Int[np.ndarray, "B F"],
-    protocol: str,
-    space: str,
-    iou: float,
-    *,
-    empty_frames: str = "protocol",
-    score_threshold: float = 0.0,
-) -> Float[np.ndarray, "B _"]:
-    """`[B, C + 1]` AP of every class, then their mean, in every resample.
-
-    NaN where a resample has no object of a class; the mean is over classes that occur.
-    """
-    chosen = protocols.get_protocol(protocol)
-    empty_frames = chosen.resolve_empty_frames(empty_frames)
-    ap = np.full((len(weights), len(data.classes) + 1), np.nan)
-    for row, weight in enumerate(weights):
-        by_class = data.frame_weights(empty_frames, weight)
-        for cls in range(len(data.classes)):
-            curve = data.curve(
-                chosen, space, iou, float(score_threshold), cls, by_class[:, cls]
-            )
-            if curve.num_gt:
-                ap[row, cls] = curve.ap
-        present = ap[row, ~np.isnan(ap[row])]
-        ap[row, -1] = present.mean() if present.size else np.nan
-    return ap
-
-
-def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:
-    """95 % percentile interval of the samples that are defined; NaN if none is."""
-    samples = samples[~np.isnan(samples)]
-    if not samples.size:
-        return float("nan"), float("nan")
-    low, high = np.quantile(samples, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
+from radejax.evaluation.files import Source, load, stored_from
+from radejax.evaluation.report import (
+    SPACE_TITLES,
+    Table,
+    numbers,
+    plain,
+    rendered,
+)
+from radejax.evaluation.results import (
+    LEVEL,
+    EvaluationOptions,
+    interval,
+    make_set,
+    resample,
+    sequence_weights,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +80,6 @@ def compare(
     spaces: Sequence[str] = SPACES,
     score_threshold: float = 0.0,
     resamples: int = 2000,
-    seed: int = 0,
 ) -> list[Comparison]:
     """Paired comparison of two runs: both see the same resampled sequences.
 
@@ -139,13 +92,12 @@ def compare(
         spaces: "bev", "3d".
         score_threshold: Score threshold of both.
         resamples: Number of resamples.
-        seed: Seed of the resampling.
 
     Raises:
         UserError: The runs differ in classes, frames or ground truth.
     """
     _check_same_truth(data_a, data_b)
-    weights = sequence_weights(sequence, resamples=resamples, seed=seed)
+    weights = sequence_weights(sequence, resamples=resamples, seed=0)
     # The first row weights every frame once: the APs themselves.
     weights = np.concatenate([np.ones_like(weights[:1]), weights])
     rows = []
@@ -209,3 +161,87 @@ def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
             raise UserError(
                 f"the runs have different {name} ({counts}), expected equal"
             )
+
+
+def comparison_table(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
+    """Two runs and which of their differences are significant."""
+    header = ["Class", "Protocol", "AP", "IoU", "A", "B", "B - A", "95 %", "p"]
+    body = []
+    for row in rows:
+        gap, low, high = numbers((row.difference, row.low, row.high), signed=True)
+        entries = [row.cls, row.protocol, SPACE_TITLES[row.space], f"{row.iou:g}"]
+        entries += [*numbers((row.ap_a, row.ap_b)), gap, f"[{low}, {high}]"]
+        verdict = "significant" if row.is_significant else "not significant"
+        body.append([*entries, f"{row.p_adjusted:.3f}", verdict])
+    title = (
+        f"B = {run_b} against A = {run_a}: 95 % intervals over sequences, p after Holm"
+    )
+    return Table(title, [*header, "Difference"], body)
+
+
+def compare_files(
+    paths: Sequence[PathLike],
+    out_dir: PathLike | None,
+    source: Source,
+    options: EvaluationOptions,
+) -> tuple[str, list[dict[str, Any]]]:
+    """Compare runs on the same frames: each with the first.
+
+    Args:
+        paths: Predictions or report folders, at least two; the first is run A.
+        out_dir: Where to write comparison.txt and comparison.json, or None.
+        source: Ground truth, unless the paths bring their own.
+        options: Classes, protocols, IoU thresholds, region, score threshold and number
+            of resamples of sequences (`bootstrap`).
+
+    Returns:
+        The tables as text, and the fields of all comparisons (B is the second run first).
+
+    Raises:
+        UserError: Fewer than two runs, or runs on different frames or ground truth.
+    """
+    if len(paths) < 2:
+        raise UserError("a comparison needs at least two runs")
+    if options.bootstrap < 1:
+        raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
+    # What one run has not stored must not count for another one.
+    threshold = max(options.score_threshold, *map(stored_from, paths))
+    options = dataclasses.replace(
+        options, score_threshold=threshold, min_score=threshold
+    )
+    usual = (protocols.RECOMMENDED, "kradar_r40")
+    names = [str(path) for path in paths]
+    (first, sequence), *others = [_load_run(path, source, options) for path in paths]
+    built, rows = [], []
+    for name, (data, _) in zip(names[1:], others, strict=True):
+        found = compare(
+            first,
+            data,
+            sequence,
+            protocol_names=[p for p in usual if p in options.protocols]
+            or options.protocols[:1],
+            iou_thresholds=options.iou_thresholds[:1],
+            score_threshold=threshold,
+            resamples=options.bootstrap,
+        )
+        built.append(comparison_table(found, names[0], name))
+        rows += [plain(dataclasses.asdict(row)) for row in found]
+    text = rendered(built, is_simulated=first.is_simulated)
+    if out_dir is not None:
+        content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
+        files.write_text(pathlib.Path(out_dir) / "comparison.txt", text)
+        files.write_json(pathlib.Path(out_dir) / "comparison.json", content)
+    return text, rows
+
+
+def _load_run(
+    path: PathLike, source: Source, options: EvaluationOptions
+) -> tuple[EvaluationSet, np.ndarray]:
+    """A run ready to be compared, and the sequence of each of its frames."""
+    truth, found, frames, _ = load(path, source, options.classes)
+    if "sequence" not in frames:
+        raise UserError(
+            f"{path}: a comparison resamples sequences, and the frame table has no column "
+            "sequence: give --data or --labels"
+        )
+    return make_set(truth, found, frames, options), np.asarray(frames["sequence"])
