@@ -220,6 +220,24 @@ def take(table: AnyColumns, rows: Shaped[np.ndarray, " K"]) -> Columns:
     return {name: np.asarray(column)[rows] for name, column in table.items()}
 
 
+def columns_of(
+    rows: Sequence[tuple[int | str, str, Sequence[float], float]],
+) -> Columns:
+    """Columns of rows of frame, class, box and score.
+
+    Examples:
+        >>> columns_of([(7, "Sedan", (20, 0, 0, 4, 2, 1.5, 0), 0.9)])["frame"].tolist()
+        [7]
+    """
+    frame, cls, box, score = ([row[i] for row in rows] for i in range(4))
+    return {
+        "frame": np.array(frame) if rows else np.zeros(0, np.int64),
+        "cls": np.array(cls, str),
+        "box": np.array(box, np.float64).reshape(-1, 7),
+        "score": np.array(score, np.float64),
+    }
+
+
 def tables_from_frames(
     frames: Iterable[Any], split: str | None = None
 ) -> tuple[Columns, Columns]:

@@ -20,13 +20,7 @@ from radejax.core.files import PathLike
 from radejax.evaluation import protocols
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 from radejax.evaluation.files import Source, load, stored_from
-from radejax.evaluation.report import (
-    SPACE_TITLES,
-    Table,
-    numbers,
-    plain,
-    rendered,
-)
+from radejax.evaluation.report import Table, numbers, plain, rendered
 from radejax.evaluation.results import (
     LEVEL,
     EvaluationOptions,
@@ -66,7 +60,7 @@ class Comparison:
     low: float
     high: float
     p_value: float
-    p_adjusted: float
+    p_adjusted: float = 1.0
     is_significant: bool = False
 
 
@@ -76,8 +70,8 @@ def compare(
     sequence: Shaped[np.ndarray, " F"],
     *,
     protocol_names: Sequence[str] = (protocols.RECOMMENDED, "kradar_r40"),
-    iou_thresholds: Sequence[float] = (0.3,),
     spaces: Sequence[str] = SPACES,
+    iou: float = 0.3,
     score_threshold: float = 0.0,
     resamples: int = 2000,
 ) -> list[Comparison]:
@@ -88,8 +82,8 @@ def compare(
         data_b: Run B on the same ground truth and frames.
         sequence: Sequence of every frame.
         protocol_names: Protocols to compare in.
-        iou_thresholds: IoU thresholds.
         spaces: "bev", "3d".
+        iou: IoU threshold.
         score_threshold: Score threshold of both.
         resamples: Number of resamples.
 
@@ -101,51 +95,43 @@ def compare(
     # The first row weights every frame once: the APs themselves.
     weights = np.concatenate([np.ones_like(weights[:1]), weights])
     rows = []
-    for metric in itertools.product(protocol_names, spaces, map(float, iou_thresholds)):
+    for protocol, space in itertools.product(protocol_names, spaces):
+        metric = protocol, space, iou
         samples_a, samples_b = (
             resample(data, weights, *metric, score_threshold=score_threshold)
             for data in (data_a, data_b)
         )
-        for index, name in enumerate((*data_a.classes, "mean")):
+        for index, cls in enumerate((*data_a.classes, "mean")):
             if not np.isnan(samples_a[0, index]):
-                pair = samples_a[:, index], samples_b[:, index]
-                rows.append(_compare_class(name, metric, *pair))
-    return _holm(rows)
+                values = _difference(samples_a[:, index], samples_b[:, index])
+                rows.append(Comparison(cls, space, iou, protocol, *values))
+    adjusted = _holm(np.array([row.p_value for row in rows])).tolist()
+    return [
+        dataclasses.replace(row, p_adjusted=p, is_significant=p < 1 - LEVEL)
+        for row, p in zip(rows, adjusted, strict=True)
+    ]
 
 
-def _compare_class(
-    cls: str,
-    metric: tuple[str, str, float],
-    samples_a: Float[np.ndarray, " B"],
-    samples_b: Float[np.ndarray, " B"],
-) -> Comparison:
-    """Comparison of one class from its APs; the first of each is over all frames."""
-    protocol, space, iou = metric
+def _difference(
+    samples_a: Float[np.ndarray, " B"], samples_b: Float[np.ndarray, " B"]
+) -> tuple[float, float, float, float, float, float]:
+    """APs, difference, interval and p-value; the first samples are over all frames."""
     ap_a, ap_b = float(samples_a[0]), float(samples_b[0])
     gaps = samples_b[1:] - samples_a[1:]
     gaps = gaps[~np.isnan(gaps)]
-    low, high = interval(gaps)
     # One is added so that no finite number of resamples gives a p-value of 0.
-    below, above = (
-        (side.sum() + 1) / (gaps.size + 1) for side in (gaps <= 0, gaps >= 0)
-    )
-    p_value = float(min(1.0, 2 * min(below, above)))
-    return Comparison(
-        cls, space, iou, protocol, ap_a, ap_b, ap_b - ap_a, low, high, p_value, p_value
-    )
+    turned = min((gaps <= 0).sum(), (gaps >= 0).sum()) + 1
+    p_value = float(min(1.0, 2 * turned / (gaps.size + 1)))
+    return ap_a, ap_b, ap_b - ap_a, *interval(gaps), p_value
 
 
-def _holm(rows: list[Comparison]) -> list[Comparison]:
-    """Adjusts p-values for the number of rows (Holm's step-down)."""
-    p_values = np.array([row.p_value for row in rows])
+def _holm(p_values: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
+    """P-values adjusted for their number (Holm's step-down)."""
     order = np.argsort(p_values, kind="stable")
-    scaled = np.minimum(1, np.arange(len(rows), 0, -1) * p_values[order])
-    adjusted = np.empty(len(rows))
+    scaled = np.minimum(1, np.arange(p_values.size, 0, -1) * p_values[order])
+    adjusted = np.empty_like(scaled)
     adjusted[order] = np.maximum.accumulate(scaled)
-    return [
-        dataclasses.replace(row, p_adjusted=p, is_significant=p < 1 - LEVEL)
-        for row, p in zip(rows, adjusted.tolist(), strict=True)
-    ]
+    return adjusted
 
 
 def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
@@ -169,7 +155,7 @@ def comparison_table(rows: Sequence[Comparison], run_a: str, run_b: str) -> Tabl
     body = []
     for row in rows:
         gap, low, high = numbers((row.difference, row.low, row.high), signed=True)
-        entries = [row.cls, row.protocol, SPACE_TITLES[row.space], f"{row.iou:g}"]
+        entries = [row.cls, row.protocol, row.space.upper(), f"{row.iou:g}"]
         entries += [*numbers((row.ap_a, row.ap_b)), gap, f"[{low}, {high}]"]
         verdict = "significant" if row.is_significant else "not significant"
         body.append([*entries, f"{row.p_adjusted:.3f}", verdict])
@@ -209,7 +195,6 @@ def compare_files(
     options = dataclasses.replace(
         options, score_threshold=threshold, min_score=threshold
     )
-    usual = (protocols.RECOMMENDED, "kradar_r40")
     names = [str(path) for path in paths]
     (first, sequence), *others = [_load_run(path, source, options) for path in paths]
     built, rows = [], []
@@ -218,9 +203,8 @@ def compare_files(
             first,
             data,
             sequence,
-            protocol_names=[p for p in usual if p in options.protocols]
-            or options.protocols[:1],
-            iou_thresholds=options.iou_thresholds[:1],
+            protocol_names=options.main_protocols[:2],
+            iou=options.iou_thresholds[0],
             score_threshold=threshold,
             resamples=options.bootstrap,
         )

@@ -350,8 +350,8 @@ class EvaluationSet:
     ) -> Curve:
         """Curve and AP of one class over weighted frames."""
         # Protocols that match alike share their rankings.
-        matching_terms = protocol.geometry, protocol.matching, space, iou
-        ranked = self._once(self._ranking, *matching_terms, score_threshold, cls)
+        matched_by = protocol.geometry, protocol.matching, space, iou
+        ranked = self._once(self._ranking, matched_by, score_threshold, cls)
         num_gt = int(weight @ self.gt_count[:, cls])
         if protocol.matching == "kradar":
             matched, events, detections = (
@@ -366,13 +366,7 @@ class EvaluationSet:
         )
 
     def _ranking(
-        self,
-        geometry: str,
-        rule: str,
-        space: str,
-        iou: float,
-        threshold: float,
-        cls: int,
+        self, matched_by: tuple[str, str, str, float], threshold: float, cls: int
     ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """What a curve of one class needs for any weights of the frames.
 
@@ -380,7 +374,7 @@ class EvaluationSet:
         protocols the counts that they add instead: to the matches of the first pass, to
         the true positives of the second, and to the predictions.
         """
-        match = self.match(geometry, rule, space, iou)
+        match = self.match(*matched_by)
         mine = self.by_score[cls]
         if isinstance(match, matching.KradarMatches):
             counted = [

@@ -22,6 +22,7 @@ from radejax.core.structures import BOX_FIELDS
 from radejax.data.kradar import KRadar
 from radejax.evaluation.boxes import (
     Columns,
+    columns_of,
     frame_ids,
     tables_from_frames,
     take,
@@ -68,14 +69,7 @@ def read_table(
             columns = {**columns, "frame": names[columns["frame"]]}
     elif path.is_dir() or path.suffix == ".json":
         parts = sorted(path.glob("*.json")) if path.is_dir() else [path]
-        records = [record for part in parts for record in _records(part, scored)]
-        frame, cls, box, score = ([r[i] for r in records] for i in range(4))
-        columns = {
-            "frame": np.array(frame),
-            "cls": np.array(cls, str),
-            "box": np.array(box, np.float64).reshape(-1, 7),
-            "score": np.array(score, np.float64),
-        }
+        columns = columns_of([row for part in parts for row in _records(part, scored)])
     elif path.suffix == ".npz":
         columns = read_npz(path)
         if missing := [name for name in wanted if name not in columns]:
@@ -167,15 +161,12 @@ def load(
         DataError: Malformed content.
     """
     path = pathlib.Path(path)
-    left_out: dict[str, int] = {}
     if (path / "predictions.npz").is_file():
-        frames = _read_frames(path / "frames.json")
-        truth = read_table(path / "ground_truth.npz", frames, scored=False)
-        found = read_table(path / "predictions.npz", frames)
-    else:
-        truth, given, left_out = _load_ground_truth(path, source, classes)
-        found = read_table(path, given)
-        frames = given or {"frame": np.union1d(truth["frame"], found["frame"])}
+        source = dataclasses.replace(source, ground_truth=str(path))
+        path = path / "predictions.npz"
+    truth, given, left_out = _load_ground_truth(path, source, classes)
+    found = read_table(path, given)
+    frames = given or {"frame": np.union1d(truth["frame"], found["frame"])}
     box = np.array(found["box"], np.float64).reshape(-1, 7)
     box[:, 2] += source.z_offset_m
     if source.yaw_degrees:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import pathlib
 import re
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -28,22 +27,17 @@ from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
 from radejax.evaluation.boxes import (
+    KNOWN_CLASSES,
     Columns,
+    columns_of,
     frame_ids,
     frame_positions,
     take,
     with_ids,
 )
 
-CLASS_KEYS = {
-    "Sedan": "sed",
-    "Bus or Truck": "bus",
-    "Pedestrian": "ped",
-    "Motorcycle": "mot",
-    "Bicycle": "bic",
-    "Pedestrian Group": "peg",
-    "Bicycle Group": "big",
-}
+KEYS = ("sed", "bus", "ped", "mot", "bic", "peg", "big")
+CLASS_KEYS = dict(zip(KNOWN_CLASSES, KEYS, strict=True))
 CLASS_NAMES = {key: name for name, key in CLASS_KEYS.items()}
 GT_HEADER = "0.00 0 0 50 50 150 150"
 PRED_HEADER = "-1 -1 0 50 50 150 150"
@@ -61,9 +55,10 @@ def write_kitti(
     frames: Columns,
     *,
     score_threshold: float = 0.0,
-    conditions: Iterable[str] = ("weather", "environment", "time"),
 ) -> int:
     """Writes folders that K-Radar's official evaluation script reads.
+
+    Every weather, environment and time of the frame table gets one beside "all".
 
     Args:
         folder: Where; a folder named after the score threshold is made in it.
@@ -73,7 +68,6 @@ def write_kitti(
         predictions: The same with scores.
         frames: Frame table; the position of a frame is the number of its file.
         score_threshold: Only predictions above it are written.
-        conditions: Columns of the frame table whose values get folders beside "all".
 
     Returns:
         Number of frames written; those without ground truth are skipped, as K-Radar's
@@ -87,22 +81,21 @@ def write_kitti(
     if not len(ground_truth["frame"]):
         raise UserError("no frame has ground truth: K-Radar's tools write none of them")
     is_above = np.asarray(predictions["score"]) > score_threshold
-    by_position = {}
-    for name, table, scored in (
-        ("ground truth", ground_truth, False),
-        ("predictions", take(predictions, is_above), True),
-    ):
+
+    def lines(table: Columns, name: str, *, scored: bool) -> dict[int, list[str]]:
         frame = with_ids(table, frames, name)["frame"]
         numbered = {**table, "frame": frame_positions(frame, ids, name)}
-        by_position[name] = _lines(numbered, scored=scored)
-    truth, found = by_position.values()
+        return _lines(numbered, scored=scored)
+
+    truth = lines(ground_truth, "ground truth", scored=False)
+    found = lines(take(predictions, is_above), "predictions", scored=True)
     root = pathlib.Path(folder) / f"{float(score_threshold)}"
-    kinds = [kind for kind in conditions if kind in frames]
+    kinds = [kind for kind in DESCRIPTION if kind in frames]
     listed: dict[pathlib.Path, list[str]] = {}
-    for position, lines in sorted(truth.items()):
+    for position in sorted(truth):
         tags = {kind: str(np.asarray(frames[kind])[position]) for kind in kinds}
         texts = {
-            "gts": "\n".join(lines) + "\n",
+            "gts": "\n".join(truth[position]) + "\n",
             "preds": "\n".join(found.get(position, [DUMMY])) + "\n",
             "desc": "\n".join(tags.get(kind, "unknown") for kind in DESCRIPTION),
         }
@@ -120,8 +113,7 @@ def write_kitti(
 def prediction_texts(detections: Detections) -> list[str]:
     """One text per frame as K-Radar's tools write predictions, without a final newline.
 
-    Args:
-        detections: Of a batch; a frame without any gets the line "dummy".
+    A frame without detections gets the line "dummy".
 
     Raises:
         UserError: K-Radar has no key for a class.
@@ -201,14 +193,7 @@ def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Colu
         for number, line in enumerate(files.read_text(path).splitlines(), 1):
             if row := _read_line(line, scored, f"{path}: line {number}"):
                 rows.append((numbers[-1], *row))
-    columns = {
-        "frame": np.array([row[0] for row in rows], np.int64),
-        "cls": np.array([row[1] for row in rows], dtype=str),
-        "box": np.array([row[2] for row in rows], np.float64).reshape(-1, 7),
-    }
-    if scored:
-        columns["score"] = np.array([row[3] for row in rows], np.float64)
-    return numbers, columns
+    return numbers, columns_of(rows)
 
 
 def _read_line(line: str, scored: bool, where: str) -> tuple | None:

@@ -37,7 +37,6 @@ class Protocol:
         curve: How precisions become one number.
         empty_frames: Frames to ignore by default: "class" those without an object of the
             class, "frame" those without an object of any class, "none" no frames.
-        summary: One line for reports.
         is_fixed: Reports apply neither their score threshold nor their empty-frame rule:
             every prediction and every frame counts.
     """
@@ -47,7 +46,6 @@ class Protocol:
     matching: Literal["kradar", "best", "free"]
     curve: CurveKind
     empty_frames: Literal["class", "frame", "none"]
-    summary: str
     is_fixed: bool = False
 
     def resolve_empty_frames(self, empty_frames: str) -> str:
@@ -66,33 +64,20 @@ RECOMMENDED = "all_point"
 """The protocol that docs/evaluation.md recommends, with the reasons."""
 
 
-def _kradar(name: str, geometry: Geometry, curve: CurveKind, summary: str) -> Protocol:
-    summary = f"K-Radar's evaluation, {summary}"
-    return Protocol(name, geometry, "kradar", curve, "frame", summary)
-
-
-def _radenet(curve: CurveKind, summary: str) -> Protocol:
-    summary = f"RADE-Net's evaluator, {summary}"
-    return Protocol(curve, "plain", "best", curve, "class", summary)
-
-
 _ALL = (
-    _kradar("kradar_r40", "swapped_lw", "r40", "revised, length and width swapped"),
-    _kradar("kradar_r40_corrected", "rounded", "r40", "revised, with the yaw right"),
-    _kradar("kradar_r11", "swapped_lw_z_top", "r11", "older, z as the top of a box"),
-    _radenet("voc11", "11 recall levels"),
-    _radenet("recall41", "41 recall levels"),
-    _radenet("coco101", "101 recall levels (RADE-Net, DinoRADE)"),
-    _radenet("auc", "area under the raw curve"),
-    Protocol(
-        RECOMMENDED,
-        "plain",
-        "free",
-        "all_point",
-        "none",
-        "exact area under the interpolated curve, every frame counts (recommended)",
-        is_fixed=True,
-    ),
+    # K-Radar's revised evaluation as published, with length and width swapped.
+    Protocol("kradar_r40", "swapped_lw", "kradar", "r40", "frame"),
+    # The same with the yaw right.
+    Protocol("kradar_r40_corrected", "rounded", "kradar", "r40", "frame"),
+    # K-Radar's older evaluation: 11 of 41 samples, z as the top of a box.
+    Protocol("kradar_r11", "swapped_lw_z_top", "kradar", "r11", "frame"),
+    # RADE-Net's evaluator: 11, 41 or 101 recall levels, or the area under the raw curve.
+    Protocol("voc11", "plain", "best", "voc11", "class"),
+    Protocol("recall41", "plain", "best", "recall41", "class"),
+    Protocol("coco101", "plain", "best", "coco101", "class"),
+    Protocol("auc", "plain", "best", "auc", "class"),
+    # The exact area under the interpolated curve; every frame counts.
+    Protocol(RECOMMENDED, "plain", "free", "all_point", "none", is_fixed=True),
 )
 PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
 

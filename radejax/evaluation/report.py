@@ -38,7 +38,6 @@ from radejax.evaluation.results import (
     evaluate_tables,
     exclusion_counts,
     to_row,
-    why_no_intervals,
 )
 
 
@@ -80,7 +79,7 @@ def write_report(
             weather, environment, time, simulated and split.
         out_dir: Folder of the report; files in it are replaced when all are written.
         options: What to compute.
-        run: Name of the run in
+        run: Name of the run in tables.
         left_out: Counts of what loading skipped, by reason.
         warnings: Of loading, to be printed.
         draw_frame: Called with (frame id, path of a figure to write) for each of the
@@ -106,9 +105,9 @@ def write_report(
         "num_predictions": len(data.pred),
         "left_out": {**(left_out or {}), **exclusion_counts(data, options)},
         "warnings": [*warnings, *analysis.sanity_checks(data)],
-        "protocols": {p: protocols.PROTOCOLS[p].summary for p in options.protocols},
-        "intervals": why_no_intervals(frames, options)
-        or f"{options.bootstrap} resamples of sequences",
+        "intervals": f"{options.bootstrap} resamples of sequences"
+        if any(result.low is not None for result in results)
+        else "none: they need --bootstrap and frames of two sequences or more",
         "ap": [to_row(result) for result in results],
         "subsets": {
             "protocol": f"{protocols.RECOMMENDED}, {settings}",
@@ -118,8 +117,9 @@ def write_report(
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
     metrics = plain(metrics)
-    text = _console_text(metrics, results, options)
-    built = _tables(metrics, results, options)
+    by_key = index(results)
+    text = _console_text(metrics, by_key, options)
+    built = _tables(metrics, by_key, options)
     with files.swapped_in(out_dir) as folder:
         # The inputs stay with the report, so that two reports can be compared later.
         columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
@@ -155,31 +155,31 @@ def _split(frames: Columns) -> str | None:
 
 
 def _tables(
-    metrics: Mapping[str, Any], results: list[Result], options: EvaluationOptions
+    metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
 ) -> list[Table]:
     """Those of the papers, then every protocol and IoU threshold, then details."""
-    by_key, ious = index(results), options.iou_thresholds
+    ious = options.iou_thresholds
     built = []
     if not metrics["is_simulated"]:
-        built += paper_tables(metrics["run"], by_key, options, metrics["split"])
-    for space, iou in itertools.product(SPACE_TITLES, ious):
-        built.append(by_protocol(by_key, options, space, iou))
+        built += paper_tables(metrics["run"], results, options, metrics["split"])
+    for space, iou in itertools.product(SPACES, ious):
+        built.append(by_protocol(results, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, ious):
-        built.append(class_by_weather(by_key, options, protocol, iou))
+        built.append(class_by_weather(results, options, protocol, iou))
     return built + detail_tables(metrics)
 
 
 def _console_text(
-    metrics: Mapping[str, Any], results: list[Result], options: EvaluationOptions
+    metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
 ) -> str:
     """The most important tables, on one screen."""
-    by_key, iou = index(results), options.iou_thresholds[0]
+    iou = options.iou_thresholds[0]
     # Two thresholds of the first protocol, one of the others.
     first, *others = options.main_protocols
     shown = [(first, level) for level in options.iou_thresholds[:2]]
     shown += [(protocol, iou) for protocol in others]
-    built = [class_by_weather(by_key, options, *terms) for terms in shown]
-    built += [by_protocol(by_key, options, space, iou) for space in SPACE_TITLES]
+    built = [class_by_weather(results, options, *terms) for terms in shown]
+    built += [by_protocol(results, options, space, iou) for space in SPACES]
     built.append(subset_table(metrics["subsets"], "distance"))
     built.append(error_table(metrics["box_errors"]))
     kind = "simulated " if metrics["is_simulated"] else ""
@@ -210,7 +210,7 @@ def _draw_curves(
     protocol, iou = protocols.RECOMMENDED, options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
     masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
-    for space in SPACE_TITLES:
+    for space in SPACES:
         panels: dict[str, dict[str, Any]] = {}
         for name, mask in masks.items():
             for result in data.results(
@@ -245,8 +245,8 @@ def plain(value: Any) -> Any:
 TITLES = {"all": "Total"} | {
     name: name.replace("snow", " snow").title() for name in WEATHERS
 }
-SPACE_TITLES = {"3d": "3D", "bev": "BEV"}
-"""Titles of the spaces, in the order of the papers."""
+SPACES = ("3d", "bev")
+"""In the order of the papers."""
 
 STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 Results = Mapping[tuple[str, str, str, str, float], Result]
@@ -324,7 +324,7 @@ def class_by_weather(
     body = []
     for cls in (*options.classes, "mean"):
         pairs = (
-            [ap_of(results, protocol, name, cls, space, iou) for space in SPACE_TITLES]
+            [ap_of(results, protocol, name, cls, space, iou) for space in SPACES]
             for name in conditions
         )
         body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
@@ -342,18 +342,18 @@ def by_protocol(
     classes = (*options.classes, "mean")
     body = []
     for name in options.protocols:
-        found = (results.get((name, "all", cls, space, iou)) for cls in classes)
+        found = (results[name, "all", cls, space, iou] for cls in classes)
         body.append([name, *map(_with_interval, found)])
-    title = f"AP {SPACE_TITLES[space]} at IoU {iou:g} in every protocol, all weathers"
+    title = f"AP {space.upper()} at IoU {iou:g} in every protocol, all weathers"
     if any(result.low is not None for result in results.values()):
         title += f", 95 % intervals of {options.bootstrap} resamples of sequences"
     return Table(title, ["Protocol", *classes], body)
 
 
-def _with_interval(result: Result | None) -> str:
+def _with_interval(result: Result) -> str:
     """AP, and its interval if there is one, such as "61.05 [50.1, 70.2]"."""
-    if result is None or result.ap_or_none is None or result.low is None:
-        return number(None if result is None else result.ap_or_none)
+    if not result.is_defined or result.low is None:
+        return number(result.ap_or_none)
     low, high = numbers((result.low, result.high), digits=1)
     return f"{number(result.ap)} [{low}, {high}]"
 
@@ -364,54 +364,46 @@ def _with_interval(result: Result | None) -> str:
 def detail_tables(metrics: Mapping[str, Any]) -> list[Table]:
     """Every table of what lies behind the APs, from the content of metrics.json."""
     kinds = [kind for kind in metrics["subsets"] if kind != "protocol"]
-    header = ["Frame", "Name", "Sequence", "Missed", "False", "Found"]
-    worst = [
-        [entry.get(name.lower(), "") for name in header]
-        for entry in metrics["worst_frames"]
-    ]
+    names = ["frame", "name", "sequence", "missed", "false", "found"]
     return [
         *(subset_table(metrics["subsets"], kind) for kind in kinds),
         error_table(metrics["box_errors"]),
-        Table("Frames with the most mistakes", header, worst),
+        _table_of("Frames with the most mistakes", metrics["worst_frames"], names),
     ]
 
 
 def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
     """AP, precision and recall per subset and class that has boxes."""
-    return Table(
-        f"By {kind}, {subsets['protocol']}",
-        [kind.capitalize(), "Class", "AP", "Precision", "Recall", "Objects"],
-        [
-            [
-                entry[kind],
-                entry["cls"],
-                *numbers(entry[name] for name in ("ap", "precision", "recall")),
-                entry["num_gt"],
-            ]
-            for entry in subsets[kind]
-            if entry["num_gt"] or entry["num_det"]
-        ],
-    )
+    title = f"By {kind}, {subsets['protocol']}"
+    entries = [entry for entry in subsets[kind] if entry["num_gt"] or entry["num_det"]]
+    names = [kind, "cls", "ap", "precision", "recall", "num_gt"]
+    return _table_of(title, entries, names)
 
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
     """Median errors of matched boxes, and how many headings are reversed."""
-    any_class = next(iter(errors.values()))
-    names = [key.removesuffix("_median") for key in any_class if "_median" in key]
-    body: list[list[str | int]] = []
-    for cls, found in errors.items():
-        medians = (
-            number(found[f"{name}_median"], digits=2 if name.endswith("_m") else 1)
-            for name in names
-        )
-        body.append([cls, int(found["count"]), *medians, number(found["reversed"])])
-    titles = [name.replace("_", " ").capitalize() for name in names]
-    return Table(
+    entries = [{"cls": cls, **found} for cls, found in errors.items()]
+    medians = [name for name in entries[0] if name.endswith("_median")]
+    return _table_of(
         "Median errors of matched boxes (all scores); reversed: heading off by more"
         " than 90 deg",
-        ["Class", "Matches", *titles, "Reversed"],
-        body,
+        entries,
+        ["cls", "count", *medians, "reversed"],
     )
+
+
+def _table_of(
+    title: str, entries: Sequence[Mapping[str, Any]], names: Sequence[str]
+) -> Table:
+    """Some values of entries of metrics.json, one row each."""
+    values = [[entry.get(name, "") for name in names] for entry in entries]
+    rows = [
+        [value if isinstance(value, str | int) else number(value) for value in row]
+        for row in values
+    ]
+    titles = {"cls": "Class", "ap": "AP", "num gt": "Objects", "count": "Matches"}
+    words = [name.removesuffix("_median").replace("_", " ") for name in names]
+    return Table(title, [titles.get(word, word.capitalize()) for word in words], rows)
 
 
 # Published rows -----------------------------------------------------------------------
@@ -424,7 +416,7 @@ Cell = tuple[str, str, str, float]
 Place = dict[str, Any]
 """Some of the four by name, as keywords of a layout; the others are the usual ones."""
 
-SPACES: list[Place] = [{"space": space} for space in SPACE_TITLES]
+_BOTH: list[Place] = [{"space": space} for space in SPACES]
 _USUAL: Place = {"condition": "all", "cls": "Sedan", "space": "3d", "iou": 0.3}
 
 
@@ -433,8 +425,7 @@ class PublishedRow:
     """One row of a published table.
 
     Attributes:
-        paper: "RADE-Net" or "DinoRADE".
-        table: Number of the table as printed.
+        source: Paper and table, such as "DinoRADE, Table 2".
         method: Name of the row; in ablations what the row ticks.
         modality: L lidar, C camera, R radar.
         label_version: K-Radar label revision.
@@ -443,19 +434,13 @@ class PublishedRow:
         values: APs as printed; the class "mean" is the paper's mAP.
     """
 
-    paper: str
-    table: str
+    source: str
     method: str
     modality: str
     label_version: str
     protocol: str
     note: str
     values: dict[Cell, str]
-
-    @property
-    def source(self) -> str:
-        """Paper and table."""
-        return f"{self.paper}, Table {self.table}"
 
     def differences(
         self,
@@ -492,6 +477,7 @@ def _read() -> tuple[PublishedRow, ...]:
     text = importlib.resources.files(__package__) / "published.csv"
     rows: dict[tuple[str, ...], PublishedRow] = {}
     for line in csv.DictReader(text.read_text(encoding="utf-8").splitlines()):
+        line["source"] = f"{line['paper']}, Table {line['table']}"
         fields = {name: line[name] for name in names}
         row = rows.setdefault(tuple(fields.values()), PublishedRow(**fields, values={}))
         for condition in filter(line.get, CONDITIONS):
@@ -528,7 +514,7 @@ def paper_tables(
         (
             "Sedan by weather at IoU 0.3 (layout of Table I)",
             ["RADE-Net, Table I", "DinoRADE, Table 1"],
-            SPACES,
+            _BOTH,
             conditions,
             split,
         ),
@@ -536,21 +522,21 @@ def paper_tables(
             "Classes by weather at IoU 0.3 (layout of Table II)",
             ["RADE-Net, Table II", "DinoRADE, Table 2"],
             classes,
-            _crossed(conditions, SPACES),
+            _crossed(conditions, _BOTH),
             split,
         ),
         (
             "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
             ["DinoRADE, Table 3"],
             [{"condition": "all"}],
-            _crossed(classes, SPACES),
+            _crossed(classes, _BOTH),
             split,
         ),
         (
             "Ablations, Sedan (layout of Table III)",
             ["RADE-Net, Table III", "DinoRADE, Table 4"],
             [{"cls": "Sedan"}],
-            _crossed([{"iou": 0.3}, {"iou": 0.5}], SPACES),
+            _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
             None,
         ),
     ]
@@ -613,5 +599,5 @@ def _layout(
 
 def _name(place: Place) -> str:
     """Title of what a group or a column is of, such as "Light Snow BEV"."""
-    names = {0.3: "IoU 0.3", 0.5: "IoU 0.5"} | TITLES | SPACE_TITLES
+    names = {"3d": "3D", "bev": "BEV", 0.3: "IoU 0.3", 0.5: "IoU 0.5"} | TITLES
     return " ".join(str(names.get(value, value)) for value in place.values())

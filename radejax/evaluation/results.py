@@ -170,8 +170,8 @@ def evaluate_tables(
     """
     data = make_set(ground_truth, predictions, frames, options)
     weathers = condition_masks(frames, "weather") if per_weather else {}
-    has_intervals = why_no_intervals(frames, options) is None
-    sequence = np.asarray(frames["sequence"]) if has_intervals else None
+    is_resampled = options.bootstrap and "sequence" in frames
+    sequence = np.asarray(frames["sequence"]) if is_resampled else None
     return data, compute_results(data, options, weathers, sequence)
 
 
@@ -332,17 +332,6 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
     present = np.unique(column).tolist()
     ordered = dict.fromkeys((*WEATHERS, *present))
     return {name: column == name for name in ordered if name in present}
-
-
-def why_no_intervals(frames: Columns, options: EvaluationOptions) -> str | None:
-    """The reason for not computing intervals, or None."""
-    if not options.bootstrap:
-        return "none requested"
-    if "sequence" not in frames:
-        return "none: the frame table has no column sequence"
-    if np.unique(np.asarray(frames["sequence"])).size < 2:
-        return "none: all frames are of one sequence"
-    return None
 
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:

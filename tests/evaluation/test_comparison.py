@@ -51,7 +51,7 @@ def test_a_large_difference_is_significant_and_antisymmetric(scene):
     good, bad = make(truth, found, frames), make(truth, thin(found, 0.3), frames)
     terms = {
         "resamples": 1000,
-        "iou_thresholds": (0.2,),
+        "iou": 0.2,
         "protocol_names": ("all_point",),
     }
     forward = compare(bad, good, frames["sequence"], **terms)
