@@ -88,9 +88,9 @@ def kradar(truth, found, cls, space, iou, *, classes, variant="revised", cut=0.0
             if best is not None:
                 taken.add(best)
                 matched.append(scores[best])
-    thresholds = _thresholds(matched, num_gt)
+    kept = thresholds(matched, num_gt)
     precision = [0.0] * 41
-    for k, threshold in enumerate(thresholds):
+    for k, threshold in enumerate(kept):
         right = wrong = 0
         for values, scores in scene:
             taken = set()
@@ -108,14 +108,15 @@ def kradar(truth, found, cls, space, iou, *, classes, variant="revised", cut=0.0
                 1 for j, s in enumerate(scores) if s >= threshold and j not in taken
             )
         precision[k] = right / (right + wrong)
-    for k in range(len(thresholds)):
+    for k in range(len(kept)):
         precision[k] = max(precision[k:])
     if variant == "legacy":
         return 100 * sum(precision[::4]) / 11
     return 100 * sum(precision) / 41
 
 
-def _thresholds(matched, num_gt):
+def thresholds(matched, num_gt):
+    """K-Radar's score thresholds of the scores that are matched."""
     matched = sorted(matched, reverse=True)
     current, kept = 0.0, []
     for i, score in enumerate(matched):

@@ -16,16 +16,6 @@ def test_roi_names_and_bounds():
         boxes.roi_bounds((0, 0, 1, 2, 3, 4))
 
 
-def test_frame_ids():
-    np.testing.assert_array_equal(boxes.frame_ids({"frame": [3, 1]}), [3, 1])
-    with pytest.raises(UserError, match=r"need a column 'frame', found \['name'\]"):
-        boxes.frame_ids({"name": ["a"]})
-    with pytest.raises(DataError, match="frame 5 occurs twice"):
-        boxes.frame_ids({"frame": [5, 1, 5]})
-    with pytest.raises(UserError, match="column 'weather' has"):
-        boxes.frame_ids({"frame": [1, 2], "weather": ["fog"]})
-
-
 def test_frame_positions_of_any_order():
     position = boxes.frame_positions(np.array([5, 3, 5]), np.array([3, 9, 5]), "x")
     assert position.tolist() == [2, 0, 2]

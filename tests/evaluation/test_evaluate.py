@@ -7,16 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import CLASSES
 from radejax.evaluation import PROTOCOLS, EvaluationSet, evaluate, mean_ap
+from radejax.evaluation.boxes import columns_of
 
 TWO = ("Sedan", "Bus or Truck")
-METHODS = {
-    "voc11": "VOC",
-    "recall41": "K-Radar",
-    "coco101": "COCO",
-    "auc": "PR-AUC",
-}
+METHODS = {"voc11": "VOC", "recall41": "K-Radar", "coco101": "COCO", "auc": "PR-AUC"}
 VARIANTS = {
     "kradar_r40": "revised",
     "kradar_r11": "legacy",
@@ -24,31 +19,32 @@ VARIANTS = {
 }
 NAMES_IN_GOLDEN = {"exact": "all_point", "kradar_r40_yaw": "kradar_r40_corrected"}
 PLAIN = ("voc11", "recall41", "coco101", "auc", "all_point")
+LEAST = {"voc11": 100 / 11, "recall41": 100 / 41, "coco101": 100 / 101}
+"""AP of RADE-Net's evaluator without any hit."""
 
 
 def car(x=20.0, y=0.0, **changes):
     box = {"x": x, "y": y, "z": 0.0, "l": 4.0, "w": 2.0, "h": 1.5, "yaw": 0.0}
-    return list({**box, **changes}.values())
+    return tuple({**box, **changes}.values())
 
 
-def table(rows, *, scored):
-    """Columns of rows (frame, box, class[, score])."""
-    columns = {
-        "frame": np.array([row[0] for row in rows], int),
-        "box": np.array([row[1] for row in rows], float).reshape(-1, 7),
-        "cls": np.array([row[2] for row in rows], str),
-    }
-    if scored:
-        columns["score"] = np.array([row[3] for row in rows], float)
-    return columns
+def found_of(*boxes, cls="Sedan", score=0.9):
+    """Columns of boxes, or of (frame, box, class, score), of frame 0 and a class."""
+    rows = [row if len(row) < 7 else (0, row, cls, score) for row in boxes]
+    return columns_of([(frame, cls, box, score) for frame, box, cls, score in rows])
 
 
-def truth_of(*rows):
-    return table(rows, scored=False)
+def truth_of(*boxes):
+    """Columns of boxes, or of (frame, box, class)."""
+    return found_of(*(row if len(row) == 7 else (*row, 1.0) for row in boxes))
 
 
-def found_of(*rows):
-    return table(rows, scored=True)
+def sedan(truth, found, protocol="all_point", **terms):
+    """Result of the class Sedan in the bird's-eye view."""
+    return evaluate(truth, found, classes=["Sedan"], protocol=protocol, **terms)[0]
+
+
+ONE, HIT = truth_of(car()), found_of(car())
 
 
 # Numbers worked out by hand -------------------------------------------------------------
@@ -73,19 +69,15 @@ def test_perfect_predictions_in_every_protocol():
             assert (result.num_gt, result.num_det) == (10, 10)
 
 
-def test_detections_without_a_hit_get_radenets_floor():
-    truth = truth_of((0, car(), "Sedan"))
-    found = found_of((0, car(60), "Sedan", 0.9))
-    for protocol, expected in {
-        "voc11": 100 / 11,
-        "recall41": 100 / 41,
-        "coco101": 100 / 101,
-        "auc": 0.0,
-        "all_point": 0.0,
-        "kradar_r40": 0.0,
-    }.items():
-        result = evaluate(truth, found, classes=["Sedan"], protocol=protocol)[0]
-        assert result.ap == pytest.approx(expected, abs=1e-9), protocol
+@pytest.mark.parametrize("protocol", list(PROTOCOLS))
+def test_detections_without_a_hit_get_the_least_ap(protocol):
+    expected = LEAST.get(protocol, 0.0)
+    assert sedan(ONE, found_of(car(60)), protocol).ap == pytest.approx(expected)
+    # Half of a car has an IoU of exactly 1/2 in every geometry: thresholds are strict.
+    half = found_of(car(l=2.0))
+    at = sedan(ONE, half, protocol, iou_thresholds=0.5)
+    assert at.ap == pytest.approx(expected)
+    assert sedan(ONE, half, protocol, iou_thresholds=0.499).ap > expected + 1e-9
 
 
 def test_exact_by_hand():
@@ -99,7 +91,7 @@ def test_exact_by_hand():
         (2, car(), "Sedan", 0.6),
         (3, car(50), "Sedan", 0.5),
     )
-    result = evaluate(truth, found, classes=["Sedan"], protocol="all_point")[0]
+    result = sedan(truth, found)
     assert result.ap == pytest.approx(62.5, abs=1e-12)
     np.testing.assert_allclose(result.precision, [1, 1 / 2, 2 / 3, 3 / 4, 3 / 5])
     np.testing.assert_allclose(result.recall, [1 / 4, 1 / 4, 2 / 4, 3 / 4, 3 / 4])
@@ -109,10 +101,8 @@ def test_equal_scores_are_one_threshold():
     truth = truth_of((0, car(), "Sedan"), (1, car(), "Sedan"))
     hit, miss = (0, car(), "Sedan", 0.5), (1, car(60), "Sedan", 0.5)
     for rows in ((hit, miss), (miss, hit)):
-        result = evaluate(
-            truth, found_of(*rows), classes=["Sedan"], protocol="all_point"
-        )[0]
-        assert result.ap == pytest.approx(25.0)  # recall 1/2 at precision 1/2
+        # Recall 1/2 at precision 1/2.
+        assert sedan(truth, found_of(*rows)).ap == pytest.approx(25.0)
 
 
 def test_frame_rules_differ_as_described():
@@ -125,46 +115,31 @@ def test_frame_rules_differ_as_described():
         (2, car(60), "Sedan", 0.7),
     )
     for skip, false in (("class", 1), ("frame", 2), ("none", 3)):
-        result = evaluate(
-            truth,
-            found,
-            classes=TWO,
-            protocol="all_point",
-            empty_frames=skip,
-            spaces="bev",
-        )[0]
+        terms = {"protocol": "all_point", "empty_frames": skip}
+        result = evaluate(truth, found, classes=TWO, **terms)[0]
         assert result.ap == pytest.approx(100 / (1 + false))
         assert result.num_det == 1 + false
         assert result.empty_frames == skip
     # Only the classes that are evaluated decide which frames are empty.
-    result = evaluate(
-        truth, found, classes=["Sedan"], protocol="all_point", empty_frames="frame"
-    )[0]
-    assert result.num_det == 2
+    assert sedan(truth, found, empty_frames="frame").num_det == 2
 
 
 def test_kradar_compares_boxes_with_length_and_width_swapped():
     # Side by side 1.5 m apart: 2 m wide cars hardly overlap, 4 m wide ones do.
-    truth, found = (
-        truth_of((0, car(), "Sedan")),
-        found_of((0, car(y=1.5), "Sedan", 0.9)),
-    )
-    terms = {"classes": ["Sedan"], "iou_thresholds": 0.4, "spaces": "bev"}
-    assert evaluate(truth, found, protocol="kradar_r40", **terms)[0].ap > 0
-    assert evaluate(truth, found, protocol="kradar_r40_corrected", **terms)[0].ap == 0
+    found = found_of(car(y=1.5))
+    assert sedan(ONE, found, "kradar_r40", iou_thresholds=0.4).ap > 0
+    assert sedan(ONE, found, "kradar_r40_corrected", iou_thresholds=0.4).ap == 0
 
 
 @pytest.mark.parametrize(("z", "top"), [(0, 1 / 3), (-1.0, 1 / 3), (0.5, 0.5 / 3.5)])
 def test_kradar_r11_takes_z_as_the_top(z, top):
-    truth = truth_of((0, car(h=3.0), "Sedan"))
-    data = EvaluationSet(truth, found_of((0, car(z=z, h=1.0), "Sedan", 0.9)))
+    data = EvaluationSet(truth_of(car(h=3.0)), found_of(car(z=z, h=1.0)))
     assert data.overlap("swapped_lw", "3d") == pytest.approx(1 / 3)
     assert data.overlap("swapped_lw_z_top", "3d") == pytest.approx(top)
 
 
 def test_kradar_rounds_ground_truth_only():
-    truth = truth_of((0, car(20.004), "Sedan"))
-    data = EvaluationSet(truth, found_of((0, car(20.004), "Sedan", 0.9)))
+    data = EvaluationSet(truth_of(car(20.004)), found_of(car(20.004)))
     assert data.overlap("plain", "bev") == pytest.approx(1.0, abs=1e-12)
     expected = np.float32((4 - 0.004) / (4 + 0.004))
     (rounded,) = data.overlap("rounded", "bev")
@@ -172,65 +147,35 @@ def test_kradar_rounds_ground_truth_only():
     assert rounded == np.float32(rounded)
 
 
-@pytest.mark.parametrize("protocol", list(PROTOCOLS))
-def test_thresholds_are_strict(protocol):
-    # Half of a car: IoU exactly 1/2 in every geometry.
-    truth = truth_of((0, car(), "Sedan"))
-    found = found_of((0, car(l=2.0), "Sedan", 0.5))
-    for iou, hit in ((0.5, False), (0.499, True)):
-        result = evaluate(
-            truth, found, classes=["Sedan"], iou_thresholds=iou, protocol=protocol
-        )[0]
-        floor = {"voc11": 100 / 11, "recall41": 100 / 41, "coco101": 100 / 101}
-        assert (result.ap > floor.get(protocol, 0) + 1e-9) == hit
-
-
 def test_score_cut_is_strict_and_zero_keeps_all_in_plain_protocols():
-    truth = truth_of((0, car(), "Sedan"))
     for protocol in ("all_point", "kradar_r40"):
-        for score, cut, kept in ((0.3, 0.3, 0), (0.31, 0.3, 1)):
-            found = found_of((0, car(), "Sedan", score))
-            result = evaluate(
-                truth,
-                found,
-                classes=["Sedan"],
-                protocol=protocol,
-                score_threshold=cut,
-            )[0]
+        for score, kept in ((0.3, 0), (0.31, 1)):
+            found = found_of(car(), score=score)
+            result = sedan(ONE, found, protocol, score_threshold=0.3)
             assert result.num_det == kept
-    found = found_of((0, car(), "Sedan", 0.0))
-    assert evaluate(truth, found, classes=["Sedan"], protocol="all_point")[0].ap == 100
-    assert evaluate(truth, found, classes=["Sedan"])[0].num_det == 0
+    found = found_of(car(), score=0.0)
+    assert sedan(ONE, found).ap == 100
+    assert sedan(ONE, found, "kradar_r40").num_det == 0
 
 
-def test_a_class_that_does_not_occur():
-    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
-    for protocol in PROTOCOLS:
-        results = evaluate(truth, found, classes=TWO, protocol=protocol, spaces="bev")
-        absent = results[1]
-        assert not absent.is_defined
-        assert (
-            absent.ap == 0 if protocol.startswith("kradar") else math.isnan(absent.ap)
-        )
-        assert mean_ap(results) == results[0].ap
+@pytest.mark.parametrize("protocol", list(PROTOCOLS))
+def test_without_objects_or_predictions(protocol):
+    results = evaluate(ONE, HIT, classes=TWO, protocol=protocol, spaces="bev")
+    absent = results[1]
+    assert not absent.is_defined
+    assert absent.ap == 0 if protocol.startswith("kradar") else math.isnan(absent.ap)
+    assert mean_ap(results) == results[0].ap
     assert math.isnan(mean_ap(results[1:]))
-
-
-def test_empty_tables():
-    nothing = found_of()
-    for protocol in PROTOCOLS:
-        for result in evaluate(truth_of(), nothing, protocol=protocol):
-            assert result.num_gt == result.num_det == result.num_frames == 0
-        truth = truth_of((0, car(), "Sedan"))
-        result = evaluate(truth, nothing, classes=["Sedan"], protocol=protocol)[0]
-        assert result.ap == 0
-        assert result.num_gt == 1
+    for result in evaluate(truth_of(), found_of(), protocol=protocol):
+        assert result.num_gt == result.num_det == result.num_frames == 0
+    result = sedan(ONE, found_of(), protocol)
+    assert (result.ap, result.num_gt) == (0, 1)
 
 
 def test_region_of_interest_is_inclusive_and_filters_both_sides():
-    truth = truth_of((0, car(72.0, 6.4), "Sedan"), (0, car(72.1), "Sedan"))
-    found = found_of(
-        (0, car(72.0, 6.4), "Sedan", 0.9), (0, car(20, -6.5), "Sedan", 0.8)
+    truth, found = (
+        truth_of(car(72.0, 6.4), car(72.1)),
+        found_of(car(72.0, 6.4), car(20, -6.5)),
     )
     data = EvaluationSet(truth, found, roi="narrow")
     assert (len(data.gt), len(data.pred)) == (1, 1)
@@ -241,13 +186,9 @@ def test_region_of_interest_is_inclusive_and_filters_both_sides():
 
 
 def test_metric_names_carry_everything():
-    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
-    result = evaluate(
-        truth, found, score_threshold=0.3, roi="wide", label_version="v2.1"
-    )[-1]
-    assert (
-        result.metric
-        == "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=wide"
+    terms = {"score_threshold": 0.3, "roi": "wide", "label_version": "v2.1"}
+    assert evaluate(ONE, HIT, **terms)[-1].metric == (
+        "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=wide"
     )
 
 
@@ -271,14 +212,8 @@ def test_golden_scenes(golden):
         for p, name in enumerate(data["protocols"].tolist()):
             protocol = NAMES_IN_GOLDEN.get(name, name)
             for c, cut in enumerate(data["cuts"].tolist()):
-                ap = [
-                    result.ap
-                    for result in shared_set.results(
-                        protocol,
-                        iou_thresholds=data["ious"].tolist(),
-                        score_threshold=cut,
-                    )
-                ]
+                terms = {"iou_thresholds": data["ious"], "score_threshold": cut}
+                ap = [result.ap for result in shared_set.results(protocol, **terms)]
                 expected = data[f"{scene}_ap"][p, c].reshape(-1)
                 np.testing.assert_allclose(ap, expected, atol=1e-9, err_msg=protocol)
 
@@ -288,25 +223,24 @@ def test_golden_scenes(golden):
 def test_equals_the_slow_implementation(reference, random_scene, seed, ties, data):
     protocol = data.draw(st.sampled_from(list(PROTOCOLS)))
     truth, found, frames = random_scene(seed, num_objects=20, ties=ties)
-    for result in evaluate(
-        truth,
-        found,
-        classes=TWO,
-        iou_thresholds=(0.2, 0.5),
-        protocol=protocol,
-        frames=frames,
-    ):
+    terms = {"classes": TWO, "iou_thresholds": (0.2, 0.5), "frames": frames}
+    for result in evaluate(truth, found, protocol=protocol, **terms):
         expected = reference.average_precision(
             protocol, truth, found, result.cls, result.space, result.iou, classes=TWO
         )
         np.testing.assert_allclose(result.ap, expected, atol=1e-9)
 
 
-def test_kradar_fixture(kradar_fixture, shared):
+@pytest.fixture(scope="module")
+def expected_of(shared):
+    """Function (name) -> content of a JSON file beside the K-Radar evaluation set."""
+    folder = shared / "fixtures" / "kradar_eval"
+    return lambda name: json.loads((folder / f"{name}.json").read_text())
+
+
+def test_kradar_fixture(kradar_fixture, expected_of):
     truth, found, frames = kradar_fixture
-    expected = json.loads(
-        (shared / "fixtures/kradar_eval/expected_ap.json").read_text()
-    )
+    expected = expected_of("expected_ap")
     keys = {name: key for key, name in expected["classes"].items()}
     data = EvaluationSet(truth, found, frames=frames)
     checked = 0
@@ -331,11 +265,10 @@ def test_kradar_fixture(kradar_fixture, shared):
     assert checked == 3 * 2 * 8 * 2 * 3 * 5
 
 
-def test_kradar_fixture_curves(kradar_fixture, shared):
+def test_kradar_fixture_curves(kradar_fixture, expected_of):
     truth, found, frames = kradar_fixture
-    folder = shared / "fixtures/kradar_eval"
-    expected = json.loads((folder / "expected_precision_all.json").read_text())
-    names = json.loads((folder / "expected_ap.json").read_text())["classes"]
+    expected = expected_of("expected_precision_all")
+    names = expected_of("expected_ap")["classes"]
     keys = {name: key for key, name in names.items()}
     data = EvaluationSet(truth, found, frames=frames)
     for protocol, variant in list(VARIANTS.items())[::2]:
@@ -345,10 +278,9 @@ def test_kradar_fixture_curves(kradar_fixture, shared):
             np.testing.assert_allclose(result.precision, entry["precision"], atol=1e-9)
 
 
-def test_radenet_fixture(kradar_fixture, shared):
+def test_radenet_fixture(kradar_fixture, expected_of):
     truth, found, frames = kradar_fixture
-    path = shared / "fixtures/kradar_eval/expected_ap_radenet.json"
-    expected = json.loads(path.read_text())["results"]
+    expected = expected_of("expected_ap_radenet")["results"]
     found = {**found, "score": found["score_unique"]}
     data = EvaluationSet(truth, found, frames=frames, roi="narrow")
     checked = 0
@@ -559,9 +491,8 @@ def test_weights_repeat_frames(random_scene):
     ],
 )
 def test_unknown_things_are_named(change, message):
-    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
     with pytest.raises(UserError, match=message):
-        evaluate(truth, found, **change)
+        evaluate(ONE, HIT, **change)
 
 
 def test_bad_rows_are_named():
@@ -594,9 +525,8 @@ def test_bad_rows_are_named():
 
 
 def test_far_too_many_boxes_of_a_frame_are_refused_at_once():
-    truth = truth_of(*((7, car(), "Sedan") for _ in range(2000)))
-    found = found_of(*((7, car(), "Sedan", 0.5) for _ in range(20000)))
-    message = "frame 7: predictions and ground truths of Sedan are 40,000,000 pairs"
+    truth, found = truth_of(*[car()] * 2000), found_of(*[car()] * 20000)
+    message = "frame 0: predictions and ground truths of Sedan are 40,000,000 pairs"
     with pytest.raises(DataError, match=message):
         evaluate(truth, found)
     half = {name: column[:500] for name, column in found.items()}  # 10**6 pairs are not
@@ -604,24 +534,23 @@ def test_far_too_many_boxes_of_a_frame_are_refused_at_once():
 
 
 def test_ground_truth_and_frames_are_checked_too():
-    truth, found = truth_of((0, car(), "Sedan")), found_of()
-    with pytest.raises(DataError, match="frame 3 occurs twice"):
-        evaluate(truth, found, frames={"frame": np.array([0, 3, 3])})
-    with pytest.raises(DataError, match="ground truth: frame 0, row 0: no such frame"):
-        evaluate(truth, found, frames={"frame": np.array([1])})
-    truth["box"][0, 5] = -1
-    with pytest.raises(
-        DataError, match=r"ground truth: frame 0, row 0: h of the box.* 0$"
+    for frames, match in (
+        ({"name": ["a"]}, r"need a column 'frame', found \['name'\]"),
+        ({"frame": [0, 1], "weather": ["fog"]}, "column 'weather' has"),
+        ({"frame": [0, 3, 3]}, "frame 3 occurs twice"),
+        ({"frame": [1]}, "ground truth: frame 0, row 0: no such frame"),
     ):
-        evaluate(truth, found)
+        with pytest.raises((DataError, UserError), match=match):
+            evaluate(ONE, found_of(), frames=frames)
+    with pytest.raises(DataError, match=r"ground truth: frame 0, row 0: h of the.* 0$"):
+        evaluate(truth_of(car(h=-1)), found_of())
 
 
 def test_missing_and_misshapen_columns():
-    truth, found = truth_of((0, car(), "Sedan")), found_of((0, car(), "Sedan", 0.9))
-    for column in ("frame", "box", "cls", "score"):
-        part = {k: v for k, v in found.items() if k != column}
+    for column in HIT:
+        part = {k: v for k, v in HIT.items() if k != column}
         with pytest.raises(UserError, match=f"predictions lack the columns.*{column}"):
-            evaluate(truth, part)
+            evaluate(ONE, part)
     for column, value, match in (
         ("box", np.zeros((1, 8)), r"predictions: columns .* boxes \(1, 8\)"),
         ("cls", np.zeros(1, int), "predictions: frame 0, row 0: unknown class '0'"),
@@ -630,13 +559,12 @@ def test_missing_and_misshapen_columns():
         ("frame", np.array([0.5]), "expected integer frame ids"),
     ):
         with pytest.raises((DataError, UserError), match=match):
-            evaluate(truth, {**found, column: value})
+            evaluate(ONE, {**HIT, column: value})
 
 
 def test_known_classes_that_were_not_asked_for_are_counted():
     truth = truth_of((0, car(), "Sedan"), (0, car(40), "Bicycle Group"))
-    found = found_of((0, car(), "Bicycle", 0.5))
+    found = found_of(car(), cls="Bicycle")
     data = EvaluationSet(truth, found, classes=["Sedan"])
     assert data.left_out["ground truth: class not evaluated"] == 1
     assert data.left_out["predictions: class not evaluated"] == 1
-    assert set(CLASSES) > {"Sedan"}

@@ -88,6 +88,12 @@ def test_greedy_equals_a_loop(seed):
     assert sorted(chosen.tolist()) == naive_greedy(claimant, target, preference, group)
 
 
+def steps_of(match):
+    """By how much the number of true positives changes at each prediction."""
+    pairs_of = zip(match.event_pred.tolist(), match.event_delta.tolist(), strict=True)
+    return dict(pairs_of)
+
+
 def test_kradar_passes_differ():
     # First pass by score: ground truth 0 takes prediction 1 (score 0.9), 1 takes 0.
     # Second pass by IoU at a threshold that both reach: 0 takes 0, and 1, which only
@@ -96,10 +102,7 @@ def test_kradar_passes_differ():
     match = matching.match_kradar(chosen, np.array([0.5, 0.9]), np.zeros(2, int), 0.3)
     first = dict(zip(match.first_gt.tolist(), match.first_pred.tolist(), strict=True))
     assert first == {0: 1, 1: 0}
-    steps = dict(
-        zip(match.event_pred.tolist(), match.event_delta.tolist(), strict=True)
-    )
-    assert steps == {1: 1, 0: 0}
+    assert steps_of(match) == {1: 1, 0: 0}
 
 
 def test_a_prediction_that_displaces_another_adds_nothing():
@@ -108,10 +111,7 @@ def test_a_prediction_that_displaces_another_adds_nothing():
     chosen = pairs((0, 0, 0.5), (1, 0, 0.9), (1, 1, 0.6))
     score = np.array([0.9, 0.5])
     match = matching.match_kradar(chosen, score, np.zeros(2, int), 0.3)
-    steps = dict(
-        zip(match.event_pred.tolist(), match.event_delta.tolist(), strict=True)
-    )
-    assert steps == {0: 1, 1: 0}
+    assert steps_of(match) == {0: 1, 1: 0}
 
 
 def second_pass_loop(pred, gt, iou, score, threshold):
@@ -168,10 +168,6 @@ def test_best_needs_the_threshold_of_the_best_one_only():
 def test_higher_score_wins_and_first_row_breaks_ties():
     chosen = pairs((0, 0, 0.9), (1, 0, 0.5), (2, 0, 0.6))
     score = np.array([0.4, 0.8, 0.8])
-    assert matching.match_best(chosen, score, 0.3).tolist() == [
-        -1,
-        0,
-        -1,
-    ]
+    assert matching.match_best(chosen, score, 0.3).tolist() == [-1, 0, -1]
     free = matching.match_free(chosen, score, np.zeros(3, int), 1, 0.3)
     assert free.tolist() == [-1, 0, -1]

@@ -6,20 +6,6 @@ from hypothesis import strategies as st
 from radejax.evaluation import protocols
 
 
-def thresholds_step_by_step(scores, num_gt):
-    """The rule as the description states it."""
-    current, kept = 0.0, []
-    for i, score in enumerate(scores):
-        last = i == len(scores) - 1
-        left = (i + 1) / num_gt
-        right = left if last else (i + 2) / num_gt
-        if right - current < current - left and not last:
-            continue
-        kept.append(score)
-        current += 1 / 40.0
-    return kept
-
-
 def test_thresholds_by_hand():
     # 120 objects, all found: the first score is kept at c = 0, then with c = 1/40 the
     # middle of (i+1, i+2)/120 must reach 3/120: i = 2 is first with (3 + 4)/2 >= 3, but
@@ -32,12 +18,12 @@ def test_thresholds_by_hand():
     assert len(index) == 41
 
 
-def test_thresholds_for_every_small_count():
+def test_thresholds_for_every_small_count(reference):
     """Ties at half a step are decided by rounding: every (found, objects) must agree."""
     for num_gt in [*range(1, 130), 155, 161, 615, 999, 1000, 1001, 2047]:
         for found in {1, 2, num_gt // 3, num_gt // 2, num_gt - 1, num_gt} - {0}:
             scores = np.linspace(1, 0, found + 1)[1:]
-            expected = thresholds_step_by_step(scores, num_gt)
+            expected = reference.thresholds(scores, num_gt)
             kept = protocols.score_thresholds(scores, np.ones(found, int), num_gt)
             assert kept.tolist() == expected, (num_gt, found)
             assert len(expected) <= 41
@@ -48,11 +34,11 @@ def test_thresholds_for_every_small_count():
     weight=st.lists(st.integers(0, 4), min_size=1, max_size=60),
     missed=st.integers(0, 200),
 )
-def test_thresholds_of_weighted_scores(weight, missed):
+def test_thresholds_of_weighted_scores(reference, weight, missed):
     scores = np.linspace(1, 0, len(weight) + 1)[1:]
     repeated = np.repeat(scores, weight)
     num_gt = repeated.size + missed
-    expected = thresholds_step_by_step(repeated, num_gt) if repeated.size else []
+    expected = reference.thresholds(repeated, num_gt) if repeated.size else []
     kept = protocols.score_thresholds(scores, np.array(weight), num_gt)
     assert kept.tolist() == expected
 
@@ -76,29 +62,15 @@ def test_no_matches_no_thresholds():
     ],
 )
 def test_pooled_curves_by_hand(curve, expected):
-    result = protocols.pooled_curve(
-        score=np.array([0.9, 0.8, 0.7]),
-        is_tp=np.array([True, False, True]),
-        weight=np.ones(3, int),
-        num_gt=2,
-        curve=curve,
-    )
+    score, is_tp = np.array([0.9, 0.8, 0.7]), np.array([True, False, True])
+    result = protocols.pooled_curve(score, is_tp, np.ones(3, int), 2, curve)
     assert result.ap == pytest.approx(100 * expected, abs=1e-8)
     assert (result.num_gt, result.num_det) == (2, 3)
 
 
 def test_frames_of_weight_zero_leave_no_trace():
-    terms = {"num_gt": 2, "curve": "auc"}
-    some = protocols.pooled_curve(
-        score=np.array([0.9, 0.8]),
-        is_tp=np.array([True, True]),
-        weight=np.ones(2, int),
-        **terms,
-    )
-    more = protocols.pooled_curve(
-        score=np.array([0.95, 0.9, 0.8, 0.7]),
-        is_tp=np.array([False, True, True, False]),
-        weight=np.array([0, 1, 1, 0]),
-        **terms,
-    )
+    score, is_tp = np.array([0.95, 0.9, 0.8, 0.7]), np.array([False, True, True, False])
+    counts, ones = np.array([0, 1, 1, 0]), np.ones(2, int)
+    more = protocols.pooled_curve(score, is_tp, counts, 2, "auc")
+    some = protocols.pooled_curve(score[1:3], is_tp[1:3], ones, 2, "auc")
     assert some.ap == more.ap
