@@ -28,8 +28,8 @@ Table III reports (Sedan, narrow region, IoU 0.3):
 | stem | 63.47 | 69.05 |
 | expand | 63.12 | 67.92 |
 
-The released code trains on one GPU with batch size 10 for epochs of 17,458 frames. The row of `no_cbam`
-has the same marks as `model` in the paper. It is read as the model without attention, because the
+The released code trains on one GPU with batch size 10 and epochs of 17,458 frames. The row of
+`no_cbam` has the same marks as `model` in the paper. It is read as the model without attention, because the
 paper says that attention helps once neck and heads are complex enough, and no other row would show
 that.
 """
@@ -58,7 +58,6 @@ PRESETS = {
         "model.crop_output": True,
         "loss.gwd_transform": "sqrt",
         "loss.assignment": "nms",
-        "loss.z0_m": 0.0,
         "decode.threshold_inclusive": True,
         "decode.roi": None,
         "decode.raw_yaw": "never",
@@ -77,7 +76,6 @@ PRESETS = {
         "model.crop_output": False,
         "loss.gwd_transform": "none",
         "loss.assignment": "center",
-        "loss.z0_m": 0.0,
         "decode.threshold_inclusive": False,
         "decode.roi": WIDE_ROI,
         "decode.raw_yaw": "always",

@@ -192,10 +192,9 @@ _FIELDS: dict[str, Any] = {
         # Weight of every loss term, at least 0, by its name in
         # `radejax.losses.detection.LOSSES`.
         "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
-        # Divide each term by its own value.
+        # Divide each term by its own value, which is constant in the gradient: the loss
+        # is then the sum of the weights.
         "normalize": True,
-        # Height that is added to regressed heights, in meters.
-        "z0_m": 0.0,
     },
     "decode": {
         # Rows of the output per frame; at least 1.

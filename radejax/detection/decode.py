@@ -91,7 +91,6 @@ def decode(
     roi: Roi | None = None,
     per_class_nms: bool = False,
     threshold_inclusive: bool = False,
-    z0_m: Scalar = 0.0,
     raw_yaw: RawYaw = "nms",
     clip_sizes: bool = True,
 ) -> Detections:
@@ -114,7 +113,6 @@ def decode(
         per_class_nms: Only boxes of the same class suppress each other.
         threshold_inclusive: Peaks that score exactly the threshold count (the paper's
             reading; the released code's is exclusive).
-        z0_m: Height added to the regressed z: the paper's sensor height.
         raw_yaw: Where the length of the regressed (sin, cos) scales the footprint of a
             box: only in "nms"; "always", so that results have that length and width, and
             a short vector shrinks a box in every overlap, as in the released NMS and
@@ -147,7 +145,6 @@ def decode(
         score_threshold=score_threshold,
         roi=roi,
         threshold_inclusive=threshold_inclusive,
-        z0_m=z0_m,
     )
     clip = _with_positive_sizes if clip_sizes else lambda boxes: boxes
     peaks = dataclasses.replace(peaks, boxes=clip(peaks.boxes))
@@ -192,7 +189,6 @@ def find_peaks(
     score_threshold: Scalar,
     roi: Roi | None = None,
     threshold_inclusive: bool = False,
-    z0_m: Scalar = 0.0,
 ) -> Peaks:
     """The strongest local maxima of the heatmaps with their boxes, before NMS.
 
@@ -220,7 +216,7 @@ def find_peaks(
     scores = jnp.where(is_peak, scores, 0.0)
     best = jnp.max(scores, axis=-1)  # [B, R, A]
     if roi is not None:
-        best = jnp.where(_in_roi(maps.box_params, grid, roi, z0_m), best, 0.0)
+        best = jnp.where(_in_roi(maps.box_params, grid, roi), best, 0.0)
     best = best.reshape(best.shape[0], -1)  # [B, R * A]
     top, flat = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
     is_valid = top > 0
@@ -229,7 +225,7 @@ def find_peaks(
     bins = jnp.stack([flat // num_azimuth, flat % num_azimuth], -1)
     return Peaks(
         bins=bins,
-        boxes=grid.boxes_at(params, bins, z0_m),
+        boxes=grid.boxes_at(params, bins),
         scores=top,
         classes=classes.astype(jnp.int32),
         is_valid=is_valid,
@@ -268,7 +264,6 @@ def _in_roi(
     params: Float[jax.Array, "B R A 8"],
     grid: RadarGrid,
     roi: Roi,
-    z0_m: Scalar,
 ) -> Bool[jax.Array, "B R A"]:
     """The box of a bin has its center in the region."""
     roi = jnp.asarray(roi, jnp.float32)
@@ -277,7 +272,7 @@ def _in_roi(
     center = params[..., :3].astype(jnp.float32)
     ground = jnp.asarray(grid.bin_centers_ego(), jnp.float32)[None]  # [1, R, A, 2]
     inside = jnp.ones(params.shape[:3], bool)
-    offsets = (ground[..., 0], ground[..., 1], z0_m)
+    offsets = (ground[..., 0], ground[..., 1], 0.0)
     for axis, offset in enumerate(offsets):
         position = center[..., axis] + offset
         inside &= (position >= roi[2 * axis]) & (position <= roi[2 * axis + 1])

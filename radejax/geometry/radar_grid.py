@@ -14,7 +14,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num, Real
+from jaxtyping import Bool, Float, Int, Real
 
 from radejax.core.errors import require
 from radejax.geometry.boxes import array_module, as_floats
@@ -289,14 +289,13 @@ class RadarGrid(ArrayValues):
         self,
         params: Float[jax.Array, "*bins 8"],
         bins: Int[jax.Array, "*bins 2"],
-        z0_m: float | Num[jax.Array, ""] = 0.0,
     ) -> Float[jax.Array, "*bins 8"]:
         """Boxes described by the parameters of given bins of a detector's maps.
 
         Args:
-            params: `[..., 8]` raw dx, dy, dz, l, w, h, sin, cos.
+            params: `[..., 8]` raw dx, dy, z, l, w, h, sin, cos; dx and dy from the
+                center of the bin, in meters.
             bins: `[..., 2]` integer range and azimuth bins.
-            z0_m: Height added to dz.
 
         Returns:
             `[..., 8]` float32 x, y, z, l, w, h and the raw sin, cos.
@@ -306,9 +305,9 @@ class RadarGrid(ArrayValues):
 
         Examples:
             >>> boxes = RadarGrid.kradar().boxes_at(
-            ...     jnp.ones((1, 8)), jnp.array([[10, 53]]), z0_m=0.5)
+            ...     jnp.ones((1, 8)), jnp.array([[10, 53]]))
             >>> boxes[0, 2:4].tolist()
-            [1.5, 1.0]
+            [1.0, 1.0]
         """
         chex.assert_shape(params, (*bins.shape[:-1], 8))
         chex.assert_axis_dimension(bins, -1, 2)
@@ -317,7 +316,7 @@ class RadarGrid(ArrayValues):
         cos = jnp.asarray(np.cos(self.azimuth_rad), jnp.float32)[bins[..., 1]]
         sin = jnp.asarray(np.sin(self.azimuth_rad), jnp.float32)[bins[..., 1]]
         zeros = jnp.zeros_like(sin)
-        center = jnp.stack([range_m * cos, -range_m * sin, zeros + z0_m], -1)
+        center = jnp.stack([range_m * cos, -range_m * sin, zeros], -1)
         return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
 
     def check_maps(self, heatmap: Any, box_params: Any) -> None:

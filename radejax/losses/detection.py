@@ -47,7 +47,6 @@ class LossOptions:
             not computed.
         normalize: Divide each loss by its own value, held constant: gradients have the
             ratio `weights`, the total is constant, losses of 0 add nothing.
-        z0_m: Sensor height, added to the regressed z.
         decoding: Thresholds of peaks and of NMS, for "nms": the boxes that are compared
             with objects are those that decoding would find.
 
@@ -65,7 +64,6 @@ class LossOptions:
         default_factory=lambda: {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
     )
     normalize: bool = True
-    z0_m: float = 0.0
     decoding: DecodeOptions = DecodeOptions()  # noqa: RUF009, immutable
 
     def __post_init__(self) -> None:
@@ -80,7 +78,6 @@ class LossOptions:
                 _are_weights,
                 f"numbers of at least 0, not all 0, for some of {names}",
             ),
-            "z0_m": (math.isfinite, "a finite number"),
         }
         check_options(vars(self), "config.loss", ranges)
 
@@ -149,7 +146,7 @@ def detection_loss(
         if chosen.assignment == "center"
         else partial(_after_nms, chosen.decoding)
     )
-    predicted, expected, is_matched = assign(maps, boxes, is_valid, grid, chosen.z0_m)
+    predicted, expected, is_matched = assign(maps, boxes, is_valid, grid)
     row = is_matched[..., None]
     pairs = Pairs(
         maps.heatmap_logits,
@@ -264,11 +261,11 @@ Assigned = tuple[
 
 
 def _at_centers(
-    maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid, z0_m: float
+    maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid
 ) -> Assigned:
     """Predictions at the objects' own bins."""
     bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
-    return _boxes_at(maps, bins, grid, z0_m), boxes, is_valid
+    return _boxes_at(maps, bins, grid), boxes, is_valid
 
 
 def _after_nms(
@@ -277,7 +274,6 @@ def _after_nms(
     boxes: Boxes8,
     is_valid: Mask,
     grid: RadarGrid,
-    z0_m: float,
 ) -> Assigned:
     """Predictions that survive NMS, and the objects that they overlap."""
     # Which boxes are compared is a choice, not a function to differentiate.
@@ -287,19 +283,18 @@ def _after_nms(
         max_peaks=_MAX_PEAKS,
         score_threshold=decoding.score_threshold,
         threshold_inclusive=decoding.threshold_inclusive,
-        z0_m=z0_m,
     )
     keep = suppress(peaks, decoding.nms_iou, per_class=decoding.per_class_nms)
     match = jax.vmap(match_boxes)
     object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
     expected = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, object_idx)
-    return _boxes_at(maps, peaks.bins, grid, z0_m), expected, is_matched
+    return _boxes_at(maps, peaks.bins, grid), expected, is_matched
 
 
 def _boxes_at(
-    maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid, z0_m: float
+    maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid
 ) -> Boxes8:
     """Predicted boxes at given bins of every frame."""
     # One gather per frame, so that a batch axis sharded over devices stays local.
     gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
-    return grid.boxes_at(gather(maps.box_params, bins), bins, z0_m)
+    return grid.boxes_at(gather(maps.box_params, bins), bins)

@@ -231,8 +231,8 @@ def test_encoded_boxes_come_back():
     for (i, j), box in zip(cells, boxes, strict=True):
         offset = box[:2] - GRID.bin_to_ego(i, j)
         heading = [np.sin(box[6]), np.cos(box[6])]
-        params[0, i, j] = [*offset, box[2] - 0.7, *box[3:6], *heading]
-    found = decode_scene(logits, params, z0_m=0.7)
+        params[0, i, j] = [*offset, box[2], *box[3:6], *heading]
+    found = decode_scene(logits, params)
     np.testing.assert_allclose(found.boxes[0, :6], boxes, atol=2e-5)
     np.testing.assert_array_equal(found.classes[0], [*classes] + [-1] * 10)
     np.testing.assert_array_equal(found.scores[0, 6:], 0)
@@ -289,8 +289,8 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
         roi=roi,
     )
     assert np.asarray(tight.is_valid).all()
-    # The sensor height counts towards z.
-    above = decode_scene(logits, params, roi=roi, z0_m=0.1)
+    params[..., 2] = 0.1
+    above = decode_scene(logits, params, roi=roi)
     assert not np.asarray(above.is_valid).any()
 
 

@@ -204,7 +204,7 @@ def loss_and_grad(maps, batch, **options):
     return _loss_and_grad(maps, batch, tuple(sorted(options.items())))
 
 
-def naive_regression(maps, batch, transform="sqrt", z0_m=0.0):
+def naive_regression(maps, batch, transform="sqrt"):
     """GWD and smooth L1 object by object, frame by frame."""
     totals = np.zeros(2)
     for b in range(len(batch.boxes)):
@@ -214,7 +214,6 @@ def naive_regression(maps, batch, transform="sqrt", z0_m=0.0):
             i, j = GRID.nearest_bin(*wanted[:2])
             predicted = np.array(maps.box_params[b, i, j])
             predicted[:2] += GRID.bin_to_ego(i, j)
-            predicted[2] += z0_m
             gap = np.abs(predicted - wanted)
             l1 = np.where(gap < 1, gap**2 / 2, gap - 0.5).mean()
             pair = jnp.asarray(predicted), jnp.asarray(wanted)
@@ -225,8 +224,8 @@ def naive_regression(maps, batch, transform="sqrt", z0_m=0.0):
 
 def test_regression_losses_object_by_object():
     maps, batch = small_scene(np.random.default_rng(0))
-    (_, parts), _ = loss_and_grad(maps, batch, z0_m=0.7)
-    expected = naive_regression(maps, batch, z0_m=0.7)
+    (_, parts), _ = loss_and_grad(maps, batch)
+    expected = naive_regression(maps, batch)
     np.testing.assert_allclose([parts["gwd"], parts["smooth_l1"]], expected, rtol=1e-5)
     assert int(parts["num_matched"]) == int(parts["num_objects"]) == 4
 
@@ -397,7 +396,6 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
         ("heatmap_sigma_bins", 0.0),
         ("gwd_transform", "cube"),
         ("gwd_tau", np.nan),
-        ("z0_m", np.inf),
         ("weights", {"focal": 1.0, "giou": 1.0}),
         ("weights", {"focal": -1.0}),
         ("weights", {"focal": np.nan}),

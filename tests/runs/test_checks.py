@@ -44,7 +44,6 @@ WRONG = [
     ("loss.weights", {"focal": 1.0, "giou": 1.0}),
     ("loss.weights", {"focal": -1.0}),
     ("loss.weights", {}),
-    ("loss.z0_m", INF),
     ("decode.max_detections", 0),
     ("train.batch_size", 0),
     ("train.num_epochs", 0),
@@ -143,7 +142,7 @@ def test_fields_that_are_missing_or_unknown() -> None:
 
 
 FIELDS = dict(fields_of(load_config("quickstart_fusion")))
-ANY_NUMBER = ("input_center", "z0_m", "radar_from_lidar_z_m", "layer_scale")
+ANY_NUMBER = ("input_center", "radar_from_lidar_z_m", "layer_scale")
 
 
 @pytest.mark.parametrize("field", FIELDS)
