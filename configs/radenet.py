@@ -29,9 +29,9 @@ Table III reports (Sedan, narrow region, IoU 0.3):
 | expand | 63.12 | 67.92 |
 
 The released code trains on one GPU with batch size 10 and epochs of 17,458 frames. The row of
-`no_cbam` has the same marks as `model` in the paper. It is read as the model without attention, because the
-paper says that attention helps once neck and heads are complex enough, and no other row would show
-that.
+`no_cbam` has the same marks as `model` in the paper. It is read as the model without
+attention, because the paper says that attention helps once neck and heads are complex enough, and
+no other row would show that.
 """
 
 from ml_collections import ConfigDict

@@ -203,7 +203,7 @@ _FIELDS: dict[str, Any] = {
         "score_threshold": 0.3,
         # Keep scores equal to the threshold.
         "threshold_inclusive": True,
-        # IoU above which NMS removes the lower score, from 0 to 1.
+        # NMS removes a box with at least this IoU with a better one, from 0 to 1.
         "nms_iou": 0.3,
         # Apply NMS to each class separately.
         "per_class_nms": False,

@@ -1,8 +1,9 @@
 """The containers that the packages pass to each other: all are JAX pytrees of fixed shape.
 
 B frames, R range bins, A azimuth bins, D Doppler and E elevation bins, N padded
-ground-truth boxes, K padded detections, C classes. Boxes live in the radar-centred
-ego frame: x forward, y left, z up, metres; yaw counter-clockwise from x, radians.
+ground-truth boxes, K padded detections, C classes. Boxes are in the radar (ego) frame: x
+forward, y left, z up, meters, with the z of the LiDAR (docs/conventions.md); yaw counter-clockwise
+from x, radians.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class DetectionMaps(struct.PyTreeNode):
 
     Attributes:
         heatmap_logits: Center-point logits, before the sigmoid.
-        box_params: Raw dx, dy, dz, l, w, h, sin yaw, cos yaw.
+        box_params: Raw dx, dy, z, l, w, h, sin yaw, cos yaw; dx and dy from the center of
+            the bin, in meters.
     """
 
     heatmap_logits: Float[jax.Array, "B R A C"]

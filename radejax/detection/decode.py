@@ -269,12 +269,11 @@ def _in_roi(
     roi = jnp.asarray(roi, jnp.float32)
     if roi.shape != (6,):
         raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
-    center = params[..., :3].astype(jnp.float32)
-    ground = jnp.asarray(grid.bin_centers_ego(), jnp.float32)[None]  # [1, R, A, 2]
+    bins = np.pad(grid.bin_centers_ego(), [(0, 0), (0, 0), (0, 1)])  # [R, A, 3], z = 0
+    center = params[..., :3].astype(jnp.float32) + jnp.asarray(bins, jnp.float32)
     inside = jnp.ones(params.shape[:3], bool)
-    offsets = (ground[..., 0], ground[..., 1], 0.0)
-    for axis, offset in enumerate(offsets):
-        position = center[..., axis] + offset
+    for axis in range(3):
+        position = center[..., axis]
         inside &= (position >= roi[2 * axis]) & (position <= roi[2 * axis + 1])
     return inside
 

@@ -98,12 +98,12 @@ def gaussian_heatmap(
 
 
 def focal_loss(
-    logits: Maps, target: Maps, alpha: float = 2, gamma: float = 4
+    logits: Maps, target: Maps, alpha: float = 2, beta: float = 4
 ) -> Float[jax.Array, ""]:
     """Center-point focal loss of a batch of heatmaps, averaged over positive bins.
 
     With p the probability: -(1 - p)^alpha log p where the target t is 1, elsewhere
-    -(1 - t)^gamma p^alpha log(1 - p); the sum divided by the number of positive bins,
+    -(1 - t)^beta p^alpha log(1 - p); the sum divided by the number of positive bins,
     or the mean over all bins where the batch has none. p is clipped to
     [1e-6, 1 - 1e-6] as released, with no gradient beyond.
 
@@ -111,7 +111,7 @@ def focal_loss(
         logits: `[B, R, A, C]`, any float dtype; computed in float32.
         target: `[B, R, A, C]` in [0, 1], from `gaussian_heatmap`.
         alpha: Exponent on the error of the prediction.
-        gamma: Exponent that spares bins near a center.
+        beta: Exponent that spares bins near a center.
 
     Returns:
         Scalar float32.
@@ -128,14 +128,14 @@ def focal_loss(
         0.3466
     """
     chex.assert_equal_shape([logits, target])
-    loss = focal_loss_per_bin(logits, target, alpha, gamma)
+    loss = focal_loss_per_bin(logits, target, alpha, beta)
     num_positive = jnp.sum(target >= 1, dtype=jnp.float32)
     num_bins = jnp.float32(loss.size)
     return jnp.sum(loss) / jnp.where(num_positive > 0, num_positive, num_bins)
 
 
 def focal_loss_per_bin(
-    logits: Bins, target: Bins, alpha: float = 2, gamma: float = 4
+    logits: Bins, target: Bins, alpha: float = 2, beta: float = 4
 ) -> Bins:
     """The terms that `focal_loss` sums: `[...]` and `[...]` -> `[...]` float32.
 
@@ -154,7 +154,7 @@ def focal_loss_per_bin(
     target = target.astype(jnp.float32)
     hit = -jax.nn.log_sigmoid(logits) * _power(jax.nn.sigmoid(-logits), alpha)
     miss = -jax.nn.log_sigmoid(-logits) * _power(jax.nn.sigmoid(logits), alpha)
-    return jnp.where(target >= 1, hit, miss * _power(1 - target, gamma))
+    return jnp.where(target >= 1, hit, miss * _power(1 - target, beta))
 
 
 def _sigmas(

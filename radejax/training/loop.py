@@ -229,7 +229,7 @@ def _restore_or_initialize(
 def loss_options(config: ConfigDict) -> dict[str, Any]:
     """Keyword arguments of `detection_loss`.
 
-    Boxes that "nms" compares with objects are those that decoding would find.
+    The assignment "nms" uses the thresholds of `config.decode`.
     """
     return {**config.loss.to_dict(), "decoding": DecodeOptions(**config.decode)}
 

@@ -1,6 +1,6 @@
 """K-Radar as it is on disk: labelled frames with boxes in the radar frame.
 
-The folders are described in `docs/data.md`. Reading starts from the label files:
+The folders are described in `docs/file_formats.md`. Reading starts from the label files:
 `KRadar` needs no radar tensor to open, so that labels can be counted and replaced without
 them. A sequence is a folder named by its number. One sequence may have folders under
 several roots (tensors on one disk, images on another); each file is taken from the first
