@@ -270,7 +270,7 @@ def _in_roi(
     if roi.shape != (6,):
         raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
     bins = np.pad(grid.bin_centers_ego(), [(0, 0), (0, 0), (0, 1)])  # [R, A, 3], z = 0
-    center = params[..., :3].astype(jnp.float32) + jnp.asarray(bins, jnp.float32)
+    center = params[..., :3].astype(jnp.float32) + jnp.asarray(bins, jnp.float32)[None]
     inside = jnp.ones(params.shape[:3], bool)
     for axis in range(3):
         position = center[..., axis]
