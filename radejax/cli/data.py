@@ -35,7 +35,7 @@ from radejax.core.errors import UserError
     "--projections",
     "output",
     flag_value="projection",
-    help="Write projections only, no radar tensors (260 MB each).",
+    help="Write projections only, no radar tensors (260 MB each at full size).",
 )
 @entry.workers
 def simulate(

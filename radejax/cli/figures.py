@@ -25,7 +25,11 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
 @entry.labelled_frames
 @entry.out_file("overlay.png", "Image file, or .gif or .mp4 for a sequence.")
-@click.option("--slices", is_flag=True, help="Draw slices of the projection.")
+@click.option(
+    "--slices",
+    is_flag=True,
+    help="Draw range-azimuth, range-Doppler and azimuth-elevation maxima.",
+)
 @click.option(
     "--roi",
     type=click.Choice(["narrow", "wide", "none"]),
@@ -108,7 +112,7 @@ def view(
     max_frames: int | None,
     **part: Any,
 ) -> None:
-    """Record a sequence for the rerun viewer (extra "viewer").
+    """Record frames, by default all, for the rerun viewer (extra "viewer").
 
     Frames without radar tensor and projection are skipped and counted. `rerun five.rrd`
     opens the recording.
