@@ -12,9 +12,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 PURE = ("geometry", "losses", "detection", "evaluation")
 """Packages of functions from arrays to arrays."""
 
-REPORTS = (
-    "bootstrap", "files", "kitti", "plots", "published", "report", "results", "tables"
-)  # fmt: skip
+REPORTS = ("comparison", "files", "kitti", "report", "results")
 """Modules of `evaluation` that read, write or compose reports."""
 
 Documented = ast.FunctionDef | ast.ClassDef

@@ -251,6 +251,11 @@ def tables_from_frames(
 
     Returns:
         Ground-truth columns and frame columns; the frame id is the position.
+
+    Examples:
+        >>> truth, frames = tables_from_frames([], "test")
+        >>> truth["box"].shape, frames["split"].size
+        ((0, 7), 0)
     """
     frames = list(frames)
     counts = [len(frame.boxes) for frame in frames]
@@ -275,6 +280,15 @@ def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
 
     Frames are written by key where the frame table has names, which survives another
     selection or order of frames, and by id otherwise.
+
+    Examples:
+        >>> import pathlib, tempfile
+        >>> boxes = Boxes(np.array([7]), np.ones((1, 7)), np.array(["Sedan"]))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "truth.npz"
+        ...     write_boxes(path, boxes, {"frame": [7], "name": ["1/00033_00001"]})
+        ...     np.load(path)["frame"].tolist()
+        ['1/00033_00001']
     """
     columns = {
         name: column for name, column in vars(boxes).items() if column is not None
