@@ -65,16 +65,9 @@ def test_json_and_csv_hold_the_numbers_of_evaluate(written, scene):
     assert metrics == made.metrics
     rows = {row["name"]: row for row in metrics["ap"]}
     assert len(rows) == len(metrics["ap"])  # names are unique
-    truth, found, frames = scene
+    data = EvaluationSet(*scene[:2], frames=scene[2], label_version="v2.1")
     for protocol in PROTOCOLS:
-        for result in evaluate(
-            truth,
-            found,
-            iou_thresholds=(0.3, 0.5, 0.7),
-            protocol=protocol,
-            frames=frames,
-            label_version="v2.1",
-        ):
+        for result in data.results(protocol, iou_thresholds=(0.3, 0.5, 0.7)):
             row = rows[f"{result.cls}/all/{result.metric}"]
             if result.is_defined:
                 assert row["ap"] == pytest.approx(result.ap, abs=1e-12)
