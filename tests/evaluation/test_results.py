@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
+from radejax.evaluation.boxes import take
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.results import (
     EvaluationOptions,
@@ -88,12 +89,8 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
     assert has_interval == {"all": True, "fog": False, "rain": True}
     # The intervals of a condition are those of its frames as a dataset of their own.
     rain = np.flatnonzero(weather == "rain")
-    part = {name: column[rain] for name, column in frames.items()} | {
-        "weather": weather[rain]
-    }
-    tables = [
-        {k: v[np.isin(t["frame"], rain)] for k, v in t.items()} for t in scene[:2]
-    ]
+    part = take({**frames, "weather": weather}, rain)
+    tables = [take(table, np.isin(table["frame"], rain)) for table in scene[:2]]
     apart = intervals(tables, part)
     for key in (k for k in found if k[0] == "rain"):
         assert found[key] == apart["all", *key[1:]]
