@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import gc
 import json
 import logging
 import os
@@ -122,9 +121,6 @@ class Program(click.Command):
         """Runs it with some arguments, by default those of this process."""
         if args is None:
             memory.restart_with_huge_pages()
-            # Tracing creates millions of objects that stay: with Python's thresholds
-            # the collector takes a sixth of a start.
-            gc.set_threshold(50_000, 20, 50)
         return super().main(args, *others, **options)
 
 
