@@ -103,7 +103,7 @@ def set_up_jax() -> None:
     # Orbax logs every step it takes; its errors are raised as well.
     absl_logging.set_verbosity(absl_logging.FATAL)
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read one of theirs
-    if jax.config.jax_compilation_cache_dir is None:
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # which JAX reads itself
         home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
         folder = pathlib.Path(home, "radejax", "jax")
         jax.config.update("jax_compilation_cache_dir", str(folder))
