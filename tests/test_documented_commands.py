@@ -15,7 +15,7 @@ import click
 import click.testing
 import pytest
 
-from radejax.cli import main
+from radejax.cli import entry, main
 from radejax.cli.evaluate import evaluate
 from radejax.cli.train import train
 from radejax.core.config import load_config, override
@@ -141,7 +141,9 @@ def _check_train(arguments: list[str]) -> None:
     arguments = [word for old, word in pairs if word != "..." or old == "--config"]
     names = ["radenet" if word == "..." else word for word in arguments]
     context = click.Context(train, **train.context_settings)
-    train.parse_args(context, names)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(entry.EXISTING, "exists", False)  # the pages' folders
+        train.parse_args(context, names)
     settings = load_config(context.params["config"])
     values = {"S": "0", "LABELS.zip": "labels.zip"}
     texts = context.meta["fields"].items()
