@@ -22,7 +22,6 @@ from radejax.core.errors import (
 )
 from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
 
-_MAX_SIDE, _MAX_PIXELS = 8192, 1 << 25
 _FINITE: Range = math.isfinite, "a finite number"
 _OPTIONS = {
     "projection": one_of("raw", "pinhole"),
@@ -55,11 +54,6 @@ def read_left_image(
         # From memory: of a file, a chunk that claims 4 GB is asked for whole.
         with Image.open(io.BytesIO(path.read_bytes())) as file:
             found = file.size
-            if max(found) > _MAX_SIDE or found[0] * found[1] > _MAX_PIXELS:
-                raise DataError(
-                    f"{path}: {found[0]} x {found[1]} pixels, expected at most "
-                    f"{_MAX_SIDE} in each direction and {_MAX_PIXELS} in all"
-                )
             if not resize and found not in ((2 * width, height), (width, height)):
                 raise DataError(
                     f"{path}: {found[0]} x {found[1]} pixels, expected "

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, no_camera, read_left_image
@@ -267,10 +267,6 @@ class LoaderOptions:
     num_threads: int = 2
     process_index: int | None = None
     process_count: int | None = None
-
-    def __post_init__(self) -> None:
-        size = self.batch_size
-        require(size >= 1, "batch_size", size, "an integer of at least 1")
 
 
 def make_loader(

@@ -63,10 +63,8 @@ def project_tensor(
             "a tesseract is a real array [Doppler, range, elevation, azimuth], got "
             f"shape {tesseract.shape} of {tesseract.dtype}"
         )
-    if not np.issubdtype(tesseract.dtype, np.floating) or tesseract.dtype.itemsize < 4:
-        tesseract = tesseract.astype(np.float32)
-    if not tesseract.dtype.isnative:
-        tesseract = tesseract.astype(tesseract.dtype.newbyteorder("="))
+    is_double = tesseract.dtype.type is np.float64
+    tesseract = tesseract.astype(np.float64 if is_double else np.float32, copy=False)
     if tesseract.T.flags.c_contiguous:
         return project_columns(tesseract.T, tesseract.shape, dtype=dtype)
     projection = _empty(tesseract.shape, dtype)

@@ -127,9 +127,6 @@ def test_left_half_of_the_stereo_pair(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no image")
     with pytest.raises(DataError, match=r"a\.png: corrupted image"):
         read_left_image(tmp_path / "a.png")
-    Image.new("1", (9000, 1)).save(tmp_path / "a.png")  # few bytes, many pixels
-    with pytest.raises(DataError, match=r"a\.png: 9000 x 1 pixels, expected at most"):
-        read_left_image(tmp_path / "a.png", resize=True)
     Image.new("L", (4, 4)).save(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:44])
     with pytest.raises(DataError, match=r"a\.png: corrupted image"):

@@ -297,10 +297,6 @@ def test_wrong_sizes(loader, records, data):
         loader(batch_size=13)
     with pytest.raises(UserError, match=r"of 15 \(3 on each of 5 .*--config\.train"):
         loader(process_count=5)
-    with pytest.raises(
-        UserError, match="batch_size is 0, expected an integer of at least 1"
-    ):
-        loader(batch_size=0)
     with pytest.raises(UserError, match="would do"):
         make_table(records, data, max_objects=0)
 

@@ -60,19 +60,13 @@ SIMULATION_MARKER = "simulation.json"
 Key = tuple[int, str]
 """Sequence number and frame name, such as `(1, "00033_00001")`."""
 
-_LABEL_FOLDERS = {
-    "v1.0": ("info_label_v1_0", "info_label"),
-    "v1.1": ("info_label_v1_1", "info_label"),
-    "v2.0": ("info_label_v2_0", "info_label_v2", "info_label"),
-    "v2.1": ("info_label_v2_1", "info_label"),
-}
 # Regular expressions, as str.isdecimal is also true of the digits of other scripts.
 _SEQUENCE = re.compile(r"[0-9]{1,6}")
 _LABELLED_SEQUENCE = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
 _LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
 _SPLIT_LINE = re.compile(r"\s*([0-9]{1,6})\s*,\s*([0-9]{1,9}_[0-9]{1,9})(?:\.txt)?\s*")
 _CAMERA_FOLDERS = ("calib", "cam_calib", "resources/cam_calib")
-_SPLITS = ("train", "test")
+_SPLIT_FOLDERS = ("split", "resources/split", ".")
 _MAX_OFFSET_M = 100.0
 
 
@@ -296,7 +290,12 @@ class KRadar(LabelledFrames[Frame]):
                     f"split {split!r} is neither 'train', 'test', None nor a split file"
                 )
             return set(read_split(split))
-        paths = {name: find_split_file(name, self._split_folders) for name in _SPLITS}
+        paths = {
+            name: _first_file(
+                self._split_folders, [f"{place}/{name}.txt" for place in _SPLIT_FOLDERS]
+            )
+            for name in ("train", "test")
+        }
         entries = {name: set(read_split(path)) for name, path in paths.items() if path}
         if len(entries) == 2 and (both := sorted(entries["train"] & entries["test"])):
             message = (
@@ -323,13 +322,15 @@ class KRadar(LabelledFrames[Frame]):
     def _read_sequence(self, number: int) -> dict[str, Any]:
         """Fields that the frames of a sequence share, from its files or by default."""
         folder = self.folders.get(number, _NO_FOLDER)
-        camera, is_own = find_camera_calibration(
-            self._camera_folders, number, common_only=self._common_camera
-        )
+        camera, own = None, f"seq_{number:02d}/cam_1.yml"
+        if not self._common_camera:
+            names = f"calib_seq_v2/{own}", own
+            camera = _first_file(self._camera_folders, names)
         if camera is None:
-            self.counts["sequences without camera calibration"] += 1
-        elif not is_own:
-            self.counts["sequences with the common camera calibration"] += 1
+            names = "common/cam_front0.yml", "cam_front0.yml"
+            camera = _first_file(self._camera_folders, names)
+            kind = "with the common" if camera else "without"
+            self.counts[f"sequences {kind} camera calibration"] += 1
         path = folder.find("info_calib", "calib_radar_lidar.txt")
         if path is None and folder.folders:
             self._report(
@@ -497,27 +498,12 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
     return {number: SequenceFolder(found[number]) for number in sorted(found)}
 
 
-def find_camera_calibration(
-    folders: Sequence[pathlib.Path], sequence: int, *, common_only: bool = False
-) -> tuple[pathlib.Path | None, bool]:
-    """Find the calibration of the left front camera.
-
-    Args:
-        folders: Where it is looked for.
-        sequence: Number of the sequence.
-        common_only: Find the common one even where the sequence has its own.
-
-    Returns:
-        The file, None where there is none, and whether it is the sequence's own.
-    """
-    own = f"seq_{sequence:02d}/cam_1.yml"
-    of_sequence = (f"calib_seq_v2/{own}", own)
-    common = ("common/cam_front0.yml", "cam_front0.yml")
-    for names, is_own in ((of_sequence, True), (common, False))[common_only:]:
-        for folder, name in itertools.product(folders, names):
-            if (folder / name).is_file():
-                return folder / name, is_own
-    return None, False
+def _first_file(
+    folders: Sequence[pathlib.Path], names: Sequence[str]
+) -> pathlib.Path | None:
+    """The first file of these names in the first folder with any; None without one."""
+    paths = (folder / name for folder, name in itertools.product(folders, names))
+    return next(filter(pathlib.Path.is_file, paths), None)
 
 
 def read_calibration(path: PathLike) -> tuple[int, float, float]:
@@ -570,9 +556,12 @@ def find_own_labels(
     sequences: dict[int, SequenceFolder], version: str
 ) -> dict[Key, LabelPath]:
     """Label files in the sequences' own folders, as the data set is delivered."""
+    subfolders = [f"info_label_{version.replace('.', '_')}", "info_label"]
+    if version == "v2.0":
+        subfolders.insert(1, "info_label_v2")
     found: dict[Key, LabelPath] = {}
     for number, folder in sequences.items():
-        for subfolder in _LABEL_FOLDERS[version]:
+        for subfolder in subfolders:
             listing = folder.listing(subfolder)
             names = sorted(name for name in listing if _LABEL_NAME.fullmatch(name))
             found |= {(number, n.removesuffix(".txt")): listing[n] for n in names}
@@ -624,13 +613,6 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
 
 
 # Splits ------------------------------------------------------------------------------
-
-
-def find_split_file(split: str, near: Sequence[pathlib.Path]) -> pathlib.Path | None:
-    """`split/<name>.txt` in or next to the given folders, None where there is none."""
-    places = itertools.product(near, ("split", "resources/split", "."))
-    paths = (folder / place / f"{split}.txt" for folder, place in places)
-    return next(filter(pathlib.Path.is_file, paths), None)
 
 
 def read_split(path: PathLike) -> list[Key]:

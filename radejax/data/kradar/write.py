@@ -67,8 +67,8 @@ def write_description(
 
 def write_splits(
     folder: str | os.PathLike,
-    train: Iterable[tuple[int | str, str]],
-    test: Iterable[tuple[int | str, str]],
+    train: Iterable[tuple[int, str]],
+    test: Iterable[tuple[int, str]],
 ) -> None:
     """Writes `train.txt` and `test.txt` into a folder.
 
@@ -78,9 +78,7 @@ def write_splits(
         test: The same for the test split.
     """
     for name, frames in (("train", train), ("test", test)):
-        lines = [
-            f"{seq},{str(frame).removesuffix('.txt')}.txt" for seq, frame in frames
-        ]
+        lines = [f"{sequence},{frame}.txt" for sequence, frame in frames]
         write_text(pathlib.Path(folder) / f"{name}.txt", "\n".join(lines))
 
 

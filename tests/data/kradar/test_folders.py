@@ -155,17 +155,21 @@ def test_a_root_of_symbolic_links(kradar_root, tmp_path):
 
 
 def test_split_files_and_camera_calibration_are_found(tmp_path):
-    split = touch(tmp_path / "b/resources/split/test.txt")
-    near = [tmp_path / "a", tmp_path / "b"]
-    assert dataset.find_split_file("test", near) == split
-    assert dataset.find_split_file("train", near) is None
-    common = touch(tmp_path / "c/common/cam_front0.yml")
+    touch(tmp_path / "b/resources/split/test.txt", f"3,{LABEL}.txt")
+    common = touch(tmp_path / "a/calib/common/cam_front0.yml")
     own = touch(tmp_path / "c/calib_seq_v2/seq_03/cam_1.yml")
-    assert dataset.find_camera_calibration([tmp_path / "c"], 3) == (own, True)
-    assert dataset.find_camera_calibration([tmp_path / "c"], 4) == (common, False)
-    found = dataset.find_camera_calibration([tmp_path / "c"], 3, common_only=True)
-    assert found == (common, False)
-    assert dataset.find_camera_calibration([tmp_path / "d"], 4) == (None, False)
+    for number in (3, 4):
+        open_sequence(tmp_path / "a", number)
+    (tmp_path / "b/3").mkdir()
+    roots, text = [tmp_path / "a", tmp_path / "b"], "sequences with the common camera"
+    assert [frame.sequence for frame in KRadar(roots, split="test")] == [3]
+    for is_common, wanted in ((False, [own, common]), (True, [common, common])):
+        data = KRadar(roots, camera_calibration=tmp_path / "c", common_camera=is_common)
+        assert [frame.camera_calibration_path for frame in data] == wanted
+        assert data.counts[f"{text} calibration"] == wanted.count(common)
+    data = open_sequence(tmp_path / "d", 4)
+    assert data[0].camera_calibration_path is None
+    assert data.counts["sequences without camera calibration"] == 1
 
 
 def test_height_of_the_radar_is_kradars_or_the_simulations(tmp_path):

@@ -50,7 +50,7 @@ def test_calibration_description_and_splits_survive(tmp_path):
     assert conditions.read_description(tmp_path / "d.txt") == conditions.Conditions(
         "urban", "night", "heavysnow"
     )
-    write.write_splits(tmp_path, [(1, "00033_00001")], [("2", "00034_00002.txt")])
+    write.write_splits(tmp_path, [(1, "00033_00001")], [(2, "00034_00002")])
     assert dataset.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
     assert dataset.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]
 
