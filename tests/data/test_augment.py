@@ -70,16 +70,6 @@ def test_mirrored_boxes_and_maps_stay_in_register(boxes, seed):
     np.testing.assert_array_equal(twice["boxes"], boxes)
 
 
-def test_blob_follows_its_box_by_hand():
-    x, y = GRID.bin_to_ego(4, 2)
-    boxes = np.array([[x, y, 0, 4, 2, 1, 0.6, 0.8]])
-    after = mirror(sample(boxes))
-    r, a = GRID.nearest_bin(*after["boxes"][0, :2])
-    assert (r, a) == (4, 9)
-    assert (after["projection"][4, 9] == np.float16(0.9)).all()
-    assert (after["projection"][4, 2] < 0.5).all()
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     points=st.lists(

@@ -3,8 +3,6 @@ import re
 import time
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.labels import (
@@ -166,43 +164,6 @@ def test_missing_and_malformed_files_and_versions(tmp_path):
     with pytest.raises(UserError, match=r"'v3' does not exist; choose from v1\.0"):
         read_labels(tmp_path / "none.txt", "v3")
     assert normalize_version("2.1") == normalize_version("V2_1") == "v2.1"
-
-
-# Properties -------------------------------------------------------------------------
-
-TEXTS = [
-    HEADER,
-    *LINES.values(),
-    "\r\n",
-    ", ",
-    "Sedan",
-    "1e5",
-    "nan",
-    "\ufeff",
-    "\u2028",
-]
-PIECES = st.lists(st.sampled_from([*TEXTS, *"\n,*#R1\x00é \t\x1c٣-"]), max_size=12)
-
-
-@settings(deadline=None, max_examples=300)
-@given(
-    content=st.one_of(
-        st.binary(max_size=200),
-        st.text(max_size=200).map(str.encode),
-        PIECES.map("".join).map(str.encode),
-        PIECES.map(lambda pieces: "\n".join([HEADER, "".join(pieces)]).encode()),
-        st.text(max_size=80).map(lambda x: x.encode("utf-16")),
-    ),
-    version=st.sampled_from(VERSIONS),
-)
-def test_fuzzed_files_never_crash(parse, content, version):
-    try:
-        file = parse(content, version)
-    except DataError:
-        return
-    for label in file.labels:
-        assert all(math.isfinite(value) for value in label.box)
-        assert min(label.box[3:6]) > 0
 
 
 # The reference data -----------------------------------------------------------------
