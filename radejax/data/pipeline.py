@@ -393,7 +393,7 @@ class _LoadBatch(grain.transforms.Map):
             batch.classes[row] = self._table.classes[index]
             batch.is_valid[row] = batch.classes[row] >= 0
             batch.frame[row] = index
-            if images is not None:
+            if batch.image is not None:
                 batch.image[row] = sample["image"]
                 cameras[row] = sample["camera"]
         return batch.replace(camera=stack_cameras(cameras)) if images else batch

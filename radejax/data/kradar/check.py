@@ -150,9 +150,9 @@ def check_dataset(
             _check_conditions(number, own, summary)
         row = _row(number, folder, own, splits)
         rows.append(row | {"tesseracts_corrupted": corrupted[number]})
-    roots = [str(path) for path in data.roots]
+    names = [str(path) for path in data.roots]
     return HealthReport(
-        roots, data.version, rows, _count_objects(data, splits), summary
+        names, data.version, rows, _count_objects(data, splits), summary
     )
 
 
