@@ -46,11 +46,10 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
 
     def detect(*inputs, **settings):
-        values = {**defaults, **settings}.values()
-        settings = [np.asarray(value, np.float32) for value in values]
+        values = [np.asarray(x, np.float32) for x in {**defaults, **settings}.values()]
         # Copies: on CPU device_put shares memory, which the caller may refill.
         own = jax.tree.map(np.array, inputs)
-        return run(weights, jax.device_put(own, device), *settings)
+        return run(weights, jax.device_put(own, device), *values)
 
     return detect
 

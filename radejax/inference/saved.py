@@ -219,12 +219,9 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
     """Inverse of `save_model`."""
     path, weights = folder / CONFIG_FILE, folder / WEIGHTS_FILE
     content = files.read_object(path)
-    if content.get("format") != FORMAT:
-        raise DataError(
-            f"{path}: format is {content.get('format')!r}, expected {FORMAT!r}"
-        )
-    data = weights.read_bytes()
+    data, kind = weights.read_bytes(), content.get("format")
     try:
+        require(kind == FORMAT, "format", kind, repr(FORMAT))
         if hashlib.sha256(data).hexdigest() != content["sha256"][WEIGHTS_FILE]:
             raise DataError(
                 f"{weights} is corrupted or of another model: its sha256 differs from "
