@@ -366,17 +366,17 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     Raises:
         UserError: The shape is of neither, or there is no frame.
     """
-    frames = _read_paths(frames, lambda path: read_frame(path, grid))
-    if isinstance(frames, list):
-        if not frames:
+    radar = _read_paths(frames, lambda path: read_frame(path, grid))
+    if isinstance(radar, list):
+        if not radar:
             raise UserError("no frames: the list is empty")
-        frames = np.stack(frames)
-    shape = tuple(np.shape(frames))
+        radar = np.stack(radar)
+    shape = tuple(np.shape(radar))
     projection, tesseract = grid.projection_shape, grid.shape_drea
     if shape in (projection, tesseract):
-        return frames[None]
+        return radar[None]
     if shape[1:] in (projection, tesseract) and shape[0]:
-        return frames
+        return radar
     raise UserError(
         f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
         f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
