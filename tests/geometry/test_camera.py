@@ -15,8 +15,7 @@ from radejax.geometry.camera import CameraCalibration
 
 from .. import small_models as small
 
-# The distortion and matrix of K-Radar's cameras.
-INTRINSICS = (567.720776478944, 577.2136917114258, 628.72078, 369.30687)
+# Of K-Radar's cameras.
 DISTORTION = (-0.028873818, 0.0006023302, 0.0039573087, -0.0050471763, 0.0)
 
 
@@ -122,13 +121,9 @@ def test_every_calibration_of_the_data_set_can_be_read(shared):
 
 
 def test_kradar_text_round_trip(tmp_path):
-    camera = CameraCalibration.from_angles(
-        intrinsics=INTRINSICS,
-        distortion=DISTORTION,
-        yaw_deg=88.6,
-        pitch_deg=0.6,
-        roll_deg=89.6,
-        translation_m=(0.18, -0.13, 0.0),
+    angles = {"yaw_deg": 88.6, "pitch_deg": 0.6, "roll_deg": 89.6}
+    camera = forward_camera(
+        distortion=DISTORTION, translation_m=(0.18, -0.13, 0.0), **angles
     )
     path = tmp_path / "cam_1.yml"
     path.write_text(camera.to_kradar_text())
@@ -158,12 +153,9 @@ def test_box_edges_ahead_and_cut_at_the_near_plane():
     assert is_visible[1].sum() == 8  # all but the four edges of the rear face
     assert not is_visible[2].any()
     # The nearest face is at 9 m: half width 2 and half height 1 at focal length 50.
-    np.testing.assert_allclose(
-        edges[0].reshape(-1, 2).min(0), [50 - 100 / 9, 40 - 50 / 9]
-    )
-    np.testing.assert_allclose(
-        edges[0].reshape(-1, 2).max(0), [50 + 100 / 9, 40 + 50 / 9]
-    )
+    ends, half = edges[0].reshape(-1, 2), np.array([100 / 9, 50 / 9])
+    np.testing.assert_allclose(ends.min(0), np.array([50, 40]) - half)
+    np.testing.assert_allclose(ends.max(0), np.array([50, 40]) + half)
     assert np.isfinite(edges).all()
 
 

@@ -64,11 +64,8 @@ class TestTree:
         assert len(KRadar(tree, split="test")) == 3
         frame = data[0]
         assert frame.tesseract_path.is_file()
-        assert (frame.environment, frame.time, frame.weather) == (
-            "urban",
-            "day",
-            "normal",
-        )
+        conditions = frame.environment, frame.time, frame.weather
+        assert conditions == ("urban", "day", "normal")
         assert np.asarray(Image.open(frame.camera_path)).shape == (36, 128, 3)
 
     def test_tesseract_has_kradars_variable_axes_and_level(self, tree):
@@ -114,12 +111,8 @@ class TestTree:
             assert np.hypot(a.box[0] - b.box[0], a.box[1] - b.box[1]) < 6.0
 
     def test_both_visibilities_occur(self, tree):
-        flags = {
-            label.visibility
-            for f in KRadar(tree, visibility=None)
-            for label in f.labels
-        }
-        assert flags == {"R", "L"}
+        labels = (f.labels for f in KRadar(tree, visibility=None))
+        assert {label.visibility for group in labels for label in group} == {"R", "L"}
 
 
 class TestRepeating:
@@ -144,9 +137,8 @@ class TestRepeating:
         monkeypatch.setattr(dataset, "_write_frame", stops)
         with pytest.raises(KeyboardInterrupt):
             simulate_dataset(small_config(), root, num_workers=0, progress=False)
-        assert not json.loads((root / dataset.SIMULATION_MARKER).read_text())[
-            "finished"
-        ]
+        marker = json.loads((root / dataset.SIMULATION_MARKER).read_text())
+        assert not marker["finished"]
         monkeypatch.setattr(dataset, "_write_frame", write)
         # A killed writer leaves its temporary file; a living one's is not touched.
         dead = subprocess.Popen([sys.executable, "-c", ""])

@@ -19,12 +19,6 @@ def test_rectangle_on_a_slanted_face_by_hand():
     np.testing.assert_allclose(found[0], expected)
 
 
-def test_the_whole_face_is_the_face():
-    face = np.random.default_rng(0).normal(size=(3, 4, 3))
-    one = np.tile([0.0, 1.0], (3, 1))
-    np.testing.assert_allclose(details.on_faces(face, one, one), face)
-
-
 @pytest.mark.parametrize("cls", CLASSES)
 def test_details_stay_in_the_box(cls):
     corners = shapes.blocks_of(cls)
@@ -51,12 +45,16 @@ def test_vehicles_are_the_same_on_both_sides(name):
     )
 
 
-def test_rails_follow_the_road_and_trees_face_the_camera():
+def frame_of(environment, seed):
     scene = make_sequence(
-        1, environment="highway", time="day", weather="normal", num_frames=2,
-        rng=np.random.default_rng(0),
+        1, environment=environment, time="day", weather="normal", num_frames=2,
+        rng=np.random.default_rng(seed),
     )  # fmt: skip
-    frame = scene.frame(0)
+    return scene.frame(0)
+
+
+def test_rails_follow_the_road_and_trees_face_the_camera():
+    frame = frame_of("highway", 0)
     origin = np.array([-2.5, 0.3, 0.7])
     corners, depth, colors = details.make_panels(frame, origin, -0.9, 0.0)
     assert corners.shape[1:] == (4, 3)
@@ -76,11 +74,7 @@ def test_rails_follow_the_road_and_trees_face_the_camera():
 
 
 def test_snow_whitens_trees():
-    scene = make_sequence(
-        1, environment="countryside", time="day", weather="normal", num_frames=2,
-        rng=np.random.default_rng(1),
-    )  # fmt: skip
-    frame, origin = scene.frame(0), np.zeros(3)
+    frame, origin = frame_of("countryside", 1), np.zeros(3)
     green = details.make_panels(frame, origin, -0.9, 0.0)[2]
     white = details.make_panels(frame, origin, -0.9, 0.9)[2]
     assert white.mean() > green.mean() + 20.0

@@ -117,15 +117,18 @@ def test_car_behind_a_truck_is_weak_and_unlit():
     assert 10 * np.log10(drop) == pytest.approx(scattering.OCCLUDED_DB, abs=0.5)
 
 
+def at(position_m, velocity_mps=(0.0, 0.0), power=1.0):
+    """Scatterers of one phase and owner."""
+    position = np.array(position_m, float)
+    count = len(position)
+    velocity = np.broadcast_to(velocity_mps, (count, 2))
+    rest = np.zeros(count), np.zeros(count, int)
+    return scattering.FrameScattering(position, velocity, np.full(count, power), *rest)
+
+
 class TestMotion:
     def test_range_rate_of_a_moving_target_seen_from_a_moving_ego(self):
-        part = scattering.FrameScattering(
-            np.array([[30.0, 40.0, 0.0]]),
-            np.array([[2.0, 11.0]]),
-            np.ones(1),
-            np.zeros(1),
-            np.zeros(1, int),
-        )
+        part = at([[30.0, 40.0, 0.0]], (2.0, 11.0))
         seen = scattering.to_scatterers(
             part, np.array([12.0, 0.0]), PARAMETERS.wavelength_m
         )
@@ -136,13 +139,7 @@ class TestMotion:
 
     def test_amplitude_has_the_power_and_the_phase_of_the_way(self):
         wavelength = PARAMETERS.wavelength_m
-        part = scattering.FrameScattering(
-            np.array([[20 * wavelength, 0, 0], [20.125 * wavelength, 0, 0]]),
-            np.zeros((2, 2)),
-            np.array([4.0, 4.0]),
-            np.zeros(2),
-            np.zeros(2, int),
-        )
+        part = at([[20 * wavelength, 0, 0], [20.125 * wavelength, 0, 0]], power=4.0)
         seen = scattering.to_scatterers(part, np.zeros(2), PARAMETERS.wavelength_m)
         # An eighth of a wavelength farther: a quarter turn.
         np.testing.assert_allclose(seen.amplitude[0], [2.0, 0.0], atol=1e-3)
@@ -185,13 +182,7 @@ def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
 
 class TestGhosts:
     def test_mirror_image_position_velocity_and_loss(self):
-        part = scattering.FrameScattering(
-            np.array([[20.0, 2.0, 0.0], [20.0, 8.0, 0.0], [90.0, 0.0, 0.0]]),
-            np.array([[3.0, -1.0]] * 3),
-            np.ones(3),
-            np.zeros(3),
-            np.zeros(3, int),
-        )
+        part = at([[20, 2, 0], [20, 8, 0], [90, 0, 0]], (3.0, -1.0))
         ghosts = scattering.scatter_ghosts(part, (6.0,))
         # Only the first: the second is behind the wall, the third too far.
         np.testing.assert_allclose(ghosts.position_m, [[20.0, 10.0, 0.0]])
@@ -201,8 +192,5 @@ class TestGhosts:
         assert ghosts.owner.tolist() == [-1]
 
     def test_without_walls_no_ghosts(self):
-        part = scattering.FrameScattering(
-            np.ones((1, 3)), np.ones((1, 2)), np.ones(1), np.zeros(1), np.zeros(1, int)
-        )
-        ghosts = scattering.scatter_ghosts(part, ())
+        ghosts = scattering.scatter_ghosts(at([[1, 1, 1]]), ())
         assert len(ghosts.power) == 0

@@ -15,6 +15,7 @@ from radejax.simulation.world import replay
 
 OFFSET = (-2.54, 0.3, 0.7)
 NUM_FRAMES = 16
+GRID = {"num_doppler": 8, "num_range": 32, "num_elevation": 5, "num_azimuth": 24}
 
 
 def boxes_at(i):
@@ -50,13 +51,7 @@ def make_config(folder, **changes):
         "frames_per_sequence": 0,
         "image_width": 0,
         "output": "projection",
-        "grid": {
-            "num_doppler": 8,
-            "num_range": 32,
-            "num_elevation": 5,
-            "num_azimuth": 24,
-            "max_range_m": 75.0,
-        },
+        "grid": GRID,
     }
     return values | changes
 
@@ -124,10 +119,8 @@ class TestWrittenTree:
         assert len(written) == NUM_FRAMES
         for i, path in enumerate(written):
             original = labels_folder / "7" / path.name
-            assert (
-                path.read_text().splitlines()[0]
-                == (original.read_text().splitlines()[0])
-            )
+            lines, given_lines = (p.read_text().splitlines() for p in (path, original))
+            assert lines[0] == given_lines[0]
             given = {(x.cls, x.track_id): x.box for x in boxes_at(i)}
             for label in read_labels(path):
                 expected = given[(label.cls, label.track_id)]
