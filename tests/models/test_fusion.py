@@ -12,14 +12,8 @@ from radejax.models.lifting import ReferencePoints
 from .plain_attention import plain_attention
 
 B, R, A, C, E, D, H, W = 2, 4, 3, 8, 3, 5, 6, 7
-SMALL = {
-    "num_heads": 2,
-    "num_points": 3,
-    "num_elevation": E,
-    "num_groups": 4,
-    "necks": False,
-    "chunk_size": 5,
-}
+SMALL = {"num_heads": 2, "num_points": 3, "num_elevation": E, "num_groups": 4}
+SMALL |= {"necks": False, "chunk_size": 5}
 
 
 def inputs(seed=0, batch_geometry=True):
@@ -40,12 +34,9 @@ def variables_of(module, args):
     """Random parameters: the initial ones leave offsets and logits at zero."""
     shapes = jax.eval_shape(module.init, jax.random.key(0), *args)
     rng = np.random.default_rng(1)
-    return {
-        "params": jax.tree.map(
-            lambda x: jnp.asarray(0.4 * rng.standard_normal(x.shape), jnp.float32),
-            shapes["params"],
-        )
-    }
+    return jax.tree.map(
+        lambda x: jnp.asarray(0.4 * rng.standard_normal(x.shape), jnp.float32), shapes
+    )
 
 
 def by_the_formulas(module, variables, radar, elevation, camera, reference):

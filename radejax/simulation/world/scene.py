@@ -204,15 +204,8 @@ def travelled(
 
 
 def class_index(name: str) -> int:
-    """Index of a class name; K-Radar's groups count as their single class.
-
-    Raises:
-        ValueError: There is no such class.
-    """
-    single = name.removesuffix(" Group")
-    if single not in CLASSES:
-        raise ValueError(f"class {name!r} is none of {', '.join(CLASSES)}")
-    return CLASSES.index(single)
+    """Index of a class name; K-Radar's groups count as their single class."""
+    return CLASSES.index(name.removesuffix(" Group"))
 
 
 def is_blocked(

@@ -15,8 +15,6 @@ def test_wrap_angle(angle, expected):
 
 def test_groups_count_as_their_single_class():
     assert scene.class_index("Pedestrian Group") == scene.class_index("Pedestrian") == 2
-    with pytest.raises(ValueError, match="Tram"):
-        scene.class_index("Tram")
 
 
 def test_points_seen_from_a_turned_ego_by_hand():
