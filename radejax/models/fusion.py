@@ -123,7 +123,12 @@ class Fusion(nn.Module):
 
         counts = self.num_heads, self.num_points, self.chunk_size
         attention = DeformableAttention(c, *counts, self.dtype, name="attention")
-        queries = map(per_bin, (radar, scale, reference.points, mean))
+        queries = (
+            per_bin(radar),
+            per_bin(scale),
+            per_bin(reference.points),
+            per_bin(mean),
+        )
         seen = attention(*queries, camera).reshape(b, r, a, c)
         share = self._camera_share(radar, seen)
         share = share * self._has_camera(reference, mean).astype(share.dtype)
