@@ -54,8 +54,7 @@ def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
     _check_keys(image, own | vit_fields, "image.")
     _check_keys(fusion, _own_fields(Fusion) - shared, "fusion.")
     _check_keys(grid, _own_fields(LiftingAxes) - {"num_elevation"}, "query_grid.")
-    kinds = {"kind": one_of("vit", "resnet50")}
-    check_options(image, "config.model.image", kinds)
+    check_options(image, "config.model.image", {"kind": one_of("vit", "resnet50")})
     vit = None
     if image["kind"] == "vit":
         vit = ViT(**{name: image[name] for name in vit_fields})

@@ -197,10 +197,9 @@ class DinoRade(RadeNet, kw_only=True):
     def _camera_map(
         self, image: Real[jax.Array, "B _ _ _"], reference: ReferencePoints, train: bool
     ) -> Float[jax.Array, "B h w C"]:
-        b = image.shape[0]
         is_embedded = tuple(image.shape[1:]) == self.feature_shape
         features = image if is_embedded else self.embed(image)
         has_image = reference.has_image
         if has_image is None:
-            has_image = jnp.ones(b, bool)
+            has_image = jnp.ones(image.shape[0], bool)
         return self.image_neck(features, jnp.asarray(has_image), train=train)
