@@ -68,7 +68,7 @@ def run(folder, name, steps):
     entry.set_up_jax()
     config = make_config(steps)
     config.data.roots = (str(folder / "data"),)
-    experiment.run(config, name=name, workdir=folder / name)
+    experiment.run(config, folder / name)
 
 
 def start(folder, name, steps):

@@ -177,7 +177,7 @@ class Work:
             config = self.config(cell, seed)
             config.data.roots = (str(self.data(cell, seed)),)
             config.data.image_backbone = backbone
-            experiment.run(config, name=name, workdir=folder)
+            experiment.run(config, folder)
         if not trained.exists():
             return False
         with self.alone():  # the held-out scenes are simulated and preprocessed once

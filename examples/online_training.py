@@ -25,6 +25,7 @@ from radejax.cli import entry
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.runs import checks
 from radejax.runs.experiment import checkpoint_info, claimed
 from radejax.simulation.config import plain
 from radejax.training import distributed, loop
@@ -72,10 +73,11 @@ def train_online(
         "test_sequences": 0,
         "seed": simulation["seed"] + SEED_OFFSET,
     }
+    checks.check(config)
+    batch_size = config.train.batch_size
+    distributed.check_batch_size(batch_size)
     workdir = pathlib.Path(workdir).absolute()
     with claimed(workdir, config):
-        batch_size = config.train.batch_size
-        distributed.check_batch_size(batch_size, distributed.make_mesh())
         batches = OnlineBatches(
             simulation,
             batch_size=batch_size,

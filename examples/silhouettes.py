@@ -74,7 +74,7 @@ def main(workdir, options, seed, resamples):
             config = load_config(f"{CONFIG}:{','.join(filter(None, chosen))}")
             config.seed = seed
             folder = pathlib.Path(workdir) / kind
-            folders.append(experiment.run(config, name="silhouettes", workdir=folder))
+            folders.append(experiment.run(config, folder))
         rows = compared(config, *folders, resamples)
         table = comparison_table(rows, "radar", "radar and silhouettes")
         click.echo(table.render(is_simulated=True))

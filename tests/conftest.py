@@ -118,6 +118,15 @@ def _process_as_it_was() -> Iterator[None]:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM_SECS)
 
 
+@pytest.fixture
+def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs compile for one device: eight on few cores take long, and are tested apart."""
+    from radejax.training import distributed
+
+    mesh = distributed.make_mesh(1)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
+
+
 @pytest.fixture(scope="session")
 def shared() -> pathlib.Path:
     """Folder of reference data that a user does not have; skips without it."""

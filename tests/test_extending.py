@@ -26,7 +26,6 @@ from radejax.models.heads import HEADS, NECKS
 from radejax.runs import checks, experiment
 from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run
-from radejax.training import distributed
 
 from . import small_models as small
 from .evaluation.scenes import random_scene
@@ -133,16 +132,15 @@ def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_device")
 def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
 ) -> None:
-    """Through the doors: one step, a checkpoint, its evaluation on the same data."""
-    mesh = distributed.make_mesh(1)
-    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
+    """One step, a checkpoint, its evaluation on the same data."""
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
     config.data.roots = (str(root),)
-    experiment.run(config, name="toy", workdir=folder)
+    experiment.run(config, folder)
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     assert np.isfinite([row[name] for name in ("focal", "gwd", "height")]).all()

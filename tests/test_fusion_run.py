@@ -68,12 +68,7 @@ class _Data:
         config = small_config() if config is None else config
         config.data.update(paths, roots=(str(self.folder),))
         workdir = self.runs / name
-        experiment.run(
-            config,
-            name=name,
-            workdir=workdir,
-            init_from=init_from,
-        )
+        experiment.run(config, workdir, init_from=init_from)
         return workdir
 
     def losses(self, workdir):

@@ -109,16 +109,12 @@ def train(
     place = coordinator, num_processes, process_id
     if distributed or place != (None,) * 3:
         join_processes(*place)
-    given: dict[str, Any] = {
-        "name": config_name(config),
-        "workdir": workdir,
-        "init_from": init_from,
-        "profile": profile or "",
-    }
+    workdir = workdir or f"runs/{config_name(config)}"
+    given: dict[str, Any] = {"init_from": init_from, "profile": profile or ""}
     if seeds:
-        run_seeds(settings, seeds, **given)
+        run_seeds(settings, workdir, seeds, **given)
     else:
-        run(settings, **given)
+        run(settings, workdir, **given)
 
 
 def join_processes(

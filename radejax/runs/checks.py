@@ -11,6 +11,7 @@ from ml_collections.config_flags import config_path
 from radejax import models
 from radejax.core.config import fields_of, load_config
 from radejax.core.errors import (
+    BELOW_ONE,
     POSITIVE,
     UserError,
     check_options,
@@ -31,7 +32,6 @@ from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
 from radejax.simulation.config import SimulationConfig, default_config
-from radejax.training.step import check_train_section
 
 _SEED = integer(0, 2**32 - 2)  # of 32 bits; a training uses the next one too
 _VERSIONS = one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
@@ -63,6 +63,24 @@ _DATA = {
     "gain_slope_db": number(0),
     "label_permutation_seed": or_none(integer(0)),
 }
+_TRAIN = {
+    "batch_size": integer(1),
+    "num_epochs": integer(1),
+    "learning_rate": POSITIVE,
+    "final_learning_rate": number(0),
+    "schedule": one_of("cosine", "cyclic_cosine"),
+    "weight_decay": number(0),
+    "warmup_steps": integer(0),
+    "gradient_clip_norm": or_none(POSITIVE),
+    "ema_decay": or_none(BELOW_ONE),
+    "gradient_accumulation_steps": integer(1),
+    "parameter_sharding": one_of("replicated", "fsdp"),
+    "log_every_steps": integer(1),
+    "checkpoint_every_steps": integer(1),
+    "checkpoints_to_keep": or_none(integer(1)),
+    "evaluate_every_epochs": integer(0),
+    "max_skipped_steps": integer(0),
+}
 _LOGGING = {
     "num_visualizations": integer(0),
     "profile_steps": (
@@ -91,13 +109,13 @@ def check(config: ConfigDict) -> None:
     _check_fields(config)
     check_options(config, "config", _RUN)
     check_options(config.data, "config.data", _DATA)
+    check_options(config.train, "config.train", _TRAIN)
     check_options(config.logging, "config.logging", _LOGGING)
     data_set(config.data.format)
     for section, construct in (
         ("model", lambda: models.build(config.model)),
         ("loss", lambda: LossOptions(**config.loss.to_dict())),
         ("decode", lambda: DecodeOptions(**config.decode)),
-        ("train", lambda: check_train_section(config.train)),
         ("data.camera", lambda: CameraOptions.from_config(config.data)),
         ("evaluation", lambda: EvaluationOptions.from_config(config)),
         ("simulation", lambda: _check_simulation(config)),
@@ -106,9 +124,17 @@ def check(config: ConfigDict) -> None:
             construct()
         except (TypeError, AttributeError, KeyError) as error:
             raise UserError(f"config.{section}: {one_line(error)}") from error
+    _check_pairs(config)
+
+
+def _check_pairs(config: ConfigDict) -> None:
+    """What one field requires of another."""
     name, count = "config.model.num_classes", config.model.num_classes
     classes = f"{len(config.classes)}, the number of config.classes"
     require(count == len(config.classes), name, count, classes)
+    peak, final = config.train.learning_rate, config.train.final_learning_rate
+    text = f"at most config.train.learning_rate, {peak}"
+    require(final <= peak, "config.train.final_learning_rate", final, text)
     if config.train.evaluate_every_epochs:
         known = [
             f"map_{space}_iou{100 * iou:.4g}"

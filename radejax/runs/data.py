@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import functools
 import hashlib
@@ -22,26 +21,12 @@ from radejax import models
 from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
+from radejax.data import pipeline, records
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.kradar.dataset import held_out
-from radejax.data.pipeline import (
-    CameraInputs,
-    LoaderOptions,
-    camera_inputs,
-    check_enough,
-    make_loader,
-    make_table,
-    require_images,
-)
-from radejax.data.records import (
-    Records,
-    describe_grid,
-    open_embeddings,
-    open_projections,
-    preprocess,
-)
+from radejax.data.records import Records
 from radejax.inference.saved import SavedModel
 from radejax.runs.checks import check_bins
 from radejax.simulation.dataset import simulate_dataset
@@ -87,7 +72,9 @@ class Data:
                     "(config.model.image.freeze=True) and, as they cannot be mirrored, "
                     "config.data.mirror_probability=0"
                 )
-            self.features = open_embeddings(options.embeddings, config.model.image)
+            self.features = records.open_embeddings(
+                options.embeddings, config.model.image
+            )
         is_common = self.camera is not None and self.camera.calibration == "common"
         self.frames = data_set(options.format)(
             options.roots,
@@ -111,7 +98,7 @@ class Data:
             UserError: No frames, records of something else, or no space left.
         """
         report = distributed.main_only(
-            lambda: preprocess(self.frames, self.options.records)
+            lambda: records.preprocess(self.frames, self.options.records)
         )
         if report is not None and report.skipped:
             _log.warning("%s", report.to_text())
@@ -122,7 +109,7 @@ class Data:
     @functools.cached_property
     def records(self) -> Records:
         """Projections of the frames, on their grid."""
-        return open_projections(self.options.records, self.frames.grid)
+        return records.open_projections(self.options.records, self.frames.grid)
 
     def split(self, name: str, *, may_be_empty: bool = False) -> LabelledFrames:
         """Frames of "train", "validation", "test", "all" or a split file.
@@ -169,7 +156,7 @@ class Data:
         """By which the best checkpoint is chosen: "validation", "test" without one."""
         return "validation" if self.options.validation else "test"
 
-    def images(self, frames: FrameSequence) -> CameraInputs | None:
+    def images(self, frames: FrameSequence) -> pipeline.CameraInputs | None:
         """Images and cameras of frames; None for a model without a camera.
 
         Raises:
@@ -178,7 +165,7 @@ class Data:
         if self.camera is None:
             return None
         size = tuple(self._model.image_size)
-        return camera_inputs(frames, size, self.camera, self.features)
+        return pipeline.camera_inputs(frames, size, self.camera, self.features)
 
     def training_batches(
         self, frames: FrameSequence, train: ConfigDict, seed: int
@@ -195,8 +182,8 @@ class Data:
                 batch.
         """
         images, options = self.images(frames), self.options
-        require_images(frames, images)
-        table = make_table(
+        pipeline.require_images(frames, images)
+        table = pipeline.make_table(
             self.records,
             frames,
             max_objects=options.max_objects,
@@ -213,12 +200,12 @@ class Data:
             options.gain_db,
             options.gain_slope_db,
         )
-        loader = LoaderOptions(
+        loader = pipeline.LoaderOptions(
             train.batch_size // jax.process_count(),
             seed,
             num_threads=options.num_threads,
         )
-        return make_loader(table, loader, augment=augment)
+        return pipeline.make_loader(table, loader, augment=augment)
 
 
 def located(config: ConfigDict) -> ConfigDict:
@@ -226,11 +213,13 @@ def located(config: ConfigDict) -> ConfigDict:
 
     Raises:
         UserError: Neither data nor a simulation is given.
-        FileNotFoundError: The folder of camera calibrations is missing.
+        FileNotFoundError: A path of `config.data` does not exist, except the data that
+            are simulated and the records, which are made.
     """
     config = config.copy_and_resolve_references()
-    roots = config.data.roots
-    if "simulation" in config:
+    options, is_simulated = config.data, "simulation" in config
+    roots = options.roots
+    if is_simulated:
         name, one = "config.data.roots", "one folder, as the config simulates it"
         require(len(roots) <= 1, name, tuple(roots), one)
         roots = roots or (_simulated_root(config.simulation),)
@@ -239,8 +228,16 @@ def located(config: ConfigDict) -> ConfigDict:
             "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
             "config that simulates them, such as quickstart"
         )
-    _set_paths(config.data, roots)
+    _set_paths(options, roots)
+    _check_exist(() if is_simulated else options.roots)
+    _check_exist((options.labels, options.embeddings, options.image_backbone))
     return config
+
+
+def _check_exist(paths: Iterable[str | None]) -> None:
+    for path in filter(None, paths):
+        if not pathlib.Path(path).exists():
+            raise FileNotFoundError(f"no such file or folder: {path}")
 
 
 def _simulated_root(simulation: ConfigDict) -> str:
@@ -257,22 +254,20 @@ def _set_paths(options: ConfigDict, roots: Iterable[str]) -> None:
     absolute = {n: x and str(pathlib.Path(x).absolute()) for n, x in paths.items()}
     with options.ignore_type():  # tuples are lists in the config of a checkpoint
         options.update(absolute, roots=roots)
-    folder = options.camera_calibration
-    if folder is not None and not pathlib.Path(folder).is_dir():
-        raise FileNotFoundError(f"no such folder: {folder}")
+    _check_exist([options.camera_calibration])
 
 
 def simulate_missing(config: ConfigDict) -> None:
     """Simulate the dataset of a located config that has a `simulation` section."""
     if "simulation" in config:
         values, root = dict(config.simulation), config.data.roots[0]
-        distributed.main_first(lambda: simulate_dataset(values, root))
+        distributed.main_only(lambda: simulate_dataset(values, root))
 
 
 def open_data(config: ConfigDict, model: nn.Module) -> Data:
     """Simulate if the config says so, preprocess what has no record yet, open all.
 
-    One process of several writes before the others read, see `distributed.main_first`.
+    One process of several writes before the others read.
 
     Args:
         config: Config of the run, see `located`.
@@ -288,18 +283,16 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
     _log.info("%s", data.frames.summary().to_text())
     # Preprocessing takes long.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
-    check_enough(len(data.split("train")), config.train.batch_size)
+    pipeline.check_enough(len(data.split("train")), config.train.batch_size)
     data.preprocess()
     if config.data.validation:
         frames = data.split("validation")
-        found = collections.Counter(cls for frame in frames for cls in frame.classes)
         _log.info(
             "validation: sequences %s of the train split are held out, %d frames beside "
-            "%d to train on; %s",
+            "%d to train on",
             ", ".join(map(str, sorted({frame.sequence for frame in frames}))),
             len(frames),
             len(data.split("train")),
-            ", ".join(f"{cls} {found[cls]}" for cls in data.classes),
         )
     return data
 
@@ -333,12 +326,9 @@ def data_of_run(
         options.update(changes)
     _set_paths(options, roots)
     data = Data(config, saved.model)
-    grids = [describe_grid(grid) for grid in (data.frames.grid, saved.grid)]
-    is_same, text = (
-        data.frames.grid == saved.grid,
-        f"{grids[1]}, as the model was trained",
-    )
-    require(is_same, f"the radar of {options.roots[0]}", grids[0], text)
+    found, name = data.frames.grid, f"the radar of {options.roots[0]}"
+    expected = f"{records.describe_grid(saved.grid)}, as the model was trained"
+    require(found == saved.grid, name, records.describe_grid(found), expected)
     return config, data
 
 

@@ -12,8 +12,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from ml_collections import ConfigDict
 
@@ -99,7 +97,6 @@ class Evaluation:
     def validate(
         self,
         state: TrainState,
-        step: int,
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
         """Scores of a state's (averaged) parameters, during training.
@@ -125,10 +122,9 @@ class Evaluation:
                     best = None if math.isnan(result.ap) else result.ap
             values[f"validation/{name}"] = result.ap
         count = self._config.logging.num_visualizations
-        draw = self._figures(predictions, count)
-        drawn = distributed.main_only(lambda: dict(draw)) or {}
-        images = {f"validation/{name}": _pixels(x) for name, x in drawn.items()}
-        return Scores(values, best, images)
+        drawn = distributed.main_only(lambda: dict(self._figures(predictions, count)))
+        named = {f"validation/{name}": figure for name, figure in (drawn or {}).items()}
+        return Scores(values, best, named)
 
     def report(
         self,
@@ -152,7 +148,6 @@ class Evaluation:
             The report that was written; None on all processes except the first.
         """
         predictions, place = self.predict(variables), out or workdir / "evaluation"
-        frames, options = self._frames, self._options
 
         def draw(index: int, path: pathlib.Path) -> None:
             save_figure(draw_frame(self._scene(predictions, index)), path)
@@ -161,35 +156,46 @@ class Evaluation:
             with files.swapped_in(place) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
                 report = write_report(
-                    *(self._truth, predictions, self._table, folder, options),
+                    *(self._truth, predictions, self._table, folder, self._options),
                     run=run or workdir.name,
-                    left_out=frames.summary().counts,
+                    left_out=self._frames.summary().counts,
                     draw_frame=draw,
                 )
                 _log.info("step %s, split %s\n%s", step, self._split, report.text)
                 if self._detector.takes_camera:
-                    model, some = self._detector.model, figures.spread(frames, 256)
-                    maps = figures.frame_shares(model, variables, self._data, some)
-                    shares = figures.average_shares(
-                        ((frame.weather, share) for frame, share in maps),
-                        self._data.records.grid,
-                    )
-                    files.write_json(folder / "camera_share.json", shares)
-                drawn = self._figures(predictions, options.num_visualizations)
-                for name, figure in drawn:
-                    save_figure(figure, folder / "figures" / f"{name}.png")
-                if (folder / "figures").exists():  # the layout of RADE-Net's Figure 4
-                    scenes = [
-                        self._scene(predictions, i, title=f"{name} ({frames[i].key})")
-                        for name, i in figures.fullest_of_weathers(frames).items()
-                    ]
-                    save_figure(draw_scenes(scenes), folder / "scenes.png")
-                figures.draw_curves(
-                    workdir, folder / "training.png", is_simulated=frames.is_simulated
-                )
+                    self._write_camera_share(variables, folder / "camera_share.json")
+                self._write_figures(predictions, workdir, folder)
             return dataclasses.replace(report, folder=place)
 
         return distributed.main_only(write)
+
+    def _write_camera_share(
+        self, variables: Mapping[str, Any], path: pathlib.Path
+    ) -> None:
+        """Writes the weight of the camera by weather, of some frames."""
+        model, some = self._detector.model, figures.spread(self._frames, 256)
+        maps = figures.frame_shares(model, variables, self._data, some)
+        shares = ((frame.weather, share) for frame, share in maps)
+        grid = self._data.records.grid
+        files.write_json(path, figures.average_shares(shares, grid))
+
+    def _write_figures(
+        self, predictions: Columns, workdir: pathlib.Path, folder: pathlib.Path
+    ) -> None:
+        """Writes figures of frames, one of all weathers, and the curves of the run."""
+        frames = self._frames
+        for name, figure in self._figures(
+            predictions, self._options.num_visualizations
+        ):
+            save_figure(figure, folder / "figures" / f"{name}.png")
+        if (folder / "figures").exists():  # the layout of RADE-Net's Figure 4
+            scenes = [
+                self._scene(predictions, i, title=f"{name} ({frames[i].key})")
+                for name, i in figures.fullest_of_weathers(frames).items()
+            ]
+            save_figure(draw_scenes(scenes), folder / "scenes.png")
+        path = folder / "training.png"
+        figures.draw_curves(workdir, path, is_simulated=frames.is_simulated)
 
     def _scene(self, predictions: Columns, index: int, **fields: Any) -> Scene:
         """The frame at a position of the split with its boxes and image.
@@ -220,12 +226,6 @@ class Evaluation:
             frame = self._frames[index]
             name = f"{frame.sequence:02d}_{frame.name}"
             yield name, draw_frame(self._scene(predictions, index))
-
-
-def _pixels(figure: Figure) -> UInt8[np.ndarray, "H W 3"]:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.array(canvas.buffer_rgba())[..., :3]
 
 
 def evaluate_run(

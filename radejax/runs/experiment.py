@@ -54,9 +54,8 @@ _log = logging.getLogger(__name__)
 
 def run(
     config: ConfigDict,
+    workdir: PathLike,
     *,
-    name: str,
-    workdir: PathLike | None = None,
     init_from: PathLike | None = None,
     profile: PathLike = "",
 ) -> pathlib.Path:
@@ -64,8 +63,7 @@ def run(
 
     Args:
         config: Complete configuration of one seed; `run_seeds` takes several.
-        name: Of the config, for the default workdir.
-        workdir: `runs/<name>` if None.
+        workdir: Folder of the run, created if missing.
         init_from: Weights to start from: official .pth file or another workdir.
         profile: Folder for a trace of the steps `config.logging.profile_steps`.
 
@@ -75,20 +73,19 @@ def run(
     Raises:
         UserError: A field of the config is out of its range, the workdir belongs to
             another configuration or is in use, no data, or no space.
+        FileNotFoundError: A path does not exist.
     """
     checks.check(config)
-    config = located(config)
-    distributed.check_batch_size(config.train.batch_size, distributed.make_mesh())
-    model = models.build(config.model)
-    folder = default_workdir(workdir, name)
+    config, folder = located(config), pathlib.Path(workdir).absolute()
+    distributed.check_batch_size(config.train.batch_size)
+    model, digest = models.build(config.model), None
+    if config.data.embeddings is not None:
+        embeddings = open_embeddings(config.data.embeddings)
+        digest = embeddings.source["weights_sha256"]
+    weights = starting_weights(
+        config.model, init_from, config.data.image_backbone, digest
+    )
     with claimed(folder, config):
-        digest = None
-        if config.data.embeddings is not None:
-            embeddings = open_embeddings(config.data.embeddings)
-            digest = embeddings.source["weights_sha256"]
-        weights = starting_weights(
-            config.model, init_from, config.data.image_backbone, digest
-        )
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid
         has_test = len(data.split("test", may_be_empty=True)) > 0
@@ -140,11 +137,6 @@ def run(
 # Workdir -----------------------------------------------------------------------------
 
 
-def default_workdir(workdir: PathLike | None, name: str) -> pathlib.Path:
-    """Absolute path of the workdir: `runs/<name>` unless another is given."""
-    return pathlib.Path(workdir or pathlib.Path("runs") / name).absolute()
-
-
 @contextlib.contextmanager
 def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
     """Locks a workdir, which is created if missing, for a training with a config.
@@ -155,30 +147,28 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
         UserError: Another process holds it, or it belongs to a run with another
             configuration; names the fields that differ.
     """
+    path = workdir / "config.json"
     message = (
         f"another training is at work in {files.relative(workdir)}: wait for its end, or "
         "give another --workdir"
     )
     with contextlib.ExitStack() as held:
-        lock = files.lock(workdir / "lock", message)
-        distributed.main_only(lambda: held.enter_context(lock))
-        distributed.main_first(lambda: _claim(workdir, config))
+
+        def take() -> None:
+            held.enter_context(files.lock(workdir / "lock", message))
+            if not any(workdir.glob("checkpoints/*")):
+                files.write_json(path, without_data_paths(config))
+
+        distributed.main_only(take)
+        files.claim(
+            path,
+            without_data_paths(config),
+            "a run with another config",
+            fix="give another --workdir, or remove that one",
+            name="config",
+            ignore=("logging",),
+        )
         yield
-
-
-def _claim(workdir: pathlib.Path, config: ConfigDict) -> None:
-    """Writes the config; compares it with that of the run, if there are checkpoints."""
-    path = workdir / "config.json"
-    if distributed.is_main() and not any(workdir.glob("checkpoints/*")):
-        path.unlink(missing_ok=True)
-    files.claim(
-        path,
-        without_data_paths(config),
-        "a run with another config",
-        fix="give another --workdir, or remove that one",
-        name="config",
-        ignore=("logging",),
-    )
 
 
 def run_info(
@@ -241,12 +231,7 @@ _KEYS = ("protocol", "condition", "cls", "space", "iou")
 
 
 def run_seeds(
-    config: ConfigDict,
-    seeds: Sequence[int],
-    *,
-    name: str,
-    workdir: PathLike | None = None,
-    **options: Any,
+    config: ConfigDict, workdir: PathLike, seeds: Sequence[int], **options: Any
 ) -> pathlib.Path:
     """Runs a config with every seed, one after the other.
 
@@ -256,9 +241,8 @@ def run_seeds(
 
     Args:
         config: Of the runs.
+        workdir: Contains `seed0`, `seed1`, ... and the summary.
         seeds: Two or more, all different.
-        name: Of the config, for the default workdir.
-        workdir: Contains `seed0`, `seed1`, ... and the summary; `runs/<name>` if None.
         **options: Further arguments of `run`.
 
     Returns:
@@ -269,17 +253,17 @@ def run_seeds(
         UserError: Two seeds are equal; and as `run`.
     """
     require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
-    workdir, tables = default_workdir(workdir, name), {}
+    workdir, tables = pathlib.Path(workdir).absolute(), {}
     for seed in seeds:
         one = config.copy_and_resolve_references()
         one.seed = seed
         _log.info("seed %d of %s", seed, list(seeds))
-        folder = run(one, name=name, workdir=workdir / f"seed{seed}", **options)
+        folder = run(one, workdir / f"seed{seed}", **options)
         metrics = folder / "evaluation" / "metrics.csv"
         if not metrics.exists():
             _log.info("seed %d is not evaluated: it is not finished, or no data", seed)
             break
-        tables[seed] = {
+        tables[str(seed)] = {
             tuple(row[key] for key in _KEYS): float(row["ap"] or "nan")
             for row in csv.DictReader(files.read_text(metrics).splitlines())
             if float(row["num_gt"])
@@ -290,17 +274,17 @@ def run_seeds(
 
 
 def _write_summary(
-    workdir: pathlib.Path, tables: dict[int, dict[tuple[str, ...], float]]
+    workdir: pathlib.Path, tables: dict[str, dict[tuple[str, ...], float]]
 ) -> None:
     """Mean, standard deviation (n - 1; None for one seed) and values of common APs."""
     rows, lines = [], []
     first, *others = tables.values()
     for key in (key for key in first if all(key in table for table in others)):
-        values = {str(seed): table[key] for seed, table in tables.items()}
+        values = {seed: table[key] for seed, table in tables.items()}
         aps = list(values.values())
-        std = float(np.std(aps, ddof=1)) if others else None
         row: dict[str, Any] = dict(zip(_KEYS, key, strict=True))
-        row |= {"mean": float(np.mean(aps)), "std": std}
+        row["mean"] = float(np.mean(aps))
+        row["std"] = float(np.std(aps, ddof=1)) if others else None
         rows.append({**row, "values": values})
         if row.pop("condition") == "all":
             lines.append(row | {f"seed {seed}": ap for seed, ap in values.items()})

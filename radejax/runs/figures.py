@@ -123,20 +123,18 @@ def average_shares(
         By group the "mean" over bins in view, None without any, and the number of
         "frames" with anything in view, that is, with an image.
     """
-    sums: dict[str, Any] = {}
-    seen: dict[str, Any] = {}
-    counts: dict[str, int] = {}
-    for group, share in shares:
-        is_seen = share > 0
-        for name in ("all", group):
-            sums[name] = sums.get(name, 0.0) + share
-            seen[name] = seen.get(name, 0) + is_seen
-            counts[name] = counts.get(name, 0) + int(is_seen.any())
-    means = {n: mean_share(sums[n] / np.maximum(seen[n], 1), grid) for n in sums}
-    return {
-        name: {"mean": None if np.isnan(mean) else mean, "frames": counts[name]}
-        for name, mean in means.items()
-    }
+    groups, maps = zip(*shares, strict=True)
+    names, stacked = np.array(groups), np.stack(maps)
+    means = {}
+    for name in ("all", *dict.fromkeys(groups)):
+        chosen = stacked if name == "all" else stacked[names == name]
+        is_seen = chosen > 0
+        mean = mean_share(chosen.sum(0) / np.maximum(is_seen.sum(0), 1), grid)
+        means[name] = {
+            "mean": None if np.isnan(mean) else mean,
+            "frames": int(is_seen.any((1, 2)).sum()),
+        }
+    return means
 
 
 def mean_share(share: Float[np.ndarray, "R A"], grid: RadarGrid) -> float:

@@ -7,18 +7,20 @@ restored.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import logging
 import pathlib
 import shutil
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
 from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import files
@@ -27,9 +29,7 @@ from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
-BEST = "best"
-"""Name of the metric that decides which checkpoint is best; higher is better."""
-
+_BEST = "best"  # name of the metric that decides which checkpoint is best
 _VARIABLES = ("params", "ema_params", "model_state")
 
 
@@ -80,7 +80,7 @@ class Checkpoints:
         return sorted(self._manager.all_steps())
 
     def best_step(self) -> int:
-        """Step of the checkpoint with the highest metric `BEST`.
+        """Step of the checkpoint with the highest metric.
 
         Raises:
             FileNotFoundError: None was evaluated.
@@ -100,23 +100,21 @@ class Checkpoints:
         data_iterator: Any,
         *,
         info: Mapping[str, Any],
-        metrics: Mapping[str, float] | None = None,
+        best: float | None = None,
     ) -> None:
         """Starts to save; returns as soon as the arrays are copied.
 
         Args:
-            step: Name of the checkpoint; an existing one is not replaced.
+            step: Name of the checkpoint, above those that exist.
             state: Pytree of arrays.
             data_iterator: The grain iterator whose next batch belongs to `step`. All
                 processes share each batch and are at the same position.
             info: Plain values: configuration, versions.
-            metrics: Of an evaluation at this step; `BEST` is one of them.
+            best: Metric of this step by which the best is chosen; higher is better.
 
         Raises:
             DiskFullError: Earlier checkpoints stay intact.
         """
-        if step in self._manager.all_steps():
-            return
         description = {
             "info": dict(info),
             "position": data_iterator.get_state(),
@@ -131,7 +129,7 @@ class Checkpoints:
                         description | {"sha256": _text_checksum(description)}
                     ),
                 ),
-                metrics=dict(metrics) if metrics else None,
+                metrics=None if best is None else {_BEST: best},
             )
 
     def wait(self) -> None:
@@ -161,21 +159,21 @@ class Checkpoints:
         Raises:
             DataError: There are checkpoints, and none is whole; they stay as they are.
         """
-        corrupted: list[int] = []
         steps = self.steps()
         for step in reversed(steps):
             found = None
             try:
-                found = self._read(step, lambda: state)
+                found = self._read(step, state)
             except DataError as error:
                 _log.warning("%s", error)
             if distributed.all_agree(found is not None) and found is not None:
-                distributed.main_only(lambda: self._move_away(corrupted))
+                corrupted = [other for other in steps if other > step]
+                move_away = functools.partial(self._move_away, corrupted)
+                distributed.main_only(move_away)
                 self._manager.reload()
                 restored, description = found
                 data_iterator.set_state(description["position"])
                 return restored, description["info"], step
-            corrupted.append(step)
         if steps:
             raise DataError(
                 f"none of the checkpoints {steps} in {self.folder} restores; move that "
@@ -205,15 +203,22 @@ class Checkpoints:
             raise FileNotFoundError(
                 f"no checkpoint of step {step} in {self.folder}; there are {steps}"
             )
-        found, description = self._read(step, lambda: self._saved_variables(step))
-        state = {name: found.get(name) for name in _VARIABLES}
-        return jax.tree.map(np.asarray, state), description["info"], step
+        found, description = self._read(step)
+        return {n: found.get(n) for n in _VARIABLES}, description["info"], step
 
-    def _read(self, step: int, wanted: Callable[[], Any]) -> tuple[Any, dict[str, Any]]:
-        """A part of the state, or all, and its description; `DataError` if corrupted."""
+    def _read(self, step: int, state: Any = None) -> tuple[Any, dict[str, Any]]:
+        """A state, or the variables as NumPy arrays, and the description of a checkpoint.
+
+        Raises:
+            DataError: It is corrupted.
+        """
         try:
-            state = wanted()
-            restore_args = ocp.checkpoint_utils.construct_restore_args(state)
+            if state is None:
+                state = self._saved_variables(step)
+                numpy = ocp.RestoreArgs(restore_type=np.ndarray)
+                restore_args = jax.tree.map(lambda _: numpy, state)
+            else:
+                restore_args = ocp.checkpoint_utils.construct_restore_args(state)
             found = self._manager.restore(
                 step,
                 args=ocp.args.Composite(
@@ -238,13 +243,11 @@ class Checkpoints:
         return found["state"], description
 
     def _saved_variables(self, step: int) -> dict[str, Any]:
-        """Shapes of the variables of a model in a checkpoint, for every device."""
+        """Descriptions of the arrays in a checkpoint that are variables of a model."""
         with ocp.PyTreeCheckpointer() as reader:
             folder = self.folder / str(step) / "state"
             saved = reader.metadata(folder).item_metadata.tree
-        saved = {name: saved[name] for name in _VARIABLES if name in saved}
-        whole = distributed.replicated(distributed.make_mesh())
-        return abstract_state(saved, jax.tree.map(lambda _: whole, saved))
+        return {name: saved[name] for name in _VARIABLES if name in saved}
 
     def _move_away(self, steps: list[int]) -> None:
         """Renames corrupted checkpoints, so that these steps can be saved again."""
@@ -264,7 +267,7 @@ class Checkpoints:
 
 
 def _best_of(metrics: Mapping[str, float]) -> float:
-    return metrics[BEST]
+    return metrics[_BEST]
 
 
 def abstract_state(state: Any, sharding: Any) -> Any:
@@ -278,41 +281,21 @@ def abstract_state(state: Any, sharding: Any) -> Any:
 
 
 def array_checksums(tree: Any) -> dict[str, int]:
-    """A checksum of 32 bits for every array of a tree, by its path "params/conv/bias".
+    """CRC-32 of the bytes of every array of a tree, by its path "params/conv/bias".
 
-    Each element, as an unsigned integer, is mixed with its position, and all are summed
-    modulo 2**32. A change of one element always changes the sum; other changes are missed
-    once in 2**32. The sums are computed where the arrays are, and are the same for every
-    placement over devices and processes.
-
-    Args:
-        tree: Arrays of numbers of at most 32 bits, or bool.
+    It is the same for every placement of the arrays over devices and processes, which all
+    have to call this.
     """
-    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-    # One small program per shape: a program of all of them takes twice as long to compile.
-    sums = jax.device_get([_sum(leaf) for _, leaf in leaves])
-    # Paths of the restored dictionaries are those of the saved dataclasses and lists.
-    names = [jax.tree_util.keystr(p, simple=True, separator="/") for p, _ in leaves]
-    return dict(zip(names, map(int, sums), strict=True))
+    checksums = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        if not getattr(leaf, "is_fully_addressable", True):
+            leaf = multihost_utils.process_allgather(leaf, tiled=True)
+        # Paths of the restored dictionaries are those of the saved dataclasses and lists.
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        checksums[name] = zlib.crc32(np.asarray(leaf).tobytes())
+    return checksums
 
 
 def _text_checksum(values: Any) -> str:
     """SHA-256 of plain values as JSON."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-
-
-@jax.jit
-def _sum(array: jax.Array) -> jax.Array:
-    if array.dtype == bool:
-        array = array.astype(jnp.uint8)
-    bits = jnp.dtype(f"uint{8 * array.dtype.itemsize}")
-    values = jax.lax.bitcast_convert_type(array, bits).astype(jnp.uint32)
-    position = jnp.arange(1, 1 + array.size, dtype=jnp.uint32).reshape(array.shape)
-    return jnp.sum(_mixed(values ^ _mixed(position)), dtype=jnp.uint32)
-
-
-def _mixed(x: jax.Array) -> jax.Array:
-    """A pseudo-random permutation of the 32-bit integers: the last step of murmur3."""
-    x = (x ^ (x >> 16)) * jnp.uint32(0x85EBCA6B)
-    x = (x ^ (x >> 13)) * jnp.uint32(0xC2B2AE35)
-    return x ^ (x >> 16)

@@ -13,7 +13,7 @@ import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -39,11 +39,9 @@ _numbers = itertools.count()
 
 def make_mesh(num_devices: int | None = None) -> Mesh:
     """One-dimensional mesh over all devices of all processes, or the first few."""
-    devices = jax.devices()
-    count = len(devices) if num_devices is None else num_devices
-    require(1 <= count <= len(devices), "num_devices", count, f"1 to {len(devices)}")
+    devices = jax.devices()[:num_devices]
     return jax.make_mesh(
-        (count,), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count]
+        (len(devices),), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices
     )
 
 
@@ -57,11 +55,9 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
 
 
-def check_batch_size(
-    batch_size: int, mesh: Mesh, name: str = "config.train.batch_size"
-) -> None:
-    """Raises `UserError` for a global batch that does not divide over the mesh."""
-    count = mesh.devices.size
+def check_batch_size(batch_size: int) -> None:
+    """Raises `UserError` for a global batch that does not divide over all devices."""
+    count, name = make_mesh().size, "config.train.batch_size"
     require(batch_size % count == 0, name, batch_size, f"a multiple of {count} devices")
 
 
@@ -69,10 +65,7 @@ def put_batch(
     batch: PyTree[Shaped[np.ndarray, "b ..."]], mesh: Mesh
 ) -> PyTree[Shaped[jax.Array, "B ..."]]:
     """Puts this process's frames, `b = B / processes`, onto the mesh as a global batch."""
-    sharding = batch_sharding(mesh)
-    return jax.tree.map(
-        lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), batch
-    )
+    return jax.make_array_from_process_local_data(batch_sharding(mesh), batch)
 
 
 def state_sharding(
@@ -109,26 +102,11 @@ def is_main() -> bool:
     return jax.process_index() == 0
 
 
-def main_first(prepare: Callable[[], T]) -> T:
-    """Calls a function on the main process, and after that on the others.
-
-    For work that finds its own results again, such as preparing data.
-
-    Raises:
-        UserError: On the others, if the main process failed; it raises its own error.
-    """
-    result = main_only(prepare)
-    if not is_main():
-        result = prepare()
-    wait_for_all()
-    return cast(T, result)  # it is None on the other processes only
-
-
 def main_only(work: Callable[[], T]) -> T | None:
     """Calls a function on the main process while the others wait; returns None on those.
 
-    For reports and figures, which may take long: processes that continued would wait in
-    a collective, or at the end of JAX, and give up after minutes.
+    For data, reports and figures, which may take long: processes that continued would
+    wait in a collective, or at the end of JAX, and give up after minutes.
 
     Raises:
         UserError: On the others, if the main process failed; it raises its own error.
@@ -136,12 +114,17 @@ def main_only(work: Callable[[], T]) -> T | None:
     if jax.process_count() == 1:
         return work()
     result = error = None
-    if is_main():
-        try:
-            result = work()
-        except Exception as failed:
-            error = failed
-    wait_for_all()
+    try:
+        result = work() if is_main() else None
+    except Exception as failed:
+        error = failed
+    # All processes are named, so that they wait at the coordinator and not in a collective,
+    # which would give up after minutes.
+    ocp.multihost.sync_global_processes(
+        f"radejax {next(_numbers)}",
+        timeout=_WAIT_S,
+        processes=set(range(jax.process_count())),
+    )
     is_fine = all_agree(error is None)
     if error is not None:
         raise error
@@ -150,23 +133,8 @@ def main_only(work: Callable[[], T]) -> T | None:
     return result
 
 
-def wait_for_all() -> None:
-    """Returns when every process has called it, which may take hours."""
-    if jax.process_count() == 1:
-        return
-    ocp.multihost.sync_global_processes(
-        f"radejax {next(_numbers)}",
-        timeout=_WAIT_S,
-        # All processes are named, so that they wait at the coordinator and not in a
-        # collective, which would give up after minutes.
-        processes=set(range(jax.process_count())),
-    )
-
-
 def all_agree(is_fine: bool) -> bool:
     """True if it is true on every process."""
-    if jax.process_count() == 1:
-        return is_fine
     return bool(multihost_utils.process_allgather(np.int32(is_fine)).all())
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
+import functools
 import logging
 import pathlib
 from collections.abc import Callable, Mapping
@@ -21,13 +23,12 @@ from radejax.core.structures import Batch
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.training import distributed
-from radejax.training.checkpoints import BEST, Checkpoints, abstract_state
+from radejax.training.checkpoints import Checkpoints, abstract_state
 from radejax.training.metric_logger import MetricLogger, Scores
 from radejax.training.step import (
     Metrics,
     Step,
     TrainState,
-    check_train_section,
     create_state,
     make_optimizer,
     make_schedule,
@@ -39,9 +40,11 @@ _log = logging.getLogger(__name__)
 
 _STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
 
-Evaluate = Callable[[TrainState, int, Callable[[], bool]], Scores]
-"""Called with the state, its step, and a function that returns whether to stop; it then
-raises `distributed.Stopped`. Every process must call that function equally often."""
+Evaluate = Callable[[TrainState, Callable[[], bool]], Scores]
+"""Called with the state, and a function that returns whether to stop; it then raises
+`distributed.Stopped`. Every process must call that function equally often."""
+
+TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def train(
@@ -55,40 +58,36 @@ def train(
     steps_per_epoch: int,
     variables: Mapping[str, Any] | None = None,
     pretrained: Mapping[str, Any] | None = None,
-    mesh: jax.sharding.Mesh | None = None,
     evaluate: Evaluate | None = None,
     profile: str = "",
 ) -> tuple[TrainState, bool]:
     """Trains until the configured epochs are done, from where an earlier start ended.
 
     Args:
-        config: `seed`, `train`, `loss`, `decode` and `logging` are read.
+        config: `seed`, `train`, `loss`, `decode` and `logging` are read, and were checked
+            by `radejax.runs.checks.check`.
         model: Called as `model.apply(variables, *inputs, train=True)`.
         loader: Checkpointable grain iterator of `Batch`; endless.
         grid: Grid of the model's maps.
         workdir: Folder of checkpoints and logs.
         info: Plain values that each checkpoint carries. Those under "same" must be the
-            same on every start of a run; "config" is shown by Weights & Biases.
+            same on every start of a run.
         steps_per_epoch: Batches of one pass over the data.
         variables: To start from; initialized from the seed if None.
         pretrained: Part of the variables that replaces initialized ones.
-        mesh: Devices to use; all by default.
         evaluate: Called every `evaluate_every_epochs` epochs and at the end.
         profile: Folder for a trace of the steps `config.logging.profile_steps`, counted
             from this start.
 
     Returns:
-        State, placed on the mesh, and whether the training is finished: False where a
+        State, placed on all devices, and whether the training is finished: False where a
         signal ended it, or its last evaluation, early; the state is saved.
 
     Raises:
         DataError: No checkpoint restores, or too many steps in a row are not finite.
-        UserError: The batch does not divide over the devices, other data, a full disk.
+        UserError: Other data than before, a warm-up that is too long, a full disk.
     """
     options, folder = config.train, pathlib.Path(workdir)
-    check_train_section(options)
-    mesh = distributed.make_mesh() if mesh is None else mesh
-    distributed.check_batch_size(options.batch_size, mesh)
     optimizer = make_optimizer(
         make_schedule(options, steps_per_epoch),
         weight_decay=options.weight_decay,
@@ -98,88 +97,139 @@ def train(
     step_fn = make_train_step(
         model, optimizer, grid, loss=loss_options(config), ema_decay=options.ema_decay
     )
-    num_steps = steps_per_epoch * options.num_epochs
-    evaluate_every_steps = steps_per_epoch * options.evaluate_every_epochs
+    create = functools.partial(_create_state, config, model, optimizer)
+    given, mesh = (_empty_batch(loader), variables, pretrained), distributed.make_mesh()
     with Checkpoints(
         folder / "checkpoints", max_to_keep=options.checkpoints_to_keep
     ) as checkpoints:
         state = _restore_or_initialize(
-            checkpoints,
-            loader,
-            info,
-            _initializer(config, model, optimizer),
-            (_empty_batch(loader), variables, pretrained),
-            mesh,
-            options.parameter_sharding,
+            checkpoints, loader, info, create, given, mesh, options.parameter_sharding
         )
-        step = int(state.step)
         train_step = _compile(step_fn, state, mesh, config.seed)
-        first, last = (step + n for n in config.logging.profile_steps)
+        num_steps = steps_per_epoch * options.num_epochs
+        with (
+            MetricLogger(folder, config, int(state.step), num_steps) as logger,
+            distributed.stop_on_signal(mesh) as stop,
+        ):
+            run = _Run(
+                *(config, steps_per_epoch, loader, info, evaluate),
+                *(checkpoints, logger, stop),
+            )
+            return run.take_steps(train_step, state, profile)
+
+
+@dataclasses.dataclass
+class _Run:
+    """The steps of a run; attributes are what `train` has, or makes."""
+
+    config: ConfigDict
+    steps_per_epoch: int
+    loader: Any
+    info: Mapping[str, Any]
+    evaluate: Evaluate | None
+    checkpoints: Checkpoints
+    logger: MetricLogger
+    stop: Callable[[], bool]
+    num_skipped: int = 0  # steps without a finite loss and gradient, as reported
+
+    def take_steps(
+        self, train_step: TrainStep, state: TrainState, profile: str
+    ) -> tuple[TrainState, bool]:
+        """Takes the remaining steps, until a signal comes; returns what `train` does."""
+        step, num_steps = int(state.step), self._num_steps
+        first, last = (step + n for n in self.config.logging.profile_steps)
         if profile and num_steps <= first:
             _log.warning("no trace: %d steps are left to train", num_steps - step)
-        wandb = None
-        if config.logging.wandb:
-            project = config.logging.wandb_project
-            wandb = {"project": project, "config": info.get("config", {})}
-        with (
-            MetricLogger(folder, step, num_steps, options.batch_size, wandb) as logger,
-            distributed.stop_on_signal(mesh) as stop,
-            contextlib.ExitStack() as trace,
-        ):
-            metrics, is_stopped, num_skipped = None, stop(), 0
+        metrics, is_stopped = None, self.stop()
+        with contextlib.ExitStack() as trace:
             while step < num_steps and not is_stopped:
-                batch = logger.next_batch(loader, metrics)
+                batch = self.logger.next_batch(self.loader, metrics)
                 if profile and step == first:
                     trace.enter_context(jax.profiler.trace(profile))
-                state, metrics = train_step(state, distributed.put_batch(batch, mesh))
+                state, metrics = train_step(state, batch)
                 if profile and step == last:
                     jax.block_until_ready(metrics)
                     trace.close()
                 step += 1
-                logger.advance(step, metrics)
-                is_logged = _is_due(step, options.log_every_steps, num_steps)
-                if is_logged:
-                    logger.log(step, metrics, epoch=step / steps_per_epoch)
-                scores = None
-                if evaluate and _is_due(step, evaluate_every_steps, num_steps):
-                    try:
-                        scores = evaluate(state, step, stop)
-                        logger.log_scores(step, scores)
-                    except distributed.Stopped:
-                        _log.warning("the evaluation after step %d is skipped", step)
-                is_stopped = stop()
-                is_saved = _is_due(step, options.checkpoint_every_steps, num_steps)
-                is_saved |= is_stopped or scores is not None
-                if is_logged or is_saved:
-                    limit = options.max_skipped_steps
-                    num_skipped = _check_skipped(state, limit, num_skipped)
-                if is_saved:
-                    found = None
-                    if scores is not None and scores.best is not None:
-                        found = {**scores.values, BEST: scores.best}
-                    kept = state.replace(frozen={})
-                    checkpoints.save(step, kept, loader, info=info, metrics=found)
-            checkpoints.wait()
-    return state, step >= num_steps and not is_stopped
+                is_stopped = self._finish_step(step, state, metrics)
+            self.checkpoints.wait()
+        return state, step >= num_steps and not is_stopped
+
+    def _finish_step(self, step: int, state: TrainState, metrics: Metrics) -> bool:
+        """Logs, evaluates and saves where it is due; returns whether a signal came."""
+        train = self.config.train
+        self.logger.advance(step, metrics)
+        is_logged = self._is_due(step, train.log_every_steps)
+        if is_logged:
+            self.logger.log(step, metrics, epoch=step / self.steps_per_epoch)
+        scores = None
+        every = self.steps_per_epoch * train.evaluate_every_epochs
+        if self.evaluate is not None and self._is_due(step, every):
+            try:
+                scores = self.evaluate(state, self.stop)
+                self.logger.log_scores(step, scores)
+            except distributed.Stopped:
+                _log.warning("the evaluation after step %d is skipped", step)
+        is_stopped = self.stop()
+        is_saved = self._is_due(step, train.checkpoint_every_steps)
+        is_saved |= is_stopped or scores is not None
+        if is_logged or is_saved:
+            self._check_skipped(state)
+        if is_saved:
+            best = None if scores is None else scores.best
+            kept = state.replace(frozen={})
+            self.checkpoints.save(step, kept, self.loader, info=self.info, best=best)
+        return is_stopped
+
+    @property
+    def _num_steps(self) -> int:
+        return self.steps_per_epoch * self.config.train.num_epochs
+
+    def _is_due(self, step: int, every: int) -> bool:
+        """True every so many steps (never for 0) and, where done at all, at the end."""
+        return every > 0 and (step % every == 0 or step == self._num_steps)
+
+    def _check_skipped(self, state: TrainState) -> None:
+        """Warns of steps without a finite loss and gradient beyond those reported.
+
+        Raises:
+            DataError: Too many were in a row.
+        """
+        in_row, limit = (
+            state.opt_state.notfinite_count,
+            self.config.train.max_skipped_steps,
+        )
+        if int(in_row) > limit:
+            raise DataError(
+                f"loss or gradient was not finite in {in_row} steps in a row (limit "
+                f"config.train.max_skipped_steps={limit})"
+            )
+        if (skipped := int(state.opt_state.total_notfinite)) > self.num_skipped:
+            _log.warning(
+                "%d steps so far were skipped because loss or gradient was not finite",
+                skipped,
+            )
+        self.num_skipped = skipped
 
 
-def _initializer(
-    config: ConfigDict, model: nn.Module, optimizer: optax.GradientTransformation
-) -> Callable[[Batch, Any, Any], TrainState]:
-    """A function of (batch, variables, pretrained) that makes the state of step 0."""
-
-    def create(batch: Batch, variables: Any, pretrained: Any) -> TrainState:
-        if variables is None:
-            keys = jax.random.split(jax.random.key(config.seed))
-            rngs = {"params": keys[0], "dropout": keys[1]}
-            variables = model.init(rngs, *batch.model_inputs(), train=False)
-        if pretrained is not None:
-            variables = with_pretrained(variables, pretrained)
-        is_frozen = getattr(model, "is_frozen", None)
-        use_ema = config.train.ema_decay is not None
-        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
-
-    return create
+def _create_state(
+    config: ConfigDict,
+    model: nn.Module,
+    optimizer: optax.GradientTransformation,
+    batch: Batch,
+    variables: Any,
+    pretrained: Any,
+) -> TrainState:
+    """The state of step 0; the batch has the shapes of the model's inputs."""
+    if variables is None:
+        keys = jax.random.split(jax.random.key(config.seed))
+        rngs = {"params": keys[0], "dropout": keys[1]}
+        variables = model.init(rngs, *batch.model_inputs(), train=False)
+    if pretrained is not None:
+        variables = with_pretrained(variables, pretrained)
+    is_frozen = getattr(model, "is_frozen", None)
+    use_ema = config.train.ema_decay is not None
+    return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
 
 
 def _restore_or_initialize(
@@ -197,15 +247,15 @@ def _restore_or_initialize(
         checkpoints: Of the run.
         loader: Set to the position that was saved.
         info: Its "same" must be what was saved.
-        create: From `_initializer`.
-        given: Its arguments, with NumPy arrays: the same on every process.
+        create: Makes the state before the first step.
+        given: Arguments of `create`.
         mesh: Devices that the state is placed on.
         parameters: How they are placed.
 
     Raises:
         UserError: The run would continue with other data or frozen weights.
     """
-    given = jax.tree.map(np.asarray, given)
+    given = jax.tree.map(np.asarray, given)  # the same on every process
     abstract = jax.eval_shape(create, *given)
     placement = distributed.state_sharding(abstract, mesh, parameters)
     saved = abstract_state(abstract, placement).replace(frozen={})
@@ -244,10 +294,11 @@ def _empty_batch(loader: Any) -> Batch:
 
 def _compile(
     step: Step, state: TrainState, mesh: jax.sharding.Mesh, seed: int
-) -> Callable[[TrainState, Batch], tuple[TrainState, Metrics]]:
+) -> TrainStep:
     """The step of a run, for states placed as this one; it consumes its state.
 
-    It returns before it is computed, unless too many steps are under way.
+    It takes the batch of this process, and returns before it is computed, unless too many
+    steps are under way.
     """
     whole = distributed.replicated(mesh)
     placement = jax.tree.map(lambda x: x.sharding, state)
@@ -256,38 +307,12 @@ def _compile(
     in_flight: collections.deque[Metrics] = collections.deque()
 
     def limited(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
+        placed = distributed.put_batch(batch, mesh)
         with jax.transfer_guard("disallow"):
-            state, metrics = compiled(state, batch, rng)
+            state, metrics = compiled(state, placed, rng)
         in_flight.append(metrics)
         if len(in_flight) > _STEPS_IN_FLIGHT:
             jax.block_until_ready(in_flight.popleft())
         return state, metrics
 
     return limited
-
-
-def _is_due(step: int, every: int, last: int) -> bool:
-    """True every so many steps (never for 0) and, where it is done at all, at the end."""
-    return every > 0 and (step % every == 0 or step == last)
-
-
-def _check_skipped(state: TrainState, limit: int, reported: int) -> int:
-    """Warns of steps without a finite loss and gradient beyond those `reported`.
-
-    Returns:
-        How many there were so far.
-
-    Raises:
-        DataError: More than `limit` were in a row.
-    """
-    if (in_row := int(state.opt_state.notfinite_count)) > limit:
-        raise DataError(
-            f"loss or gradient was not finite in {in_row} steps in a row (limit "
-            f"config.train.max_skipped_steps={limit})"
-        )
-    if (skipped := int(state.opt_state.total_notfinite)) > reported:
-        _log.warning(
-            "%d steps so far were skipped because loss or gradient was not finite",
-            skipped,
-        )
-    return skipped

@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import pathlib
-import re
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -15,15 +14,13 @@ import jax
 import numpy as np
 import tensorboardX
 import tqdm
-from jaxtyping import UInt8
+from matplotlib.figure import Figure
+from ml_collections import ConfigDict
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.losses.detection import LOSSES
 from radejax.training import distributed
-
-Values = Mapping[str, float]
-Figures = Mapping[str, UInt8[np.ndarray, "_ _ 3"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +30,12 @@ class Scores:
     Attributes:
         values: Metrics by name.
         best: The metric that decides which checkpoint is best; None where undefined.
-        figures: Images `[H, W, 3]` by name, on the main process.
+        figures: By name, on the main process.
     """
 
-    values: Values
+    values: Mapping[str, float]
     best: float | None = None
-    figures: Figures = dataclasses.field(default_factory=dict)
+    figures: Mapping[str, Figure] = dataclasses.field(default_factory=dict)
 
 
 class MetricLogger:
@@ -49,10 +46,9 @@ class MetricLogger:
 
     Args:
         folder: Workdir; contains `metrics.jsonl` and `tensorboard/`.
+        config: Of the run; Weights & Biases shows it, if `config.logging.wandb` is set.
         start_step: Step of the restored state.
         num_steps: Of the whole training.
-        frames_per_step: For the rate.
-        wandb: Project and config of a run at Weights & Biases; None for no such run.
 
     Raises:
         UserError: Weights & Biases is asked for and not installed.
@@ -62,19 +58,19 @@ class MetricLogger:
     def __init__(
         self,
         folder: pathlib.Path,
+        config: ConfigDict,
         start_step: int,
         num_steps: int,
-        frames_per_step: int,
-        wandb: Mapping[str, Any] | None = None,
     ) -> None:
         is_main = distributed.is_main()
-        self._path, self._frames_per_step = folder / "metrics.jsonl", frames_per_step
+        self._path = folder / "metrics.jsonl"
+        self._frames_per_step = config.train.batch_size
         self._board, self._wandb = None, None
         if is_main:
             if self._path.exists():
                 _remove_after(start_step, self._path)
-            if wandb is not None:
-                self._wandb = _start_wandb(folder, wandb)
+            if config.logging.wandb:
+                self._wandb = _start_wandb(folder, config)
             # An unlimited queue: a limited one blocks forever on a full disk.
             self._board = tensorboardX.SummaryWriter(
                 str(folder / "tensorboard"), purge_step=start_step + 1, max_queue=0
@@ -132,7 +128,9 @@ class MetricLogger:
         self._write(step, scores.values, scores.figures)
         self._restart_timer(step)
 
-    def _write(self, step: int, values: Values, figures: Figures) -> None:
+    def _write(
+        self, step: int, values: Mapping[str, float], figures: Mapping[str, Figure]
+    ) -> None:
         if self._board is None:
             return
         with files.disk_full(self._path):
@@ -140,10 +138,9 @@ class MetricLogger:
                 file.write(json.dumps({"step": step, **values}) + "\n")
             self._board.flush()  # raises if its thread could not write
             for name, value in values.items():
-                name = re.sub(r"[^\w./-]", "_", name)  # TensorBoard allows no others
                 self._board.add_scalar(name, value, step)
             for name, figure in figures.items():
-                self._board.add_image(name, figure, step, dataformats="HWC")
+                self._board.add_figure(name, figure, step)
 
     def __enter__(self) -> MetricLogger:
         return self
@@ -171,7 +168,7 @@ def _remove_after(step: int, path: pathlib.Path) -> None:
     files.write_text(path, "".join(kept))
 
 
-def _start_wandb(folder: pathlib.Path, arguments: Mapping[str, Any]) -> Any:
+def _start_wandb(folder: pathlib.Path, config: ConfigDict) -> Any:
     """The run of a workdir at Weights & Biases, which copies what TensorBoard gets."""
     try:
         import wandb
@@ -186,5 +183,6 @@ def _start_wandb(folder: pathlib.Path, arguments: Mapping[str, Any]) -> Any:
         resume="allow",
         dir=str(folder),
         sync_tensorboard=True,
-        **arguments,
+        project=config.logging.wandb_project,
+        config=json.loads(config.to_json()),
     )

@@ -18,53 +18,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int, Num
 from ml_collections import ConfigDict
 
-from radejax.core.errors import (
-    BELOW_ONE,
-    POSITIVE,
-    UserError,
-    check_options,
-    integer,
-    number,
-    one_of,
-    or_none,
-    require,
-)
+from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import detection_loss
 
 Metrics = dict[str, Num[jax.Array, ""]]
 Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
-
-_RANGES = {
-    "batch_size": integer(1),
-    "num_epochs": integer(1),
-    "learning_rate": POSITIVE,
-    "final_learning_rate": number(0),
-    "schedule": one_of("cosine", "cyclic_cosine"),
-    "weight_decay": number(0),
-    "warmup_steps": integer(0),
-    "gradient_clip_norm": or_none(POSITIVE),
-    "ema_decay": or_none(BELOW_ONE),
-    "gradient_accumulation_steps": integer(1),
-    "parameter_sharding": one_of("replicated", "fsdp"),
-    "log_every_steps": integer(1),
-    "checkpoint_every_steps": integer(1),
-    "checkpoints_to_keep": or_none(integer(1)),
-    "evaluate_every_epochs": integer(0),
-    "max_skipped_steps": integer(0),
-}
-
-
-def check_train_section(train: ConfigDict) -> None:
-    """Raises `UserError` for a field of `config.train` that is out of its range."""
-    check_options(train, "config.train", _RANGES)
-    require(
-        train.final_learning_rate <= train.learning_rate,
-        "config.train.final_learning_rate",
-        train.final_learning_rate,
-        f"at most config.train.learning_rate, {train.learning_rate}",
-    )
 
 
 # Optimizer ---------------------------------------------------------------------------
@@ -140,13 +100,11 @@ def make_optimizer(
             parameters, see `optax.MultiSteps`.
     """
     count = gradient_accumulation_steps
-    if count == 1:
-        adamw = optax.adamw(schedule, weight_decay=weight_decay)
-    else:  # which counts updates
-        adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)
-    optimizer: optax.GradientTransformation = optax.chain(adamw)
+    # The optimizer counts updates, and the schedule steps.
+    parts = [optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)]
     if gradient_clip_norm is not None:
-        optimizer = optax.chain(optax.clip_by_global_norm(gradient_clip_norm), adamw)
+        parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
+    optimizer: optax.GradientTransformation = optax.chain(*parts)
     if count > 1:
         optimizer = optax.MultiSteps(optimizer, count).gradient_transformation()
     return skip_not_finite(optimizer)

@@ -35,7 +35,8 @@ class _Runs:
         self.simulated.add((root.name, json.dumps(simulation)))
         return root
 
-    def run(self, config: Any, *, name: str, workdir: Any) -> None:
+    def run(self, config: Any, workdir: Any) -> None:
+        name = workdir.parent.name.replace("_", " ")
         self.trained.append((name, config))
         if name != self.stops_at:
             (workdir / "evaluation").mkdir(parents=True)

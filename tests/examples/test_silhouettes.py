@@ -22,7 +22,7 @@ silhouettes = load_module(ROOT / "examples" / "silhouettes.py")
 def _run(score_of_camera: float, seen: list[Any]) -> Any:
     """Stands for a training: each frame has an object, the radar finds every other."""
 
-    def run(config: Any, *, name: str, workdir: pathlib.Path) -> pathlib.Path:
+    def run(config: Any, workdir: pathlib.Path) -> pathlib.Path:
         seen.append(config)
         frame = np.arange(40)
         box = np.tile([20.0, 0, 0, 4, 2, 1.5, 0], (40, 1))

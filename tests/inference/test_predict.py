@@ -106,22 +106,20 @@ def test_a_prediction_stops_where_it_is_told_to(setup):
 
     state = SimpleNamespace(eval_variables=setup.variables)
     with pytest.raises(distributed.Stopped):
-        Evaluation(setup.config, setup.data).validate(state, 7, should_stop)
+        Evaluation(setup.config, setup.data).validate(state, should_stop)
     assert asked == [True]
 
 
 def test_scores_during_training_name_their_protocol(setup):
     state = SimpleNamespace(eval_variables=setup.variables)
-    scores = Evaluation(setup.config, setup.data).validate(state, 7)
+    scores = Evaluation(setup.config, setup.data).validate(state)
     name = "validation/map_3d_iou30/coco101/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
     assert all("/simulated" in key for key in scores.values)
     assert any(key.endswith("/Sedan") for key in scores.values)
     means = [v for k, v in scores.values.items() if k.startswith(name)]
     assert means == [scores.best]
-    (picture,) = scores.figures.values()
-    assert picture.dtype == np.uint8
-    assert picture.shape[2] == 3
+    assert len(scores.figures) == 1
     mesh = distributed.make_mesh(1)
-    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(state, 7)
+    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(state)
     assert alone.values == pytest.approx(scores.values)

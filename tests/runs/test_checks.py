@@ -50,7 +50,8 @@ WRONG = [
     ("train.learning_rate", 0.0),
     ("train.final_learning_rate", 1.0),
     ("train.gradient_clip_norm", 0.0),
-    ("train.ema_decay", 2.0),
+    ("train.ema_decay", 1.0),
+    ("train.schedule", "step"),
     ("train.gradient_accumulation_steps", 0),
     ("train.log_every_steps", 0),
     ("train.checkpoint_every_steps", 0),
@@ -113,9 +114,19 @@ def test_an_impossible_value_is_named_with_what_is_expected(
 def test_nothing_is_written_or_built_for_a_wrong_config(tmp_path: pathlib.Path) -> None:
     config = _with("evaluation.protocols", ("nope",))
     with pytest.raises(UserError, match=r"evaluation.protocols"):
-        experiment.run(config, name="x", workdir=tmp_path / "run")
-    with pytest.raises(UserError, match=r"evaluation.protocols"):
-        experiment.run_seeds(config, (0, 1), name="x", workdir=tmp_path / "run")
+        experiment.run_seeds(config, tmp_path / "run", (0, 1))
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_written_for_paths_that_do_not_exist(tmp_path: pathlib.Path) -> None:
+    config = base_config()
+    config.train.batch_size = 8
+    config.data.roots = (str(tmp_path / "nope"),)
+    with pytest.raises(FileNotFoundError, match=r"no such file or folder: .*nope"):
+        experiment.run(config, tmp_path / "run")
+    config.data.roots = (str(tmp_path),)
+    with pytest.raises(FileNotFoundError, match=r"weights\.pth"):
+        experiment.run(config, tmp_path / "run", init_from=tmp_path / "weights.pth")
     assert not list(tmp_path.iterdir())
 
 
@@ -127,7 +138,7 @@ def test_a_batch_that_does_not_divide_is_refused_first(
     with pytest.raises(
         UserError, match=r"batch_size is 2, expected a multiple of 4 devices"
     ):
-        experiment.run(_with("train.batch_size", 2), name="x", workdir=tmp_path / "run")
+        experiment.run(_with("train.batch_size", 2), tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
 

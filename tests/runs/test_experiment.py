@@ -8,10 +8,8 @@ import sys
 from types import SimpleNamespace
 from typing import Any
 
-import click.testing
 import pytest
 
-from radejax.cli.train import train
 from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
@@ -20,7 +18,7 @@ from radejax.inference.saved import StartingWeights
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.training import distributed, loop
+from radejax.training import loop
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
@@ -28,6 +26,7 @@ from .. import small_models as small
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 
 
+@pytest.mark.usefixtures("one_device")
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -49,10 +48,8 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     config.train.batch_size = 2
     config.decode.update(score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False)
     monkeypatch.setattr(loop, "train", train)
-    mesh = distributed.make_mesh(1)
-    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     config.data.roots = (str(root),)
-    experiment.run(config, name="x", workdir=tmp_path / "run")
+    experiment.run(config, tmp_path / "run")
     assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
     assert "radejax detect" in caplog.text
@@ -77,6 +74,7 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     assert stays(["1/a"], "0" * 64) != stays(["1/a"], "1" * 64)
 
 
+@pytest.mark.usefixtures("one_device")
 def test_labels_are_read_once(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -91,8 +89,6 @@ def test_labels_are_read_once(
         return read(path, version, **options)
 
     monkeypatch.setattr(dataset, "read_label_file", count)
-    mesh = distributed.make_mesh(1)
-    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
     config.simulation.update(
         train_sequences=3, frames_per_sequence=2, output="projection"
@@ -111,7 +107,7 @@ def test_labels_are_read_once(
     )
     with caplog.at_level("INFO", "radejax"):
         config.data.roots = (str(tmp_path / "data"),)
-        folder = experiment.run(config, name="x", workdir=tmp_path / "run")
+        folder = experiment.run(config, tmp_path / "run")
     assert evaluated == [[2, 2], [4, 4]]
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
@@ -200,8 +196,6 @@ def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
 
 # Several seeds -----------------------------------------------------------------------
 
-HEAD = "protocol,condition,cls,space,iou,ap,num_gt\n"
-
 
 def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
@@ -209,23 +203,20 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     aps = {0: 50.0, 1: 53.0, 2: 59.0}
     seen = []
 
-    def run(config: Any, *, workdir: Any, **options: Any) -> pathlib.Path:
-        seen.append((config.seed, pathlib.Path(workdir).name, options["init_from"]))
-        folder = pathlib.Path(workdir) / "evaluation"
-        folder.mkdir(parents=True)
-        (folder / "metrics.csv").write_text(
-            HEAD
+    def run(config: Any, workdir: pathlib.Path, *, init_from: str) -> pathlib.Path:
+        seen.append((config.seed, workdir.name, init_from))
+        (workdir / "evaluation").mkdir(parents=True)
+        (workdir / "evaluation" / "metrics.csv").write_text(
+            "protocol,condition,cls,space,iou,ap,num_gt\n"
             + f"all_point,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
             + "all_point,all,Bicycle,3d,0.3,,0\n"
             + f"all_point,rain,Sedan,3d,0.3,{config.seed},3\n"
         )
-        return pathlib.Path(workdir)
+        return workdir
 
     monkeypatch.setattr(experiment, "run", run)
     config = base_config()
-    experiment.run_seeds(
-        config, range(3), name="x", workdir=tmp_path / "runs", init_from="w"
-    )
+    experiment.run_seeds(config, tmp_path / "runs", range(3), init_from="w")
     assert seen == [(i, f"seed{i}", "w") for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
@@ -238,13 +229,7 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     assert "rain" not in text
 
 
-def test_train_takes_several_seeds(tmp_path: pathlib.Path) -> None:
-    arguments = ["--config=quickstart:short", "--seeds=1,2,1"]
-    done = click.testing.CliRunner().invoke(
-        train, [*arguments, f"--workdir={tmp_path / 'run'}"]
-    )
-    assert done.exit_code == 2
-    assert done.stderr.startswith(
-        "error: --seeds is (1, 2, 1), expected different seeds"
-    )
-    assert done.stderr.count("\n") == 1
+def test_seeds_are_different(tmp_path: pathlib.Path) -> None:
+    message = r"--seeds is \(1, 2, 1\), expected different seeds"
+    with pytest.raises(UserError, match=message):
+        experiment.run_seeds(base_config(), tmp_path, (1, 2, 1))

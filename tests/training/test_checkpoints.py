@@ -96,11 +96,11 @@ def test_state_position_and_info_come_back(folder: pathlib.Path) -> None:
 
 def test_the_best_is_kept(tmp_path: pathlib.Path) -> None:
     iterator = _iterator()
-    metrics = {2: {"best": 5.0}, 4: {"best": 3.0}}
+    metrics = {2: 5.0, 4: 3.0}
     with Checkpoints(tmp_path, max_to_keep=1) as checkpoints:
         for step in range(1, 6):
             checkpoints.save(
-                step, _state(step), iterator, info={}, metrics=metrics.get(step)
+                step, _state(step), iterator, info={}, best=metrics.get(step)
             )
             checkpoints.wait()
         assert checkpoints.steps() == [2, 5]
@@ -250,18 +250,6 @@ def test_whole_files_with_other_weights_are_found(folder: pathlib.Path) -> None:
     ):
         _read(folder)
     assert _restored_step(folder) == 2
-
-
-def test_every_bit_and_every_order_has_its_checksum() -> None:
-    values = np.zeros((3, 5), np.float32)
-    sums = {array_checksums([values])["0"]}
-    for element in range(15):
-        for bit in range(32):
-            other = values.copy()
-            other.reshape(-1).view(np.uint32)[element] ^= np.uint32(1 << bit)
-            sums.add(array_checksums([other])["0"])
-    assert len(sums) == 15 * 32 + 1
-    assert array_checksums([WEIGHTS]) != array_checksums([WEIGHTS[::-1].copy()])
 
 
 def test_the_checksum_does_not_depend_on_the_placement() -> None:

@@ -18,14 +18,18 @@ def two(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Makes this process one of two; returns what happens between them, in order."""
     events: list[str] = []
 
+    def wait(*_: Any, **__: Any) -> None:
+        events.append("wait")
+
     def become(index: int, *, main_is_fine: bool = True) -> list[str]:
         def gather(value: np.ndarray) -> np.ndarray:
-            events.append("told")
+            events.append("gather")
             return np.stack([value if index == 0 else np.int32(main_is_fine), value])
 
         monkeypatch.setattr(jax, "process_count", lambda: 2)
         monkeypatch.setattr(jax, "process_index", lambda: index)
-        monkeypatch.setattr(distributed, "wait_for_all", lambda: events.append("wait"))
+        multihost = distributed.ocp.multihost
+        monkeypatch.setattr(multihost, "sync_global_processes", wait)
         monkeypatch.setattr(distributed.multihost_utils, "process_allgather", gather)
         return events
 
@@ -35,11 +39,11 @@ def two(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_the_others_wait_while_the_main_process_works(two: Any) -> None:
     events = two(0)
     assert distributed.main_only(lambda: events.append("work") or 5) == 5
-    assert events == ["work", "wait", "told"]
+    assert events == ["work", "wait", "gather"]
     events.clear()
     two(1)
     assert distributed.main_only(lambda: events.append("work")) is None
-    assert events == ["wait", "told"]
+    assert events == ["wait", "gather"]
 
 
 def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
@@ -49,16 +53,10 @@ def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
     events = two(0)
     with pytest.raises(OSError, match="broken"):
         distributed.main_only(fail)
-    assert events == ["wait", "told"]
+    assert events == ["wait", "gather"]
     two(1, main_is_fine=False)
     with pytest.raises(UserError, match="process 0 stopped with an error"):
         distributed.main_only(fail)
-
-
-def test_what_the_main_process_prepared_is_found_by_the_others(two: Any) -> None:
-    events = two(1)
-    assert distributed.main_first(lambda: events.append("work") or "found") == "found"
-    assert events == ["wait", "told", "work", "wait"]
 
 
 def test_put_batch_splits_the_leading_axis() -> None:
@@ -81,12 +79,3 @@ def test_fsdp_splits_the_widest_axis_that_divides() -> None:
     assert placed["bias"].spec == placed["odd"].spec == PartitionSpec()
     whole = distributed.state_sharding(state, mesh, "replicated")
     assert {s.spec for s in whole.values()} == {PartitionSpec()}
-
-
-def test_a_batch_that_does_not_divide_names_those_that_do() -> None:
-    with pytest.raises(
-        UserError, match=r"batch_size is 6, expected a multiple of 4 devices"
-    ):
-        distributed.check_batch_size(6, distributed.make_mesh(4))
-    with pytest.raises(UserError, match="num_devices is 9, expected 1 to 8"):
-        distributed.make_mesh(9)

@@ -13,6 +13,7 @@ import grain
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from ml_collections import ConfigDict
 
 from radejax.core.errors import DataError, UserError
@@ -58,22 +59,28 @@ def run(tiny: Tiny) -> Any:
     """`train` on the tiny data, on one device by default."""
 
     def train(
-        workdir: pathlib.Path, loader: Any = None, config: Any = None, **others: Any
+        workdir: pathlib.Path,
+        loader: Any = None,
+        config: Any = None,
+        num_devices: int = 1,
+        **others: Any,
     ) -> Any:
         options = {
-            "info": {"config": {"seed": 0}},
+            "info": {},
             "steps_per_epoch": STEPS_PER_EPOCH,
             "variables": tiny.variables,
-            "mesh": distributed.make_mesh(1),
         }
-        return loop.train(
-            tiny.config if config is None else config,
-            tiny.model,
-            tiny.loader() if loader is None else loader,
-            tiny.map_grid,
-            workdir,
-            **(options | others),
-        )
+        mesh = distributed.make_mesh(num_devices)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(distributed, "make_mesh", lambda: mesh)
+            return loop.train(
+                tiny.config if config is None else config,
+                tiny.model,
+                tiny.loader() if loader is None else loader,
+                tiny.map_grid,
+                workdir,
+                **(options | others),
+            )
 
     return train
 
@@ -183,14 +190,14 @@ def test_sigterm_in_an_evaluation_saves_and_stops(
     config.train.evaluate_every_epochs = 1
     cut_at = []
 
-    def evaluate(state: Any, step: int, should_stop: Any) -> Scores:
+    def evaluate(state: Any, should_stop: Any) -> Scores:
         assert not should_stop()
-        if step not in cut_at:
+        if (step := int(state.step)) not in cut_at:
             cut_at.append(step)
             os.kill(os.getpid(), signal.SIGTERM)
         if should_stop():
             raise distributed.Stopped
-        raise AssertionError("the signal was not told")
+        raise AssertionError("the signal was not seen")
 
     def start() -> Any:
         return run(workdir, config=config, evaluate=evaluate)
@@ -293,10 +300,8 @@ def test_a_run_continues_on_another_number_of_devices(
         raise RuntimeError("moved")
 
     with pytest.raises(RuntimeError, match="moved"):
-        run(
-            workdir, Stopping(tiny.loader(), 6, stop), mesh=distributed.make_mesh(first)
-        )
-    assert run(workdir, mesh=distributed.make_mesh(then))[1]
+        run(workdir, Stopping(tiny.loader(), 6, stop), num_devices=first)
+    assert run(workdir, num_devices=then)[1]
     losses, expected = _losses(workdir), _losses(undisturbed[1])
     np.testing.assert_allclose(
         [v for _, v in losses], [v for _, v in expected], rtol=0.05
@@ -327,16 +332,12 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
 ) -> None:
     config = tiny.config.copy_and_resolve_references()
     config.train.update(evaluate_every_epochs=1, num_epochs=4, checkpoints_to_keep=1)
-    seen = []
 
-    def evaluate(state: Any, step: int, should_stop: Any) -> Scores:
-        seen.append((step, int(state.step)))
-        best = {2: 1.5, 4: 3.5, 6: 2.5, 8: 2.0}[step]
-        picture = np.zeros((4, 6, 3), np.uint8)
-        return Scores({"validation/ap_bev_iou30/exact": best}, best, {"a": picture})
+    def evaluate(state: Any, should_stop: Any) -> Scores:
+        best = {2: 1.5, 4: 3.5, 6: 2.5, 8: 2.0}[int(state.step)]
+        return Scores({"validation/ap_bev_iou30/exact": best}, best, {"a": Figure()})
 
     run(workdir, config=config, evaluate=evaluate, steps_per_epoch=2)
-    assert seen == [(2, 2), (4, 4), (6, 6), (8, 8)]
     rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
     name = "validation/ap_bev_iou30/exact"
     assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5, 2.0]

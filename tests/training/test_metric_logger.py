@@ -4,10 +4,12 @@ import errno
 import json
 import pathlib
 import sys
+from unittest import mock
 
-import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
+from radejax.core.config import base_config
 from radejax.core.errors import DiskFullError, UserError
 from radejax.training import distributed
 from radejax.training.metric_logger import MetricLogger, Scores
@@ -18,8 +20,10 @@ def _steps(folder: pathlib.Path) -> list[int]:
     return [json.loads(line)["step"] for line in lines]
 
 
-def _logger(folder: pathlib.Path, start: int) -> MetricLogger:
-    return MetricLogger(folder, start_step=start, num_steps=10, frames_per_step=4)
+def _logger(folder: pathlib.Path, start: int, **logging: object) -> MetricLogger:
+    config = base_config()
+    config.logging.update(logging)
+    return MetricLogger(folder, config, start_step=start, num_steps=10)
 
 
 def test_records_after_the_restored_step_are_written_anew(
@@ -91,39 +95,22 @@ def test_tensorboard_on_a_full_disk_is_an_error_and_blocks_nothing(
             log()
 
 
-class FakeWandb:
-    """What `MetricLogger` needs of the module wandb."""
-
-    def __init__(self) -> None:
-        self.init_arguments: dict = {}
-        self.is_finished = False
-
-    def init(self, **arguments: object) -> "FakeWandb":
-        self.init_arguments = arguments
-        return self
-
-    def finish(self) -> None:
-        self.is_finished = True
-
-
 def test_weights_and_biases_copies_tensorboard_and_gets_the_config(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fake = FakeWandb()
+    fake = mock.Mock()
     monkeypatch.setitem(sys.modules, "wandb", fake)
-    options = {"num_steps": 4, "frames_per_step": 2}
-    options["wandb"] = {"project": "p", "config": {"seed": 3}}
-    with MetricLogger(tmp_path, start_step=0, **options) as logger:
-        logger.log(1, {"focal": 2.5}, epoch=0.5)
-        picture = np.zeros((4, 6, 3), np.uint8)
-        logger.log_scores(2, Scores({"ap/exact": 7.0}, 7.0, {"frame": picture}))
-    assert fake.init_arguments["sync_tensorboard"]
-    assert fake.init_arguments["project"] == "p"
-    assert fake.init_arguments["config"] == {"seed": 3}
-    assert fake.is_finished
-    run_id = fake.init_arguments["id"]
-    with MetricLogger(tmp_path, start_step=2, **options):
-        assert fake.init_arguments["id"] == run_id  # the same run goes on
+    for start in (0, 2):  # the second time, the same run goes on
+        with _logger(tmp_path, start, wandb=True, wandb_project="p") as logger:
+            logger.log(start + 1, {"focal": 2.5}, epoch=0.5)
+            scores = Scores({"ap/exact": 7.0}, 7.0, {"frame": Figure()})
+            logger.log_scores(start + 2, scores)
+    first, second = (call.kwargs for call in fake.init.call_args_list)
+    assert first == second
+    assert first["sync_tensorboard"]
+    assert first["project"] == "p"
+    assert first["config"]["train"]["batch_size"] == base_config().train.batch_size
+    assert fake.init.return_value.finish.call_count == 2
 
 
 def test_weights_and_biases_that_is_not_installed_is_named(
@@ -131,4 +118,4 @@ def test_weights_and_biases_that_is_not_installed_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match=r"wandb is not installed: pip install"):
-        MetricLogger(tmp_path, 0, 1, 1, wandb={"project": "p"})
+        _logger(tmp_path, 0, wandb=True)

@@ -18,7 +18,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import starting_weights
 from radejax.losses.detection import detection_loss
 from radejax.runs import checks
-from radejax.training import distributed, loop
+from radejax.training import loop
 from radejax.training.step import (
     create_state,
     make_optimizer,
@@ -197,6 +197,7 @@ def _batch(config: Any, grid: RadarGrid) -> Batch:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_device")
 def test_fine_tuning_starts_from_an_official_checkpoint(
     tiny: Any, workdir: pathlib.Path
 ) -> None:
@@ -217,7 +218,6 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
         info={},
         steps_per_epoch=2,
         variables=variables,
-        mesh=distributed.make_mesh(1),
     )
     assert state.step == 2
     chex.assert_trees_all_close(state.params, official["params"], atol=1e-7)
