@@ -125,12 +125,12 @@ def test_results_on_other_data_are_named_by_folder_and_labels(
 def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
     root: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    damaged = next(frame for frame in KRadar(root) if frame.sequence == 1)
-    damaged.projection_path.write_bytes(b"half")
+    corrupted = next(frame for frame in KRadar(root) if frame.sequence == 1)
+    corrupted.projection_path.write_bytes(b"half")
     with caplog.at_level("WARNING", "radejax"):
         data = _open(_config(root))
     assert "6 frames: 0 were done, 5 preprocessed, 1 skipped" in caplog.text
-    assert damaged.key not in [frame.key for frame in data.split("train")]
+    assert corrupted.key not in [frame.key for frame in data.split("train")]
     assert len(data.split("all")) == len(data.records.keys()) == 5
     part = _open(_config(root, sequences=(1, 3)))  # the same records
     assert len(part.split("all")) == 3

@@ -102,15 +102,6 @@ def test_changes_replace_what_the_config_says() -> None:
         EvaluationOptions.from_config(config, classes=("Tram",))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Loaded:
-    config: ConfigDict
-    model: None = None
-    variables: None = None
-    step: int = 3
-    run: str = "run"
-
-
 @pytest.mark.parametrize(
     ("choosing", "split", "step", "folder", "remark"),
     [
@@ -133,7 +124,8 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
 ) -> None:
     written: dict[str, Any] = {}
     data = SimpleNamespace(choosing_split=choosing, preprocess=lambda: None)
-    loaded = _Loaded(_config())
+    saved = {"run": "run", "variables": None, "step": 3}
+    loaded = SimpleNamespace(config=_config(), **saved)
     monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
     monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
     evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))

@@ -1,4 +1,4 @@
-"""Checkpoints: what is kept, what is refused, and that all damage to them is found."""
+"""Checkpoints: what is kept, what is refused, and that all corruption of them is found."""
 
 import gc
 import itertools
@@ -20,7 +20,7 @@ from radejax.core.errors import DataError, DiskFullError
 from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints, abstract_state, array_checksums
 
-# Restoring of damaged files ends orbax's event loop while others are still read.
+# Restoring of corrupted files ends orbax's event loop while others are still read.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )
@@ -119,7 +119,7 @@ def test_nothing_to_restore(tmp_path: pathlib.Path) -> None:
         _read(tmp_path)
 
 
-def test_all_damaged_is_an_error_not_a_fresh_start(folder: pathlib.Path) -> None:
+def test_all_corrupted_is_an_error_not_a_fresh_start(folder: pathlib.Path) -> None:
     for path in folder.rglob("*"):
         if path.is_file() and "state" in path.parts:
             path.write_bytes(b"")
@@ -176,7 +176,7 @@ def test_a_full_disk_is_one_clear_error_and_earlier_checkpoints_stay(
     np.testing.assert_array_equal(restored["w"], values * step)
 
 
-# Damage ------------------------------------------------------------------------------
+# Corruption --------------------------------------------------------------------------
 
 
 @pytest.fixture

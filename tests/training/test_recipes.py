@@ -13,7 +13,7 @@ from radejax import models
 from radejax.core.config import load_module
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import starting_weights
 from radejax.losses.detection import detection_loss
@@ -27,7 +27,7 @@ from radejax.training.step import (
 )
 from radejax.weights import radenet_torch
 
-from ..small_models import drawn
+from ..small_models import calibration, drawn
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SIZE = (32, 576)  # the released crop leaves out 280 columns on both sides
@@ -181,15 +181,7 @@ def _batch(config: Any, grid: RadarGrid) -> Batch:
     )
     if config.model.name != "dinorade":
         return batch
-    camera = CameraCalibration.from_angles(
-        intrinsics=(24.0, 24.0, 24.0, 16.0),
-        yaw_deg=90.0,
-        pitch_deg=0.0,
-        roll_deg=90.0,
-        translation_m=(0.0, 0.0, 0.0),
-        width=SIZE[1],
-        height=SIZE[0],
-    ).camera(is_valid=True)
+    camera = calibration(width=SIZE[1], height=SIZE[0]).camera(is_valid=True)
     return batch.replace(
         image=rng.integers(0, 256, (2, *SIZE, 3)).astype(np.uint8),
         camera=stack_cameras([camera, camera]),
