@@ -195,11 +195,8 @@ class _Run:
         Raises:
             DataError: Too many were in a row.
         """
-        in_row, limit = (
-            state.opt_state.notfinite_count,
-            self.config.train.max_skipped_steps,
-        )
-        if int(in_row) > limit:
+        limit = self.config.train.max_skipped_steps
+        if (in_row := int(state.opt_state.notfinite_count)) > limit:
             raise DataError(
                 f"loss or gradient was not finite in {in_row} steps in a row (limit "
                 f"config.train.max_skipped_steps={limit})"
