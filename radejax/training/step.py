@@ -101,7 +101,8 @@ def make_optimizer(
     """
     count = gradient_accumulation_steps
     # The optimizer counts updates, and the schedule steps.
-    parts = [optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)]
+    adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)
+    parts: list[optax.GradientTransformation] = [adamw]
     if gradient_clip_norm is not None:
         parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
     optimizer: optax.GradientTransformation = optax.chain(*parts)
