@@ -207,6 +207,10 @@ def default_config() -> dict[str, Any]:
     return dataclasses.asdict(SimulationConfig())
 
 
-def plain(config: Any) -> dict[str, Any]:
-    """A ConfigDict or another mapping as a dictionary."""
-    return config.to_dict() if hasattr(config, "to_dict") else dict(config)
+def plain(config: Any) -> Any:
+    """ConfigDicts and other mappings as dictionaries, recursively."""
+    if hasattr(config, "to_dict"):
+        config = config.to_dict()
+    if isinstance(config, Mapping):
+        return {str(key): plain(value) for key, value in config.items()}
+    return config
