@@ -91,7 +91,11 @@ def detect(
     help="Keep the weights of the image transformer. DINOv3's license restricts "
     "redistribution.",
 )
-@entry.batch_size(1, "Batch size of the ONNX files.")
+@click.option(
+    "--batch-size",
+    type=entry.COUNT,
+    help="Fixed batch size of the program. Default: any (stablehlo), 1 (onnx).",
+)
 @click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
@@ -101,9 +105,9 @@ def export(
     """Export a model as a folder for other programs.
 
     SOURCE is the workdir of a run, its checkpoints, one of them, an exported folder or an
-    official .pth file. "stablehlo" runs with jax only, for any batch size; "onnx" is for
-    ONNX Runtime and TensorRT, for one batch size; "huggingface" is weights, config and
-    model card. Detector.from_workdir reads all of them.
+    official .pth file. "stablehlo" runs with jax, flatbuffers and numpy; "onnx" is for ONNX
+    Runtime; "huggingface" is weights, config and model card. Detector.from_workdir reads
+    all of them.
 
     Example: radejax export runs/quickstart --out exported
     """

@@ -69,7 +69,7 @@ def export(
     kind: str = "stablehlo",
     platforms: Sequence[str] = PLATFORMS,
     with_backbone: bool = False,
-    batch_size: int = 1,
+    batch_size: int | None = None,
     half: bool = False,
 ) -> dict[str, Any]:
     """Write a folder with the model; existing files of the same names are replaced.
@@ -82,7 +82,7 @@ def export(
             batch size; "huggingface": weights, config and model card.
         platforms: Platforms of StableHLO, of `KNOWN_PLATFORMS`.
         with_backbone: Keep the weights of the image transformer, see `save_model`.
-        batch_size: Frames of a call of the ONNX files.
+        batch_size: Frames of a call; None for any number with StableHLO and 1 with ONNX.
         half: Store float16; only of "huggingface".
 
     Returns:
@@ -100,9 +100,11 @@ def export(
     folder = pathlib.Path(folder)
     programs: dict[str, bytes] = {}
     if kind == "stablehlo":
-        programs[PROGRAM_FILE] = _stablehlo(detector, platforms, with_backbone)
+        programs[PROGRAM_FILE] = _stablehlo(
+            detector, platforms, batch_size, with_backbone
+        )
     elif kind == "onnx":
-        programs = _onnx_files(detector, batch_size, with_backbone)
+        programs = _onnx_files(detector, batch_size or 1, with_backbone)
     content = save_model(
         detector.saved,
         folder,
@@ -175,13 +177,17 @@ def _detect(
 
 
 def _stablehlo(
-    detector: Detector, platforms: Sequence[str], with_backbone: bool
+    detector: Detector,
+    platforms: Sequence[str],
+    batch_size: int | None,
+    with_backbone: bool,
 ) -> bytes:
     """The serialized program: weights, inputs, settings -> dictionary of arrays.
 
-    The batch size is symbolic. Without the backbone the images are embedded ones.
+    The batch size is symbolic if it is None. Without the backbone the images are
+    embedded ones.
     """
-    (batch,) = jax.export.symbolic_shape("b")
+    batch = batch_size or jax.export.symbolic_shape("b")[0]
     variables, inputs = _exported(detector, batch, with_backbone)
     flat = traverse_util.flatten_dict(variables, sep="/")
 

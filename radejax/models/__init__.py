@@ -49,7 +49,7 @@ def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
     """Attributes of `DinoRade` from the fields of its config."""
     image, fusion, grid = (fields.pop(k) for k in ("image", "fusion", "query_grid"))
     shared = {"num_groups", "dtype", "remat"}
-    vit_fields = _own_fields(ViT) - {*shared, "qkv_bias"}
+    vit_fields = _own_fields(ViT) - shared
     own = {"kind", "size", "freeze", "standardize", "resnet_width"}
     _check_keys(image, own | vit_fields, "image.")
     _check_keys(fusion, _own_fields(Fusion) - shared, "fusion.")

@@ -47,7 +47,6 @@ class ViT(nn.Module):
         patch_size: Pixels of a patch's side.
         num_registers: Learned tokens beside the class token.
         gated_mlp: SwiGLU, as in the larger DINOv3 models, instead of a GELU MLP.
-        qkv_bias: Whether query, key and value projections have a bias.
         layer_scale: Initial value of the learned scales of the residual branches.
         attention: "auto" picks by platform; see `attend`.
         dtype: Dtype of the computation; statistics and tokens are float32.
@@ -61,7 +60,6 @@ class ViT(nn.Module):
     patch_size: int = 16
     num_registers: int = 4
     gated_mlp: bool = False
-    qkv_bias: tuple[bool, bool, bool] = (True, False, True)
     layer_scale: float = 1.0
     attention: AttentionKind = "auto"
     dtype: Any = jnp.float32
@@ -112,7 +110,6 @@ class ViT(nn.Module):
             self.mlp_dim,
             self.num_prefix,
             self.gated_mlp,
-            self.qkv_bias,
             self.layer_scale,
             self.attention,
             self.dtype,
@@ -144,7 +141,6 @@ class Block(nn.Module):
     mlp_dim: int
     num_prefix: int
     gated_mlp: bool
-    qkv_bias: tuple[bool, bool, bool]
     layer_scale: float
     attention: AttentionKind
     dtype: Any
@@ -160,8 +156,10 @@ class Block(nn.Module):
     def _attend(self, x: Tokens, rope: Rope) -> Tokens:
         b, t, c = x.shape
         query, key, value = (
-            self._dense(c, name, use_bias=bias)(x).reshape(b, t, self.num_heads, -1)
-            for name, bias in zip(("query", "key", "value"), self.qkv_bias, strict=True)
+            self._dense(c, name, use_bias=name != "key")(x).reshape(
+                b, t, self.num_heads, -1
+            )
+            for name in ("query", "key", "value")
         )  # [B, T, heads, C / heads]
         query = rotate(query, rope, self.num_prefix)
         key = rotate(key, rope, self.num_prefix)

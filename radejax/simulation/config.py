@@ -140,7 +140,7 @@ class SimulationConfig:
         Raises:
             UserError: A field is unknown or out of its range.
         """
-        values = plain(values)
+        values = dict(plain(values))
         fields = {field.name: field for field in dataclasses.fields(cls)}
         for name in values:
             require(name in fields, "config.simulation field", name, ", ".join(fields))

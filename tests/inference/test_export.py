@@ -117,6 +117,17 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     _check(found, "3", again(projection))
 
 
+def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
+    detector = small.detector()
+    export.export(detector, tmp_path, platforms=("cpu",), batch_size=2)
+    exported = jax.export.deserialize((tmp_path / "detector.stablehlo").read_bytes())
+    assert exported.in_avals[-4].shape == (2, *detector.grid.projection_shape)
+    # PJRT compiles neither dynamic shapes nor the index of a platform.
+    text = exported.mlir_module()
+    assert "dynamic_broadcast" not in text
+    assert "_platform_index" not in text
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("with_backbone", [True, False])
 def test_a_radar_camera_model_too(with_backbone, tmp_path):
