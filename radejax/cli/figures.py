@@ -24,7 +24,7 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
 @click.argument("name", metavar="[FRAME]", default="")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
 @entry.labelled_frames
-@entry.out_file("overlay.png", "Image file, or .gif or .mp4 for a sequence.")
+@entry.out_file("overlay.png", "Image file, or .gif or .mp4 for several frames.")
 @click.option(
     "--slices",
     is_flag=True,
@@ -48,7 +48,7 @@ def overlay(
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
-    FRAME is sequence/radar_lidar, sequence/radar, or a sequence, of which the first
+    FRAME is sequence/radar_lidar, sequence/radar, or one sequence, of which the first
     frame is drawn. All frames are drawn where --out ends in .gif or .mp4.
     --sequences and --weather select frames without a FRAME.
 
@@ -162,7 +162,7 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
     help="Seed of the scene; the model was trained on scenes of seed 0.",
 )
 def demo(out: pathlib.Path, seed: int) -> None:
-    """Simulate a frame, detect its objects with a small trained model, draw both.
+    """Simulate one frame, detect its objects with a small trained model, draw both.
 
     Only this package is needed. The model is that of the quickstart: it was trained on
     simulated frames of a coarse radar, not on K-Radar's.

@@ -149,7 +149,7 @@ class Detections(struct.PyTreeNode):
         }
 
     def to_list(self) -> list[list[dict[str, Any]]]:
-        """One list a frame of dictionaries: cls, score and the seven box numbers."""
+        """One list per frame of dictionaries: cls, score and the seven box numbers."""
         frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
         columns = (column.tolist() for column in self.to_columns().values())
         for frame, box, cls, score in zip(*columns, strict=True):

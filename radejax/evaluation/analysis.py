@@ -104,7 +104,7 @@ def _numbers(
     in_pred: Bool[np.ndarray, " M"],
     match: Int[np.ndarray, " M"],
 ) -> dict[str, float]:
-    """AP, precision, recall and counts of a class in a subset."""
+    """AP, precision, recall and counts of one class in one subset."""
     order = data.by_score[cls]
     order = order[in_pred[order]]
     score, is_tp = data.score[order], match[order] >= 0

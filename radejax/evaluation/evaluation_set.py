@@ -23,7 +23,7 @@ T = TypeVar("T")
 SPACES = ("bev", "3d")
 
 MAX_PAIRS = 1_000_000
-"""Of predictions and ground truths of a class in a frame; 100 and 20 are many."""
+"""Most pairs of predictions and objects per class and frame; 100 and 20 are many."""
 
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 

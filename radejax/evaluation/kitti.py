@@ -116,7 +116,7 @@ def prediction_texts(detections: Detections) -> list[str]:
     A frame without detections gets the line "dummy".
 
     Raises:
-        UserError: K-Radar has no key for a class.
+        UserError: K-Radar has no key for one of the classes.
     """
     found = _lines(detections.to_columns(), scored=True)
     num_frames = detections.is_valid.shape[0]

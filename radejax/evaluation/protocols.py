@@ -1,6 +1,6 @@
 """The protocols: what each does to boxes, frames, matches and the curve.
 
-Everything here is exact for weighted frames: a weight of 0 ignores a frame, 2 counts
+Everything here is exact for weighted frames: a weight of 0 ignores the frame, 2 counts
 it twice. Conditions (weathers) and bootstrap resamples are then the same computation.
 """
 

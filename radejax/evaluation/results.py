@@ -297,7 +297,7 @@ def resample(
 ) -> Float[np.ndarray, "B _"]:
     """`[B, C + 1]` AP of every class, then their mean, in every resample.
 
-    NaN where a resample has no object of a class; the mean is over classes that occur.
+    NaN where a resample has no object of the class; the mean is over classes that occur.
     """
     chosen = protocols.get_protocol(protocol)
     empty_frames = chosen.resolve_empty_frames(empty_frames)

@@ -1,7 +1,7 @@
 """Boxes for folders of frames: what `radejax detect` does.
 
 Labels are not needed, but for images: in K-Radar only the header of a label file says
-which image belongs to a frame.
+which image belongs to which frame.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from radejax.inference.detector import Detector
 from radejax.inference.saved import Step
 
 PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
-"""Names of the files that hold a frame."""
+"""Patterns of the names of radar files."""
 
 
 def find_frames(
@@ -46,7 +46,7 @@ def find_frames(
         weather: Only sequences of these, by their `description.txt`; all if None.
 
     Raises:
-        FileNotFoundError: A path, or the description of a sequence, does not exist.
+        FileNotFoundError: A path, or a `description.txt`, does not exist.
         UserError: There is no frame; names what was looked for.
     """
     found: set[pathlib.Path] = set()

@@ -185,7 +185,7 @@ class Pairs(NamedTuple):
     is_matched: Mask
 
     def mean(self, values: Float[jax.Array, "B N"]) -> Float[jax.Array, ""]:
-        """Mean of `[B, N]` values over the matched boxes of a frame, then over frames."""
+        """Mean of `[B, N]` values over the matched boxes of each frame, then over frames."""
         total = jnp.sum(jnp.where(self.is_matched, values, 0.0), axis=1)
         return jnp.mean(total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1))
 

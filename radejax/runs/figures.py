@@ -56,7 +56,7 @@ def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
 
 
 def spread(values: Any, count: int) -> list[Any]:
-    """At most `count` of a sequence, evenly spread."""
+    """At most `count` items, evenly spaced."""
     places = np.linspace(0, len(values) - 1, min(count, len(values)))
     return [values[int(i)] for i in np.round(places)]
 

@@ -193,7 +193,7 @@ class _Run:
         """Warns of steps without a finite loss and gradient beyond those reported.
 
         Raises:
-            DataError: Too many were in a row.
+            DataError: Too many were consecutive.
         """
         limit = self.config.train.max_skipped_steps
         if (in_row := int(state.opt_state.notfinite_count)) > limit:

@@ -31,7 +31,7 @@ Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 
 
 def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
-    """Linear warm-up from zero, then a cosine between the peak and the floor.
+    """Linear warm-up from zero, then a cosine between the peak and the minimum.
 
     RADE-Net section IV-B: cosine per step from 1e-3 to 1e-4, no warm-up.
 
@@ -48,7 +48,7 @@ def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
     Raises:
         UserError: The warm-up is not shorter than the training.
     """
-    peak, floor = train.learning_rate, train.final_learning_rate
+    peak, minimum = train.learning_rate, train.final_learning_rate
     num_steps, warmup_steps = steps_per_epoch * train.num_epochs, train.warmup_steps
     require(
         warmup_steps < num_steps,
@@ -58,24 +58,24 @@ def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
     )
     if train.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(
-            0.0, peak, warmup_steps, num_steps, floor
+            0.0, peak, warmup_steps, num_steps, minimum
         )
     warmup = optax.linear_schedule(0.0, peak, warmup_steps)
-    cyclic = _cyclic_cosine(peak, floor, steps_per_epoch)
+    cyclic = _cyclic_cosine(peak, minimum, steps_per_epoch)
     return optax.join_schedules([warmup, cyclic], [warmup_steps])
 
 
-def _cyclic_cosine(peak: float, floor: float, half_period: int) -> optax.Schedule:
-    """What torch's recursion comes to: floor + (peak - floor) cos^2(pi t / 2T).
+def _cyclic_cosine(peak: float, minimum: float, half_period: int) -> optax.Schedule:
+    """Closed form of torch's recursion: minimum + (peak - minimum) cos^2(pi t / 2T).
 
-    In whole steps from the nearest floor, so that float32 keeps all digits of the rate
+    In whole steps from the nearest minimum, so that float32 keeps all digits of the rate
     where it is small and after any number of epochs.
     """
 
     def rate(step: ArrayLike) -> Float[jax.Array, "..."]:
         from_floor = jnp.abs(jnp.mod(step, 2 * half_period) - half_period)
         angle = jnp.asarray(from_floor, jnp.float32) * (jnp.pi / (2 * half_period))
-        return floor + (peak - floor) * jnp.square(jnp.sin(angle))
+        return minimum + (peak - minimum) * jnp.square(jnp.sin(angle))
 
     return rate
 
@@ -114,7 +114,7 @@ def make_optimizer(
 def skip_not_finite(
     optimizer: optax.GradientTransformation,
 ) -> optax.GradientTransformation:
-    """An optimizer that ignores gradients that are not finite, any number in a row."""
+    """An optimizer that ignores gradients that are not finite, any number of them."""
     return optax.apply_if_finite(optimizer, np.iinfo(np.int32).max)
 
 

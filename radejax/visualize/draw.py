@@ -185,7 +185,7 @@ def draw_frame(scene: Scene) -> Figure:
 
 
 def draw_scenes(scenes: Sequence[Scene]) -> Figure:
-    """Figure of scenes, four in a row, each with its camera image above its map.
+    """Figure of scenes, four per row, each with its camera image above its map.
 
     Args:
         scenes: At least one; the legend is that of the first.

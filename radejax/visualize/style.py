@@ -296,7 +296,7 @@ def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
 
 
 def color_limits_of(values: np.ndarray) -> tuple[float, float]:
-    """Limits from the noise floor (20 %) to the strongest echoes (99.9 %).
+    """Limits from the noise (20 %) to the strongest echoes (99.9 %).
 
     Non-finite values are ignored; a constant map gets a range of one unit.
     """

@@ -1,4 +1,4 @@
-"""K-Radar on disk: sequence folders, labels, splits, as a sequence of frames."""
+"""K-Radar on disk: sequence folders, labels, splits, as frames in order."""
 
 from radejax.data.kradar.dataset import Frame, KRadar
 from radejax.data.kradar.labels import Label, read_labels

@@ -43,7 +43,7 @@ _CONDITIONS = {
 
 
 class Conditions(NamedTuple):
-    """Circumstances of a sequence, as in its `description.txt`."""
+    """Conditions of one sequence, as in its `description.txt`."""
 
     environment: str
     time: str

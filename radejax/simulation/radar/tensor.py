@@ -49,7 +49,7 @@ _RANGES = {
 class RadarParameters:
     """What the sensor is beyond its axes; hashable, so static under `jax.jit`.
 
-    K-Radar publishes no link budget. The level is set so that the noise floor lies
+    K-Radar publishes no link budget. The level is set so that the noise lies
     near the middle of the TPM's normalised scale and a car at 5 m near its upper end.
 
     Attributes:
