@@ -30,7 +30,7 @@ def module_calls(run: Callable[[], Any], depth: int = 1) -> dict[str, ModuleCall
     """The calls of a model's parts while it runs, by their names in the parameters.
 
     Args:
-        run: Applies or initialises a model, also while it is traced.
+        run: Applies or initializes a model, also while it is traced.
         depth: Most levels of parts: 1 for those of the model itself.
 
     Returns:

@@ -45,7 +45,7 @@ def untrained(config: ConfigDict, **overrides: Any) -> Detector:
     inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
     if models.has_camera(model):
         inputs += placeholder(1, model)
-    # Shapes alone: to compile the initialisation takes longer than to measure.
+    # Shapes alone: to compile the initialization takes longer than to measure.
     shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(0)
     variables = jax.tree.map(

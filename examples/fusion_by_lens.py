@@ -55,7 +55,7 @@ def lens_of_frames(root, frames):
     """State of the lens in every row of the frame table of a simulated dataset."""
     marker = pathlib.Path(root) / MARKER
     if not marker.exists():
-        raise UserError(f"{root} is no simulated data set: {MARKER} is missing")
+        raise UserError(f"{root} is no simulated dataset: {MARKER} is missing")
     simulation = files.read_json(marker)["config"]
     if simulation["scenes"] != "procedural":
         raise UserError(f"{root}: the lens is known of procedural scenes only")
@@ -150,7 +150,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
 @click.argument("radar", type=click.Path(exists=True, path_type=pathlib.Path))
 @click.option("--out", type=click.Path(path_type=pathlib.Path), help="Beside FUSION.")
 @click.option(
-    "--data", type=click.Path(exists=True), help="Another data set than the runs'."
+    "--data", type=click.Path(exists=True), help="Another dataset than the runs'."
 )
 @click.option("--split", default="test", show_default=True, help="Or all.")
 @click.option("--resamples", default=1000, show_default=True)

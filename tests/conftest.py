@@ -12,7 +12,7 @@ from collections.abc import Generator, Iterator
 import pytest
 from absl import flags
 
-# Compiling takes most of the time here: LLVM optimises nothing, and fusions are emitted
+# Compiling takes most of the time here: LLVM optimizes nothing, and fusions are emitted
 # the older way, which compiles several times as fast (jaxlib 0.11 has it no more, and ends
 # a process that asks for it). Read by `import jax`. With XLA_FLAGS= in the environment
 # programs are what users get: CI's slow tests of single programs.

@@ -76,7 +76,7 @@ def camera_config() -> ConfigDict:
 
 @functools.lru_cache(maxsize=4)
 def _variables(kind: str) -> Any:
-    """Where zeros, as initialised, would hide what they multiply."""
+    """Where zeros, as initialized, would hide what they multiply."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
     inputs = [np.zeros((1, *small_grid().projection_shape), np.float32)]
     if kind == "camera":
@@ -86,9 +86,9 @@ def _variables(kind: str) -> Any:
 
 
 def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
-    """Random variables of a module, and not as initialised.
+    """Random variables of a module, and not as initialized.
 
-    From shapes alone: to compile an initialisation takes longer than most tests.
+    From shapes alone: to compile an initialization takes longer than most tests.
     """
     shapes = jax.eval_shape(module.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(seed)

@@ -29,16 +29,16 @@ RARE_SHARE = 0.02
 of DinoRADE."""
 
 BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
-"""Names of the numbers of a box, metres and radians."""
+"""Names of the numbers of a box, meters and radians."""
 
 NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
-"""K-Radar's benchmark region: x, y, z from and to, metres, ego frame."""
+"""K-Radar's benchmark region: x, y, z from and to, meters, ego frame."""
 
 MIN_SIZE_M = 0.01
 """What sizes of decoded boxes are clipped to: none is negative."""
 
 WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
-"""K-Radar's wide region: x, y, z from and to, metres, ego frame."""
+"""K-Radar's wide region: x, y, z from and to, meters, ego frame."""
 
 ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
 """Regions by name; bounds are inclusive, and of box centers."""
@@ -48,12 +48,12 @@ class Batch(struct.PyTreeNode):
     """One batch of frames as the pipeline delivers it and the losses consume it.
 
     Attributes:
-        projection: Normalised projections as they are stored, D Doppler channels first,
+        projection: Normalized projections as they are stored, D Doppler channels first,
             then E of elevation.
         boxes: x, y, z, l, w, h, sin yaw, cos yaw; full extents; float32.
         classes: int32 class indices; any value where not `is_valid`.
         is_valid: True where a box is an object and not padding.
-        frame: int32 index of the frame in its data set; -1 where the batch is filled up.
+        frame: int32 index of the frame in its dataset; -1 where the batch is filled up.
         image: `[B, H, W, 3]` uint8 left front camera images, or what the image backbone
             made of them; or None.
         camera: `Camera` or `ReferencePoints` of higher layers, `[B, ...]`; or None.

@@ -1,4 +1,4 @@
-"""What a run needs from a data set: its frames, their radar, images and labels.
+"""What a run needs from a dataset: its frames, their radar, images and labels.
 
 `radejax.data.kradar` reads K-Radar; docs/extending.md has another reader. Readers derive
 from the two classes below.
@@ -26,7 +26,7 @@ from radejax.geometry.radar_grid import RadarGrid
 
 @dataclasses.dataclass
 class Summary:
-    """What reading a data set found.
+    """What reading a dataset found.
 
     Attributes:
         counts: What was read and what was skipped, by reason.
@@ -73,7 +73,7 @@ class LabelledFrame:
     Attributes:
         sequence: Number of the sequence.
         name: Name that is unique in the sequence.
-        boxes: x, y, z, l, w, h, yaw in the radar frame: metres, radians.
+        boxes: x, y, z, l, w, h, yaw in the radar frame: meters, radians.
         classes: Class names of `boxes`.
         environment, time, weather: Conditions, by which results are tabulated.
         radar_path: File of the radar tensor; None where it is missing.
@@ -102,7 +102,7 @@ class LabelledFrame:
 
     @property
     def key(self) -> str:
-        """Name that is unique in a data set: `"1/00033_00001"`."""
+        """Name that is unique in a dataset: `"1/00033_00001"`."""
         return f"{self.sequence}/{self.name}"
 
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
@@ -128,17 +128,17 @@ class LabelledFrame:
 
 
 FrameSequence = Sequence[LabelledFrame]
-"""A data set or a part of one: where only its frames matter."""
+"""A dataset or a part of one: where only its frames matter."""
 
 _F = TypeVar("_F", bound=LabelledFrame)
 
 
 class LabelledFrames(Sequence[_F]):
-    """The frames of a data set in a fixed order; a reader adds how they are found.
+    """The frames of a dataset in a fixed order; a reader adds how they are found.
 
     Attributes:
         grid: Axes of the radar.
-        is_simulated: The data set is simulated.
+        is_simulated: The dataset is simulated.
     """
 
     def __init__(

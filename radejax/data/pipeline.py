@@ -74,7 +74,7 @@ def camera_inputs(
     """Cameras of left front images, each calibration file read once.
 
     Args:
-        frames: Frames of a data set.
+        frames: Frames of a dataset.
         image_size: Height and width of the images that the model sees.
         options: With `allow_missing`, frames without an image or a calibration get a
             black image and a camera whose `is_valid` is False, and how many is logged.

@@ -34,7 +34,7 @@ def project_tensor(
     """Tensor max projection of a 4D radar tensor, in one pass over its memory.
 
     Channels are the maximum over elevation of every Doppler bin, then the maximum over
-    Doppler of every elevation bin, both on a normalised logarithmic scale:
+    Doppler of every elevation bin, both on a normalized logarithmic scale:
     p = (10 log10(power + 1e-10) + 1.2) / 184.3.
 
     Args:
@@ -137,7 +137,7 @@ def _row_maxima(row: Real[np.ndarray, "D E A"]) -> Real[np.ndarray, "A D+E"]:
 def to_log_scale(
     power: Float[np.ndarray, "*cells"], out: Float[np.ndarray, "*cells"] | None = None
 ) -> Float[np.ndarray, "*cells"]:
-    """Linear power to the normalised decibels that the networks see."""
+    """Linear power to the normalized decibels that the networks see."""
     level = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
     return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)

@@ -96,7 +96,7 @@ def decode(
 ) -> Detections:
     """Boxes of a batch of detection maps.
 
-    As released: a peak is a bin that is not exceeded in its 3 x 3 neighbourhood of its
+    As released: a peak is a bin that is not exceeded in its 3 x 3 neighborhood of its
     own class map and scores above the threshold; a bin gives at most one box, of its
     best class (the first of equals); boxes outside the region are dropped; greedy
     bird's-eye-view NMS.
@@ -109,7 +109,7 @@ def decode(
         score_threshold: Peaks must score above it.
         nms_iou: Of two boxes overlapping this much or more the weaker is dropped.
         pre_nms: Peaks that enter NMS at most, the strongest; default 2 K.
-        roi: `[6]` (x0, x1, y0, y1, z0, z1) in metres, bounds included, or None.
+        roi: `[6]` (x0, x1, y0, y1, z0, z1) in meters, bounds included, or None.
         per_class_nms: Only boxes of the same class suppress each other.
         threshold_inclusive: Peaks that score exactly the threshold count (the paper's
             reading; the released code's is exclusive).
@@ -249,7 +249,7 @@ def _with_positive_sizes(boxes: Boxes8) -> Boxes8:
 
 
 def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
-    """Maximum over each bin and its neighbours in range and azimuth."""
+    """Maximum over each bin and its neighbors in range and azimuth."""
     for axis in (1, 2):
         size = values.shape[axis]
         pad = [(0, 0)] * values.ndim

@@ -3,7 +3,7 @@
     <folder>/<score threshold>/<condition>/{preds,gts,desc}/000012.txt and val.txt
 
 with condition "all" or a tag of the frame (weather, environment, time). The number of a
-file is the frame's position in the data set. A line is
+file is the frame's position in the dataset. A line is
 
     sed 0.00 0 0 50 50 150 150 h w l y z x yaw          (ground truth, 2 decimals)
     sed -1 -1 0 50 50 150 150 h w l y z x yaw score     (prediction)

@@ -43,7 +43,7 @@ def candidate_pairs(
     """
     first = np.searchsorted(group_b, group_a)
     count = np.searchsorted(group_b, group_a, side="right") - first
-    # Half diagonals; 3 cm of slack for boxes that a protocol rounds to centimetres.
+    # Half diagonals; 3 cm of slack for boxes that a protocol rounds to centimeters.
     reach_a = 0.5 * np.hypot(box_a[:, 3], box_a[:, 4]) + 0.03
     reach_b = 0.5 * np.hypot(box_b[:, 3], box_b[:, 4])
     parts = []

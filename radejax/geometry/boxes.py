@@ -55,7 +55,7 @@ def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
     """Boxes with sin and cos of yaw: `[..., 7]` -> `[..., 8]`.
 
     Args:
-        boxes: `[..., 7]` x, y, z, l, w, h, yaw; metres and radians.
+        boxes: `[..., 7]` x, y, z, l, w, h, yaw; meters and radians.
 
     Returns:
         `[..., 8]` x, y, z, l, w, h, sin yaw, cos yaw.
@@ -108,10 +108,10 @@ def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
     ```
 
     Args:
-        boxes: `[..., 7]`, or `[..., 8]` whose yaw vector is normalised first.
+        boxes: `[..., 7]`, or `[..., 8]` whose yaw vector is normalized first.
 
     Returns:
-        `[..., 4, 2]` x and y in metres.
+        `[..., 4, 2]` x and y in meters.
 
     Examples:
         >>> bev_corners(np.array([10.0, 0, 0, 4, 2, 1.5, 0])).tolist()
@@ -137,7 +137,7 @@ def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
         boxes: `[..., 7]` or `[..., 8]`, as for `bev_corners`.
 
     Returns:
-        `[..., 8, 3]` x, y, z in metres.
+        `[..., 8, 3]` x, y, z in meters.
 
     Examples:
         >>> corners(np.array([10.0, 0, 0, 4, 2, 1.5, 0]))[[0, 4]].tolist()

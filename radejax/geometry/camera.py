@@ -58,7 +58,7 @@ class Camera(struct.PyTreeNode):
     """A calibrated camera as arrays, one or a batch of them: a pytree for jitted code.
 
     Attributes:
-        cam_from_ego: `[..., 3, 4]` rotation and translation, metres.
+        cam_from_ego: `[..., 3, 4]` rotation and translation, meters.
         intrinsics: `[..., 4]` fx, fy, cx, cy in pixels.
         distortion: `[..., 5]` k1, k2, p1, p2, k3 (OpenCV's order); zeros for none.
         max_radius: `[...]` largest tangent of the viewing angle at which the distortion
@@ -85,13 +85,13 @@ def project(
     for v, where d is the lens distortion (Brown's model as in OpenCV).
 
     Args:
-        points_ego: `[..., 3]` metres.
+        points_ego: `[..., 3]` meters.
         camera: A single camera, or a batch of them whose axes are the points' first.
         depth_offset_m: Added to the depth before the division; the released DinoRADE
             adds 1e-6.
 
     Returns:
-        Pixels `[..., 2]` (u, v) and depth `[...]` in metres. Where the depth is not
+        Pixels `[..., 2]` (u, v) and depth `[...]` in meters. Where the depth is not
         positive the pixels are finite but mean nothing.
 
     Raises:
@@ -129,7 +129,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
 def to_camera(
     points: Real[Any, "*points 3"], camera: Camera
 ) -> Float[Any, "*points 3"]:
-    """Points `[..., 3]` of the ego frame in the camera frame, metres.
+    """Points `[..., 3]` of the ego frame in the camera frame, meters.
 
     Examples:
         >>> raised = np.column_stack([np.eye(3), [0, 0, 2.0]])
@@ -336,7 +336,7 @@ class CameraCalibration(ArrayValues):
     def project_ego(
         self, points_ego: Real[np.ndarray, "*points 3"], image: ImageKind = "raw"
     ) -> tuple[Float[np.ndarray, "*points 2"], Float[np.ndarray, "*points"]]:
-        """Pixels `[..., 2]` and depth `[...]` in metres of ego-frame points `[..., 3]`.
+        """Pixels `[..., 2]` and depth `[...]` in meters of ego-frame points `[..., 3]`.
 
         Pixels mean nothing where the depth is not positive; see `in_image`.
         """

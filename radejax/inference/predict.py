@@ -1,4 +1,4 @@
-"""Detections and embedded images of whole data sets."""
+"""Detections and embedded images of whole datasets."""
 
 from __future__ import annotations
 

@@ -45,14 +45,14 @@ def gaussian_heatmap(
     an object's bin is exactly 1.
 
     Args:
-        boxes: `[..., N, 7 or 8]` boxes in the ego frame, metres; only x, y, l, w count.
+        boxes: `[..., N, 7 or 8]` boxes in the ego frame, meters; only x, y, l, w count.
         classes: `[..., N]` class indices; indices outside `[0, C)` draw nothing.
         is_valid: `[..., N]` bool, True where a box is an object.
         grid: The grid of the maps.
         num_classes: C.
         sigma_mode: "fixed": `sigma_bins` in both axes. "adaptive": 0.3 max(l, w) in both.
             "anisotropic": l / 6 along range and w / 6 along azimuth. The latter two
-            read metres as bins, as released.
+            read meters as bins, as released.
         sigma_bins: Standard deviation for "fixed", in bins.
 
     Returns:
@@ -176,7 +176,7 @@ def _sigmas(
 def _profile(
     center: Int[jax.Array, "*objects"], sigma: PerObject, size: int
 ) -> Float[jax.Array, "*objects {size}"]:
-    """Unnormalised Gaussians over `size` bins: `[...]` centers -> `[..., size]`."""
+    """Unnormalized Gaussians over `size` bins: `[...]` centers -> `[..., size]`."""
     bins = jnp.arange(size, dtype=jnp.float32)
     bins = bins.reshape((1,) * center.ndim + (size,))
     distance = (bins - center[..., None]) / sigma[..., None]

@@ -85,7 +85,7 @@ class CBAM(nn.Module):
 
     Attributes:
         kind: "official" or "paper".
-        num_groups: Groups of the normalisations of the official block.
+        num_groups: Groups of the normalizations of the official block.
         dtype: Dtype of the computation and the output.
     """
 
@@ -111,12 +111,12 @@ class InputStem(nn.Module):
     """Encodes Doppler and elevation channels apart before they are mixed.
 
     1x1 convolutions to `features` and `features / 2` channels, then a 3x3
-    convolution; all with normalisation and SiLU and without bias.
+    convolution; all with normalization and SiLU and without bias.
 
     Attributes:
         features: Output channels.
         doppler_bins: The first so many channels are Doppler, the rest elevation.
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation and the output.
     """
 
@@ -148,7 +148,7 @@ class Backbone(nn.Module):
         doppler_bins: Doppler channels of the input; only the stem tells them apart.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage.
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         cbam: Attention on the skips, or None.
         input_stem: `InputStem` instead of one 3x3 convolution.
         dtype: Dtype of the computation and the output.

@@ -39,8 +39,8 @@ class Linear(nn.Module):
 
     Attributes:
         features: Output channels C'.
-        kernel_init: Initialiser of the kernel.
-        bias_init: Initialiser of the bias.
+        kernel_init: Initializer of the kernel.
+        bias_init: Initializer of the bias.
         dtype: Dtype of the product.
         precision: Of the product, as in `jax.lax.dot`.
     """

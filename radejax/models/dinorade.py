@@ -114,7 +114,7 @@ class DinoRade(RadeNet, kw_only=True):
 
         Args:
             projection: `[B, R, A, D+E]`, Doppler channels first; any float dtype.
-            image: `[B, H, W, 3]` uint8 RGB (floats: normalised already), or what
+            image: `[B, H, W, 3]` uint8 RGB (floats: normalized already), or what
                 `embed` made of it, `[B, h, w, C]`.
             camera: Where the cameras look: a batch of `Camera`, or reference points
                 computed before, one for all frames or one per frame.
@@ -146,7 +146,7 @@ class DinoRade(RadeNet, kw_only=True):
         """What the image backbone makes of images: `__call__` takes it in their place.
 
         Args:
-            image: `[B, H, W, 3]` uint8 RGB, or floats normalised already.
+            image: `[B, H, W, 3]` uint8 RGB, or floats normalized already.
 
         Returns:
             `[B, h, w, C]` float32: patch tokens, or the ResNet's third stage.

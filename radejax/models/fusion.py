@@ -46,7 +46,7 @@ class Fusion(nn.Module):
         necks: A dilated neck on each map before the attention. The released settings
             have them, and only with them are there the paper's 31 M parameters.
         dropout: Rate on the fused map.
-        num_groups: Groups of the necks' normalisations.
+        num_groups: Groups of the necks' normalizations.
         chunk_size: Bins attended at a time; 0 chooses by platform.
         dtype: Dtype of the computation and the output.
         remat: Recompute the necks in the backward pass.

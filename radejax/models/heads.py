@@ -24,11 +24,11 @@ from radejax.models.layers import Conv, ConvGNSiLU, Features, GroupNorm, Map
 
 
 class DilatedResidual(nn.Module):
-    """Dilated `ConvGNSiLU`, convolution, normalisation, plus the input, SiLU.
+    """Dilated `ConvGNSiLU`, convolution, normalization, plus the input, SiLU.
 
     Attributes:
         dilation: Distance of the first convolution's taps in bins.
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation and the output.
     """
 
@@ -55,7 +55,7 @@ class Neck(nn.Module):
     """What every neck has; it keeps shape and width.
 
     Attributes:
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation and the output.
         remat: Recompute blocks in the backward pass instead of storing them.
     """
@@ -99,7 +99,7 @@ class Head(nn.Module):
 
     Attributes:
         features: Output channels.
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
         initial_bias: What the output's initial biases scatter around.
@@ -146,7 +146,7 @@ class Heads(nn.Module):
     Attributes:
         num_classes: Channels of the heatmap.
         kind: Of `HEADS`.
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
         heatmap_prior: Confidence that an untrained model gives every bin: 0.5 as

@@ -29,17 +29,17 @@ HasImage = Bool[jax.Array, " B"]
 Mask = Bool[jax.Array, "B 1 1 1"] | None
 
 _IMAGENET = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
-"""Mean and standard deviation of the colours."""
+"""Mean and standard deviation of the colors."""
 
 
 def normalize(
     image: Real[jax.Array, "B H W 3"], *, standardize: bool = True
 ) -> Float[jax.Array, "B H W 3"]:
-    """Colours to the scale that ImageNet-trained backbones expect.
+    """Colors to the scale that ImageNet-trained backbones expect.
 
     Args:
         image: `[B, H, W, 3]` RGB: uint8 in 0..255, or floats, which are taken as
-            normalised already and returned as they are.
+            normalized already and returned as they are.
         standardize: Subtract ImageNet's mean and divide by its deviation. The
             released DinoRADE only scales to [0, 1] for its ResNet.
 
@@ -63,7 +63,7 @@ class TransposedConv(nn.Module):
     """Transposed 4x4 convolution, stride 2, padding 1: `[B,H,W,C]` -> `[B,2H,2W,C']`.
 
     Every output sees 2x2 inputs through one of four kernels, by its parity: one matrix
-    product of four neighbours to four times the channels, interleaved. As a convolution,
+    product of four neighbors to four times the channels, interleaved. As a convolution,
     of a dilated input or to four times the channels, its weight gradient alone takes
     seconds on a CPU.
 
@@ -106,7 +106,7 @@ class CameraNeck(nn.Module):
     """Image tokens `[B, h, w, C]` -> camera map `[B, 4h, 4w, features]`.
 
     A linear layer, two doublings by transposed convolutions and a 3x3 convolution, the
-    last three with batch normalisation and ReLU.
+    last three with batch normalization and ReLU.
 
     Attributes:
         features: Output channels.
@@ -125,7 +125,7 @@ class CameraNeck(nn.Module):
         Args:
             tokens: `[B, h, w, C]` patch tokens.
             has_image: `[B]` bool; frames without image stay out of the statistics.
-            train: Normalise by the batch and update the running statistics
+            train: Normalize by the batch and update the running statistics
                 (collection "batch_stats").
         """
         x = Dense(self.features, dtype=self.dtype, name="proj")(tokens)
@@ -146,7 +146,7 @@ def counted_frames(has_image: HasImage) -> Bool[jax.Array, "B 1 1 1"]:
 
 
 def batch_norm(name: str, dtype: Any, train: bool) -> nn.BatchNorm:
-    """Batch normalisation as torch has it by default (momentum 0.1, epsilon 1e-5).
+    """Batch normalization as torch has it by default (momentum 0.1, epsilon 1e-5).
 
     torch's running variance is the unbiased one; over a camera map they are equal to
     five digits.
@@ -166,7 +166,7 @@ STRIDE = 16
 
 
 class FrozenBatchNorm(nn.Module):
-    """Batch normalisation by fixed statistics, which are parameters here.
+    """Batch normalization by fixed statistics, which are parameters here.
 
     So a frozen backbone is all in one collection, and nothing updates it.
 
@@ -233,7 +233,7 @@ class Bottleneck(nn.Module):
         features: Channels inside; the output has four times as many.
         stride: Step of the block.
         is_first: The first block of a stage projects its input.
-        frozen: Fixed statistics, else batch normalisation.
+        frozen: Fixed statistics, else batch normalization.
         dtype: Dtype of the computation and the output.
     """
 
@@ -265,7 +265,7 @@ class ResNetTrunk(nn.Module):
     Attributes:
         width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
         depths: Blocks of the three stages.
-        frozen: Fixed statistics, as in a detector; else batch normalisation, to learn
+        frozen: Fixed statistics, as in a detector; else batch normalization, to learn
             the weights of such a trunk (`frozen_params`).
         dtype: Dtype of the computation; the output is float32.
     """

@@ -1,7 +1,7 @@
-"""Convolution, normalisation and resampling layers with torch's default initialisers.
+"""Convolution, normalization and resampling layers with torch's default initializers.
 
 Maps are `[B, R, A, C]`, channels last. Parameters are float32; `dtype` is the dtype
-of the computation and of the output. Statistics of the normalisation are float32 in
+of the computation and of the output. Statistics of the normalization are float32 in
 any dtype. Every layer here equals its torch counterpart to rounding.
 """
 
@@ -82,7 +82,7 @@ class Conv(nn.Module):
 
 
 class Dense(nn.Module):
-    """Linear layer on the last axis with torch's initialiser.
+    """Linear layer on the last axis with torch's initializer.
 
     Attributes:
         features: Output channels.
@@ -138,7 +138,7 @@ def max_pool(x: Map) -> Float[jax.Array, "B R//2 A//2 C"]:
 
 
 class GroupNorm(nn.Module):
-    """Group normalisation over bins and the channels of a group, then scale and bias.
+    """Group normalization over bins and the channels of a group, then scale and bias.
 
     Sums run per channel first and are joined into groups after, so that the map is
     read with channels innermost.
@@ -174,11 +174,11 @@ class GroupNorm(nn.Module):
 
 
 class ConvGNSiLU(nn.Module):
-    """Convolution, group normalisation, SiLU; `[B, R, A, C]` -> `[B, R, A, C']`.
+    """Convolution, group normalization, SiLU; `[B, R, A, C]` -> `[B, R, A, C']`.
 
     Attributes:
         features: Output channels C'.
-        num_groups: Groups of the normalisation.
+        num_groups: Groups of the normalization.
         size: Taps per axis.
         dilation: Distance of taps in bins.
         use_bias: Whether the convolution has a bias.
@@ -213,7 +213,7 @@ class DoubleConvResidual(nn.Module):
 
     Attributes:
         features: Output channels.
-        num_groups: Groups of the normalisations.
+        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation and the output.
     """
 

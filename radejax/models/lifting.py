@@ -63,7 +63,7 @@ class LiftingAxes:
     Hashable, so that it can be part of a module.
 
     Attributes:
-        range_m: First bin center and step, metres.
+        range_m: First bin center and step, meters.
         azimuth_deg: First bin center and step; positive to the right.
         elevation_deg: From and to of the span that `num_elevation` segments divide,
             positive up. (18, -18) for a tensor whose elevation axis points down: code
@@ -109,7 +109,7 @@ class LiftingAxes:
     def centers_ego(
         self, num_range: int, num_azimuth: int
     ) -> Float[np.ndarray, "{num_range} {num_azimuth} {self.num_elevation} 3"]:
-        """Query centers `[R, A, E, 3]` in the ego frame, metres."""
+        """Query centers `[R, A, E, 3]` in the ego frame, meters."""
         range_m = self.range_m[0] + self.range_m[1] * np.arange(num_range)
         azimuth = np.deg2rad(
             self.azimuth_deg[0] + self.azimuth_deg[1] * np.arange(num_azimuth)

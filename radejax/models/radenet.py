@@ -46,7 +46,7 @@ class RadeNet(nn.Module):
         elevation_bins: Remaining channels of the projection.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage, neck and heads.
-        num_groups: Groups of every normalisation; must divide every width.
+        num_groups: Groups of every normalization; must divide every width.
         cbam: "official", "paper" or None; see `radejax.models.backbone.CBAM`.
         input_stem: Encode Doppler and elevation apart first.
         backbone, neck, heads: Of `BACKBONES`, `NECKS` and `HEADS`.

@@ -37,7 +37,7 @@ class ViT(nn.Module):
     """Images `[B, H, W, 3]` -> tokens `[B, 1 + registers + patches, C]`.
 
     Tokens are the class token, the registers, then the patches row by row, after the
-    final normalisation. Any height and width that the patch size divides will do.
+    final normalization. Any height and width that the patch size divides will do.
 
     Attributes:
         hidden_size: Channels C of the tokens.
@@ -89,7 +89,7 @@ class ViT(nn.Module):
     def __call__(
         self, image: Float[jax.Array, "B H W 3"]
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
-        """Tokens of normalised float images `[B, H, W, 3]`, float32."""
+        """Tokens of normalized float images `[B, H, W, 3]`, float32."""
         rows, columns = (n // self.patch_size for n in image.shape[1:3])
         height, width = rows * self.patch_size, columns * self.patch_size
         chex.assert_shape(image, (None, height, width, 3))

@@ -60,11 +60,11 @@ def simulate_dataset(
     num_workers: int | None = None,
     progress: bool = True,
 ) -> pathlib.Path:
-    """Simulates a data set into `root`, or finishes or reuses the one that is there.
+    """Simulates a dataset into `root`, or finishes or reuses the one that is there.
 
     Args:
         config: Plain values as `default_config` returns (a mapping or ConfigDict).
-        root: Folder of the data set; made if missing.
+        root: Folder of the dataset; made if missing.
         num_workers: Processes that make scenes and render images; 0: this one; None: one
             per core, or this one for few frames.
         progress: Show a progress bar.
@@ -75,13 +75,13 @@ def simulate_dataset(
         calibrations and, for a grid other than K-Radar's, `radar_grid.json`.
 
     Raises:
-        UserError: A config value is wrong, `root` holds something else or a data set
+        UserError: A config value is wrong, `root` holds something else or a dataset
             of another config, the disk is full, or a worker was killed.
     """
     checked = SimulationConfig.from_mapping(config)
     root = pathlib.Path(root)
     if _is_finished(root, checked):
-        _log.info("Simulated data set %s is complete: reused.", root)
+        _log.info("Simulated dataset %s is complete: reused.", root)
         return root
     source = make_source(checked)
     num_frames, size = expected_size(checked, source)
@@ -97,7 +97,7 @@ def simulate_dataset(
 
 
 def expected_size(config: SimulationConfig, source: SceneSource) -> tuple[int, float]:
-    """Frames of a data set and about how many bytes its files take."""
+    """Frames of a dataset and about how many bytes its files take."""
     grid = config.make_grid()
     is_whole = config.output == "tesseract"
     numbers = np.prod(grid.shape_drea if is_whole else grid.projection_shape)
@@ -107,28 +107,28 @@ def expected_size(config: SimulationConfig, source: SceneSource) -> tuple[int, f
 
 
 def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
-    """True for a complete data set of this config; an error for anything alien."""
+    """True for a complete dataset of this config; an error for anything alien."""
     if root.exists() and not root.is_dir():
-        raise UserError(f"{root} is a file, expected a folder for the data set")
+        raise UserError(f"{root} is a file, expected a folder for the dataset")
     marker = root / SIMULATION_MARKER
     if not marker.exists():
         if root.exists() and any(not p.name.endswith(".tmp") for p in root.iterdir()):
             raise UserError(
-                f"{root} is not empty and holds no simulated data set;"
+                f"{root} is not empty and holds no simulated dataset;"
                 " choose another folder"
             )
         return False
     files.claim(
         marker,
         _marker(config),
-        "a data set of another simulation config",
+        "a dataset of another simulation config",
         ignore=("finished",),
     )
     return files.read_object(marker, "finished")["finished"] is True
 
 
 def _marker(config: SimulationConfig) -> dict[str, Any]:
-    """What an unfinished data set says of itself; the fingerprint has the version."""
+    """What an unfinished dataset says of itself; the fingerprint has the version."""
     return {
         "config": json.loads(config.to_json()),
         "finished": False,

@@ -191,7 +191,7 @@ _FIRST_TIMESTAMP_S = 1.65e9
 
 @dataclasses.dataclass(frozen=True)
 class FrameSpec:
-    """One frame of a data set before it is simulated.
+    """One frame of a dataset before it is simulated.
 
     Attributes:
         scene_idx: Its index in the scene of the sequence.

@@ -130,7 +130,7 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
 
 
 def _line(i: int) -> dict[str, Any]:
-    """Colour and dash pattern of the i-th line; no two alike among the first 24."""
+    """Color and dash pattern of the i-th line; no two alike among the first 24."""
     return {
         "color": SERIES_COLORS[i % len(SERIES_COLORS)],
         "linestyle": _LINE_STYLES[(i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)],

@@ -1,4 +1,4 @@
-"""A small data set in K-Radar's folders, written with the package's own writers."""
+"""A small dataset in K-Radar's folders, written with the package's own writers."""
 
 import pathlib
 
@@ -56,13 +56,13 @@ def write_kradar(
 
 @pytest.fixture(scope="session")
 def kradar_writer():
-    """The function that writes such a data set."""
+    """The function that writes such a dataset."""
     return write_kradar
 
 
 @pytest.fixture(scope="session")
 def kradar_root(tmp_path_factory) -> pathlib.Path:
-    """A data set of two sequences with six frames each. Do not change it."""
+    """A dataset of two sequences with six frames each. Do not change it."""
     root = tmp_path_factory.mktemp("kradar")
     write_kradar(root)
     return root

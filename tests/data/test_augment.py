@@ -100,7 +100,7 @@ def test_image_is_mirrored_with_its_camera():
     assert mirror(sample(boxes))["image"] is None
 
 
-def test_a_point_has_its_colour_in_the_resized_and_the_mirrored_image(tmp_path):
+def test_a_point_has_its_color_in_the_resized_and_the_mirrored_image(tmp_path):
     """Read as the model samples: pixel i has its center at i + 1/2."""
     ramp = np.broadcast_to(
         2 * np.arange(128, dtype=np.uint8)[None, :, None], (64, 128, 3)
@@ -110,7 +110,7 @@ def test_a_point_has_its_colour_in_the_resized_and_the_mirrored_image(tmp_path):
         CAMERA, intrinsics=(60.0, 60.0, 55.0, 30.0), width=128, height=64
     )
     points = np.array([[20.0, 3.0, 0.0], [30.0, -8.5, 0.0], [15.0, 2.25, 1.0]])
-    colours = []
+    colors = []
     for scale in (1, 2):
         width, height = 128 // scale, 64 // scale
         image = read_left_image(tmp_path / "a.png", (height, width), resize=True)
@@ -119,9 +119,9 @@ def test_a_point_has_its_colour_in_the_resized_and_the_mirrored_image(tmp_path):
         for frame, sign in ((before, 1), (mirror(before), -1)):
             (pixels, _) = project(points * (1, sign, 1), frame["camera"])
             row = frame["image"][0, :, 0].astype(float)
-            colours.append(np.interp(pixels[:, 0] - 0.5, np.arange(width), row))
-    for found in colours[1:]:
-        np.testing.assert_allclose(found, colours[0], atol=1e-6)
+            colors.append(np.interp(pixels[:, 0] - 0.5, np.arange(width), row))
+    for found in colors[1:]:
+        np.testing.assert_allclose(found, colors[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint8])

@@ -173,7 +173,7 @@ def sigmoid(x):
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_peaks_equal_the_definition(seed, inclusive):
     rng = np.random.default_rng(seed)
-    # Few levels: many equal neighbours, equal classes and scores on the threshold.
+    # Few levels: many equal neighbors, equal classes and scores on the threshold.
     logits = rng.integers(-3, 2, (1, 20, 12, C)).astype(np.float32)
     maps = DetectionMaps(jnp.asarray(logits), jnp.zeros((1, 20, 12, 8)))
     threshold = sigmoid(np.float32(0))
@@ -285,7 +285,7 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
 
 
 def overlapping_classes():
-    """Two classes that overlap, in bins that are not neighbours."""
+    """Two classes that overlap, in bins that are not neighbors."""
     logits = np.full((1, 20, 12, C), -8.0, np.float32)
     logits[0, 10, 5, 0], logits[0, 10, 7, 1] = 2, 1
     params = np.zeros((1, 20, 12, 8), np.float32)

@@ -15,7 +15,7 @@ center_distance = load_module(ROOT / "examples" / "center_distance.py")
 
 
 def columns(*rows: tuple, scored: bool = False) -> dict[str, np.ndarray]:
-    """Frame, class, x, y (and score) of boxes of half a metre."""
+    """Frame, class, x, y (and score) of boxes of half a meter."""
     found = {
         "frame": np.array([row[0] for row in rows]),
         "cls": np.array([row[1] for row in rows]),

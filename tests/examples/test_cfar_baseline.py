@@ -1,4 +1,4 @@
-"""The classical detector from a data set to its report."""
+"""The classical detector from a dataset to its report."""
 
 import json
 import pathlib
@@ -17,7 +17,7 @@ from radejax.simulation.dataset import default_config, simulate_dataset
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """A small data set without images, projected."""
+    """A small dataset without images, projected."""
     root = tmp_path_factory.mktemp("data")
     config = default_config() | {
         "train_sequences": 2,

@@ -37,7 +37,7 @@ def test_patches_show_the_classes_that_are_drawn():
     plain_images = _drawn(6)
     flat = _drawn(6, camera_mode="oracle")
     np.testing.assert_array_equal(flat.pixels, plain_images.pixels)
-    # Silhouettes have the colour of their class: where the roadside hides none, each
+    # Silhouettes have the color of their class: where the roadside hides none, each
     # of its pixels is one of the class.
     red = (flat.image[..., 0] > 0) & ~flat.image[..., 1:].any(-1)
     by_patch = red.reshape(6, 2, 16, 8, 16).sum((2, 4))

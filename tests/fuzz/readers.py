@@ -84,7 +84,7 @@ def _read_weights(folder: Folder, suffix: str) -> None:
 
 
 def _of_root(read: object, path: str) -> Reader:
-    """A reader of one file of a small data set."""
+    """A reader of one file of a small dataset."""
     return Reader(_root, lambda folder: read(folder / path), path)
 
 
@@ -108,7 +108,7 @@ READERS |= {
     ),
     "description": _of_root(conditions.read_description, "1/description.txt"),
     "camera yml": _of_root(_camera, "1/cam_1.yml"),
-    "data set": Reader(_root, _read_root, "**/*.txt", 200),
+    "dataset": Reader(_root, _read_root, "**/*.txt", 200),
     "projection npy": Reader(
         functools.partial(_tensor, kind="plain"),
         lambda folder: read_projection_npy(folder / "a.npy"),

@@ -88,7 +88,7 @@ def test_padding_keeps_bins_in_place_unless_stretched():
 
 @settings(deadline=None, max_examples=50)
 @given(st.floats(1, 255), st.floats(0, 106), st.sampled_from([KRADAR, *GRIDS.values()]))
-def test_cells_and_metres_are_inverse(range_cell, azimuth_cell, grid):
+def test_cells_and_meters_are_inverse(range_cell, azimuth_cell, grid):
     position = grid.bin_to_ego(range_cell, azimuth_cell)
     cell = grid.ego_to_bin(position[0], position[1])
     np.testing.assert_allclose(cell, [range_cell, azimuth_cell], atol=1e-9)

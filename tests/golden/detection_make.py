@@ -1,4 +1,4 @@
-"""Makes the golden files of `tests/detection` from the reference data set.
+"""Makes the golden files of `tests/detection` from the reference dataset.
 
     python tests/golden/detection_make.py ../shared/fixtures
 
@@ -8,7 +8,7 @@ The reference boxes come from the released RADE-Net code (commit 9a94d64) with P
 detection_postproc.npz: per case `<case>/<name>`: the blobs from which the test rebuilds
     the maps, the peaks, the boxes before NMS in order of bins, and the rows kept by NMS
     in order of score. Indices agree exactly, box numbers to 4e-6.
-detection_ties.npz: a hand-made map with equal neighbours and equal classes.
+detection_ties.npz: a hand-made map with equal neighbors and equal classes.
 """
 
 import json

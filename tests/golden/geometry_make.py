@@ -1,4 +1,4 @@
-"""Makes the golden files of `tests/geometry` from the reference data set.
+"""Makes the golden files of `tests/geometry` from the reference dataset.
 
     python tests/golden/geometry_make.py ../shared/fixtures
 

@@ -1,4 +1,4 @@
-"""Makes the golden files of `tests/losses` from the reference data set.
+"""Makes the golden files of `tests/losses` from the reference dataset.
 
     python tests/golden/losses_make.py ../shared/fixtures
 

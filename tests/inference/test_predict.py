@@ -1,4 +1,4 @@
-"""Predictions and scores of a data set: the same on one device and on eight."""
+"""Predictions and scores of a dataset: the same on one device and on eight."""
 
 from types import SimpleNamespace
 

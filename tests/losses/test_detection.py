@@ -293,7 +293,7 @@ def test_bfloat16_maps_are_compared_in_float32():
     assert grad.box_params.dtype == jnp.bfloat16
 
 
-def test_normalised_yaw_ignores_the_length_of_the_vector():
+def test_normalized_yaw_ignores_the_length_of_the_vector():
     maps, batch = small_scene(np.random.default_rng(6))
     longer = maps.replace(box_params=maps.box_params.at[..., 6:].multiply(2.5))
     gwd = [

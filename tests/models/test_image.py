@@ -10,7 +10,7 @@ from radejax.models import image as image_lib
 from radejax.models.image import CameraNeck, TransposedConv
 
 
-def test_bytes_become_standardised_colours():
+def test_bytes_become_standardised_colors():
     image = jnp.asarray([[[[0, 255, 51]]]], jnp.uint8)
     expected = [-0.485 / 0.229, (1 - 0.456) / 0.224, (0.2 - 0.406) / 0.225]
     np.testing.assert_allclose(image_lib.normalize(image)[0, 0, 0], expected, rtol=1e-6)
@@ -18,7 +18,7 @@ def test_bytes_become_standardised_colours():
     np.testing.assert_allclose(scaled[0, 0, 0], [0, 1, 0.2], rtol=1e-6)
 
 
-def test_floats_are_normalised_already():
+def test_floats_are_normalized_already():
     image = jnp.full((1, 2, 2, 3), 0.3)
     assert image_lib.normalize(image) is image
 
@@ -46,7 +46,7 @@ def test_strided_convolution():
         )
 
 
-def test_frozen_normalisation_by_its_formula():
+def test_frozen_normalization_by_its_formula():
     x = np.random.default_rng(0).standard_normal((1, 2, 2, 3)).astype(np.float32)
     params = {
         "scale": np.array([1.0, 2.0, 3.0], np.float32),

@@ -84,7 +84,7 @@ def test_group_norm_statistics_are_float32_in_bfloat16():
     np.testing.assert_allclose(actual.astype(jnp.float32), expected, atol=2e-2)
 
 
-def test_initialiser_is_uniform_within_torchs_bound():
+def test_initializer_is_uniform_within_torchs_bound():
     values = uniform_fan_in(25)(jax.random.key(0), (20_000,))
     assert np.abs(values).max() <= 0.2
     # Variance of a uniform distribution: bound squared over 3.

@@ -162,7 +162,7 @@ def test_elevation_weights_sum_to_one(kind):
     weights = jax.jit(network.apply)(variables, elevation)
     chex.assert_shape(weights, (2, 5, 4, 6))
     np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-6)
-    # The MLP sees one bin alone, the CNN its neighbours.
+    # The MLP sees one bin alone, the CNN its neighbors.
     moved = elevation.copy()
     moved[:, 0, 0] += 1
     changed = np.abs(jax.jit(network.apply)(variables, moved) - weights).max(-1) > 1e-7

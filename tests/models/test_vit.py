@@ -100,7 +100,7 @@ def test_shapes_parameters_and_jit(fields):
     chex.assert_shape(tokens, (2, 3 + 2 * 3, 16))
     assert model.num_prefix == 3
     chex.assert_tree_all_finite(tokens)
-    # The final normalisation: zero mean, unit deviation over channels.
+    # The final normalization: zero mean, unit deviation over channels.
     np.testing.assert_allclose(np.mean(tokens, -1), 0, atol=1e-5)
     mlps = 3 if fields else 2
     per_layer = 2 * 32 + 2 * 16 + 4 * 16 * 16 + 3 * 16

@@ -75,10 +75,10 @@ class TestTree:
         power = scipy.io.loadmat(path)["arrDREA"]
         assert power.shape == (8, 32, 5, 24)
         assert power.dtype == np.float32
-        normalised = (10.0 * np.log10(power + 1e-10) + 1.2) / 184.3
-        assert normalised.min() >= 0.0
-        assert normalised.max() <= 1.0
-        assert 0.45 < np.median(normalised) < 0.6  # the noise floor
+        normalized = (10.0 * np.log10(power + 1e-10) + 1.2) / 184.3
+        assert normalized.min() >= 0.0
+        assert normalized.max() <= 1.0
+        assert 0.45 < np.median(normalized) < 0.6  # the noise floor
 
     def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
         cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras

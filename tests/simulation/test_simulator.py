@@ -59,7 +59,7 @@ def test_frames_repeat_and_differ(urban):
     assert np.abs(radar_frame(urban, 2) - radar_frame(urban, 3)).max() > 0.01
 
 
-def test_normalised_values_have_a_floor_and_stay_below_one(urban):
+def test_normalized_values_have_a_floor_and_stay_below_one(urban):
     for weather in ("normal", "rain", "heavysnow"):
         projection = radar_frame(simulator(weather), 0)
         assert 0.4 < projection.min() < 0.55

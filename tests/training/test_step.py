@@ -129,7 +129,7 @@ def plain(tiny: Tiny, start: Any) -> tuple[Any, Any, Any]:
     """Gradient descent, whose step is as exact as the gradient; its step on one device.
 
     Adam divides by the gradient's size, so that rounding of a gradient that is zero
-    (a bias before a normalisation) becomes a whole step.
+    (a bias before a normalization) becomes a whole step.
     """
     optimizer = skip_not_finite(optax.sgd(0.1))
     variables = {"params": start[1].params}

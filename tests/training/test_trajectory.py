@@ -207,7 +207,7 @@ def images(fixture: Mapping[str, np.ndarray], model: Any, variables: Any) -> np.
     return embedded
 
 
-# Their gradient is rounding alone, before a normalisation by batch.
+# Their gradient is rounding alone, before a normalization by batch.
 NO_GRADIENT = [f"image_neck.{n}.0.bias" for n in ("fpn_layer1", "fpn_layer2", "refine")]
 
 

@@ -17,7 +17,7 @@ def test_precision_over_recall_in_order_of_recall():
     assert [ax.get_title() for ax in figure.axes] == ["AP", "B", "C"]
     np.testing.assert_array_equal(one.lines[0].get_xydata(), [[0.1, 1.0], [0.5, 0.8]])
     assert [line.get_label() for line in one.lines] == ["all", "rain"]
-    # Fog has a colour of its own where it is not drawn: rain's is the third.
+    # Fog has a color of its own where it is not drawn: rain's is the third.
     assert one.lines[1].get_color() == SERIES_COLORS[2]
     assert not two.texts
     assert [text.get_text() for text in three.texts] == ["none found"]

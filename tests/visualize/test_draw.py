@@ -31,7 +31,7 @@ def pixels_of(figure) -> np.ndarray:
 
 
 def brightest_tile(figure, ax) -> np.ndarray:
-    """Center, in display coordinates, of the pixels in the strongest colour."""
+    """Center, in display coordinates, of the pixels in the strongest color."""
     picture = pixels_of(figure)
     frame = np.round(ax.get_window_extent().extents).astype(int)
     inside = picture[frame[1] : frame[3], frame[0] : frame[2]]
@@ -48,7 +48,7 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     _, polar = draw.draw_frame(scene).axes
     ax = draw.draw_bev(scene)
     outline = slices.to_polar(np.array([x, y]))
-    # At 5 pixels a metre a bin is 10 pixels deep; its center is hit to one pixel.
+    # At 5 pixels a meter a bin is 10 pixels deep; its center is hit to one pixel.
     for axes, point in ((ax, (y, x)), (polar, outline)):
         tile = brightest_tile(axes.figure, axes)
         np.testing.assert_allclose(tile, axes.transData.transform(point), atol=1.0)
@@ -182,7 +182,7 @@ def test_scenes_share_a_scale_and_have_an_image_above_a_map() -> None:
     figure = draw_scenes(scenes)
     titles = [ax.get_title() for ax in figure.axes]
     assert [title for title in titles if title] == ["fog", "rain"]
-    assert len(figure.axes) == 4  # image and map, map, colour bar
+    assert len(figure.axes) == 4  # image and map, map, color bar
     assert "power" in figure.axes[-1].get_xlabel()
     maps = [mesh for ax in figure.axes[1:3] for mesh in ax.findobj(QuadMesh)]
     assert len({mesh.get_clim() for mesh in maps}) == 1 < len(maps)

@@ -74,6 +74,6 @@ def test_radar_colors_keep_white_and_red_visible():
 
     brightest = luminance(style.COLOR_MAP(1.0))
     assert 1.05 / (brightest + 0.05) > 1.5
-    # Monotone in brightness: readable in grey and under colour blindness.
+    # Monotone in brightness: readable in gray and under color blindness.
     steps = [luminance(style.COLOR_MAP(v)) for v in np.linspace(0, 1, 20)]
     assert (np.diff(steps) > 0).all()

@@ -64,7 +64,7 @@ def test_a_folder_that_is_written_is_the_one_that_was_read(
 
 
 def test_the_first_layers_alone(golden, make, tensors):
-    # Without the final normalisation's statistics, to see where an error starts.
+    # Without the final normalization's statistics, to see where an error starts.
     expected = np.load(golden / "dinorade_vit.npz")
     config = make.TINY_CONFIG | {"num_hidden_layers": 1}
     kept = {

@@ -55,7 +55,7 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 SIMULATION_MARKER = "simulation.json"
-"""File that marks a data set as simulated and has the settings of the simulator."""
+"""File that marks a dataset as simulated and has the settings of the simulator."""
 
 Key = tuple[int, str]
 """Sequence number and frame name, such as `(1, "00033_00001")`."""
@@ -75,7 +75,7 @@ class Frame(LabelledFrame):
     """One labelled frame of K-Radar.
 
     Its `name` has the radar and LiDAR frame numbers, such as `"00033_00001"`; its `boxes`
-    are those that the filters of the data set keep.
+    are those that the filters of the dataset keep.
 
     Attributes:
         header: Frame numbers of all sensors and the time stamp.
@@ -195,7 +195,7 @@ class KRadar(LabelledFrames[Frame]):
         self._camera_folders = _as_paths(camera_calibration)
         self._camera_folders += [r / name for r in roots for name in _CAMERA_FOLDERS]
         self._common_camera = common_camera
-        # Shared by the splits of a data set: no label file is read twice.
+        # Shared by the splits of a dataset: no label file is read twice.
         self._read_label_file = functools.cache(
             functools.partial(
                 read_label_file,
@@ -206,7 +206,7 @@ class KRadar(LabelledFrames[Frame]):
         self._read(split)
 
     def of_split(self, split: PathLike | None) -> KRadar:
-        """Return the frames of a split, as opening the data set with it gives them.
+        """Return the frames of a split, as opening the dataset with it gives them.
 
         Label files that were read before are not read again.
 
@@ -510,7 +510,7 @@ def read_calibration(path: PathLike) -> tuple[int, float, float]:
     """Read `info_calib/calib_radar_lidar.txt`: a header line and three numbers.
 
     Returns:
-        Radar frame number minus LiDAR frame number, and metres to add to a LiDAR x
+        Radar frame number minus LiDAR frame number, and meters to add to a LiDAR x
         and y.
 
     Raises:
@@ -543,7 +543,7 @@ def _read_common(
                 found[path] = read(read_json(path))
     if len(set(found.values())) > 1:
         raise DataError(
-            f"{' and '.join(map(str, found))} differ; data sets of different sensors "
+            f"{' and '.join(map(str, found))} differ; datasets of different sensors "
             "cannot be read as one"
         )
     return next(iter(found.values()), None)
@@ -555,7 +555,7 @@ def _read_common(
 def find_own_labels(
     sequences: dict[int, SequenceFolder], version: str
 ) -> dict[Key, LabelPath]:
-    """Label files in the sequences' own folders, as the data set is delivered."""
+    """Label files in the sequences' own folders, as the dataset is delivered."""
     subfolders = [f"info_label_{version.replace('.', '_')}", "info_label"]
     if version == "v2.0":
         subfolders.insert(1, "info_label_v2")

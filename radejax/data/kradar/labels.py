@@ -42,7 +42,7 @@ VERSIONS = ("v1.0", "v1.1", "v2.0", "v2.1")
 VISIBILITY_FLAGS = ("R", "L", "L1")
 
 _MAX_BYTES = 1 << 18  # K-Radar's largest label files have 3 kB
-_MAX_NUMBER = 1e4  # metres or degrees
+_MAX_NUMBER = 1e4  # meters or degrees
 
 # Every pattern takes linear time.
 _NUMBER = r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)"
@@ -83,7 +83,7 @@ class Label:
 
     Attributes:
         cls: One of `LABEL_CLASSES`.
-        box: x, y, z, l, w, h, yaw: center and full extents in metres in the LiDAR
+        box: x, y, z, l, w, h, yaw: center and full extents in meters in the LiDAR
             frame, heading in radians, not normalized.
         visibility: `R` is visible to the radar, `L` to the LiDAR only, `L1` not judged.
             Versions without the flag (v1.0, v2.0) read `R`: every object counts.

@@ -1,6 +1,6 @@
 """Writers of K-Radar's files: what `kradar` and `projection` read, byte for byte.
 
-The simulator writes its data sets with these. Every file appears under its name only
+The simulator writes its datasets with these. Every file appears under its name only
 when it is complete: writers write beside it and rename.
 """
 
@@ -53,7 +53,7 @@ def write_labels(
 def write_calibration(
     path: str | os.PathLike, frame_difference: int, dx_m: float, dy_m: float
 ) -> None:
-    """Writes `info_calib/calib_radar_lidar.txt`: metres to add to LiDAR positions."""
+    """Writes `info_calib/calib_radar_lidar.txt`: meters to add to LiDAR positions."""
     text = f"frame difference,x,y\n{int(frame_difference)},{float(dx_m)!r},{float(dy_m)!r}\n"
     write_text(path, text)
 
@@ -106,7 +106,7 @@ def write_tesseract(
 
 
 def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
-    """Writes `radar_grid.json` at the root of a data set of another sensor grid."""
+    """Writes `radar_grid.json` at the root of a dataset of another sensor grid."""
     write_text(pathlib.Path(root) / "radar_grid.json", json.dumps(grid.to_dict()))
 
 

@@ -26,7 +26,7 @@ class Detail(NamedTuple):
         block: Index of the block.
         face: `FRONT`, `REAR`, `LEFT`, `RIGHT` or `TOP`.
         u: From and to, from the face's first corner to its second.
-        v: From and to, upward; may leave [0, 1] where the block's neighbour is there.
+        v: From and to, upward; may leave [0, 1] where the block's neighbor is there.
         color: Red, green, blue.
     """
 
@@ -170,7 +170,7 @@ def make_panels(
         white: Snow on everything, 0 to 1.
 
     Returns:
-        Corners, distances and colours.
+        Corners, distances and colors.
     """
     fixed = frame.reflectors
     near = np.hypot(fixed.position_m[:, 0], fixed.position_m[:, 1]) < _FAR_M

@@ -66,7 +66,7 @@ def haze(
     veil: Float[np.ndarray, "3"],
     extinction_per_m: float,
 ) -> Float[np.ndarray, "*points 3"]:
-    """Colours at distances seen through a veil of a colour."""
+    """Colors at distances seen through a veil of a color."""
     clear = np.exp(-extinction_per_m * depth_m)[..., None]
     return color * clear + veil * (1.0 - clear)
 

@@ -19,7 +19,7 @@ from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera import details, lens, shapes
 from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
 
-# K-Radar's values for the pair (see the calibration files of the data set).
+# K-Radar's values for the pair (see the calibration files of the dataset).
 _INTRINSICS = (567.7208, 577.2137, 628.7208, 369.3069)
 _DISTORTION = (-0.028874, 0.000602, 0.003957, -0.005047, 0.0)
 _ANGLES = {"yaw_deg": 88.6, "pitch_deg": 0.6, "roll_deg": 89.6}
@@ -51,7 +51,7 @@ def stereo_calibration(
     """Left and right front camera with K-Radar's intrinsics, scaled to an image size.
 
     Args:
-        radar_from_lidar_m: Metres to add to LiDAR positions to get radar positions.
+        radar_from_lidar_m: Meters to add to LiDAR positions to get radar positions.
         width: Width of one of the two images.
         height: Height.
     """
@@ -87,7 +87,7 @@ class Ground:
     up: Float[np.ndarray, "H W"]
 
 
-@functools.lru_cache(maxsize=4)  # of a data set's cameras, for all its sequences
+@functools.lru_cache(maxsize=4)  # of a dataset's cameras, for all its sequences
 def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
     """Where every pixel's ray meets the ground plane `z = ground_m` (radar frame)."""
     fx, fy, cx, cy = calibration.intrinsics
@@ -115,7 +115,7 @@ def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
 def undistort(
     seen: Float[np.ndarray, "*points 2"], distortion: Float[np.ndarray, "5"]
 ) -> Float[np.ndarray, "*points 2"]:
-    """Inverse of the lens model by fixed-point iteration; normalised coordinates."""
+    """Inverse of the lens model by fixed-point iteration; normalized coordinates."""
     k1, k2, p1, p2, k3 = distortion
     ideal = seen.copy()
     for _ in range(12):
@@ -132,9 +132,9 @@ class CameraRenderer:
     """Draws the front stereo image of frames of one sequence.
 
     Args:
-        sequence: Scene; its conditions choose light, colours and weather.
+        sequence: Scene; its conditions choose light, colors and weather.
         calibrations: Left and right camera.
-        seed: Colours of the objects, drops and flakes.
+        seed: Colors of the objects, drops and flakes.
         cover_lens: Let bad weather cover the lens at times.
         mode: "scene", or "oracle": only silhouettes of the objects, see `silhouettes`.
     """
@@ -192,7 +192,7 @@ class CameraRenderer:
         return np.asarray(canvas)
 
     def silhouettes(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
-        """Objects in the colour of their class on black.
+        """Objects in the color of their class on black.
 
         The nearer the brighter, half as bright at 20 m, near ones before far ones, in
         any weather and light: what a camera that knows classes and distances would see.
@@ -261,7 +261,7 @@ class CameraRenderer:
     def _ground_color(
         self, frame: SceneFrame, ground: Ground
     ) -> Float[np.ndarray, "P 3"]:
-        """Colours of the pixels that show ground."""
+        """Colors of the pixels that show ground."""
         sequence, lanes = self.sequence, self.sequence.lanes_m
         x, y, depth = ground.x_m, ground.y_m, ground.depth_m
         verge = _VERGE.get(sequence.environment, _GRASS)

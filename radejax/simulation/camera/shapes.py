@@ -12,7 +12,7 @@ from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details, lens
 from radejax.simulation.camera.details import Panels
 
-# A block in units of the half extents: x, y, z ranges; colour role; share kept of the
+# A block in units of the half extents: x, y, z ranges; color role; share kept of the
 # length and width at its top (a taper).
 _Block = tuple[
     tuple[float, float],
@@ -100,7 +100,7 @@ class Polygon:
 def object_colors(
     cls: Int[np.ndarray, " N"], rng: np.random.Generator
 ) -> Float[np.ndarray, "N 2 3"]:
-    """Body colour and second colour (legs) of objects by class index."""
+    """Body color and second color (legs) of objects by class index."""
     paint = _PAINT[rng.integers(len(_PAINT), size=len(cls))]
     clothes = _CLOTHES[rng.integers(len(_CLOTHES), size=len(cls))]
     paint = paint * rng.uniform(0.82, 1.08, (len(cls), 1))
@@ -127,7 +127,7 @@ class Light:
 
     Attributes:
         ambient: Brightness, 1 by day.
-        veil: Colour of the haze.
+        veil: Color of the haze.
         extinction_per_m: Density of the haze.
         headlights: True if the ego vehicle lights up what is ahead.
     """
@@ -144,7 +144,7 @@ class Light:
         y_m: Float[np.ndarray, " N"],
         depth_m: Float[np.ndarray, " N"],
     ) -> Float[np.ndarray, "N 3"]:
-        """Colours of surfaces at positions as they appear."""
+        """Colors of surfaces at positions as they appear."""
         brightness = np.full(np.shape(depth_m), self.ambient)
         if self.headlights:
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))

@@ -17,7 +17,7 @@ References:
     Both effects of rain on automotive radar: Zang et al., "The impact of adverse weather
     conditions on autonomous vehicles", IEEE Vehicular Technology Magazine 2019.
     Melting snow attenuates more than rain of its water: Jain and Watson, "Attenuation in
-    melting snow on microwave- and millimetre-wave terrestrial radio links", Electronics
+    melting snow on microwave- and millimeter-wave terrestrial radio links", Electronics
     Letters 1985.
     Reflection: Fresnel's equations; loss of coherence by roughness: Ament, "Toward a
     theory of reflection by a rough surface", Proc. IRE 1953. Asphalt: Locatelli,
@@ -107,7 +107,7 @@ def noise_profile(
     """Mean noise power of range and Doppler cells: receiver plus backscatter.
 
     Many drops in one cell add up to a complex Gaussian, like noise, so they need no
-    scatterers. The cell of beam solid angle W at range R holds R^2 W dR cubic metres,
+    scatterers. The cell of beam solid angle W at range R holds R^2 W dR cubic meters,
     so its power falls with R^-2. Drops stand still in the air: their range rate is
     minus the ego speed, plus a spread, on an axis that wraps around.
 

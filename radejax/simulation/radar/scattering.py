@@ -40,7 +40,7 @@ class ClassScattering:
     """Radar cross-section of one class.
 
     Attributes:
-        rcs_dbsm: Mean over aspects and objects, in dB of the mean of square metres.
+        rcs_dbsm: Mean over aspects and objects, in dB of the mean of square meters.
         spread_db: Standard deviation from object to object.
         num_points: Scattering centers on the whole surface.
         glint: Power of the flash of a flat face at normal incidence, relative to its
@@ -298,7 +298,7 @@ def to_scatterers(
 
     Returns:
         float32 NumPy arrays. The phase of an amplitude is that of the reflection plus
-        `4 pi R / wavelength`, so it turns as the object moves, and neighbours on one
+        `4 pi R / wavelength`, so it turns as the object moves, and neighbors on one
         object add up or cancel from frame to frame.
     """
     position, amplitude = found.position_m, np.sqrt(found.power)
@@ -367,7 +367,7 @@ def scatter_ghosts(
 
     Args:
         objects: Scatterers of the objects of the frame.
-        mirrors_m: Rails and walls, metres left of the ego; near it they run along x.
+        mirrors_m: Rails and walls, meters left of the ego; near it they run along x.
 
     References:
         Ghosts: Kraus et al., "Using machine learning to detect ghost images in

@@ -50,7 +50,7 @@ class RadarParameters:
     """What the sensor is beyond its axes; hashable, so static under `jax.jit`.
 
     K-Radar publishes no link budget. The level is set so that the noise lies
-    near the middle of the TPM's normalised scale and a car at 5 m near its upper end.
+    near the middle of the TPM's normalized scale and a car at 5 m near its upper end.
 
     Attributes:
         gain_db: Received power in dB of 0 dBsm at 1 m on boresight.
@@ -220,7 +220,7 @@ def simulate(
 
 
 def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:
-    """Normalised maxima of one range row."""
+    """Normalized maxima of one range row."""
     maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
     return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
@@ -314,7 +314,7 @@ def _white_noise(
 ) -> Float[jax.Array, " {count}"]:
     """Independent Gaussian numbers of mean square 1/2.
 
-    Neighbours are the real and imaginary part of one complex number, made of one
+    Neighbors are the real and imaginary part of one complex number, made of one
     32-bit number: 20 bits for its power, which is exponential, 12 for its phase.
     """
     counter = lax.iota(jnp.uint32, count)

@@ -117,7 +117,7 @@ def make_surroundings(
         law: Road type.
         road: Centerline.
         length_m: How far they reach.
-        edges: Right and left edge, metres left of the centerline.
+        edges: Right and left edge, meters left of the centerline.
         rng: Source of everything random.
         ground_m: Height of the ground in the radar's frame.
 

@@ -27,7 +27,7 @@ from radejax.simulation.world.scene import (
     Sequence,
     Tracks,
     class_index,
-    travelled,
+    traveled,
 )
 
 MAX_SPEED_MPS = 60.0
@@ -44,7 +44,7 @@ def make_real_sequence(
 
     Args:
         frames: Consecutive frames of one sequence in order, with all their labels.
-        radar_from_lidar_m: Metres to add to LiDAR positions to get radar positions.
+        radar_from_lidar_m: Meters to add to LiDAR positions to get radar positions.
         rng: Source of the surroundings and of what labels do not tell.
 
     Returns:
@@ -57,7 +57,7 @@ def make_real_sequence(
     law = ENVIRONMENTS.get(environment, ENVIRONMENTS["urban"])
     speed = infer_ego_speed(tracks, relative, law.speed_mps)
     periods = np.diff(clock, append=clock[-1] + FRAME_PERIOD_S).clip(0.02, 1.0)
-    along = travelled(speed, periods)
+    along = traveled(speed, periods)
     ground = _ground_height(tracks)
     edges = _road_edges(tracks, law)
     reflectors, mirrors = make_surroundings(
@@ -124,9 +124,9 @@ def relative_velocity(
 ) -> Float[np.ndarray, "F N 2"]:
     """Velocities in the radar's frame from the labels' motion.
 
-    Central differences over neighbouring frames where the track is present on both
+    Central differences over neighboring frames where the track is present on both
     sides, one-sided at its ends, zero for tracks of one frame. Labels jitter by some
-    centimetres, so three velocities in a row are averaged.
+    centimeters, so three velocities in a row are averaged.
     """
     flat = tracks.position_m[..., :2]
     count, present = len(clock), tracks.is_present

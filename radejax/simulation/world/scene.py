@@ -134,9 +134,9 @@ class Sequence:
         tracks: Objects.
         reflectors: Static surroundings.
         road: Centerline, on which the ego drives.
-        lanes_m: Borders of the lanes, metres left of the centerline.
+        lanes_m: Borders of the lanes, meters left of the centerline.
         ground_m: Height of the ground in the radar's frame (negative).
-        mirrors_m: Rails and walls that reflect like mirrors: metres left of the
+        mirrors_m: Rails and walls that reflect like mirrors: meters left of the
             centerline.
     """
 
@@ -170,7 +170,7 @@ class Sequence:
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = _to_ego(fixed.position_m, pose)
         distance = np.hypot(points[:, 0], points[:, 1])
-        # Behind the radar its own vehicle shields; two metres off nothing stands.
+        # Behind the radar its own vehicle shields; two meters off nothing stands.
         seen = np.flatnonzero(
             (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
         )
@@ -195,11 +195,11 @@ class Sequence:
         )
 
 
-def travelled(
+def traveled(
     speed_mps: Float[np.ndarray, " F"],
     period_s: float | Float[np.ndarray, " F"] = FRAME_PERIOD_S,
 ) -> Float[np.ndarray, " F"]:
-    """Metres since the first frame at speeds that are held for a period each."""
+    """Meters since the first frame at speeds that are held for a period each."""
     return np.concatenate([[0.0], np.cumsum((speed_mps * period_s)[:-1])])
 
 

@@ -24,10 +24,10 @@ from radejax.simulation.world.scene import (
     Sequence,
     Tracks,
     class_index,
-    travelled,
+    traveled,
 )
 
-# Length, width, height in metres and their standard deviations.
+# Length, width, height in meters and their standard deviations.
 SIZES = {
     "Sedan": ((4.6, 1.87, 1.55), (0.3, 0.07, 0.12)),
     "Bus or Truck": ((8.2, 2.4, 2.9), (1.9, 0.12, 0.35)),
@@ -63,7 +63,7 @@ def make_sequence(
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * FRAME_PERIOD_S
     speed = rng.uniform(*law.speed_mps) * _speed_wave(clock, rng)
-    along = travelled(speed)
+    along = traveled(speed)
     traffic = _Traffic(law, road, clock, along, speed, rng)
     edges = traffic.fill()
     reflectors, mirrors = make_surroundings(
@@ -159,7 +159,7 @@ class _Traffic:
     def _lane(self, left_m, speed, direction, *, is_ego_lane=False) -> None:
         """A file of vehicles that keep their distances."""
         rng = self.rng
-        way = travelled(speed) * direction
+        way = traveled(speed) * direction
         relative = way - self.ego_along
         along = -30.0 - max(relative.max(), 0.0) + rng.uniform(0.0, 20.0)
         last = SIGHT_M - min(relative.min(), 0.0)

@@ -24,7 +24,7 @@ HEADER = (
 
 
 def open_sequence(root, number=1, **options):
-    """A data set of one frame of a sequence."""
+    """A dataset of one frame of a sequence."""
     touch(root / f"{number}/info_label/{LABEL}.txt", HEADER)
     return KRadar(root, **options)
 
@@ -151,7 +151,7 @@ def test_a_root_of_symbolic_links(kradar_root, tmp_path):
     assert KRadar(tmp_path)[0].tesseract_path is not None
 
 
-# Files of a whole data set ----------------------------------------------------------
+# Files of a whole dataset ----------------------------------------------------------
 
 
 def test_split_files_and_camera_calibration_are_found(tmp_path):
@@ -195,7 +195,7 @@ def test_grid_of_the_roots(tmp_path):
     open_sequence(b)
     assert KRadar([a, b]).grid == grid
     write.write_grid(b, dataclasses.replace(grid, fov_range_m=50.0))
-    with pytest.raises(DataError, match="data sets of different sensors"):
+    with pytest.raises(DataError, match="datasets of different sensors"):
         KRadar([a, b])
     broken = ('{"range_m": 3}', "[" * 100_000, "9" * 5000, '{"range_m": 1e400}', "1")
     for text in broken:

@@ -12,7 +12,7 @@ KEYS = [(1, f"{i:05d}_{i:05d}") for i in range(8)] + [(2, "00000_00000")]
 
 
 def select(tmp_path, **options):
-    """Keys of the selected frames, and the data set."""
+    """Keys of the selected frames, and the dataset."""
     for sequence, name in KEYS:
         path = tmp_path / f"labels/{sequence}/{name}.txt"
         write.write_labels(path, [int(name[:5])] * 5, 0.5, [])

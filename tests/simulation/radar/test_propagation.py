@@ -59,7 +59,7 @@ def test_order_of_weathers():
     assert clutter("lightsnow") > clutter("fog") > clutter("normal") * 0.999
 
 
-def test_rain_is_ten_millimetres_an_hour():
+def test_rain_is_ten_millimeters_an_hour():
     # ITU-R P.838-3 at 77 GHz, horizontal: k = 1.132, alpha = 0.7177; and 24 dBZ in
     # Rayleigh's law, pi^5 |K|^2 Z / lambda^4 with |K|^2 = 0.7.
     law = propagation.WEATHERS["rain"]

@@ -62,7 +62,7 @@ class TestCrossSection:
         gain = scattering.face_gain(cosine, centers.glint[:, None])
         power = centers.power_m2 * gain.mean(1)
         rcs = np.bincount(centers.track, power)
-        # Mean in square metres within the spread's statistical error.
+        # Mean in square meters within the spread's statistical error.
         relative = np.sqrt(np.exp((law.spread_db * np.log(10) / 10) ** 2) - 1)
         limit = 4.0 * relative / np.sqrt(count) + 0.05
         assert rcs.mean() / 10 ** (law.rcs_dbsm / 10) == pytest.approx(1.0, abs=limit)

@@ -102,7 +102,7 @@ class TestPointTarget:
     @pytest.mark.parametrize("shift", [-0.4, -0.15, 0.1, 0.35])
     def test_sub_bin_position_by_interpolation(self, shift):
         # For a Hann window the ratio of the two largest bins gives the position:
-        # shift = (2 m - 1) / (m + 1), m = larger neighbour / peak (amplitudes).
+        # shift = (2 m - 1) / (m + 1), m = larger neighbor / peak (amplitudes).
         step_d = GRID.doppler_mps[1] - GRID.doppler_mps[0]
         power = tesseract(
             points(
@@ -203,7 +203,7 @@ class TestPhysics:
 
     def test_energy_does_not_depend_on_the_grid(self):
         # A range axis twice as fine over the same resolution: twice the cells, so
-        # energy per metre stays.
+        # energy per meter stays.
         fine = RadarGrid.reduced(
             num_doppler=16, num_range=63, num_elevation=9, num_azimuth=24,
             max_range_m=31.0,
@@ -245,11 +245,11 @@ class TestNoise:
     def test_frames_and_range_rows_are_independent(self):
         first = tesseract(self.NONE, noise=self.POWER)
         second = tesseract(self.NONE, noise=self.POWER, seed=(2,))
-        limit = 8.0 / np.sqrt(first.size)  # neighbours in a row are not independent
+        limit = 8.0 / np.sqrt(first.size)  # neighbors in a row are not independent
         for a, b in ((first, second), (first[:, 1:], first[:, :-1])):
             assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < limit
 
-    def test_neighbours_correlate_as_windows_and_arrays_say(self):
+    def test_neighbors_correlate_as_windows_and_arrays_say(self):
         # Powers of complex Gaussian noise correlate by the square of the field's
         # correlation, here summed over samples and antennas in float64.
         noise = np.mean(

@@ -45,7 +45,7 @@ class TestOcclusion:
 
     def test_turned_box(self):
         turned = self.BOX.copy()
-        turned[0, 6] = np.pi / 2  # now 4 m across: 1.7 m off centre is inside
+        turned[0, 6] = np.pi / 2  # now 4 m across: 1.7 m off center is inside
         point = np.array([[40.0, 3.4, 0.0]])
         assert scene.is_blocked(point, turned, np.array([-1]))[0]
         assert not scene.is_blocked(point, self.BOX, np.array([-1]))[0]
