@@ -141,6 +141,20 @@ class Command(Program):
         text = "Show tracebacks of user errors."
         self.params.append(click.Option(["--debug"], is_flag=True, help=text))
 
+    def format_options(
+        self, ctx: click.Context, formatter: click.HelpFormatter
+    ) -> None:
+        """Write the options in the groups of `together`, "Options" for the others."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if isinstance(parameter, click.Option) and record is not None:
+                group = vars(parameter).get("group", "Options")
+                groups.setdefault(group, []).append(record)
+        for group, records in groups.items():
+            with formatter.section(group):
+                formatter.write_dl(records)
+
     def invoke(self, ctx: click.Context) -> Any:
         with exit_codes(debug=ctx.params.pop("debug")):
             return super().invoke(ctx)
@@ -197,12 +211,17 @@ def several(
     )
 
 
-def together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Several options as one decorator, in the order of the help."""
+def together(
+    *options: Callable[[Any], Any], group: str = "Options"
+) -> Callable[[Any], Any]:
+    """Several options as one decorator, in the order and with a heading of the help."""
 
     def decorate(command: Any) -> Any:
+        count = len(getattr(command, "__click_params__", ()))
         for option in reversed(options):
             command = option(command)
+        for parameter in command.__click_params__[count:]:
+            parameter.group = group
         return command
 
     return decorate

@@ -23,11 +23,16 @@ _DATA = together(
         default="test",
         help="train, test, all, validation (of a run), or a split file.",
     ),
-    several("--data", help="Roots of K-Radar. Default: those of the run."),
+    several(
+        "--data",
+        help="Roots of K-Radar. Default: those of the run, or the ground truth next to the "
+        "predictions.",
+    ),
     click.option(
         "--label-version", help="Version of the labels. Default: v2.1, or the run's."
     ),
     entry.part,
+    group="Data",
 )
 _SETTINGS = together(
     several(
@@ -58,8 +63,8 @@ _SETTINGS = together(
     click.option(
         "--empty-frames",
         type=click.Choice(["protocol", "class", "frame", "none"]),
-        help="Frames to ignore: without the class, without any object, none, or as each "
-        "protocol does (default).",
+        help="Frames to ignore: those of the protocol's rule, those without the class, "
+        "those without any object, or none. Default: protocol, or the run's.",
     ),
     click.option(
         "--invalid-sizes",
@@ -73,10 +78,9 @@ _SETTINGS = together(
         help="Resamples of sequences for 95 % intervals; 0: none. Default: 200 (score), "
         "2000 (compare), or the run's.",
     ),
-    entry.json_option,
+    group="Metrics",
 )
-_FILES = together(
-    _DATA,
+_PREDICTIONS = together(
     click.option(
         "--ground-truth",
         help="Ground-truth file with frames.json next to it, or folder of a report or of a "
@@ -91,7 +95,7 @@ _FILES = together(
     click.option(
         "--yaw-degrees", is_flag=True, help="Yaws of predictions are in degrees."
     ),
-    _SETTINGS,
+    group="Data",
 )
 _OTHER_DATA = (
     *("data", "labels", "label_version", "sequences", "weather"),
@@ -106,7 +110,7 @@ _OTHER_DATA = (
 @click.option("--out", help="Output folder. Default: in the workdir.")
 @click.option("--name", "run", help="Name of the run in tables.")
 @_DATA
-@entry.beside_data
+@together(entry.beside_data, group="Data")
 @entry.image_backbone
 @click.option(
     "--shuffle-images",
@@ -119,6 +123,7 @@ _OTHER_DATA = (
 @click.option("--batch-size", type=int, help="Frames per batch.")
 @click.option("--num-visualizations", type=int, help="Number of frames to draw.")
 @_SETTINGS
+@entry.json_option
 def evaluate(
     run_folder: str | None, workdir: str | None, as_json: bool, **options: Any
 ) -> None:
@@ -146,7 +151,10 @@ def evaluate(
 @click.argument("predictions")
 @click.option("--out", help="Output folder. Default: next to the predictions.")
 @click.option("--name", help="Name of the run in tables.")
-@_FILES
+@_DATA
+@_PREDICTIONS
+@_SETTINGS
+@entry.json_option
 def score(
     predictions: str, out: str | None, name: str | None, as_json: bool, **options: Any
 ) -> None:
@@ -170,7 +178,10 @@ def score(
 @click.command(cls=entry.Command)
 @click.argument("runs", nargs=-1, metavar="A B [C ...]")
 @click.option("--out", help="Folder to write the comparison to. Default: none.")
-@_FILES
+@_DATA
+@_PREDICTIONS
+@_SETTINGS
+@entry.json_option
 def compare(
     runs: tuple[str, ...], out: str | None, as_json: bool, **options: Any
 ) -> None:

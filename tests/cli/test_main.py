@@ -42,6 +42,14 @@ def test_help_shows_an_example(command: list[str]) -> None:
     assert "Example: radejax " + " ".join(command) in " ".join(result.output.split())
 
 
+def test_help_of_evaluate_has_groups_of_options() -> None:
+    text = _run("evaluate", "--help").output
+    options, data, metrics = (
+        text.index(f"\n{name}:") for name in ("Options", "Data", "Metrics")
+    )
+    assert options < data < text.index("--records") < metrics < text.index("--iou")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
