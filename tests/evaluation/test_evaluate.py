@@ -217,7 +217,10 @@ def test_golden_scenes(golden):
         for p, name in enumerate(data["protocols"].tolist()):
             protocol = NAMES_IN_GOLDEN.get(name, name)
             for c, cut in enumerate(data["cuts"].tolist()):
-                terms = {"iou_thresholds": data["ious"], "score_threshold": cut}
+                terms = {
+                    "iou_thresholds": data["ious"].tolist(),
+                    "score_threshold": cut,
+                }
                 ap = [result.ap for result in shared_set.results(protocol, **terms)]
                 expected = data[f"{scene}_ap"][p, c].reshape(-1)
                 np.testing.assert_allclose(ap, expected, atol=1e-9, err_msg=protocol)
