@@ -162,7 +162,7 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
     help="Seed of the scene; the model was trained on scenes of seed 0.",
 )
 def demo(out: pathlib.Path, seed: int) -> None:
-    """Simulate one frame, detect its objects with a small trained model, draw both.
+    """Simulate one frame, detect its objects with a bundled model and draw the result.
 
     Only this package is needed. The model is that of the quickstart: it was trained on
     simulated frames of a coarse radar, not on K-Radar's.
