@@ -148,7 +148,7 @@ def evaluate(
 
 
 @click.command(cls=entry.Command)
-@click.argument("predictions")
+@click.argument("predictions", type=entry.EXISTING)
 @click.option("--out", help="Output folder. Default: next to the predictions.")
 @click.option("--name", help="Name of the run in tables.")
 @_DATA
@@ -176,7 +176,7 @@ def score(
 
 
 @click.command(cls=entry.Command)
-@click.argument("runs", nargs=-1, metavar="A B [C ...]")
+@click.argument("runs", nargs=-1, type=entry.EXISTING, metavar="A B [C ...]")
 @click.option("--out", help="Folder to write the comparison to. Default: none.")
 @_DATA
 @_PREDICTIONS
