@@ -184,13 +184,14 @@ class Evaluation:
     ) -> None:
         """Writes figures of frames, one of all weathers, and the curves of the run."""
         frames = self._frames
+        suffix = ", simulated" if frames.is_simulated else ""
         for name, figure in self._figures(
             predictions, self._options.num_visualizations
         ):
             save_figure(figure, folder / "figures" / f"{name}.png")
         if (folder / "figures").exists():  # the layout of RADE-Net's Figure 4
             scenes = [
-                self._scene(predictions, i, title=f"{name} ({frames[i].key})")
+                self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
                 for name, i in figures.fullest_of_weathers(frames).items()
             ]
             save_figure(draw_scenes(scenes), folder / "scenes.png")

@@ -135,3 +135,27 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     name = f"{tmp_path.name} ({remark})" if remark else tmp_path.name
     assert written["run"] == name
     assert ("may not be reported" in caplog.text) == bool(remark)
+
+
+@pytest.mark.parametrize("is_simulated", [True, False])
+def test_titles_of_scenes_say_whether_they_are_simulated(
+    is_simulated: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Frames(list[Any]):
+        pass
+
+    frames = Frames([SimpleNamespace(key="1/00033_00001", weather="fog", boxes=[])])
+    frames.is_simulated = is_simulated
+    titles: list[str] = []
+    (tmp_path / "figures").mkdir()
+    monkeypatch.setattr(evaluate, "draw_scenes", titles.extend)
+    monkeypatch.setattr(evaluate, "save_figure", lambda *_: None)
+    monkeypatch.setattr(evaluate.figures, "draw_curves", lambda *_, **__: None)
+    evaluation: Any = SimpleNamespace(
+        _frames=frames,
+        _options=SimpleNamespace(num_visualizations=1),
+        _figures=lambda *_: [],
+        _scene=lambda _, __, title: title,
+    )
+    evaluate.Evaluation._write_figures(evaluation, {}, tmp_path, tmp_path)
+    assert titles == [f"fog (1/00033_00001){', simulated' if is_simulated else ''}"]
