@@ -77,7 +77,7 @@ def tpm(machine):
 
 
 def nms(machine):
-    """Peaks to boxes, against the released loops in Python."""
+    """Decoding of peaks to boxes, compared with the released Python loops."""
     for peaks in (40, 100):
         maps, loops = inputs.make_maps(peaks), inputs.peaks_on_host(peaks)
         ours = inputs.jitted_decode(128)
@@ -97,7 +97,7 @@ def nms(machine):
 
 
 def evaluate(machine):
-    """A test split's worth of predictions, every protocol, all weathers."""
+    """Evaluation of as many predictions as the test split has: every protocol and weather."""
     for false_per_frame in (2, 50):
         truth, found, frames = inputs.synthetic_set(false_per_frame=false_per_frame)
         options = EvaluationOptions(protocols=tuple(PROTOCOLS))
@@ -114,7 +114,7 @@ def evaluate(machine):
 
 
 def load(machine):
-    """Records to host batches of 8, against the released `.npy` files."""
+    """Loading of records as host batches of 8, compared with the released `.npy` files."""
     size, count = 8, 128
     with contextlib.ExitStack() as stack:
         columns = {}
@@ -123,7 +123,7 @@ def load(machine):
             table = make_table(source, inputs.labelled(source), max_objects=32)
             batches = make_loader(table, LoaderOptions(size))
             take = functools.partial(itertools.islice, batches, count // size)
-            # The last batch alone is kept, as in training.
+            # Only the last batch is kept, as in training.
             columns[name] = functools.partial(
                 timed, lambda take=take: collections.deque(take(), maxlen=1)
             )
@@ -155,7 +155,7 @@ def simulate(machine):
 
 
 def deploy(machine):
-    """What `radejax export` writes, beside the detector that it was written from."""
+    """Exported programs of `radejax export`, compared with the detector that was exported."""
     has_onnx = importlib.util.find_spec("onnxruntime") and machine["platform"] == "cpu"
     for name in ("quickstart", "radenet"):
         config = load_config(name)
@@ -203,4 +203,4 @@ BENCHMARKS = {
     "start": (start.start, 240),
 }
 """Function, and seconds that it takes on two cores, by name for `--only`, in the order in
-which they are run: what matters most comes first."""
+which they are run: the most important ones first."""

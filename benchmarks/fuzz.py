@@ -24,7 +24,7 @@ AT_ONCE = 1000
 
 
 def fuzz(name, seconds, start):
-    """Counts and wrong outcomes of one reader."""
+    """Run one reader on corrupted files; returns its counts and the inputs that it mishandled."""
     total, all_wrong, end = collections.Counter(), [], time.time() + seconds
     while not total or time.time() < end:
         counts, wrong = engine.counts(name, start, AT_ONCE)
@@ -35,7 +35,7 @@ def fuzz(name, seconds, start):
 
 
 def keep(name, number):
-    """Put an input into the corpus."""
+    """Add an input to the corpus."""
     with tempfile.TemporaryDirectory() as folder:
         case = engine.Case(name, READERS[name], pathlib.Path(folder))
         path, content = case.content(number)
@@ -45,7 +45,7 @@ def keep(name, number):
 
 
 def table(results):
-    """Markdown: a row per reader, and what they raised."""
+    """Markdown table with one row per reader and the exceptions that it raised."""
     lines = ["| reader | inputs | read | refused | wrong |", "|---|---|---|---|---|"]
     for name, (counts, wrong) in results.items():
         refused = counts.total() - counts["read"] - len(wrong)

@@ -68,7 +68,7 @@ def frames_of(size, **camera):
 
 
 def simulator_of(count, weather="rain"):
-    """Radar inputs of frames of a scene, and the function that makes projections of them."""
+    """Inputs of the simulated radar for frames of a scene, and the function that projects them."""
     config = SimulationConfig.from_mapping(default_config() | FULL_SIZE)
     sequence = make_sequence(
         1, environment="urban", time="day", weather=weather, num_frames=count,
@@ -85,7 +85,7 @@ def simulator_of(count, weather="rain"):
 
 @contextlib.contextmanager
 def folder_of_records(count, grid, dtype):
-    """Random projections as records, while the block runs."""
+    """Context with a folder of random projections as records."""
     levels = np.random.default_rng(0).random(grid.projection_shape, np.float32)
     with tempfile.TemporaryDirectory() as folder:
         source = {"grid": grid.to_dict()}
@@ -96,7 +96,7 @@ def folder_of_records(count, grid, dtype):
 
 
 def labelled(records):
-    """The frames of records with five boxes each."""
+    """Frames of the records, with five boxes each."""
     box = np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]])
     return [
         types.SimpleNamespace(
@@ -117,7 +117,7 @@ def write_npy(folder, count, grid):
 
 
 def read_npy(paths, size, count):
-    """`np.load` and `np.stack` of `count` frames, the files again and again."""
+    """Read `count` frames with `np.load` and `np.stack`, the same files repeatedly."""
     names = itertools.cycle(paths)
     for _ in range(count // size):
         np.stack([np.load(path) for path in itertools.islice(names, size)])
@@ -131,7 +131,7 @@ THRESHOLD, NMS_IOU = 0.3, 0.3
 
 
 def make_maps(num_peaks: int, seed: int = 0) -> DetectionMaps:
-    """Single-bin peaks of distinct scores, far enough apart not to hide each other."""
+    """Maps with single-bin peaks of distinct scores, too far apart to suppress each other."""
     rng = np.random.default_rng(seed)
     logits = rng.uniform(-6, -4, MAP_SHAPE).astype(np.float32)
     cells = [(i, j) for i in range(20, 256, 3) for j in range(1, 111, 3)]
@@ -146,7 +146,7 @@ def make_maps(num_peaks: int, seed: int = 0) -> DetectionMaps:
 
 
 def loop_decode(logits: np.ndarray, params: np.ndarray) -> list[tuple]:
-    """(score, class, box) of every peak, bin by bin, then NMS: by descending score."""
+    """Decode (score, class, box) of every peak in a loop, then apply NMS; by descending score."""
     scores = 1 / (1 + np.exp(-logits))
     around = np.pad(scores, [(1, 1), (1, 1), (0, 0)], constant_values=-np.inf)
     around = np.lib.stride_tricks.sliding_window_view(around, (3, 3), (0, 1))
@@ -162,7 +162,7 @@ def loop_decode(logits: np.ndarray, params: np.ndarray) -> list[tuple]:
 
 
 def loop_nms(found: list[tuple]) -> list[tuple]:
-    """Keeps the best box, drops what overlaps it, and so on with the rest."""
+    """Greedy NMS in a loop: keep the best box, drop the boxes that overlap it, repeat."""
     kept = []
     while found:
         best, rest = found[0], found[1:]
@@ -178,7 +178,7 @@ def loop_iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def jitted_decode(pre_nms):
-    """Maps to boxes; so many peaks may enter NMS."""
+    """Jitted decoding of maps to boxes with the given number of peaks before NMS."""
     return jax.jit(
         functools.partial(
             decode,
@@ -192,7 +192,7 @@ def jitted_decode(pre_nms):
 
 
 def peaks_on_host(num_peaks):
-    """Arguments of `loop_decode`: one frame's maps."""
+    """Arguments of `loop_decode` for one frame's maps."""
     maps = make_maps(num_peaks)
     return [np.asarray(x[0]) for x in (maps.heatmap_logits, maps.box_params)]
 
@@ -253,7 +253,7 @@ def synthetic_set(num_frames: int = 17536, false_per_frame: float = 2.0, seed: i
 
 
 def onnx_session(path):
-    """Function of a projection: outputs of an exported detector, nothing left out."""
+    """Function from a projection to all outputs of an exported detector."""
     import onnxruntime  # of the extra "onnx"
 
     session = onnxruntime.InferenceSession(path)

@@ -11,13 +11,13 @@ import flax.linen as nn
 
 @dataclasses.dataclass(frozen=True)
 class ModuleCall:
-    """One call of a part.
+    """One call of a module.
 
     Attributes:
-        module: The part, of no model: it takes its own share of the variables.
-        args: Arrays that it was called with.
-        kwargs: Settings, such as `train=False`.
-        output: What it returned.
+        module: The unbound module; apply it with its own part of the variables.
+        args: Arrays of the call.
+        kwargs: Other arguments, such as `train=False`.
+        output: Result of the call.
     """
 
     module: nn.Module

@@ -44,7 +44,7 @@ COMPILED = {("bfloat16", 8), ("bfloat16", 10), ("tf32", 8), ("tf32", 10)}
 
 
 def settings(machine, those):
-    """Pairs of dtype and batch size that fit."""
+    """Pairs of dtype and batch size that fit into memory."""
     return [("float32", 1)] if machine["platform"] == "cpu" else those
 
 
@@ -63,7 +63,7 @@ def random_variables(model, *arguments):
 
 
 def network(path, dtype, **fields):
-    """Config, model, and the precision of its products."""
+    """Config, model and precision of its matrix products."""
     config = load_config(str(CONFIGS / path))
     config.model.update(
         dtype="bfloat16" if dtype == "bfloat16" else "float32", **fields
@@ -73,7 +73,7 @@ def network(path, dtype, **fields):
 
 
 def torch_state(model, variables):
-    """Tensors of a `DinoRade` by the names of `torch_dinorade.DinoRade`."""
+    """Parameters with the tensor names of `torch_dinorade.DinoRade`."""
     params = dict(variables["params"])
     names = radenet_torch.module_names(len(model.widths), model.heads)
     for part in ("radar_neck", "camera_neck"):
@@ -105,7 +105,7 @@ def rivals(machine, *arguments):
 
 
 def same_maps(machine, maps):
-    """Difference of our maps from those that torch has built; None without torch."""
+    """Difference between the maps of radejax and torch; None without torch."""
     if not machine["rival"]:
         return None
     ours = [np.moveaxis(np.asarray(x), -1, 1) for x in jax.tree.leaves(maps)]
@@ -115,9 +115,9 @@ def same_maps(machine, maps):
 
 
 def step_of(config, model, variables, batch, precision):
-    """The package's training step on a state that it keeps, and its cost.
+    """Training step of radejax, which keeps its state, and the fields of a `Case` with its cost.
 
-    The function takes a batch, or the one given here.
+    The function takes a batch or uses the one given here.
     """
     optimizer = make_optimizer(lambda _: 1e-4, weight_decay=0.01)
     state = create_state(
@@ -197,7 +197,7 @@ def radenet_training(machine):
 
 
 def feeding(machine):
-    """Records from the loader into RADE-Net's training step."""
+    """Training steps of RADE-Net with batches from the loader."""
     dtype, size = ("float32", 1) if machine["platform"] == "cpu" else ("bfloat16", 8)
     config, model, precision = network("radenet.py", dtype)
     with inputs.folder_of_records(32, GRID, "float16") as records:
@@ -230,7 +230,7 @@ def feeding(machine):
 
 
 def dinorade(machine, task="forward"):
-    """DinoRADE from image and projection: forward pass, or training step."""
+    """DinoRADE from image and projection: forward pass or training step."""
     sizes = (1, 8, 10) if task == "forward" else (8,)
     for dtype, size in settings(
         machine, list(itertools.product(("bfloat16", "tf32"), sizes))
@@ -331,7 +331,7 @@ def attention(machine):
 
 
 def detector(machine):
-    """Tesseracts in host memory to boxes, beside the released order of things."""
+    """Tesseracts in host memory to boxes, compared with the released sequence of steps."""
     is_cpu = machine["platform"] == "cpu"
     for dtype, size in itertools.product(
         ("float32",) if is_cpu else ("bfloat16", "tf32"), (1, 10)

@@ -13,7 +13,7 @@ BEGIN, END = "<!-- tables: benchmarks/run.py -->", "<!-- end of tables -->"
 
 
 def store(run, folder):
-    """Write a run into its device's file, which keeps the other measurements."""
+    """Write a run into its device's file and keep the file's other measurements."""
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^a-z0-9]+", "_", run["device"].lower()).strip("_")
     path = folder / f"{name}.json"
@@ -26,7 +26,7 @@ def store(run, folder):
 
 
 def write_page():
-    """Write the tables of all JSON files between the two marks of the page."""
+    """Write the tables of all JSON files between the two markers of the page."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
     before, rest = PAGE.read_text().split(BEGIN)
     _, after = rest.split(END)
@@ -35,14 +35,14 @@ def write_page():
 
 
 def table(result):
-    """Markdown table of one file."""
+    """Markdown table of one JSON file."""
     if "tables" in result:
         return "\n\n".join(map(plain_table, result["tables"]))
     return devices_table(result["runs"]) if "runs" in result else programs_table(result)
 
 
 def plain_table(content):
-    """Markdown of a table that was written by hand, with title and text."""
+    """Markdown of a table written by hand, with title and text."""
     lines = [f"### {content['title']}", "", content["text"], ""]
     head, rows = content["columns"], content["rows"]
     lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
@@ -50,7 +50,7 @@ def plain_table(content):
 
 
 def devices_table(runs):
-    """Markdown of what `run.py` measured on one device, in one run or several."""
+    """Markdown of the measurements of `run.py` on one device, from one or several runs."""
     lines = [
         f"### {runs[-1]['device']}",
         "",
@@ -78,7 +78,7 @@ def devices_table(runs):
 
 
 def row_text(row, where):
-    """A line of a device's table; on a CPU, CPU time is shown and compared too."""
+    """Row of a device's table; on a CPU, CPU times are shown and compared as well."""
     is_cpu = where == "cpu"
     clock = row["processor_s" if is_cpu else "wall_s"]
     others = [name for name in clock if name != "radejax"]
@@ -109,20 +109,20 @@ def row_text(row, where):
 
 
 def duration(seconds):
-    """Three digits with a unit."""
+    """Duration with three digits and a unit."""
     if seconds >= 1:
         return f"{seconds:.3g} s"
     return f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.3g} us"
 
 
 def programs_table(result):
-    """Markdown of what `programs.py` found."""
+    """Markdown of the results of `programs.py`."""
     devices = list(result["programs"][0]["least_ms_a_frame"])
     lines = [
         "### Programs, lowered for CUDA and not run",
         "",
         f"`{result['command']}`, {result['date']}, jax {result['jax']}, bfloat16. Bytes are "
-        "those of matrix products, convolutions, gathers and scatters alone. The least time "
+        "only those of matrix products, convolutions, gathers and scatters. The least time "
         "is by published dense peaks.",
         "",
         "| program | batch | GFLOP per frame | MiB per frame | convolutions | products | loops | "

@@ -59,7 +59,7 @@ def shape_of(*shape, dtype=jnp.float32):
 
 
 def batch_of(model, grid, size, max_objects=16):
-    """Shapes of a batch for training."""
+    """Shapes of a training batch."""
     rows = size, max_objects
     image = camera = None
     if models.has_camera(model):
@@ -119,17 +119,16 @@ def text_of(function, arguments, platform):
     return exported.mlir_module()
 
 
-# What the text shows -----------------------------------------------------------------
+# Facts from the text -----------------------------------------------------------------
 
 
 def facts(text):
-    """What can be read off a program's text.
+    """Facts from a program's text.
 
     Returns:
-        "ops" by name; "types" of elements; "calls" to code outside of the program;
-        "convolutions" by type of result; "turned": shapes of the arrays of four axes and
-        more whose innermost axis a transpose moves; "wide": the primitives that compute
-        in 64 bits.
+        "ops" by name; "types" of elements; "calls" to external code; "convolutions" by result
+        type; "turned": shapes of the arrays of four or more axes whose innermost axis a
+        transpose moves; "wide": operations that compute in 64 bits.
     """
     lines = text.splitlines()
     turned = []
@@ -186,7 +185,7 @@ def _work(jaxpr, platform, times):
             chosen[eqn.outvars[0]] = here[0]
         elif name in ("dot_general", "conv_general_dilated", "gather", "scatter-add"):
             moved = sum(_bytes(v.aval) for v in (*eqn.invars, *eqn.outvars))
-            if name == "gather":  # what is not asked for is not read
+            if name == "gather":  # elements that are not gathered are not read
                 moved = 2 * _bytes(eqn.outvars[0].aval)
             yield name, eqn.invars[0].aval.dtype.name, _flops(eqn), moved, times
         elif name == "cond":
@@ -215,7 +214,7 @@ def _flops(eqn):
 
 
 def least_seconds(found, device):
-    """Seconds that a device needs at least, see the top."""
+    """Lower bound of a device's time in seconds, see the module docstring."""
     bfloat16, tf32, bandwidth = DEVICES[device]
     total = 0.0
     for _, dtype, flops, moved, times in found:
@@ -246,7 +245,7 @@ HEAVY = (
 
 
 def rows(size):
-    """One row a program: what is in it, and the least milliseconds a frame."""
+    """One row per program: its facts and the lower bound in milliseconds per frame."""
     for name, (function, arguments, frames) in full_size(size).items():
         sys.stderr.write(f"{name}\n")
         found = work(function, arguments, "cuda")

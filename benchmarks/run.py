@@ -25,7 +25,9 @@ import time
 import traceback
 from importlib import metadata
 
-os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # torch needs some too
+os.environ.setdefault(
+    "XLA_PYTHON_CLIENT_PREALLOCATE", "false"
+)  # torch needs memory as well
 
 import jax
 import page
@@ -64,9 +66,9 @@ def main():
 
 
 def run(chosen, seconds, store=lambda so_far: None):
-    """Everything that there is time for, as the JSON file holds it.
+    """Run the benchmarks that fit into the time; returns the content of the JSON file.
 
-    Stored after each benchmark: a run that is stopped keeps what it has measured.
+    The file is written after each benchmark, so that an interrupted run keeps its results.
     """
     began = time.perf_counter()
     device = jax.devices()[0]
@@ -106,7 +108,7 @@ def run(chosen, seconds, store=lambda so_far: None):
 
 
 def measured(case, seconds_left):
-    """One row: medians by column, after a first call each; all take turns."""
+    """One row: medians by column of interleaved calls, after a first call of each."""
     row = {"name": case.name, "dtype": case.dtype, "frames": case.frames}
     row |= {"error": case.error, "mib": case.mib, "compile_s": case.compile_s}
     if case.error is not None and not case.error <= case.tolerance:
@@ -134,7 +136,7 @@ def measured(case, seconds_left):
 
 
 def facts(device, *more):
-    """What ran, where and when."""
+    """Versions, machine and date of a run."""
     packages = ("jax", "numpy", *filter(None, more))
     name = device.device_kind
     if device.platform == "cpu":
@@ -151,9 +153,9 @@ def facts(device, *more):
 
 
 def processor_name(path=pathlib.Path("/proc/cpuinfo")):
-    """Of the CPU; its architecture where Linux does not say.
+    """Name of the CPU, or its architecture where Linux has none.
 
-    With family and model: in virtual machines all generations may be "AMD EPYC".
+    It includes family and model, as virtual machines may call every generation "AMD EPYC".
     """
     text = path.read_text() if path.is_file() else ""
     said = dict(re.findall(r"^([\w ]+?)\s*: (.+)$", text, re.MULTILINE))

@@ -45,7 +45,7 @@ def untrained(config: ConfigDict, **overrides: Any) -> Detector:
     inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
     if models.has_camera(model):
         inputs += placeholder(1, model)
-    # Shapes alone: to compile the initialization takes longer than to measure.
+    # Only shapes: compiling the initialization takes longer than measuring.
     shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(0)
     variables = jax.tree.map(
@@ -62,29 +62,27 @@ def measure(
     tesseract: bool = True,
     seed: int = 0,
 ) -> list[dict[str, Any]]:
-    """Times calls of a detector on random tensors, its stages and the network's parts.
+    """Time calls of a detector on random tensors, its stages and the network's parts.
 
-    Stages and parts are timed apart, each until its result is there; the whole is one call of the
-    detector, whose compiler and dispatch may join what the stages do in turn. All take
-    turns in every repeat; the best of the repeats counts.
+    Stages and parts are timed separately, each until its result is ready. The whole is one
+    call of the detector, in which the compiler and asynchronous dispatch may overlap the
+    stages. All are interleaved in every repeat, and the best repeat counts.
 
     Args:
-        detector: Of any kind; a radar-camera model gets black images, transferred and
-            looked at as real ones are.
-        batch_sizes: Frames at once.
-        repeats: Of each measurement, after one that compiles.
-        tesseract: From tesseracts; else from projections, without their stage.
-        seed: Of the tensors.
+        detector: A detector; a radar-camera model gets black images.
+        batch_sizes: Numbers of frames per call.
+        repeats: Number of repeats after a first call that compiles.
+        tesseract: Start from tesseracts; otherwise from projections, without that stage.
+        seed: Seed of the random tensors.
 
     Returns:
-        One dictionary a batch size: batch, input, seconds of every stage ("stages"), of
-        their sum, of the network's parts ("parts": backbone, neck, heads, and what a
-        camera adds) and of the whole call, frames_per_s of the whole, device, and jax's
-        version.
+        One dictionary per batch size: batch, input, seconds of every stage ("stages"), of
+        their sum, of the network's parts ("parts": backbone, neck, heads, and the camera's)
+        and of the whole call, frames_per_s of the whole, device, and jax's version.
 
     References:
-        Leitgeb et al., RADE-Net, section IV-B.2: backbone, neck and head of batches of
-        10 frames, on an NVIDIA L40S 49, 31 and 18 ms.
+        Leitgeb et al., RADE-Net, section IV-B.2: backbone, neck and head of batches of 10
+        frames take 49, 31 and 18 ms on an NVIDIA L40S.
     """
     return [_measure(detector, n, repeats, tesseract, seed) for n in batch_sizes]
 
@@ -149,7 +147,7 @@ def _measure(
 def _parts(
     model: nn.Module, variables: Mapping[str, Any], inputs: tuple[Any, ...]
 ) -> dict[str, Callable[[], Any]]:
-    """Calls of the network's parts on what they get in a call of the network."""
+    """Calls of the network's parts with the arguments that they have in the network."""
     calls: dict[str, ModuleCall] = {}
 
     @jax.jit
@@ -168,7 +166,7 @@ def _parts(
 
 
 def _best(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Shortest time of each, interleaved, after one call that compiles."""
+    """Shortest time of each function, interleaved, after one call that compiles."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for repeat in range(repeats + 1):
         for name, function in functions.items():
@@ -180,9 +178,9 @@ def _best(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str,
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Milliseconds of every stage with its share of their sum, one column a batch.
+    """Milliseconds of every stage with its share of their sum, one column per batch size.
 
-    Below the network its parts, of which the compiler may join what is timed apart here.
+    The network's parts are below it; within the network, the compiler may fuse them.
     """
     names = [n for n in STAGES if any(n in row["stages"] for row in rows)]
     header = ["from " + rows[0]["input"], *(f"batch {r['batch']}" for r in rows)]

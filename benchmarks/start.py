@@ -30,15 +30,15 @@ print("found:", np.asarray(found(x).scores).shape)
 
 
 def start(machine):
-    """From the command to the first step; from `import radejax` to the first boxes."""
+    """Time from the command to the first step, and from `import radejax` to the first boxes."""
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         numbers = itertools.count()
 
         def train(programs):
-            words = [str(_ROOT / "train.py"), "--config", "quickstart:short"]
-            words += ["--workdir", str(folder / f"run{next(numbers)}")]
-            return until(_FIRST_STEP, words, folder, programs)
+            arguments = [str(_ROOT / "train.py"), "--config", "quickstart:short"]
+            arguments += ["--workdir", str(folder / f"run{next(numbers)}")]
+            return until(_FIRST_STEP, arguments, folder, programs)
 
         def detect(programs):
             return until("found:", ["-c", _DETECT], folder, programs)
@@ -62,22 +62,22 @@ def start(machine):
             )
 
 
-def until(text, words, folder, programs):
+def until(text, arguments, folder, programs):
     """Wall and CPU seconds of a Python process until it writes a text.
 
     Args:
-        text: Part of the line that ends the time; the process is ended then.
-        words: Arguments of the interpreter.
-        folder: Where it runs.
-        programs: Folder of its compiled programs.
+        text: Part of the line that ends the measurement; the process is stopped then.
+        arguments: Arguments of the interpreter.
+        folder: Working directory.
+        programs: Folder of the compilation cache.
 
     Raises:
-        RuntimeError: It ended without that text.
+        RuntimeError: The process ended without writing the text.
     """
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(programs)}
     began = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-u", *words],
+        [sys.executable, "-u", *arguments],
         cwd=folder,
         env=environment,
         stdout=subprocess.PIPE,
@@ -95,4 +95,4 @@ def until(text, words, folder, programs):
             return seconds, usage.ru_utime + usage.ru_stime
     process.wait()
     process.stdout.close()
-    raise RuntimeError(f"no {text!r} from {words}: {''.join(lines)[-2000:]}")
+    raise RuntimeError(f"no {text!r} from {arguments}: {''.join(lines)[-2000:]}")

@@ -44,9 +44,9 @@ def _channels_first(x):
 
 
 def _calls(device, network, dtype, task, is_compiled, inputs):
-    """Column name -> function that runs a task: a forward pass, or a step of training.
+    """Functions that run a task by column name: a forward pass or a training step.
 
-    A step is forward, gradient of the outputs' mean square, and AdamW.
+    A step is a forward pass, the gradient of the outputs' mean square, and AdamW.
     """
     torch.backends.cuda.matmul.allow_tf32 = dtype == "tf32"
     torch.backends.cudnn.allow_tf32 = dtype == "tf32"
@@ -86,21 +86,21 @@ def _calls(device, network, dtype, task, is_compiled, inputs):
 
 
 def radenet(device, config, state, projection, *how):
-    """RADE-Net with the released names of tensors; `how` is as in `_calls`."""
+    """RADE-Net with the released tensor names; `how` is as in `_calls`."""
     network = torch_radenet.RadeNet(config)
     network.load_state_dict(_tensors(state))
     return _calls(device, network, *how, [_channels_first(projection)])
 
 
 def dinorade(device, config, state, points, projection, image, *how):
-    """The whole network, image backbone included; `how` is as in `_calls`."""
+    """Whole network with its image backbone; `how` is as in `_calls`."""
     network = torch_dinorade.DinoRade(config, torch.tensor(points))
     network.load_state_dict(_tensors(state))
     return _calls(device, network, *how, [_channels_first(projection), image])
 
 
 def attention(device, state, feature, scale, points, value):
-    """Deformable attention, forward."""
+    """Forward pass of deformable attention."""
     module = torch_dinorade.Attention(*ATTENTION)
     module.load_state_dict(_tensors(state))
     value = np.ascontiguousarray(value.transpose(0, 3, 1, 2))

@@ -136,13 +136,13 @@ def field_comments(source: str) -> dict[str, str]:
 
 
 def root_page(name: str) -> str:
-    """A Markdown file of the root, its links and pictures turned to the site's places.
+    """Text of a Markdown file of the root, with links and images as the site has them.
 
-    What the site does not have, such as LICENSE, becomes plain text.
+    A link to a file that is not on the site, such as LICENSE, becomes plain text.
     """
     text = (ROOT / name).read_text(encoding="utf-8")
 
-    def turn(match: re.Match[str]) -> str:
+    def convert(match: re.Match[str]) -> str:
         bang, label, target = match.groups()
         if target.startswith(("http://", "https://", "#")):
             return match[0]
@@ -153,7 +153,7 @@ def root_page(name: str) -> str:
             return f"[{label}](notebooks/01_batch_inference.ipynb)"
         return label
 
-    return re.sub(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", turn, text)
+    return re.sub(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", convert, text)
 
 
 def public_names() -> Iterator[str]:
