@@ -12,10 +12,10 @@ from collections.abc import Generator, Iterator
 import pytest
 from absl import flags
 
-# Compiling takes most of the time here: LLVM optimizes nothing, and fusions are emitted
-# the older way, which compiles several times as fast (jaxlib 0.11 has it no more, and ends
-# a process that asks for it). Read by `import jax`. With XLA_FLAGS= in the environment
-# programs are what users get: CI's slow tests of single programs.
+# Compilation takes most of the tests' time. Therefore LLVM does not optimize, and the older
+# fusion emitters are used, which compile several times as fast (jaxlib 0.11 has removed them
+# and aborts on the flag). `import jax` reads the variable. With XLA_FLAGS= in the
+# environment, as in CI's slow tests, programs are compiled as for users.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0"
@@ -68,11 +68,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Where a test's timeout does not end it, its process ends, and says where it hung.
+    """End the process with a traceback if a test's timeout does not end the test.
 
-    The timeout is an exception in the main thread, which comes to nothing while that is
-    in C code, or waits for another thread that waits for ever: once CI stood still in
-    one such test until its own end, an hour later, and never said in which.
+    The timeout is an exception in the main thread. It has no effect while that thread runs
+    C code or waits for another thread.
     """
     marker = item.get_closest_marker("timeout")
     given = marker.args[0] if marker else item.config.getoption("timeout")
@@ -93,7 +92,7 @@ def pytest_collection_modifyitems(
     if config.getoption("shapes"):
         if "--shapes" not in config.invocation_params.args:
             raise pytest.UsageError("--shapes must be on the command line itself")
-        skip = pytest.mark.skip(reason="passes what annotations forbid")
+        skip = pytest.mark.skip(reason="passes arguments that annotations forbid")
         for item in items:
             if item.get_closest_marker("wrong_types"):
                 item.add_marker(skip)
@@ -108,9 +107,9 @@ def _reset_log() -> None:
 
 @pytest.fixture(autouse=True)
 def _process_as_it_was() -> Iterator[None]:
-    """Commands set up log and JAX for their process; here that is every later test.
+    """Undo what commands set for the whole process: log handlers and JAX's cache.
 
-    Before a test as well: fixtures of a module come first, and may be commands.
+    The log is also reset before a test, as fixtures of a module may run commands.
     """
     _reset_log()
     yield
@@ -120,7 +119,7 @@ def _process_as_it_was() -> Iterator[None]:
 
 @pytest.fixture
 def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs compile for one device: eight on few cores take long, and are tested apart."""
+    """Runs compile for one device, as compiling for eight takes long on few cores."""
     from radejax.training import distributed
 
     mesh = distributed.make_mesh(1)
@@ -129,21 +128,23 @@ def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def shared() -> pathlib.Path:
-    """Folder of reference data that a user does not have; skips without it."""
+    """Folder of reference data that users do not have; skips the test without it."""
     if not SHARED.is_dir():
-        pytest.skip("reference data (../shared) not at hand")
+        pytest.skip("reference data (../shared) not available")
     return SHARED
 
 
 @pytest.fixture(scope="session")
 def make() -> types.ModuleType:
     """Recipes of the radar-camera golden files: seeded weights and inputs."""
-    from radejax.core.config import load_module  # by now --shapes checks its room
+    from radejax.core.config import (
+        load_module,
+    )  # after --shapes has installed its checks
 
     return load_module(GOLDEN / "dinorade_make.py")
 
 
 @pytest.fixture(scope="session")
 def golden() -> pathlib.Path:
-    """Folder of small golden files that travel with the tests."""
+    """Folder of small golden files in the repository."""
     return GOLDEN

@@ -1,4 +1,4 @@
-"""Annotations of radejax, shapes of arrays among them, checked while tests run."""
+"""Checks of radejax's annotations, including array shapes, while tests run."""
 
 import functools
 from collections.abc import Callable, MutableMapping
@@ -10,7 +10,7 @@ from flax import struct
 from jaxtyping import install_import_hook
 from ml_collections import ConfigDict
 
-ROOMS = (
+PACKAGES = (
     "core.structures",
     "geometry",
     "losses",
@@ -33,16 +33,16 @@ ROOMS = (
     "inference.predict",
     "visualize",
 )
-"""Rooms whose annotations have shapes."""
+"""Modules and packages whose annotations have shapes."""
 
 _CHECKED = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, which refuses what its annotations do not say.
+    """Wrap a function so that arguments and results must match its annotations.
 
-    Not constructors of pytrees, which JAX rebuilds from shapes, specs and None, nor
-    those whose `__post_init__` makes arrays of what it is given.
+    Constructors of pytrees are not checked, as JAX rebuilds these from shapes, specs and
+    None, nor are those of classes whose `__post_init__` converts arguments to arrays.
     """
     checked = _CHECKED(function)
     if function.__name__ != "__init__":
@@ -59,6 +59,8 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def install() -> Any:
-    """Rooms that are imported from now on are checked; ends as a context does."""
-    MutableMapping.register(ConfigDict)  # it has all that one has
-    return install_import_hook([f"radejax.{r}" for r in ROOMS], f"{__name__}.check")
+    """Check the modules that are imported from now on; a context manager ends it."""
+    MutableMapping.register(ConfigDict)  # it has all methods of one
+    return install_import_hook(
+        [f"radejax.{name}" for name in PACKAGES], f"{__name__}.check"
+    )

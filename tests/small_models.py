@@ -50,7 +50,7 @@ def shrink_run(config: ConfigDict) -> ConfigDict:
 
 
 def write_config(path: pathlib.Path, config: ConfigDict) -> pathlib.Path:
-    """Writes a config as a file for `--config`."""
+    """Write a config as a file for `--config`."""
     path.write_text(
         "from ml_collections import ConfigDict\n"
         f"def get_config():\n    return ConfigDict({json.loads(config.to_json())!r})\n"
@@ -63,7 +63,7 @@ def radar_config() -> ConfigDict:
 
 
 def camera_config() -> ConfigDict:
-    """The whole DinoRADE in small."""
+    """Config of a whole DinoRADE of small size."""
     module = load_module(CONFIGS / "dinorade.py")
     config = _shrink(module.get_config())
     config.model.image.update(
@@ -76,7 +76,7 @@ def camera_config() -> ConfigDict:
 
 @functools.lru_cache(maxsize=4)
 def _variables(kind: str) -> Any:
-    """Where zeros, as initialized, would hide what they multiply."""
+    """Random variables: initial zeros would hide the values that they multiply."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
     inputs = [np.zeros((1, *small_grid().projection_shape), np.float32)]
     if kind == "camera":
@@ -86,9 +86,9 @@ def _variables(kind: str) -> Any:
 
 
 def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
-    """Random variables of a module, and not as initialized.
+    """Random variables of a module instead of its initial ones.
 
-    From shapes alone: to compile an initialization takes longer than most tests.
+    Only shapes are traced, as compiling the initialization takes longer than most tests.
     """
     shapes = jax.eval_shape(module.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The runner of the benchmarks: turns, budget, refusal of other numbers, and its page."""
+"""Tests of the benchmark runner: order, time limit, comparison of results, and its page."""
 
 import functools
 import json
@@ -14,7 +14,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 @pytest.fixture
 def modules(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
-    """`run.py`, the page that it writes, and what it measures."""
+    """`run.py`, the module of its page, and its cases."""
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     import case
     import page
@@ -38,7 +38,7 @@ def _case(modules: Any, order: list[str], **fields: Any) -> Any:
     return modules.Case(**fields)
 
 
-def test_rivals_take_turns_and_what_did_not_fit_is_said(modules: Any) -> None:
+def test_implementations_alternate_and_skipped_cases_are_listed(modules: Any) -> None:
     order: list[str] = []
     first = _case(modules, order, error=1e-6, mib=3.0, note=lambda: "after it")
     chosen = {
@@ -60,7 +60,7 @@ def test_rivals_take_turns_and_what_did_not_fit_is_said(modules: Any) -> None:
     assert "Not run, for want of time: long (takes 700 s, 600 s were left)." in text
 
 
-def test_a_case_that_comes_too_late_is_not_begun(modules: Any) -> None:
+def test_no_case_starts_after_the_time_limit(modules: Any) -> None:
     order: list[str] = []
     cases = [_case(modules, order, name=f"number {i}") for i in range(2)]
     late = modules.run.run({"all": (lambda machine: iter(cases), -2)}, -1.0)
@@ -77,7 +77,7 @@ def test_other_numbers_are_no_measurement(modules: Any, error: float) -> None:
     assert row["refused"].startswith("results differ by")
 
 
-def test_what_fails_is_said_and_the_others_are_measured(modules: Any) -> None:
+def test_failed_cases_are_listed_and_the_others_are_measured(modules: Any) -> None:
     def fails(machine: Any) -> Any:
         raise RuntimeError("out of memory")
         yield
@@ -103,7 +103,7 @@ def test_a_run_that_is_stopped_keeps_what_it_measured(modules: Any) -> None:
     assert [row["benchmark"] for row in kept[-1]["rows"]] == ["one"]
 
 
-def test_a_process_is_timed_until_it_says_so(
+def test_a_process_is_timed_until_its_text(
     modules: Any, tmp_path: pathlib.Path
 ) -> None:
     import start
@@ -132,7 +132,7 @@ def test_a_process_is_timed_until_it_says_so(
         (["BogoMIPS\t: 50.00", "CPU part\t: 0xd40"], platform.machine()),
     ],
 )
-def test_processors_of_one_name_are_told_apart(
+def test_processors_of_one_name_are_distinguished(
     modules: Any, tmp_path: pathlib.Path, lines: list[str], expected: str
 ) -> None:
     path = tmp_path / "cpuinfo"

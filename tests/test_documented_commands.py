@@ -1,4 +1,4 @@
-"""Every command in README and docs is understood, and those on data folders run."""
+"""Every command in README and docs is valid, and commands on data folders run."""
 
 import contextlib
 import functools
@@ -30,7 +30,7 @@ PAGES = [
 ]
 PROGRAMS = ("python", "python3", "radejax", "pip", "pytest", "git", ".", "cd")
 
-# What can be called by itself; other files are modules of these.
+# Scripts; the other files are modules that they import.
 SCRIPTS = sorted(
     str(path.relative_to(ROOT))
     for folder in ("benchmarks", "docs/images", "examples")
@@ -100,17 +100,17 @@ def test_a_documented_command_is_understood(page: str, command: str) -> None:
 
 
 def _without_placeholders(arguments: list[str]) -> list[str]:
-    """Drops the brackets of optional arguments: `[--records DIR]`."""
+    """Remove the brackets of optional arguments: `[--records DIR]`."""
     return [word.strip("[]") for word in arguments]
 
 
 def _check_radejax(arguments: list[str], command: click.Command = main.main) -> None:
-    """Options exist and no required parameter is missing, as click would say it."""
+    """All options exist and no required parameter is missing."""
     while isinstance(command, click.Group):
         name = arguments[0]
         assert name in command.commands, f"no command {name!r}"
         command, arguments = command.commands[name], arguments[1:]
-    if not arguments:  # mentioned by name alone
+    if not arguments:  # only the name is mentioned
         return
     context = click.Context(command, **command.context_settings)
     given, rest, _ = command.make_parser(context).parse_args(list(arguments))
@@ -134,8 +134,8 @@ def _check_script(script: str, arguments: list[str]) -> None:
 
 
 def _check_train(arguments: list[str]) -> None:
-    """Config, words, fields and their values are understood."""
-    if not arguments:  # mentioned by name alone
+    """Config, its options, fields and their values exist."""
+    if not arguments:  # only the name is mentioned
         return
     pairs = zip(["", *arguments], arguments, strict=False)
     arguments = [word for old, word in pairs if word != "..." or old == "--config"]
@@ -160,7 +160,7 @@ def _check_pip(arguments: list[str]) -> None:
 
 @functools.cache
 def _help(script: str) -> str:
-    """What `python script --help` prints, from this process: imports are shared."""
+    """Output of `python script --help`, run in this process to share imports."""
     path = ROOT / script
     output = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output):

@@ -1,4 +1,4 @@
-"""docs/extending.md, carried out: every block is run as it stands there."""
+"""Every code block of docs/extending.md is run as it is."""
 
 import json
 import pathlib
@@ -37,7 +37,7 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | r
 
 @pytest.fixture(autouse=True)
 def _page() -> Iterator[None]:
-    """Carries out the page, and takes its names out again."""
+    """Run the page and remove its registered names afterwards."""
     before = [dict(names) for names in NAMES]
     for number, block in enumerate(BLOCKS):
         exec(
@@ -50,7 +50,7 @@ def _page() -> Iterator[None]:
 
 
 def _config() -> ConfigDict:
-    """The small model with every part of the page."""
+    """Config of the small model with every component of the page."""
     config = small.radar_config()
     config.model.update(backbone="flat", neck="strip", heads="wide")
     config.loss.weights.height = 0.5
@@ -62,7 +62,7 @@ def _config() -> ConfigDict:
 
 
 def _write_toy(root: pathlib.Path) -> pathlib.Path:
-    """Two drives of two frames, the first frame with a picture."""
+    """Write two drives of two frames, the first frame with an image."""
     rng, grid = np.random.default_rng(0), small.small_grid()
     (root / "1").mkdir(parents=True)
     (root / "2").mkdir()

@@ -84,7 +84,7 @@ def opened(workdir):
 
 @pytest.fixture(scope="module", autouse=True)
 def one_device():
-    """Eight fake devices on few cores compile slowly; that is tested elsewhere."""
+    """One device only: compiling for eight takes long and is tested elsewhere."""
     mesh = distributed.make_mesh(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(distributed, "make_mesh", lambda *_: mesh)
@@ -141,7 +141,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     found, wanted = data.losses(workdir), data.losses(from_images)
     assert len(found) == len(wanted) > 0
     np.testing.assert_allclose(found, wanted, rtol=2e-5)
-    # Evaluated from the embeddings too: the backbone is nowhere.
+    # The evaluation uses the embeddings too: the backbone's weights do not exist.
     assert "image_backbone" not in load_model(workdir).variables["params"]
     reports = [
         json.loads((w / "evaluation" / "metrics.json").read_text())
@@ -158,7 +158,7 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
 
 
 def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
-    # No --image-backbone: the weights come with those that the run starts from.
+    # Without --image-backbone, the initial weights include the backbone's.
     workdir = data.train("continued", init_from=str(from_images))
     assert (workdir / "evaluation" / "metrics.json").exists()
     first, second = (load_model(w).variables for w in (from_images, workdir))
@@ -203,7 +203,7 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
         UserError, match=r"1 of 4 frames have an image that .* `radejax embed`"
     ):
         embedded.images(other)
-    # Embedded images need no files.
+    # Images with embeddings need no files.
     gone = [dataclasses.replace(frame, camera_path=None) for frame in frames]
     inputs = embedded.images(gone)
     assert all(camera.is_valid for camera in inputs.cameras)
@@ -348,7 +348,7 @@ def test_example_compares_fusion_and_radar_by_the_lens(
 ):
     out, run = tmp_path / "by_lens", shutil.copytree(from_images, tmp_path / "run")
     evaluate_run(run, num_visualizations=0)
-    # The run with itself: nothing gained, on all frames and by the lens.
+    # A run compared with itself has no gain, on all frames and by state of the lens.
     text = _example("fusion_by_lens", run, run, "--out", out, "--resamples", 10)
     assert (out / "by_lens.txt").read_text() in text
     content = json.loads((out / "by_lens.json").read_text())
@@ -359,13 +359,13 @@ def test_example_compares_fusion_and_radar_by_the_lens(
     shares = json.loads((out / "camera_share.json").read_text())
     parts = set(shares) - {"all"}
     assert sum(shares[name]["frames"] for name in parts) == 12
-    # Three sequences in other weathers: a condition of one has no interval.
+    # Three sequences in different weather: a condition with one sequence has no interval.
     alone = {n for n in parts if f"left out: {n} (4 frames" in text}
     told = {row["condition"]: row for row in content["share"]}
     assert told.keys() == {row["condition"] for row in rows}
     assert parts - alone == told.keys() - {"all"}
     for name, row in told.items():
-        # Of frames here, of bins there: the padded bins' share is the same.
+        # Averages over frames and over bins must agree.
         assert row["share"] == pytest.approx(shares[name]["mean"], abs=0.02)
         assert row["frames"] == shares[name]["frames"]
         assert 0 < row["share low"] <= row["share"] <= row["share high"] < 1
@@ -421,7 +421,7 @@ def test_embed_command(data, from_images, tmp_path, monkeypatch):
     result = CliRunner().invoke(main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert "12 embedded" in result.stdout
-    # Without a folder: of what the config simulates, here made anew.
+    # Without a folder, the config's dataset is simulated again.
     monkeypatch.chdir(tmp_path)
     command = ["embed", *command[2:], "--out", "again"]
     result = CliRunner().invoke(main, command, catch_exceptions=False)

@@ -1,4 +1,4 @@
-"""The pictures of the networks: shapes of the models, and text that can be read."""
+"""The figures of the networks have the models' shapes and legible text."""
 
 import itertools
 import pathlib
@@ -20,7 +20,7 @@ PARAMETERS = {"radenet": "26.56 M", "dinorade": "21.60 M"}
 
 
 @pytest.mark.parametrize("name", list(networks.SHEETS))
-def test_pictures_show_the_models_and_no_text_meets_another(name: str) -> None:
+def test_figures_have_the_models_shapes_and_no_texts_overlap(name: str) -> None:
     config, lay_out = networks.SHEETS[name]
     sheet = lay_out(networks.Network.of(config))
     lines = {line for block in sheet.blocks for line in block.lines}
@@ -41,7 +41,7 @@ def test_pictures_show_the_models_and_no_text_meets_another(name: str) -> None:
     assert len(frames) == len(sheet.blocks)
     for one, other in itertools.combinations(frames, 2):
         assert not one.overlaps(other), (one, other)
-    for text in texts:  # within its block, or in none
+    for text in texts:  # within its own block or outside all blocks
         met = [frame for frame in frames if frame.overlaps(text)]
         assert len(met) <= 1
         for frame in met:

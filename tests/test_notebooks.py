@@ -1,4 +1,4 @@
-"""The notebooks: whole, clean and running from start to end."""
+"""The notebooks are complete and run from start to end."""
 
 import ast
 import json
@@ -18,8 +18,9 @@ by_name = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 @pytest.fixture(scope="session")
 def work(tmp_path_factory) -> pathlib.Path:
-    """Runs and data of the notebooks: of `.ci/run quickstart`; else the first one that
-    needs a run trains it in short."""
+    """Folder of the notebooks' runs and data: that of `.ci/run quickstart` if RADEJAX_WORK is set;
+    otherwise the first notebook that needs a run trains a short one.
+    """
     given = os.environ.get("RADEJAX_WORK")
     return pathlib.Path(given) if given else tmp_path_factory.mktemp("notebooks")
 

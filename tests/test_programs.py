@@ -1,4 +1,4 @@
-"""What the programs for GPU and TPU show before any of them runs: traced, never compiled."""
+"""Programs that are lowered for GPU and TPU without compiling them."""
 
 import functools
 import pathlib
@@ -19,7 +19,7 @@ PLATFORMS = ("cuda", "tpu")
 TOKENS = 2 * 3 + 5
 """Of the small ViT: patches, class and registers."""
 
-# Maps large enough for the paths that are a CPU's alone.
+# Maps large enough for the code paths that only a CPU takes.
 GRID = RadarGrid.reduced(
     num_doppler=2, num_range=96, num_elevation=3, num_azimuth=62, max_range_m=90.0
 )
@@ -33,7 +33,7 @@ def programs() -> types.ModuleType:
 
 @pytest.fixture(scope="module")
 def facts(programs: types.ModuleType) -> Any:
-    """Function from kind, task and platform to what the program's text shows."""
+    """Function from kind, task and platform to the facts from the program's text."""
 
     @functools.cache
     def read(kind: str, task: str, platform: str) -> dict[str, Any]:
@@ -65,19 +65,19 @@ def test_accelerators_get_lean_programs(
     assert found["wide"] == ({"iota_2x32_shape"} if has_dropout else set())
     assert not found["calls"]  # neither the host nor a library outside of XLA
     assert set(found["convolutions"]) == {"bf16"}
-    # Channels stay innermost from first to last; heads of the ViT's tokens do not.
+    # Channels stay innermost throughout, except for the heads of the ViT's tokens.
     assert [shape for shape in found["turned"] if f"x{TOKENS}" not in shape] == []
 
 
 @pytest.mark.slow
-def test_what_is_for_cpus_is_gone(facts: Any) -> None:
-    """Loops over blocks that fit a cache, and nothing else, tell the programs apart."""
+def test_programs_for_accelerators_lack_the_loops_for_cpus(facts: Any) -> None:
+    """Only loops over cache-sized blocks are particular to CPUs."""
     assert facts("radar", "train_step", "cpu")["ops"]["while"] > 0
     assert facts("radar", "train_step", "cuda")["ops"]["while"] == 0
 
 
 def test_bins_are_sampled_in_large_steps(programs: types.ModuleType) -> None:
-    """... wherever the program is made: exported on a CPU, it runs on a GPU."""
+    """This holds wherever the program is exported: one exported on a CPU runs on a GPU."""
     bins, shape = 4096, programs.shape_of
     module = DeformableAttention(8, num_heads=2, num_points=2)
     arguments = (
@@ -115,7 +115,7 @@ def test_simulated_rows_are_made_together(
 
 @pytest.mark.slow
 def test_work_is_what_the_compiler_counts(programs: types.ModuleType) -> None:
-    """Operations of a radar detector, which has no loop that the compiler counts once."""
+    """Operations of a radar detector, without loops that the compiler counts once."""
     config = small_models.radar_config()
     config.model.update(widths=(32, 32), decoder_width=32)
     function, arguments = programs.detector(config, GRID, 1)
@@ -123,7 +123,7 @@ def test_work_is_what_the_compiler_counts(programs: types.ModuleType) -> None:
     ours = sum(flops * times for _, _, flops, _, times in found)
     theirs = jax.jit(function).trace(*arguments).lower(lowering_platforms=("cuda",))
     assert ours == pytest.approx(theirs.cost_analysis()["flops"], rel=0.1)
-    # Of a loop, each turn.
+    # Every iteration of a loop is counted.
     step = lambda x, _: (x @ x, None)  # noqa: E731
     loop = lambda x: jax.lax.scan(step, x, None, length=5)[0]  # noqa: E731
     looped = programs.work(loop, (programs.shape_of(8, 8),), "cuda")

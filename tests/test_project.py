@@ -1,4 +1,4 @@
-"""What a contributor meets first: pages, workflows and `.ci/run` say the same."""
+"""Contributing pages, workflows and `.ci/run` agree."""
 
 import pathlib
 import re
@@ -17,7 +17,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
 def _parts() -> list[str]:
-    """The parts that `.ci/run` names."""
+    """Names of the parts of `.ci/run`."""
     (line,) = re.findall(
         r'^parts="(.*)"$', CI.read_text(encoding="utf-8"), re.MULTILINE
     )

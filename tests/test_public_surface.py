@@ -1,4 +1,4 @@
-"""What `import radejax` gives, each name on first use."""
+"""Every public name of `import radejax` exists and is imported on first use."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The quickstart as a user types it, in small: from nothing to metrics, and killed."""
+"""A small quickstart through its commands, uninterrupted and killed."""
 
 import csv
 import json
@@ -69,12 +69,12 @@ def _metrics(folder: pathlib.Path) -> dict:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Path, str]:
-    """A run from start to end: its folder and what it printed."""
+    """An uninterrupted run: its folder and its output."""
     folder = tmp_path_factory.mktemp("undisturbed")
     return folder, _finish(_start(folder))
 
 
-def test_from_nothing_to_metrics_and_pictures(undisturbed: tuple) -> None:
+def test_from_an_empty_folder_to_metrics_and_figures(undisturbed: tuple) -> None:
     folder, output = undisturbed
     stages = ("simulate", "preprocess", "train", "detect", "Done in")
     assert all(line in output for line in stages)
@@ -144,7 +144,7 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     assert "split is 'test' there and 'train' here; give --out" in done.stderr
 
 
-def test_a_checkpoint_alone_is_the_model_of_its_run(undisturbed: tuple) -> None:
+def test_a_checkpoint_folder_loads_as_the_model_of_its_run(undisturbed: tuple) -> None:
     run = undisturbed[0] / "run"
     expected = load_model(run)
     newest = max((run / "checkpoints").glob("[0-9]*"), key=lambda p: int(p.name))
@@ -170,7 +170,7 @@ def _training(folder: pathlib.Path) -> bool:
 
 
 def _evaluating(folder: pathlib.Path) -> bool:
-    """Results are written into a folder beside theirs, and moved when all are there."""
+    """Whether an evaluation is running; it writes a temporary folder and moves it when complete."""
     return any((folder / "run").glob("*evaluation*.tmp"))
 
 

@@ -1,4 +1,4 @@
-"""`pytest --shapes` refuses arrays of other shapes than annotations say."""
+"""`pytest --shapes` rejects arrays that do not match annotations."""
 
 import importlib
 import sys
@@ -16,7 +16,7 @@ Checked = Callable[[str], types.ModuleType]
 
 @pytest.fixture
 def checked(monkeypatch: pytest.MonkeyPatch) -> Checked:
-    """Imports a module once more, with its annotations checked."""
+    """Import a module again with its annotations checked."""
 
     def load(name: str) -> types.ModuleType:
         room, _, last = name.rpartition(".")

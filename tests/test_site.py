@@ -13,7 +13,7 @@ pages = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "site_pages.py"), {
 
 
 def _pages(node: object) -> list[str]:
-    """All files that a navigation names."""
+    """All files in a navigation."""
     if isinstance(node, str):
         return [node]
     values = node.values() if isinstance(node, dict) else node

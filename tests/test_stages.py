@@ -1,4 +1,4 @@
-"""Stages of the benchmark are those of a detector's call."""
+"""The benchmark measures the stages of a detector's call."""
 
 import pathlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""The torch network that the benchmark compares with is the same one."""
+"""The torch network of the benchmark equals DinoRADE."""
 
 import pathlib
 

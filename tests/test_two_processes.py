@@ -35,7 +35,7 @@ def _config() -> ConfigDict:
 
 
 def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) -> None:
-    """Runs train.py on two devices, of one process or one of each of two."""
+    """Run train.py on two devices, in one process or in two."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         coordinator = f"127.0.0.1:{free.getsockname()[1]}"
@@ -68,7 +68,7 @@ def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) 
 
 
 def _cut(folder: pathlib.Path, run: str, to: str) -> None:
-    """A copy of a run as it was in its middle."""
+    """Copy of a run in the state of its middle."""
     shutil.copytree(folder / run, folder / to)
     for path in (folder / to / "checkpoints").iterdir():
         if path.name.isdigit() and int(path.name) > MIDDLE:
@@ -90,7 +90,7 @@ def _aps(folder: pathlib.Path) -> list:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """Folder with the runs "one" and "two", and what each continued of the other."""
+    """Folder with the runs "one" and "two", each also resumed by the other number of processes."""
     folder = tmp_path_factory.mktemp("processes")
     _train(folder, "two", 2)
     _train(folder, "one", 1)
@@ -117,7 +117,7 @@ def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
 def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
     runs: pathlib.Path,
 ) -> None:
-    # The second process must not look for what the first one still writes.
+    # The second process must not read files that the first one is still writing.
     _train(
         runs,
         "seeds",

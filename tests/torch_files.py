@@ -1,4 +1,4 @@
-"""A writer of `.pth` files without torch, for tests of what reads them."""
+"""A writer of `.pth` files without torch, for tests of the reader."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def pickle_tensor(
 
 
 def write_zip(path: pathlib.Path, pickled: bytes, **members: bytes) -> None:
-    """An archive as torch lays it out, with any pickle and storages in it."""
+    """Write an archive with torch's layout and the given pickle and storages."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("x/data.pkl", pickled)
         archive.writestr("x/byteorder", "little")
@@ -57,7 +57,7 @@ def write_zip(path: pathlib.Path, pickled: bytes, **members: bytes) -> None:
 
 
 def write_pth(path: pathlib.Path, tensors: Mapping[str, np.ndarray]) -> None:
-    """A state dict."""
+    """Write a state dict."""
     body, members = b"\x80\x02}(", {}
     for i, (name, value) in enumerate(tensors.items()):
         strides = tuple(

@@ -1,4 +1,4 @@
-"""Examples import each other by name, as `python examples/x.py` lets them."""
+"""Examples import each other by name, as when `python examples/x.py` runs."""
 
 import pathlib
 import sys

@@ -1,4 +1,4 @@
-"""The ablations: what is run, that it goes on, differences and verdicts."""
+"""Tests of the ablations: runs, resuming, differences and verdicts."""
 
 import json
 import pathlib
@@ -17,11 +17,11 @@ from radejax.evaluation.results import EvaluationOptions
 from radejax.runs import checks
 
 SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "shuffled labels": 0.1}
-"""Of what share of the objects a cell finds; 0.5 where it is not told."""
+"""Fraction of the objects that a cell detects; 0.5 by default."""
 
 
 class _Runs:
-    """Stands for training and evaluation: objects of which a share is found."""
+    """Replaces training and evaluation: a fraction of the objects is detected."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.trained: list[tuple[str, Any, Any]] = []
@@ -106,7 +106,7 @@ def test_what_is_missing_is_run_and_judged(
     assert verdicts["sanity check: labels matter"] == "supported"
     assert "supported" in (tmp_path / "table_sigma.md").read_text()
     assert r"\begin{tabular}" in (tmp_path / "table_sigma.tex").read_text()
-    # One table's cells are another's: nothing is run again.
+    # Tables share cells: nothing is run again.
     before = len(runs.trained)
     command = ["--table", "3", "--seeds", "0", "--resamples", "40"]
     CliRunner().invoke(ablation.main, [*command, "--out", str(tmp_path)])
@@ -142,7 +142,7 @@ def test_verdicts(numbers: tuple[float, ...], word: str) -> None:
 def test_intervals_are_paired(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Equal runs differ by nothing, however few scenes there are."""
+    """Equal runs have no difference, even with few scenes."""
     runs = _Runs(monkeypatch)
     monkeypatch.setitem(SKILL, "sigma 3", 0.5)
     _call(tmp_path, "--seeds", "1")

@@ -1,4 +1,4 @@
-"""AP by the distance of centers, and how far they are off along and across."""
+"""AP by the distance of centers, and errors of centers along and across the line of sight."""
 
 import json
 import pathlib
@@ -15,7 +15,7 @@ center_distance = load_module(ROOT / "examples" / "center_distance.py")
 
 
 def columns(*rows: tuple, scored: bool = False) -> dict[str, np.ndarray]:
-    """Frame, class, x, y (and score) of boxes of half a meter."""
+    """Columns frame, class, x, y (and score) of boxes with edges of half a meter."""
     found = {
         "frame": np.array([row[0] for row in rows]),
         "cls": np.array([row[1] for row in rows]),
@@ -43,7 +43,7 @@ def data() -> EvaluationSet:
 
 
 def names(data: EvaluationSet, match: np.ndarray) -> dict[float, float]:
-    """x of the object of every prediction that has one, by its score."""
+    """x of the object of every matched prediction, by its score."""
     hit = match >= 0
     x = data.gt.box[match[hit], 0]
     return dict(zip(data.pred.score[hit].tolist(), x.tolist(), strict=True))

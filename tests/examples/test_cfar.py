@@ -1,4 +1,4 @@
-"""The classical detector on maps with known answers."""
+"""The CFAR detector on maps with known results."""
 
 import cfar
 import numpy as np
@@ -66,7 +66,7 @@ def test_cross_section_chooses_the_class(rcs_db, cls):
     assert found["cls"][0] == cls
 
 
-def test_noise_alone_gives_next_to_nothing():
+def test_noise_without_targets_gives_few_detections():
     found = cfar.detect(projection_of((15.0, 0.0, -200.0)), GRID, PARAMETERS)
     assert len(found["score"]) == 0
     assert found["box"].shape == (0, 7)

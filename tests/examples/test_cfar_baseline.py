@@ -1,4 +1,4 @@
-"""The classical detector from a dataset to its report."""
+"""The CFAR baseline from a dataset to its report."""
 
 import json
 import pathlib
@@ -17,7 +17,7 @@ from radejax.simulation.dataset import default_config, simulate_dataset
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """A small dataset without images, projected."""
+    """A small dataset without images, with records."""
     root = tmp_path_factory.mktemp("data")
     config = default_config() | {
         "train_sequences": 2,
@@ -42,7 +42,7 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     assert sedan["num_det"] > 0
     assert 0.0 < sedan["ap"] < 95.0
 
-    # The same fit, named: as from another folder.
+    # The same training data, named explicitly.
     again = module.run_baseline(
         data, tmp_path / "again", protocols=("all_point",), fit_data=data
     )

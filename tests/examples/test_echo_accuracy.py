@@ -1,4 +1,4 @@
-"""How well an echo says where a pedestrian is: places between bins, and overlaps."""
+"""Positions of echoes between bins, and overlaps of boxes at these positions."""
 
 import pathlib
 

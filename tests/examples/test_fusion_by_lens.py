@@ -1,4 +1,4 @@
-"""Conditions of frames, and the camera's share by them."""
+"""Conditions of frames, and the camera's weight by condition."""
 
 import fusion_by_lens
 import numpy as np
@@ -38,7 +38,7 @@ def test_share_by_condition_with_intervals_over_sequences() -> None:
     assert fog["difference high"] < -0.03
     assert (whole["difference"], whole["difference high"]) == (0.0, 0.0)
     assert np.isnan([snow["share"], snow["share low"]]).all()
-    # Frames of one sequence are drawn together: whole sequences, not frames, vary.
+    # Sequences are resampled as a whole, not frames.
     steady = np.where(np.isin(sequence, [0, 2, 4]), 0.9, 0.1)
     (row,) = fusion_by_lens.share_rows(steady, sequence, {"all": groups["all"]}, 500)
     assert row["share high"] - row["share low"] > 0.08

@@ -1,4 +1,4 @@
-"""Batches without a disk: pure in seed and step, equal to the written frames' physics."""
+"""Batches without a dataset on disk depend on seed and step only and equal written frames."""
 
 import jax
 import numpy as np

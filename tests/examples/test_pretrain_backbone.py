@@ -1,4 +1,4 @@
-"""The backbone for simulated images: what it is shown, that it learns, its folder."""
+"""The pretrained backbone: its images, its training and its output folder."""
 
 import pathlib
 

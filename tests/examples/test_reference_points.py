@@ -32,5 +32,5 @@ def test_valid_points_and_the_radar_are_drawn_in_pixels():
     dots, radar = ax.collections
     np.testing.assert_allclose(dots.get_offsets(), [[24.5, 39.5], [49.5, 59.5]])
     np.testing.assert_allclose(radar.get_offsets(), [[49.5, 40 + 25 - 0.5]])
-    # Every second range bin: the first point alone.
+    # Every second range bin: only the first point.
     assert draw_reference_points(*args, every=(2, 1, 1)) == 1

@@ -1,4 +1,4 @@
-"""The control with silhouettes: the same scenes for both runs, and when its bar is met."""
+"""The oracle images: both runs have the same scenes, and the condition for success."""
 
 import dataclasses
 import pathlib
@@ -20,7 +20,7 @@ silhouettes = load_module(ROOT / "examples" / "silhouettes.py")
 
 
 def _run(score_of_camera: float, seen: list[Any]) -> Any:
-    """Stands for a training: each frame has an object, the radar finds every other."""
+    """Replaces a training: every frame has an object, and the radar detects every other one."""
 
     def run(config: Any, workdir: pathlib.Path) -> pathlib.Path:
         seen.append(config)

@@ -1,4 +1,4 @@
-"""The job script requeues itself where it was stopped."""
+"""The job script requeues itself after a stop."""
 
 import os
 import pathlib

@@ -1,8 +1,8 @@
-"""Readers on corrupted inputs: a child process reads them, its parent counts outcomes.
+"""Readers on corrupted inputs: a child process reads them, and its parent counts outcomes.
 
-A crash or hang ends only the child; the parent notes on which input, and starts another
-child. Input number n of a reader is made of `Random(f"{reader}/{n}")`, so that it is the
-same in every process.
+A crash or hang ends only the child. The parent notes the input and starts another child.
+Input number n of a reader is made of `Random(f"{reader}/{n}")`, so that it is the same in
+every process.
 """
 
 import collections
@@ -76,7 +76,7 @@ class Case:
         return path, mutate(rng, content)
 
     def judge(self, number: int) -> Outcome:
-        """Read an input and return what came of it."""
+        """Read an input and return the outcome."""
         path, content = self.content(number)
         before = dict(self._seeds)[path]
         path.write_bytes(content)
@@ -95,7 +95,7 @@ class Case:
 
 
 def _kind(error: Exception) -> str:
-    """How an error looks to a user."""
+    """Kind of an error."""
     message = str(error)
     if not hasattr(error, "exit_code"):
         return f"undocumented: {type(error).__name__}"
@@ -126,7 +126,7 @@ def serve(name: str, start: int, count: int) -> None:
 
 
 def run(name: str, start: int, count: int) -> Iterator[Outcome]:
-    """Yield what becomes of `count` inputs of a reader, in order."""
+    """Yield the outcomes of `count` inputs of a reader, in order."""
     number, end = start, start + count
     while number < end:
         code = f"from tests.fuzz.engine import serve; serve({name!r}, {number}, "
@@ -151,7 +151,7 @@ def run(name: str, start: int, count: int) -> Iterator[Outcome]:
 
 
 def _outcomes(child: subprocess.Popen, number: int) -> Iterator[Outcome]:
-    """Outcomes as the child writes them, until it ends or hangs."""
+    """Outcomes that the child writes until it ends or hangs."""
     assert child.stdout is not None
     text = b""
     while select.select([child.stdout], [], [], MAX_SECONDS)[0]:
@@ -168,7 +168,7 @@ def _outcomes(child: subprocess.Popen, number: int) -> Iterator[Outcome]:
 def counts(
     name: str, start: int, count: int
 ) -> tuple[collections.Counter, list[Outcome]]:
-    """How often each kind of outcome came, and the outcomes that are wrong."""
+    """Number of outcomes of each kind, and the wrong outcomes."""
     outcomes = list(run(name, start, count))
     wrong = [o for o in outcomes if not o[1].startswith(("read", "refused"))]
     return collections.Counter(kind for _, kind, _ in outcomes), wrong

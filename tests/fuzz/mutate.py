@@ -1,7 +1,7 @@
 """Corrupts inputs: bits, lengths, tokens, numbers, and members of archives.
 
-A zip file is also changed inside, with sizes and checksums made right again, so that the
-corruption comes past them.
+A zip file is also changed inside with correct sizes and checksums, so that the corruption
+reaches the reader of its members.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ def mutate(rng: random.Random, content: bytes) -> bytes:
 
 def _mutate(rng: random.Random, content: bytes) -> bytes:
     if content[:2] == b"PK" and rng.random() < 0.7:
-        # What is corrupted already may not be a zip file any more.
+        # A file that is corrupted already may not be a zip file any more.
         with contextlib.suppress(Exception), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return _zip(rng, content)

@@ -1,4 +1,4 @@
-"""Corrupted inputs are read, or refused by one line."""
+"""Corrupted inputs are read, or rejected by one line."""
 
 import pytest
 
