@@ -8,7 +8,6 @@ import itertools
 import pathlib
 import time
 
-import flax.traverse_util
 import inputs
 import jax
 import jax.numpy as jnp
@@ -75,19 +74,19 @@ def network(path, dtype, **fields):
 def torch_state(model, variables):
     """Parameters with the tensor names of `torch_dinorade.DinoRade`."""
     params = dict(variables["params"])
-    names = radenet_torch.module_names(len(model.widths), model.heads)
-    for part in ("radar_neck", "camera_neck"):
-        names |= radenet_torch.neck_names(f"image_fusion/{part}", f"{part}.neck")
-    for path in flax.traverse_util.flatten_dict(params):
-        module = path[:-1] if path[-1] in ("kernel", "scale", "bias") else path
-        name = ".".join(module).removeprefix("image_fusion.")
-        name = name.replace("image_backbone.layers", "image_backbone.layers.{}")
-        names.setdefault("/".join(module), name)
+    rules = (
+        *radenet_torch.neck_rules("image_fusion/radar_neck", "radar_neck.neck"),
+        *radenet_torch.neck_rules("image_fusion/camera_neck", "camera_neck.neck"),
+        *radenet_torch.rules(model.heads),
+        (r"^image_backbone/layers/", "image_backbone.layers.{}."),
+        (r"^image_fusion/", ""),
+        (r"/", "."),
+    )
     backbone, size = params["image_backbone"], model.vit.patch_size
     patches = dict(backbone["patch_embed"])
     patches["kernel"] = patches["kernel"].reshape(size, size, 3, -1)
     params["image_backbone"] = {**backbone, "patch_embed": patches}
-    state = convert.to_torch(names, {**variables, "params": params})
+    state = convert.to_torch(rules, {**variables, "params": params})
     for name in [n for n in state if n.endswith(".running_var")]:
         state[name.replace("running_var", "num_batches_tracked")] = np.array(0)
     rows, columns, channels = model.feature_shape

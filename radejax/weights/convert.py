@@ -1,7 +1,7 @@
 """Conversion of PyTorch tensors by name to Flax variables, in both directions.
 
-A model is described by one table from our modules to those of torch, such as
-`{"backbone/start": "backbone.start_conv"}`. Names of leaves and layouts follow from it:
+A model is described by rules that rewrite the names of our modules to those of torch,
+such as `("^backbone/start/", "backbone.start_conv.")`. Names of leaves and layouts follow:
 
 | leaf | torch | layout there |
 |---|---|---|
@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 import pathlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import flax.traverse_util
@@ -35,8 +35,9 @@ from radejax.core.files import PathLike
 from radejax.models.lifting import ReferencePoints
 from radejax.weights import torch_file
 
-Names = Mapping[str, str]
-"""Module of torch, "backbone.start_conv", by our module, "backbone/start"."""
+Rules = Sequence[tuple[str, str | Callable[[re.Match], str]]]
+"""Arguments of `re.sub`, applied in order to our path, "backbone/start/kernel". A rule
+ends each module that it rewrites with a dot: a name that keeps a slash is unknown."""
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shape of each variable by its path, "params/backbone/start/kernel"."""
@@ -53,7 +54,7 @@ _SHOWN = 20
 
 
 def from_torch(
-    names: Names,
+    rules: Rules,
     shapes: Shapes,
     tensors: Mapping[str, Any],
     source: PathLike,
@@ -62,8 +63,8 @@ def from_torch(
     """Variables of a model from tensors by name.
 
     Args:
-        names: Table of the model; it may have modules that the model is without.
-        shapes: Of the variables wanted.
+        rules: Names of the model's modules in torch.
+        shapes: Shapes of the wanted variables.
         tensors: NumPy, JAX or torch arrays.
         source: What error messages call them.
         ignored: Pattern of names (from the start) that may be left over.
@@ -73,7 +74,7 @@ def from_torch(
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape; all are listed.
-        UserError: The table lacks a module: torch's code has no such part.
+        UserError: No rule is for a module: torch's code has no such part.
     """
     left, problems = dict(tensors), []
 
@@ -95,7 +96,7 @@ def from_torch(
 
     flat: dict[str, Any] = {}
     for path, shape in shapes.items():
-        name = torch_name(names, path)
+        name = torch_name(rules, path)
         if "{}" in name:
             layers = [take(name.format(i), path, shape[1:]) for i in range(shape[0])]
             flat[path] = None if problems else np.stack(layers)  # type: ignore[arg-type]
@@ -112,11 +113,11 @@ def from_torch(
     return flax.traverse_util.unflatten_dict(flat, sep="/")
 
 
-def to_torch(names: Names, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def to_torch(rules: Rules, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Tensors by name: inverse of `from_torch`, but for 1x1 convolutions."""
     tensors = {}
     for path, leaf in flax.traverse_util.flatten_dict(variables, sep="/").items():
-        name, value = torch_name(names, path), np.asarray(leaf, np.float32)
+        name, value = torch_name(rules, path), np.asarray(leaf, np.float32)
         stack = enumerate(value) if "{}" in name else [(0, value)]
         for i, part in stack:
             part = to_torch_layout(path, part)
@@ -124,18 +125,21 @@ def to_torch(names: Names, variables: Mapping[str, Any]) -> dict[str, np.ndarray
     return tensors
 
 
-def torch_name(names: Names, path: str) -> str:
+def torch_name(rules: Rules, path: str) -> str:
     """Name in torch of a variable of ours, "params/backbone/start/kernel".
 
     Raises:
-        UserError: The table lacks it.
+        UserError: No rule is for its module.
     """
-    module, _, leaf = path.partition("/")[2].rpartition("/")
-    if (whole := f"{module}/{leaf}".strip("/")) in names:  # a parameter by itself
-        return names[whole]
-    if module not in names:
-        raise UserError(f"{module} has no counterpart in the released code")
-    return f"{names[module]}.{_LEAVES[leaf]}"
+    ours = name = path.partition("/")[2]
+    for pattern, replacement in rules:
+        name = re.sub(pattern, replacement, name)
+    if "/" in name:
+        raise UserError(
+            f"{ours.rpartition('/')[0]} has no counterpart in the released code"
+        )
+    module, dot, leaf = name.rpartition(".")
+    return module + dot + _LEAVES.get(leaf, leaf)
 
 
 def to_torch_layout(path: str, value: np.ndarray) -> np.ndarray:

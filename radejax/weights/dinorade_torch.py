@@ -18,12 +18,13 @@ from radejax.core.files import PathLike
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.weights import dinov3_hf, radenet_torch
 from radejax.weights.convert import (
+    Rules,
     from_torch,
     read_state_dict,
     to_numpy,
     variable_shapes,
 )
-from radejax.weights.image_backbone import resnet_names
+from radejax.weights.image_backbone import RESNET_RULES
 
 PART = "rad_backbone."
 """Start of names by which a state dict of DinoRADE is recognized."""
@@ -79,14 +80,12 @@ def read(
     of_radar = {k: v for k, v in model_overrides.items() if k not in fusion}
     config |= radenet_torch.infer_config(tensors, source, of_radar, "rad_")
     fusion |= infer_fusion(tensors, of_fusion)
-    names = radenet_torch.module_names(len(config["widths"]), config["heads"], "rad_")
-    names |= fusion_names() | CAMERA_NECK
     backbone = None
     is_resnet = any(n.startswith("image_backbone.frozen_layers.") for n in tensors)
-    if is_resnet and dinov3 is None:
+    is_resnet = is_resnet and dinov3 is None
+    if is_resnet:
         # The released code feeds its ResNet colors in [0, 1].
         config["image"] |= {"kind": "resnet50", "standardize": False}
-        names |= image_branch_names()
         shapes = variable_shapes(models.build(config))
     else:
         fields, backbone = _transformer(tensors, source, dinov3)
@@ -94,6 +93,7 @@ def read(
         tensors = {k: v for k, v in tensors.items() if not k.startswith(IMAGE_BACKBONE)}
         shapes = variable_shapes(models.build(config))
         shapes = {k: s for k, s in shapes.items() if f"/{IMAGE_BACKBONE}/" not in k}
+    names = rules(config["heads"], is_resnet)
     variables = from_torch(names, shapes, tensors, source, _UNUSED)
     if backbone is not None:
         variables["params"][IMAGE_BACKBONE] = backbone
@@ -135,39 +135,42 @@ def infer_fusion(
 
 # Names -------------------------------------------------------------------------------
 
-CAMERA_NECK = {
-    "image_neck/proj": "image_neck.channel_proj",
-    "image_neck/up_1": "image_neck.fpn_layer1.0",
-    "image_neck/up_1_norm": "image_neck.fpn_layer1.1",
-    "image_neck/up_2": "image_neck.fpn_layer2.0",
-    "image_neck/up_2_norm": "image_neck.fpn_layer2.1",
-    "image_neck/refine": "image_neck.refine.0",
-    "image_neck/refine_norm": "image_neck.refine.1",
-}
-"""Torch's module by module of ours, of the neck of a transformer."""
+_FUSION: Rules = (
+    (r"^image_fusion/attention/(\w+)/", r"fusion.deform_attn.\1."),
+    (r"^image_fusion/gate_hidden/", "fusion.fusion_gate.0."),
+    (r"^image_fusion/gate_out/", "fusion.fusion_gate.2."),
+    # Convolution, normalization and ReLU each take a number.
+    (r"^image_fusion/weighting/", "fusion.weighting_network/"),
+    (r"network/conv_(\d)/", lambda m: f"network.{3 * int(m[1]) - 3}."),
+    (r"network/norm_(\d)/", lambda m: f"network.{3 * int(m[1]) - 2}."),
+    (r"network/out/", "network.9."),
+    *radenet_torch.neck_rules("image_fusion/radar_neck", "fusion.rad_neck.neck"),
+    *radenet_torch.neck_rules("image_fusion/camera_neck", "fusion.cam_neck.neck"),
+)
 
+_CAMERA_NECK: Rules = (
+    (r"^image_neck/proj/", "image_neck.channel_proj."),
+    (r"^image_neck/up_(\d)/", r"image_neck.fpn_layer\1.0."),
+    (r"^image_neck/up_(\d)_norm/", r"image_neck.fpn_layer\1.1."),
+    (r"^image_neck/refine/", "image_neck.refine.0."),
+    (r"^image_neck/refine_norm/", "image_neck.refine.1."),
+)
 
-def fusion_names() -> dict[str, str]:
-    """Torch's module by module of ours, of the fusion."""
-    attention = ("sampling_offsets", "attention_weights", "value_proj", "output_proj")
-    names = {f"attention/{name}": f"deform_attn.{name}" for name in attention}
-    names |= {"gate_hidden": "fusion_gate.0", "gate_out": "fusion_gate.2"}
-    for i in (1, 2, 3):  # convolution, normalization, ReLU
-        names[f"weighting/conv_{i}"] = f"weighting_network.{3 * i - 3}"
-        names[f"weighting/norm_{i}"] = f"weighting_network.{3 * i - 2}"
-    names["weighting/out"] = "weighting_network.9"
-    names |= radenet_torch.neck_names("radar_neck", "rad_neck.neck")
-    names |= radenet_torch.neck_names("camera_neck", "cam_neck.neck")
-    return {f"image_fusion/{k}": f"fusion.{v}" for k, v in names.items()}
-
-
-def image_branch_names() -> dict[str, str]:
-    """Torch's module by module of ours, of the image branch with a ResNet-50."""
+_RESNET: Rules = (
+    *RESNET_RULES,
     # Positions in the released Sequential: stem, its norm, ReLU, pooling, stages.
-    conv, norm, *stages = (f"image_backbone.frozen_layers.{i}" for i in (0, 1, 4, 5, 6))
-    last = "image_backbone.layer4"
-    names = resnet_names(conv, norm, (*stages, last))
-    return names | {"image_neck/proj": "image_backbone.projection"}
+    (r"^conv1\.", "image_backbone.frozen_layers.0."),
+    (r"^bn1\.", "image_backbone.frozen_layers.1."),
+    (r"^layer([123])\.", lambda m: f"image_backbone.frozen_layers.{int(m[1]) + 3}."),
+    (r"^layer4\.", "image_backbone.layer4."),
+    (r"^image_neck/proj/", "image_backbone.projection."),
+)
+
+
+def rules(heads: str, is_resnet: bool) -> Rules:
+    """Rules from modules of DinoRADE to the official ones, for `convert`."""
+    image = _RESNET if is_resnet else _CAMERA_NECK
+    return (*image, *_FUSION, *radenet_torch.rules(heads, "rad_"))
 
 
 def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
-from radejax.weights.convert import from_torch, shapes_of, to_numpy, to_torch
+from radejax.weights.convert import Rules, from_torch, shapes_of, to_numpy, to_torch
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -55,23 +55,19 @@ def _constants(gated_mlp: bool) -> dict[str, Any]:
 
 
 _CLASS, _REGISTERS = "embeddings.cls_token", "embeddings.register_tokens"
-_NAMES = {
-    "prefix_tokens": _CLASS,
-    "patch_embed": "embeddings.patch_embeddings",
-    "norm": "norm",
-    "layers/norm_1": "layer.{}.norm1",
-    "layers/norm_2": "layer.{}.norm2",
-    "layers/scale_1": "layer.{}.layer_scale1.lambda1",
-    "layers/scale_2": "layer.{}.layer_scale2.lambda1",
-    "layers/query": "layer.{}.attention.q_proj",
-    "layers/key": "layer.{}.attention.k_proj",
-    "layers/value": "layer.{}.attention.v_proj",
-    "layers/out": "layer.{}.attention.o_proj",
-    "layers/up": "layer.{}.mlp.up_proj",
-    "layers/gate": "layer.{}.mlp.gate_proj",
-    "layers/down": "layer.{}.mlp.down_proj",
-}
-"""Hugging Face's module by module of ours, for `convert`."""
+_RULES: Rules = (
+    (r"^prefix_tokens", _CLASS),
+    (r"^patch_embed/", "embeddings.patch_embeddings."),
+    (r"^norm/", "norm."),
+    (r"^layers/norm_(\d)/", r"layer.{}.norm\1."),
+    (r"^layers/scale_(\d)", r"layer.{}.layer_scale\1.lambda1"),
+    (
+        r"^layers/(query|key|value|out)/",
+        lambda m: f"layer.{{}}.attention.{m[1][0]}_proj.",
+    ),
+    (r"^layers/(up|gate|down)/", r"layer.{}.mlp.\1_proj."),
+)
+"""Rules from modules of ours to Hugging Face's, for `convert`."""
 
 
 def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
@@ -186,7 +182,7 @@ def to_params(
         del tensors[_REGISTERS]
     # The mask token is used in pretraining only.
     ignored = r"embeddings\.mask_token$"
-    return from_torch(_NAMES, _shapes(model), tensors, source, ignored)["params"]
+    return from_torch(_RULES, _shapes(model), tensors, source, ignored)["params"]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -194,7 +190,7 @@ def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     size, params = model.patch_size, dict(params)
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
-    tensors = to_torch(_NAMES, {"params": params | {"patch_embed": patches}})
+    tensors = to_torch(_RULES, {"params": params | {"patch_embed": patches}})
     tokens = tensors[_CLASS]
     tensors[_CLASS] = np.ascontiguousarray(tokens[:, :1])
     if model.num_registers:

@@ -6,6 +6,7 @@ torch is not needed.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,7 @@ from radejax.core.files import PathLike, differences
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.weights import dinov3_hf
 from radejax.weights.convert import (
+    Rules,
     from_torch,
     read_state_dict,
     shapes_of,
@@ -123,32 +125,18 @@ def weights_sha256(params: Mapping[str, Any]) -> str:
 
 # ResNet-50 as torchvision distributes it ---------------------------------------------
 
-_DEPTHS = (3, 4, 6, 3)
-
-
-def resnet_names(
-    conv: str = "conv1",
-    norm: str = "bn1",
-    stages: tuple[str, ...] = ("layer1", "layer2", "layer3", "layer4"),
-) -> dict[str, str]:
-    """Torch's module by module of ours, for `convert`.
-
-    Args:
-        conv: First convolution.
-        norm: Its normalization.
-        stages: Prefixes of the four stages; the last one is part of our neck.
-    """
-    names = {"image_backbone/stem_conv": conv, "image_backbone/stem_norm": norm}
-    for stage, (theirs, depth) in enumerate(zip(stages, _DEPTHS, strict=True), 1):
-        ours = "image_neck/" if stage == 4 else f"image_backbone/stage_{stage}_"
-        for i in range(depth):
-            block = f"{ours}block_{i + 1}"
-            for k in (1, 2, 3):
-                names[f"{block}/conv_{k}"] = f"{theirs}.{i}.conv{k}"
-                names[f"{block}/norm_{k}"] = f"{theirs}.{i}.bn{k}"
-            names[f"{block}/conv_shortcut"] = f"{theirs}.{i}.downsample.0"
-            names[f"{block}/norm_shortcut"] = f"{theirs}.{i}.downsample.1"
-    return names
+RESNET_RULES: Rules = (
+    (r"^image_backbone/stem_conv/", "conv1."),
+    (r"^image_backbone/stem_norm/", "bn1."),
+    (r"^image_backbone/stage_(\d)_block_", r"layer\1.block_"),
+    (r"^image_neck/block_", "layer4.block_"),
+    (r"\.block_(\d)/", lambda m: f".{int(m[1]) - 1}."),
+    (r"\.conv_(\d)/", r".conv\1."),
+    (r"\.norm_(\d)/", r".bn\1."),
+    (r"\.conv_shortcut/", ".downsample.0."),
+    (r"\.norm_shortcut/", ".downsample.1."),
+)
+"""Rules from modules of DinoRADE to torchvision's; its last stage is part of our neck."""
 
 
 def load_resnet(
@@ -171,18 +159,17 @@ def load_resnet(
         DataError: Tensors are missing, unexpected or of another shape; all are listed.
     """
     tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
-    names = resnet_names()
     has_last = any(name.startswith("layer4.") for name in tensors)
+    parts = r"image_backbone/|image_neck/block_" if has_last else r"image_backbone/"
     shapes = {
         path: shape
         for path, shape in variable_shapes(model).items()
-        if path.partition("/")[2].rpartition("/")[0] in names
-        and (has_last or "/image_neck/" not in path)
+        if re.match(rf"\w+/({parts})", path)
     }
-    return from_torch(names, shapes, tensors, source, r"fc\.")
+    return from_torch(RESNET_RULES, shapes, tensors, source, r"fc\.")
 
 
 def save_resnet(params: Mapping[str, Any], path: PathLike) -> None:
     """Writes the parameters of a `ResNetTrunk` under torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
-    write_state_dict(path, to_torch(resnet_names(), trunk))
+    write_state_dict(path, to_torch(RESNET_RULES, trunk))

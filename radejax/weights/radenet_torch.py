@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -13,6 +14,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.models.radenet import RadeNet
 from radejax.weights.convert import (
+    Rules,
     from_torch,
     read_state_dict,
     to_torch,
@@ -65,7 +67,7 @@ def read(
     config = load_config("radenet:official").model.to_dict()
     config |= infer_config(tensors, source, model_overrides)
     shapes = variable_shapes(models.build(config))
-    names = module_names(len(config["widths"]), config["heads"])
+    names = rules(config["heads"])
     return config, from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
 
@@ -100,8 +102,7 @@ def save(
             f"input_center={model.input_center} and input_scale={model.input_scale}: "
             "train with 0 and 1 to save it for that code"
         )
-    names = module_names(len(model.widths), model.heads)
-    state = to_torch(names, {"params": variables["params"]})
+    state = to_torch(rules(model.heads), {"params": variables["params"]})
     if model.cbam is None:
         for name, shape in torch_shapes(model.clone(cbam="official")).items():
             is_scale = len(shape) == 1 and name.endswith("weight")
@@ -176,81 +177,56 @@ def infer_config(
 # Names -------------------------------------------------------------------------------
 
 
-def module_names(levels: int, heads: str, prefix: str = "") -> dict[str, str]:
-    """Official module by module of ours, for `convert`.
+def rules(heads: str, prefix: str = "") -> Rules:
+    """Rules from modules of RADE-Net to the official ones, for `convert`.
 
     Args:
-        levels: Of the encoder.
         heads: Kind, "expanded" or "default".
-        prefix: Of "backbone" and "neck": "rad_" in DinoRADE.
+        prefix: Prefix of "backbone" and "neck": "rad_" in DinoRADE.
     """
     unet = f"{prefix}backbone"
-    names = {"backbone/start": f"{unet}.start_conv"}
-    for part in ("doppler", "elevation", "mix"):
-        conv = f"{unet}.transform_input.{part}_conv"
-        names |= _norm_conv(f"backbone/stem/{part}", conv, "0", "1")
-    for i in (1, 2):
-        conv = f"{unet}.bottleneck.conv{i}"
-        names |= double_conv_names(f"backbone/bottleneck_{i}", conv)
-    for i in range(1, levels + 1):
-        for part in ("encoder", "decoder"):
-            block = f"{unet}.{part}_block_{i}"
-            names |= double_conv_names(f"backbone/{part}_{i}", block)
-        names |= cbam_names(f"backbone/cbam_{i}", f"{unet}.cbam_{i}")
-        names[f"backbone/upsample_{i}"] = f"{unet}.upsample_{i}.upsample"
-    names |= neck_names("neck", f"{prefix}neck.neck")
-    count = 3 if heads == "expanded" else 1
-    for ours, theirs in (("heatmap", "heatmap_head.head"), ("box", "reg_head.head")):
+    out = 9 if heads == "expanded" else 3
+    return (
+        (r"^backbone/start/", f"{unet}.start_conv."),
+        (r"^backbone/stem/(\w+)/", rf"{unet}.transform_input.\1_conv."),
+        (r"^backbone/bottleneck_(\d)/", rf"{unet}.bottleneck.conv\1."),
+        (r"^backbone/(encoder|decoder)_(\d+)/", rf"{unet}.\1_block_\2."),
+        (r"^backbone/upsample_(\d+)/", rf"{unet}.upsample_\1.upsample."),
+        (r"^backbone/cbam_(\d+)/", rf"{unet}.cbam_\1."),
+        (r"\.channel/squeeze/", ".channel_attention.fc1."),
+        (r"\.channel/excite/", ".channel_attention.fc2."),
+        (r"\.spatial/conv/", ".spatial_attention.convolution."),
+        (r"\.(start|end)/", r".\1_conv.single_conv."),
+        (r"\.shortcut/", ".adjust_input."),
+        (r"\.conv_(\d)/", lambda m: f".double_conv.{int(m[1]) - 1}.single_conv."),
+        (r"\.conv/", ".0."),
+        (r"\.norm/", ".1."),
+        *neck_rules("neck", f"{prefix}neck.neck"),
         # Convolution, normalization and activation each take a number.
-        for i in range(count):
-            block = f"heads/{ours}/conv_{i + 1}"
-            names |= _norm_conv(block, f"head.{theirs}", str(3 * i), str(3 * i + 1))
-        names[f"heads/{ours}/out"] = f"head.{theirs}.{3 * count}"
-    return names
+        (r"^heads/heatmap/", "head.heatmap_head.head/"),
+        (r"^heads/box/", "head.reg_head.head/"),
+        (r"head/conv_(\d)/conv/", lambda m: f"head.{3 * int(m[1]) - 3}."),
+        (r"head/conv_(\d)/norm/", lambda m: f"head.{3 * int(m[1]) - 2}."),
+        (r"head/out/", f"head.{out}."),
+    )
+
+
+def neck_rules(ours: str, theirs: str) -> Rules:
+    """A neck of either kind; the plain one has `conv`, the dilated `conv_1`, `conv_2`."""
+    block = rf"({re.escape(theirs)}\.\d\.(?:conv1\.)?)"
+    return (
+        (rf"^{ours}/block_(\d)/", lambda m: f"{theirs}.{int(m[1]) - 1}."),
+        (rf"{block}conv_(\d)/", r"\1conv\2."),
+        (rf"{block}conv/", r"\1conv."),
+        (rf"{block}norm/", r"\1gn."),
+    )
 
 
 def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
     """Shape of every official tensor that a model uses, by its official name."""
-    names = module_names(len(model.widths), model.heads)
+    names = rules(model.heads)
     return {
         # A broadcast scalar has the shape without the memory.
         torch_name(names, path): to_torch_layout(path, np.broadcast_to(0, shape)).shape
         for path, shape in variable_shapes(model).items()
     }
-
-
-def _norm_conv(ours: str, theirs: str, conv: str, norm: str) -> dict[str, str]:
-    return {f"{ours}/conv": f"{theirs}.{conv}", f"{ours}/norm": f"{theirs}.{norm}"}
-
-
-def double_conv_names(ours: str, theirs: str) -> dict[str, str]:
-    """A `DoubleConvResidual`."""
-    names = {f"{ours}/shortcut": f"{theirs}.adjust_input"}
-    for i in (1, 2):
-        block = f"{theirs}.double_conv.{i - 1}.single_conv"
-        names |= _norm_conv(f"{ours}/conv_{i}", block, "0", "1")
-    return names
-
-
-def cbam_names(ours: str, theirs: str) -> dict[str, str]:
-    """A `CBAM`."""
-    names = {
-        f"{ours}/channel/squeeze": f"{theirs}.channel_attention.fc1",
-        f"{ours}/channel/excite": f"{theirs}.channel_attention.fc2",
-        f"{ours}/spatial/conv": f"{theirs}.spatial_attention.convolution",
-    }
-    for end in ("start", "end"):
-        block = f"{theirs}.{end}_conv.single_conv"
-        names |= _norm_conv(f"{ours}/{end}", block, "0", "1")
-    return names
-
-
-def neck_names(ours: str, theirs: str) -> dict[str, str]:
-    """A neck of either kind; the plain one has `conv`, the dilated `conv_1`, `conv_2`."""
-    names: dict[str, str] = {}
-    for i in (1, 2, 3):
-        block, conv = f"{ours}/block_{i}", f"{theirs}.{i - 1}"
-        names |= _norm_conv(block, conv, "conv", "gn")
-        names |= _norm_conv(f"{block}/conv_1", f"{conv}.conv1", "conv", "gn")
-        names[f"{block}/conv_2"] = f"{conv}.conv2"
-    return names

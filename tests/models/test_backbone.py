@@ -12,7 +12,6 @@ from radejax.models.backbone import (
     InputStem,
     SpatialAttention,
 )
-from radejax.weights.radenet_torch import cbam_names
 
 
 def test_input_stem_equals_official(module_case, run_like_torch):
@@ -58,7 +57,15 @@ def test_skips_are_joined_after_the_upsampled_map():
     np.testing.assert_array_equal(backbone.apply(variables, x), y)
 
 
-NAMES = {k[2:]: v[2:] for k, v in cbam_names("m", "m").items()}
+NAMES = {
+    "channel/squeeze": "channel_attention.fc1",
+    "channel/excite": "channel_attention.fc2",
+    "spatial/conv": "spatial_attention.convolution",
+    "start/conv": "start_conv.single_conv.0",
+    "start/norm": "start_conv.single_conv.1",
+    "end/conv": "end_conv.single_conv.0",
+    "end/norm": "end_conv.single_conv.1",
+}
 
 
 @pytest.mark.parametrize("case", ["channel_attention", "channel_attention_small"])

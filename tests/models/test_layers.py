@@ -15,12 +15,17 @@ from radejax.models.layers import (
     max_pool,
     uniform_fan_in,
 )
-from radejax.weights.radenet_torch import double_conv_names
 
 
 def test_double_conv_residual_equals_official(module_case, run_like_torch):
     x, expected = module_case("double_conv_residual")
-    names = {k[2:]: v[2:] for k, v in double_conv_names("m", "m").items()}
+    names = {
+        "shortcut": "adjust_input",
+        "conv_1/conv": "double_conv.0.single_conv.0",
+        "conv_1/norm": "double_conv.0.single_conv.1",
+        "conv_2/conv": "double_conv.1.single_conv.0",
+        "conv_2/norm": "double_conv.1.single_conv.1",
+    }
     actual = run_like_torch(DoubleConvResidual(64, 32), names, x)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 

@@ -51,9 +51,12 @@ def part(shared, name, prefix):
     return {prefix + key: value for key, value in tensors.items()}
 
 
-def below(part, names):
-    """Names of a part by itself."""
-    return {k.removeprefix(f"{part}/"): v for k, v in names.items()}
+def part_from_torch(name, part_variables, tensors, source, ignored=r"\Z"):
+    """Variables of a part of DinoRADE from the tensors of that part only."""
+    whole = {kind: {name: tree} for kind, tree in part_variables.items()}
+    names = dinorade_torch.rules("expanded", is_resnet=False)
+    found = from_torch(names, shapes_of(whole), tensors, source, ignored)
+    return {kind: tree[name] for kind, tree in found.items()}
 
 
 def released_geometry(shared):
@@ -87,9 +90,8 @@ def test_released_camera_neck(shared):
     file = np.load(shared / "fixtures" / "dinorade" / "camneck.npz")
     tensors = part(shared, "camneck", "image_neck.")
     inputs = patch_tokens(), jnp.ones(1, bool)
-    shapes = shapes_of(jax.eval_shape(CameraNeck().init, jax.random.key(0), *inputs))
-    names = below("image_neck", dinorade_torch.CAMERA_NECK)
-    variables = from_torch(names, shapes, tensors, "camneck")
+    shapes = jax.eval_shape(CameraNeck().init, jax.random.key(0), *inputs)
+    variables = part_from_torch("image_neck", shapes, tensors, "camneck")
     out = jax.jit(CameraNeck().apply)(variables, *inputs)
     chex.assert_shape(out, (1, 180, 320, 128))
     out = np.asarray(out[0])
@@ -114,9 +116,8 @@ def test_released_fusion(shared):
 
     inputs = radar, elevation, camera, reference
     shapes = jax.eval_shape(Fusion(**fields).init, jax.random.key(0), *inputs)
-    names = below("image_fusion", dinorade_torch.fusion_names())
-    variables = from_torch(
-        names, shapes_of(shapes), tensors, "fusion", r"fusion\.output_proj"
+    variables = part_from_torch(
+        "image_fusion", shapes, tensors, "fusion", r"fusion\.output_proj"
     )
 
     @jax.jit
@@ -242,7 +243,7 @@ def test_resnet_in_place_of_the_transformer(shared):
     config = load_config("dinorade:official,rcw_resnet50").model
     model = build(config)
     shapes = variable_shapes(model)
-    names = dinorade_torch.image_branch_names()
+    names = dinorade_torch.rules("expanded", is_resnet=True)
     expected = {}
     for path, shape in shapes.items():
         if path.split("/")[1] in ("image_backbone", "image_neck"):

@@ -313,6 +313,6 @@ def test_names_and_shapes_are_the_official_ones(variant, shared):
 
 
 def test_a_module_of_another_model_has_no_name():
-    names = radenet_torch.module_names(3, "expanded")
+    names = radenet_torch.rules("expanded")
     with pytest.raises(UserError, match="neck/strip has no counterpart in the rel"):
         torch_name(names, "params/neck/strip/kernel")
