@@ -39,9 +39,9 @@ class Augmentation:
     """
 
     grid: RadarGrid
-    mirror_probability: float = 0.5
-    gain_db: float = 1.0
-    gain_slope_db: float = 2.0
+    mirror_probability: float = 0.0
+    gain_db: float = 0.0
+    gain_slope_db: float = 0.0
 
     def __post_init__(self) -> None:
         azimuth = self.grid.azimuth_rad

@@ -72,7 +72,7 @@ class RadeNet(nn.Module):
     neck: str = "dilated"
     heads: str = "expanded"
     pad_multiple: int = 8
-    crop_output: bool = False
+    crop_output: bool = True
     dtype: str = "float32"
     remat: str = "none"
     heatmap_prior: float = 0.5
