@@ -90,7 +90,7 @@ def decode(
     pre_nms: int | None = None,
     roi: Roi | None = None,
     per_class_nms: bool = False,
-    threshold_inclusive: bool = False,
+    threshold_inclusive: bool = True,
     raw_yaw: RawYaw = "nms",
     clip_sizes: bool = True,
 ) -> Detections:
@@ -188,7 +188,7 @@ def find_peaks(
     max_peaks: int,
     score_threshold: Scalar,
     roi: Roi | None = None,
-    threshold_inclusive: bool = False,
+    threshold_inclusive: bool = True,
 ) -> Peaks:
     """The strongest local maxima of the heatmaps with their boxes, before NMS.
 
@@ -271,11 +271,8 @@ def _in_roi(
         raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
     bins = np.pad(grid.bin_centers_ego(), [(0, 0), (0, 0), (0, 1)])  # [R, A, 3], z = 0
     center = params[..., :3].astype(jnp.float32) + jnp.asarray(bins, jnp.float32)[None]
-    inside = jnp.ones(params.shape[:3], bool)
-    for axis in range(3):
-        position = center[..., axis]
-        inside &= (position >= roi[2 * axis]) & (position <= roi[2 * axis + 1])
-    return inside
+    low, high = roi.reshape(3, 2).T[:, None, None, None]
+    return jnp.all((center >= low) & (center <= high), axis=-1)
 
 
 def _compact(

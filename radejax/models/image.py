@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from radejax.models.convolution import conv2d, plain_conv2d, product
+from radejax.models.convolution import product
 from radejax.models.layers import Conv, Dense, uniform_fan_in
 
 Tokens = Float[jax.Array, "B h w C"]
@@ -189,33 +189,8 @@ class FrozenBatchNorm(nn.Module):
         )
 
 
-class StridedConv(nn.Module):
-    """Convolution without bias, padded by half its size.
-
-    Attributes:
-        features: Output channels.
-        size: Taps per axis, odd.
-        stride: Step per axis.
-        dtype: Dtype of the computation and the output.
-    """
-
-    features: int
-    size: int
-    stride: int = 1
-    dtype: Any = jnp.float32
-
-    @nn.compact
-    def __call__(
-        self, x: Float[jax.Array, "B H W _"]
-    ) -> Float[jax.Array, "B h w {self.features}"]:
-        shape = (self.size, self.size, x.shape[-1], self.features)
-        kernel = self.param("kernel", uniform_fan_in(self.size**2 * shape[2]), shape)
-        if self.size == 1:  # a stride only leaves out
-            x = x[:, :: self.stride, :: self.stride]
-        x, kernel = jnp.asarray(x, self.dtype), jnp.asarray(kernel, self.dtype)
-        if self.size == 1 or self.stride == 1:
-            return conv2d(x, kernel)
-        return plain_conv2d(x, kernel, stride=self.stride)
+def _conv(features: int, size: int, stride: int, dtype: Any, name: str) -> Conv:
+    return Conv(features, size, stride=stride, use_bias=False, dtype=dtype, name=name)
 
 
 def _normalized(
@@ -248,7 +223,7 @@ class Bottleneck(nn.Module):
         self, x: Float[jax.Array, "B H W C"], train: bool, mask: Mask = None
     ) -> Float[jax.Array, "B h w {4*self.features}"]:
         def block(x: jax.Array, features: int, size: int, stride: int, name: str):
-            x = StridedConv(features, size, stride, self.dtype, name=f"conv_{name}")(x)
+            x = _conv(features, size, stride, self.dtype, f"conv_{name}")(x)
             return _normalized(x, f"norm_{name}", self.frozen, self.dtype, train, mask)
 
         y = nn.relu(block(x, self.features, 1, 1, "1"))
@@ -279,7 +254,7 @@ class ResNetTrunk(nn.Module):
     def __call__(
         self, image: Float[jax.Array, "B H W 3"], train: bool = False
     ) -> Float[jax.Array, "B (H+15)//16 (W+15)//16 {16*self.width}"]:
-        x = StridedConv(self.width, 7, 2, self.dtype, name="stem_conv")(image)
+        x = _conv(self.width, 7, 2, self.dtype, "stem_conv")(image)
         x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
         for stage, depth in enumerate(self.depths, 1):

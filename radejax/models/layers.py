@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from radejax.models.convolution import conv2d, product
+from radejax.models.convolution import conv2d, plain_conv2d, product
 
 Initializer = Callable[..., jax.Array]
 Map = Float[jax.Array, "B R A C"]
@@ -49,12 +49,13 @@ def _cut(numbers: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 class Conv(nn.Module):
-    """Stride-1 convolution that keeps the size, `[B, R, A, C]` -> `[B, R, A, C']`.
+    """Convolution padded by half its size, `[B, R, A, C]` -> `[B, R, A, C']`.
 
     Attributes:
         features: Output channels C'.
         size: Taps per axis, odd. 1 is a matrix product.
         dilation: Distance of taps in bins.
+        stride: Step per axis; needs a dilation of 1 if above 1.
         use_bias: Add a vector per output channel.
         initial_bias: What the initial biases scatter around.
         dtype: Dtype of the computation and the output.
@@ -63,6 +64,7 @@ class Conv(nn.Module):
     features: int
     size: int = 3
     dilation: int = 1
+    stride: int = 1
     use_bias: bool = True
     initial_bias: float = 0.0
     dtype: Any = jnp.float32
@@ -72,7 +74,13 @@ class Conv(nn.Module):
         init = uniform_fan_in(self.size**2 * x.shape[-1])
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", init, shape)
-        y = conv2d(x.astype(self.dtype), kernel.astype(self.dtype), self.dilation)
+        x, kernel = x.astype(self.dtype), kernel.astype(self.dtype)
+        if self.stride == 1:
+            y = conv2d(x, kernel, self.dilation)
+        elif self.size == 1:
+            y = conv2d(x[:, :: self.stride, :: self.stride], kernel)
+        else:
+            y = plain_conv2d(x, kernel, stride=self.stride)
         if self.use_bias:
             bias = self.param(
                 "bias", lambda *args: init(*args) + self.initial_bias, (self.features,)
@@ -198,7 +206,7 @@ class ConvGNSiLU(nn.Module):
             self.features,
             self.size,
             self.dilation,
-            self.use_bias,
+            use_bias=self.use_bias,
             dtype=self.dtype,
             name="conv",
         )(x)

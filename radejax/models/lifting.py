@@ -107,9 +107,13 @@ class LiftingAxes:
         )
 
     def centers_ego(
-        self, num_range: int, num_azimuth: int
-    ) -> Float[np.ndarray, "{num_range} {num_azimuth} {self.num_elevation} 3"]:
-        """Query centers `[R, A, E, 3]` in the ego frame, meters."""
+        self, num_range: int, num_azimuth: int, xp: Any = np
+    ) -> Float[Any, "{num_range} {num_azimuth} {self.num_elevation} 3"]:
+        """Query centers `[R, A, E, 3]` in the ego frame, meters.
+
+        They are an outer product of small tables: with `jax.numpy` as `xp`, in float32,
+        a program has no constant of millions of numbers. NumPy's are float64.
+        """
         range_m = self.range_m[0] + self.range_m[1] * np.arange(num_range)
         azimuth = np.deg2rad(
             self.azimuth_deg[0] + self.azimuth_deg[1] * np.arange(num_azimuth)
@@ -117,11 +121,12 @@ class LiftingAxes:
         low, high = self.elevation_deg
         part = (np.arange(self.num_elevation) + 0.5) / self.num_elevation
         elevation = np.deg2rad(low + (high - low) * part)
-        flat = range_m[:, None, None] * np.cos(elevation)  # [R, 1, E]
-        x = flat * np.cos(azimuth)[:, None]
-        y = -flat * np.sin(azimuth)[:, None]
-        z = range_m[:, None, None] * np.sin(elevation)
-        return np.stack(np.broadcast_arrays(x, y, z), -1)
+        x = np.cos(elevation) * np.cos(azimuth)[:, None]  # [A, E]
+        y = -np.cos(elevation) * np.sin(azimuth)[:, None]
+        axes = np.broadcast_arrays(x, y, np.sin(elevation))
+        dtype = np.float64 if xp is np else np.float32
+        unit = xp.asarray(np.stack(axes, -1)[None], dtype)
+        return xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
 
 
 def reference_points(
@@ -149,9 +154,7 @@ def reference_points(
     is_batch = np.ndim(camera.max_radius) > 0
     on_host = isinstance(camera.intrinsics, np.ndarray)
     xp = np if on_host else jnp
-    # Small products in the program, no constant of millions of numbers.
-    make_centers = LiftingAxes.centers_ego if on_host else _centers_in_program
-    centers: Any = make_centers(axes, num_range, num_azimuth)
+    centers = axes.centers_ego(num_range, num_azimuth, xp)
     if not is_batch:
         camera = jax.tree.map(lambda x: xp.asarray(x)[None], camera)
     centers = xp.broadcast_to(centers[None], (*camera.max_radius.shape, *centers.shape))
@@ -217,13 +220,3 @@ class WeightingNetwork(nn.Module):
                 x = nn.relu(GroupNorm(8, dtype=self.dtype, name=f"norm_{i}")(x))
         logits = Dense(self.num_elevation, dtype=self.dtype, name="out")(x)
         return nn.softmax(logits.astype(jnp.float32), -1)
-
-
-def _centers_in_program(
-    axes: LiftingAxes, num_range: int, num_azimuth: int
-) -> Float[Any, "{num_range} {num_azimuth} {axes.num_elevation} 3"]:
-    """`centers_ego` as outer products of small tables."""
-    unit = dataclasses.replace(axes, range_m=(1.0, 0.0)).centers_ego(1, num_azimuth)
-    centers_m = axes.range_m[0] + axes.range_m[1] * np.arange(num_range)
-    range_m = jnp.asarray(centers_m, jnp.float32).reshape(-1, 1, 1, 1)
-    return range_m * jnp.asarray(unit, jnp.float32)

@@ -23,6 +23,7 @@ GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimu
 C = 3
 SIZES = ("grid", "max_detections", "pre_nms", "per_class_nms")
 FLAGS = ("threshold_inclusive", "raw_yaw", "clip_sizes")
+RELEASED = {"threshold_inclusive": False}
 
 _decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
 _find_peaks = jax.jit(
@@ -32,11 +33,11 @@ _find_peaks = jax.jit(
 
 def decode(*args, **options):
     """Results in NumPy: JAX compiles every slice of another size."""
-    return jax.device_get(_decode(*args, **options))
+    return jax.device_get(_decode(*args, **RELEASED | options))
 
 
 def find_peaks(*args, **options):
-    return jax.device_get(_find_peaks(*args, **options))
+    return jax.device_get(_find_peaks(*args, **RELEASED | options))
 
 
 def logit(p):

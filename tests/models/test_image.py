@@ -8,6 +8,7 @@ import scipy.signal
 
 from radejax.models import image as image_lib
 from radejax.models.image import CameraNeck, TransposedConv
+from radejax.models.layers import Conv
 
 
 def test_bytes_become_standardised_colors():
@@ -36,7 +37,7 @@ def convolved(x, kernel, stride):
 def test_strided_convolution():
     x = np.random.default_rng(0).standard_normal((2, 7, 8, 3)).astype(np.float32)
     for size, stride in ((1, 1), (1, 2), (3, 2), (7, 2)):
-        module = image_lib.StridedConv(4, size, stride)
+        module = Conv(4, size, stride=stride, use_bias=False)
         variables = module.init(jax.random.key(0), jnp.asarray(x))
         kernel = np.asarray(variables["params"]["kernel"])
         np.testing.assert_allclose(
