@@ -17,7 +17,7 @@ import os
 import pathlib
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -48,6 +48,7 @@ _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 _FEW_FRAMES = 100  # done before worker processes have started
 
+_T = TypeVar("_T")
 _Prepared = tuple[int, FrameSpec, RadarInput, list[Label]]
 
 _log = logging.getLogger(__name__)
@@ -136,9 +137,7 @@ def _marker(config: SimulationConfig) -> dict[str, Any]:
     }
 
 
-def _cameras(
-    config: SimulationConfig,
-) -> tuple[CameraCalibration, CameraCalibration] | tuple[()]:
+def _cameras(config: SimulationConfig) -> tuple[CameraCalibration, ...]:
     """Left and right camera, or none."""
     if not config.image_width:
         return ()
@@ -187,16 +186,18 @@ def _write_frames(
         _prepared(num_workers, missing, root, config, source) as frames,
     ):
         progress_bar.update(total - len(missing))
-        last: tuple[Any, ...] | None = None
-        for number, spec, given, labels in frames:
-            # The device computes this frame while the one before is written.
-            output = compute(given.scatterers, given.noise_power, given.key)
-            if last:
-                _write_frame(root, config, *last)
-                progress_bar.update()
-            last = number, spec, output, labels
-        if last:
-            _write_frame(root, config, *last)
+        computed = (
+            (
+                number,
+                spec,
+                compute(given.scatterers, given.noise_power, given.key),
+                labels,
+            )
+            for number, spec, given, labels in frames
+        )
+        # The device computes the next frame while this one is written.
+        for frame in _started_ahead(computed, 1):
+            _write_frame(root, config, *frame)
             progress_bar.update()
 
 
@@ -300,14 +301,19 @@ def _by_workers(
     submit: Submit, missing: Sequence[tuple[int, FrameSpec]], num_ahead: int
 ) -> Iterator[_Prepared]:
     started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
-    waiting = collections.deque(itertools.islice(started, num_ahead))
-    while waiting:
-        frame, future = waiting.popleft()
-        waiting.extend(itertools.islice(started, 1))
+    for frame, future in _started_ahead(started, num_ahead):
         path = pathlib.Path(future.result())
         given, labels = pickle.loads(path.read_bytes())
         path.unlink()
         yield (*frame, given, labels)
+
+
+def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:
+    """The items, each after `count` further ones have been taken and so started."""
+    waiting = collections.deque(itertools.islice(items, count))
+    while waiting:
+        waiting.extend(itertools.islice(items, 1))
+        yield waiting.popleft()
 
 
 _scenes: Any = None

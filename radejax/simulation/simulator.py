@@ -91,7 +91,8 @@ class SequenceSimulator:
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
         static = scattering.scatter_surroundings(frame, self._static_phase, parameters)
         ghosts = scattering.scatter_ghosts(objects, sequence.mirrors_m)
-        found = scattering.join([objects, static, ghosts])
+        kinds = zip(objects, static, ghosts, strict=True)
+        found = scattering.FrameScattering(*map(np.concatenate, kinds))
         count, is_mirrored = len(objects.power), np.ones(len(found.power), bool)
         # The cross-section of the ground stands for what it returns as it lies there.
         is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
@@ -171,16 +172,16 @@ class SequenceSimulator:
         """
         visible = self.is_radar_visible(frame, given)
         distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
-        labels = []
+        labels, tracks = [], self.sequence.tracks
         for n in np.flatnonzero(distance < max_distance_m):
             box = frame.boxes[n].copy()
             box[:3] -= radar_from_lidar_m
             labels.append(
                 Label(
-                    cls=self.sequence.tracks.label_cls[frame.track[n]],
+                    cls=tracks.label_cls[frame.track[n]],
                     box=tuple(box.tolist()),
                     visibility="R" if visible[n] else "L",
-                    track_id=int(frame.track_id[n]),
+                    track_id=int(tracks.track_id[frame.track[n]]),
                 )
             )
         return labels

@@ -97,7 +97,7 @@ def test_labels_are_in_the_lidar_frame(urban):
     distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
     assert len(labels) == (distance < 60.0).sum()
     for n in np.flatnonzero(distance < 60.0):
-        box = by_id[frame.track_id[n]].box
+        box = by_id[urban.sequence.tracks.track_id[frame.track[n]]].box
         np.testing.assert_allclose(
             np.add(box[:3], (-2.54, 0.3, 0.7)), frame.boxes[n, :3]
         )

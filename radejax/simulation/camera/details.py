@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame
 
@@ -153,29 +153,39 @@ _TREES = np.array([(58, 84, 48), (70, 92, 52), (48, 74, 50)], float)
 _SNOWY = np.array([206, 210, 214.0])
 _FAR_M = 110.0
 
-Panels = tuple[
-    Float[np.ndarray, "P 4 3"], Float[np.ndarray, " P"], Float[np.ndarray, "P 3"]
-]
+
+class Faces(NamedTuple):
+    """Quadrilaterals in the radar's frame.
+
+    Attributes:
+        corners: x, y, z.
+        color: Red, green, blue in white light.
+        depth_m: Distance of the object.
+        block_depth_m: Distance of the block.
+        box: Index of the box, -1 for none.
+    """
+
+    corners: Float[np.ndarray, "F 4 3"]
+    color: Float[np.ndarray, "F 3"]
+    depth_m: Float[np.ndarray, " F"]
+    block_depth_m: Float[np.ndarray, " F"]
+    box: Int[np.ndarray, " F"]
 
 
 def make_panels(
     frame: SceneFrame, origin: Float[np.ndarray, "3"], ground_m: float, white: float
-) -> Panels:
-    """Upright rectangles of the surroundings in one frame.
+) -> Faces:
+    """Upright rectangles of the surroundings in one frame, which belong to no box.
 
     Args:
         frame: Its reflectors are drawn.
         origin: Camera position; trees and poles turn their face to it.
         ground_m: Height of the ground.
         white: Snow on everything, 0 to 1.
-
-    Returns:
-        Corners, distances and colors.
     """
     fixed = frame.reflectors
     near = np.hypot(fixed.position_m[:, 0], fixed.position_m[:, 1]) < _FAR_M
-    panels = [np.zeros((0, 4, 3))]
-    colors = [np.zeros((0, 3))]
+    panels, colors = [], []
     for name, half_width, low, high, palette in (
         ("tree", 0.15, 0.0, 2.2, np.array([(74.0, 60.0, 46.0)])),
         ("tree", 1.5, 2.0, 6.0, _TREES),
@@ -190,24 +200,15 @@ def make_panels(
             facing = np.arctan2(position[:, 1] - origin[1], position[:, 0] - origin[0])
         angle = facing + np.pi / 2.0
         side = half_width * np.stack([np.cos(angle), np.sin(angle)], 1)
-        panels.append(_upright(position[:, :2], side, ground_m + low, ground_m + high))
+        a, b = position[:, :2] - side, position[:, :2] + side
+        z = np.broadcast_to([ground_m + low, ground_m + high], a.shape)
+        corners = np.stack([a, b, b, a], 1), z[:, [0, 0, 1, 1], None]
+        panels.append(np.concatenate(corners, -1))
         color = palette[frame.reflector_idx[chosen] * 7919 % len(palette)]
         if name in ("tree", "pole"):
             color = color + white * 0.6 * (_SNOWY - color)
         colors.append(color)
     corners = np.concatenate(panels)
     depth = np.linalg.norm(corners.mean(1) - origin, axis=1)
-    return corners, depth, np.concatenate(colors)
-
-
-def _upright(
-    center: Float[np.ndarray, "P 2"],
-    side: Float[np.ndarray, "P 2"],
-    low: float,
-    high: float,
-) -> Float[np.ndarray, "P 4 3"]:
-    """Rectangles around ground points."""
-    a, b = center - side, center + side
-    flat = np.stack([a, b, b, a], 1)
-    height = np.broadcast_to([[low], [low], [high], [high]], (len(center), 4, 1))
-    return np.concatenate([flat, height], -1)
+    no_box = np.full(len(depth), -1)
+    return Faces(corners, np.concatenate(colors), depth, depth, no_box)

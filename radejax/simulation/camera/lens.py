@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 from PIL import Image, ImageDraw
 
 
@@ -58,17 +57,6 @@ def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
     """State of the lens in one frame, one of `LEVELS`; constant over blocks of frames."""
     rng = np.random.default_rng([seed, sequence, frame // BLOCK_FRAMES, 13])
     return LEVELS[rng.choice(4, p=AIR[weather].cover)]
-
-
-def haze(
-    color: Float[np.ndarray, "*points 3"],
-    depth_m: Float[np.ndarray, "*points"],
-    veil: Float[np.ndarray, "3"],
-    extinction_per_m: float,
-) -> Float[np.ndarray, "*points 3"]:
-    """Colors at distances seen through a veil of a color."""
-    clear = np.exp(-extinction_per_m * depth_m)[..., None]
-    return color * clear + veil * (1.0 - clear)
 
 
 def add_precipitation(

@@ -47,7 +47,7 @@ _HALF_BRIGHT_M = 20.0
 
 def stereo_calibration(
     radar_from_lidar_m: tuple[float, float, float], width: int = 1280, height: int = 720
-) -> tuple[CameraCalibration, CameraCalibration]:
+) -> tuple[CameraCalibration, ...]:
     """Left and right front camera with K-Radar's intrinsics, scaled to an image size.
 
     Args:
@@ -55,7 +55,7 @@ def stereo_calibration(
         width: Width of one of the two images.
         height: Height.
     """
-    left, right = (
+    return tuple(
         CameraCalibration.from_angles(
             intrinsics=_INTRINSICS,
             distortion=_DISTORTION,
@@ -65,7 +65,6 @@ def stereo_calibration(
         ).resized(width, height)
         for translation in _TRANSLATIONS
     )
-    return left, right
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +141,7 @@ class CameraRenderer:
     def __init__(
         self,
         sequence: Sequence,
-        calibrations: tuple[CameraCalibration, CameraCalibration],
+        calibrations: tuple[CameraCalibration, ...],
         seed: int,
         *,
         cover_lens: bool = True,
@@ -267,7 +266,7 @@ class CameraRenderer:
         verge = _VERGE.get(sequence.environment, _GRASS)
         verge = verge + self.air.white * (_SNOW - verge)
         left = y - 0.5 * sequence.road.curvature_per_m * x * x
-        along = x + frame.ego_along_m
+        along = x + sequence.ego_along_m[frame.index]
         grain = _hash_noise(np.floor(along * 3.0), np.floor(left * 3.0)) - 0.5
         color = np.broadcast_to(verge, (x.size, 3)) + 24.0 * grain[:, None]
         if lanes:

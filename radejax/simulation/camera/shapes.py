@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from radejax.geometry.camera import CameraCalibration, project
-from radejax.simulation.camera import details, lens
-from radejax.simulation.camera.details import Panels
+from radejax.simulation.camera import details
+from radejax.simulation.camera.details import Faces
 
 # A block in units of the half extents: x, y, z ranges; color role; share kept of the
 # length and width at its top (a taper).
@@ -149,9 +148,8 @@ class Light:
         if self.headlights:
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
             brightness = brightness + 0.75 * beam * np.exp(-np.abs(x_m) / 28.0)
-        return lens.haze(
-            color * brightness[..., None], depth_m, self.veil, self.extinction_per_m
-        )
+        clear = np.exp(-self.extinction_per_m * depth_m)[..., None]
+        return color * brightness[..., None] * clear + self.veil * (1.0 - clear)
 
 
 def visible_polygons(
@@ -160,7 +158,7 @@ def visible_polygons(
     colors: Float[np.ndarray, "N 2 3"],
     calibration: CameraCalibration,
     light: Light,
-    panels: Panels | None = None,
+    roadside: Faces,
 ) -> list[Polygon]:
     """Faces that look at the camera, far objects first.
 
@@ -170,13 +168,10 @@ def visible_polygons(
         colors: Of `object_colors`.
         calibration: The camera.
         light: Brightness and haze.
-        panels: Surroundings, of `make_panels`.
+        roadside: Surroundings, see `details.make_panels`.
     """
-    faces = _object_faces(boxes, classes, colors, camera_position(calibration))
-    if panels is not None:
-        corners, depth, color = panels
-        roadside = Faces(corners, color, depth, depth, np.full(len(depth), -1))
-        faces = Faces(*map(np.concatenate, zip(faces, roadside, strict=True)))
+    objects = _object_faces(boxes, classes, colors, camera_position(calibration))
+    faces = Faces(*map(np.concatenate, zip(objects, roadside, strict=True)))
     order = np.lexsort((-faces.block_depth_m, -faces.depth_m))
     faces = Faces(*(column[order] for column in faces))
     center = faces.corners.mean(1)
@@ -196,24 +191,6 @@ def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
     return calibration.radar_from_lidar_m - (
         calibration.rotation.T @ calibration.translation_m
     )
-
-
-class Faces(NamedTuple):
-    """Quadrilaterals in the radar's frame.
-
-    Attributes:
-        corners: x, y, z.
-        color: Red, green, blue in white light.
-        depth_m: Distance of the object.
-        block_depth_m: Distance of the block.
-        box: Index of the box, -1 for none.
-    """
-
-    corners: Float[np.ndarray, "F 4 3"]
-    color: Float[np.ndarray, "F 3"]
-    depth_m: Float[np.ndarray, " F"]
-    block_depth_m: Float[np.ndarray, " F"]
-    box: Int[np.ndarray, " F"]
 
 
 def _object_faces(boxes, classes, colors, origin) -> Faces:

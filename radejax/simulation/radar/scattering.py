@@ -24,7 +24,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +32,12 @@ from jaxtyping import Float, Int
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
-from radejax.simulation.world.scene import SceneFrame, is_blocked, rotate
+from radejax.simulation.world.scene import (
+    FRAME_PERIOD_S,
+    SceneFrame,
+    is_blocked,
+    rotate,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +154,10 @@ def _one_object(
     weight = rng.exponential(1.0, count)
     is_micro = rng.random(count) < law.micro
     micro = np.where(is_micro, rng.uniform(0.4, 1.0, count), 0.0)
-    glint = np.full(count, law.glint)
-    mean = _aspect_mean(normal, weight, glint)
+    # Mean total cross-section over all horizontal aspects.
+    angle = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
+    cosine = normal[:, :2] @ np.stack([np.cos(angle), np.sin(angle)])  # [S, aspects]
+    mean = (weight[:, None] * face_gain(cosine, law.glint)).sum(0).mean()
     rcs_db = law.rcs_dbsm + law.spread_db * rng.normal()
     # The log-normal factor has mean exp(s^2 / 2): the class's mean stays exact.
     rcs_db -= law.spread_db**2 * np.log(10.0) / 20.0
@@ -159,22 +166,11 @@ def _one_object(
         position=position,
         normal=normal,
         power_m2=weight / mean * 10.0 ** (rcs_db / 10.0),
-        glint=glint,
+        glint=np.full(count, law.glint),
         phase_rad=rng.uniform(0.0, 2.0 * np.pi, count),
         micro=micro,
         micro_phase_rad=rng.uniform(0.0, 2.0 * np.pi, count),
     )
-
-
-def _aspect_mean(
-    normal: Float[np.ndarray, "S 3"],
-    weight: Float[np.ndarray, " S"],
-    glint: Float[np.ndarray, " S"],
-) -> float:
-    """Mean total cross-section over all horizontal aspects of weights of 1 m2."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
-    cosine = normal[:, :2] @ np.stack([np.cos(angle), np.sin(angle)])  # [S, aspects]
-    return float((weight[:, None] * face_gain(cosine, glint[:, None])).sum(0).mean())
 
 
 def face_gain(
@@ -213,15 +209,6 @@ class FrameScattering(NamedTuple):
     owner: Int[np.ndarray, " S"]
 
 
-def join(parts: Iterable[FrameScattering]) -> FrameScattering:
-    """Scatterers of several kinds together; of none, none."""
-    flat = np.zeros(0)
-    none = FrameScattering(
-        np.zeros((0, 3)), np.zeros((0, 2)), flat, flat, flat.astype(int)
-    )
-    return FrameScattering(*map(np.concatenate, zip(none, *parts, strict=True)))
-
-
 def scatter_objects(
     frame: SceneFrame, centers: ObjectScatterers, parameters: RadarParameters
 ) -> tuple[FrameScattering, Float[np.ndarray, " N"]]:
@@ -254,18 +241,16 @@ def scatter_objects(
 
     # Wheel rims, legs and pedals swing between 0 and twice the speed of the body.
     speed = np.hypot(*frame.velocity_mps.T)[owner]
-    turning = np.where(np.isin(frame.cls[owner], _ON_FOOT), 1.8, speed / 0.33)
+    is_walking = frame.cls[owner] == CLASSES.index("Pedestrian")
+    turning = np.where(is_walking, 1.8, speed / 0.33)
     swing = centers.micro[used] * np.sin(
-        turning * frame.time_s + centers.micro_phase_rad[used]
+        turning * (frame.index * FRAME_PERIOD_S) + centers.micro_phase_rad[used]
     )
     velocity = frame.velocity_mps[owner] * (1.0 + swing[:, None])
     scattering = FrameScattering(
         position, velocity, power, centers.phase_rad[used], owner
     )
     return scattering, lit / np.maximum(total, 1e-30)
-
-
-_ON_FOOT = [CLASSES.index("Pedestrian")]
 
 
 def received_power(
@@ -373,25 +358,20 @@ def scatter_ghosts(
         Ghosts: Kraus et al., "Using machine learning to detect ghost images in
         automotive radar", ITSC 2020, arXiv:2007.05280. The loss is our choice.
     """
-    parts = []
-    near = np.flatnonzero(
-        np.hypot(objects.position_m[:, 0], objects.position_m[:, 1]) < _MIRROR_REACH_M
+    forward, left, _ = objects.position_m.T
+    planes = np.array(mirrors_m, float)
+    is_near = np.hypot(forward, left) < _MIRROR_REACH_M
+    is_on_our_side = np.sign(planes)[:, None] * (planes[:, None] - left) > 0
+    mirror, chosen = np.nonzero(is_near & is_on_our_side)  # of [mirrors, S]
+    plane, position = planes[mirror], objects.position_m[chosen]
+    direct = np.linalg.norm(position, axis=1)
+    position[:, 1] = 2.0 * plane - position[:, 1]
+    mirrored = np.linalg.norm(position, axis=1)
+    loss = 10.0 ** (MIRROR_DB / 10.0) * (direct / mirrored) ** 4
+    return FrameScattering(
+        position,
+        objects.velocity_mps[chosen] * (1.0, -1.0),
+        objects.power[chosen] * loss,
+        objects.phase_rad[chosen] + plane,
+        np.full(len(chosen), -1),
     )
-    for plane in mirrors_m:
-        position = objects.position_m[near].copy()
-        inside = np.sign(plane) * (plane - position[:, 1]) > 0  # on our side of it
-        chosen, position = near[inside], position[inside]
-        direct = np.linalg.norm(position, axis=1)
-        position[:, 1] = 2.0 * plane - position[:, 1]
-        mirrored = np.linalg.norm(position, axis=1)
-        loss = 10.0 ** (MIRROR_DB / 10.0) * (direct / mirrored) ** 4
-        parts.append(
-            FrameScattering(
-                position,
-                objects.velocity_mps[chosen] * (1.0, -1.0),
-                objects.power[chosen] * loss,
-                objects.phase_rad[chosen] + plane,
-                np.full(len(chosen), -1),
-            )
-        )
-    return join(parts)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +25,6 @@ from radejax.core.errors import check_options, integer, number
 from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
-
-Output = Literal["rows", "projection"]
 
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
@@ -163,7 +161,7 @@ def simulate(
     *,
     grid: RadarGrid,
     parameters: RadarParameters = RadarParameters(),
-    output: Output = "projection",
+    output: Literal["rows", "projection"] = "projection",
 ) -> Float[jax.Array, "..."]:
     """One radar frame, jitted; map it over frames with `jax.vmap`.
 
@@ -211,12 +209,9 @@ def simulate(
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
 
-    def by_rows(count: int, *rows: Any) -> jax.Array:
-        # One by one is without a batch's axis.
-        return lax.map(row, rows, batch_size=None if count == 1 else count)
-
-    one, many = (functools.partial(by_rows, count) for count in (1, 64))
-    return lax.platform_dependent(*rows, cpu=one, default=many)
+    one_by_one = functools.partial(lax.map, row)
+    in_batches = functools.partial(lax.map, row, batch_size=64)
+    return lax.platform_dependent(rows, cpu=one_by_one, default=in_batches)
 
 
 def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:

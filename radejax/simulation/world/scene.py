@@ -98,26 +98,20 @@ class SceneFrame:
         velocity_mps: Over ground, along the ego axes.
         cls: Index into `CLASSES`.
         track: Index into the tracks of the sequence.
-        track_id: Identity written to the labels.
         ego_velocity_mps: Of the radar over ground, along its own axes.
         reflectors: Static surroundings near the ego, in this frame.
         reflector_idx: Which reflectors of the sequence these are.
-        index: Of the frame in its sequence.
-        time_s: Since the start of the sequence.
-        ego_along_m: Position of the ego along its road (for drawing the road).
+        index: Index of the frame in its sequence.
     """
 
     boxes: Float[np.ndarray, "N 7"]
     velocity_mps: Float[np.ndarray, "N 2"]
     cls: Int[np.ndarray, " N"]
     track: Int[np.ndarray, " N"]
-    track_id: Int[np.ndarray, " N"]
     ego_velocity_mps: Float[np.ndarray, "2"]
     reflectors: Reflectors
     reflector_idx: Int[np.ndarray, " M"]
     index: int
-    time_s: float
-    ego_along_m: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +174,6 @@ class Sequence:
             velocity_mps=np.stack(rotate(velocity[:, 0], velocity[:, 1], -pose[2]), 1),
             cls=tracks.cls[chosen],
             track=chosen,
-            track_id=tracks.track_id[chosen],
             ego_velocity_mps=np.array([self.ego_speed_mps[index], 0.0]),
             reflectors=Reflectors(
                 position_m=points[seen],
@@ -190,8 +183,6 @@ class Sequence:
             ),
             reflector_idx=seen,
             index=index,
-            time_s=index * FRAME_PERIOD_S,
-            ego_along_m=float(self.ego_along_m[index]),
         )
 
 

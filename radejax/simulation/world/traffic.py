@@ -62,7 +62,9 @@ def make_sequence(
     law = ENVIRONMENTS[environment].with_vulnerable(vru_density_scale)
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * FRAME_PERIOD_S
-    speed = rng.uniform(*law.speed_mps) * _speed_wave(clock, rng)
+    mean_speed = rng.uniform(*law.speed_mps)
+    waves = clock / rng.uniform(8.0, 25.0) + rng.random()  # traffic slows and speeds up
+    speed = mean_speed * (1.0 + 0.12 * np.sin(2 * np.pi * waves))
     along = traveled(speed)
     traffic = _Traffic(law, road, clock, along, speed, rng)
     edges = traffic.fill()
@@ -83,14 +85,6 @@ def make_sequence(
         ground_m=GROUND_M,
         mirrors_m=mirrors,
     )
-
-
-def _speed_wave(
-    clock: Float[np.ndarray, " F"], rng: np.random.Generator
-) -> Float[np.ndarray, " F"]:
-    """Slow rise and fall of traffic's speed around 1."""
-    period = rng.uniform(8.0, 25.0)
-    return 1.0 + 0.12 * np.sin(2 * np.pi * (clock / period + rng.random()))
 
 
 @dataclasses.dataclass

@@ -56,7 +56,8 @@ def frame_of(environment, seed):
 def test_rails_follow_the_road_and_trees_face_the_camera():
     frame = frame_of("highway", 0)
     origin = np.array([-2.5, 0.3, 0.7])
-    corners, depth, colors = details.make_panels(frame, origin, -0.9, 0.0)
+    corners, colors, depth, _, box = details.make_panels(frame, origin, -0.9, 0.0)
+    assert (box == -1).all()
     assert corners.shape[1:] == (4, 3)
     assert len(corners) == len(depth) == len(colors) > 20
     assert corners[..., 2].min() == -0.9
@@ -75,6 +76,6 @@ def test_rails_follow_the_road_and_trees_face_the_camera():
 
 def test_snow_whitens_trees():
     frame, origin = frame_of("countryside", 1), np.zeros(3)
-    green = details.make_panels(frame, origin, -0.9, 0.0)[2]
-    white = details.make_panels(frame, origin, -0.9, 0.9)[2]
+    green = details.make_panels(frame, origin, -0.9, 0.0).color
+    white = details.make_panels(frame, origin, -0.9, 0.9).color
     assert white.mean() > green.mean() + 20.0

@@ -1,8 +1,7 @@
-"""Covered lenses in the paper's proportions; haze by the law of Lambert and Beer."""
+"""Covered lenses in the paper's proportions."""
 
 import csv
 
-import numpy as np
 import pytest
 
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS
@@ -40,10 +39,3 @@ def test_level_holds_for_a_block_and_good_weather_is_clear():
     assert {lens.cover_level(1, 5, i, "normal") for i in range(0, 5000, 50)} == {
         "clear"
     }
-
-
-def test_haze_halves_contrast_at_its_half_distance():
-    color, veil = np.array([[200.0, 100.0, 0.0]] * 2), np.full(3, 100.0)
-    half = np.log(2.0) / 0.03
-    seen = lens.haze(color, np.array([0.0, half]), veil, 0.03)
-    np.testing.assert_allclose(seen, [[200, 100, 0], [150, 100, 50]])

@@ -5,10 +5,11 @@ import pytest
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.camera import shapes
-from radejax.simulation.camera.details import DETAILS
+from radejax.simulation.camera.details import DETAILS, Faces
 from radejax.simulation.camera.renderer import stereo_calibration
 
 CALIBRATION = stereo_calibration((-2.54, 0.3, 0.7), 320, 180)[0]
+NO_ROADSIDE = Faces(*map(np.zeros, ((0, 4, 3), (0, 3), 0, 0, 0)))
 DAY = shapes.Light(1.0, np.full(3, 128.0), 0.0, False)
 
 
@@ -24,7 +25,7 @@ def test_blocks_fill_the_box_and_stay_in_it(cls):
 def polygons(boxes, classes):
     colors = np.zeros((len(boxes), 2, 3)) + 100.0
     return shapes.visible_polygons(
-        np.array(boxes, float), classes, colors, CALIBRATION, DAY
+        np.array(boxes, float), classes, colors, CALIBRATION, DAY, NO_ROADSIDE
     )
 
 
@@ -69,3 +70,10 @@ def test_light_by_hand():
     color = np.full((1, 3), 100.0)
     ahead = night.apply(color, np.zeros(1), np.zeros(1), np.full(1, 10.0))
     np.testing.assert_allclose(ahead, 100.0 * (0.2 + 0.75) / 2.0)
+
+
+def test_haze_halves_contrast_at_its_half_distance():
+    haze = shapes.Light(1.0, np.full(3, 100.0), 0.03, False)
+    color, position = np.array([[200.0, 100.0, 0.0]] * 2), np.zeros(2)
+    seen = haze.apply(color, position, position, np.array([0.0, np.log(2.0) / 0.03]))
+    np.testing.assert_allclose(seen, [[200, 100, 0], [150, 100, 50]])

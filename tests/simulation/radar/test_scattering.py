@@ -22,7 +22,7 @@ SIZES = {
 }
 
 
-def make_frame(boxes, cls, velocity=None, *, time_s=0.0, tracks=None, reflectors=None):
+def make_frame(boxes, cls, velocity=None, *, index=0, tracks=None, reflectors=None):
     boxes = np.asarray(boxes, float).reshape(-1, 7)
     count, empty = len(boxes), np.zeros(0)
     if reflectors is None:
@@ -32,13 +32,10 @@ def make_frame(boxes, cls, velocity=None, *, time_s=0.0, tracks=None, reflectors
         velocity_mps=np.zeros((count, 2)) if velocity is None else np.array(velocity),
         cls=np.array([CLASSES.index(c) for c in cls], int),
         track=np.arange(count) if tracks is None else np.array(tracks),
-        track_id=np.arange(count),
         ego_velocity_mps=np.zeros(2),
         reflectors=reflectors,
         reflector_idx=np.arange(len(reflectors.kind)),
-        index=0,
-        time_s=time_s,
-        ego_along_m=0.0,
+        index=index,
     )
 
 
@@ -149,7 +146,7 @@ class TestMotion:
     def test_wheels_and_legs_spread_in_doppler_and_bodies_do_not(self):
         centers = centers_of("Pedestrian", 40)
         boxes = np.tile([15.0, 0.0, 0.0, 0.6, 0.6, 1.7, 0.0], (40, 1))
-        walking = make_frame(boxes, ["Pedestrian"] * 40, [[1.4, 0.0]] * 40, time_s=0.4)
+        walking = make_frame(boxes, ["Pedestrian"] * 40, [[1.4, 0.0]] * 40, index=4)
         found, _ = scattering.scatter_objects(walking, centers, PARAMETERS)
         speed = found.velocity_mps[:, 0]
         is_micro = centers.micro > 0

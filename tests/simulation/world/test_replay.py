@@ -67,7 +67,12 @@ class TestScene:
         frame = scene.frame(5)
         boxes = {
             (scene.tracks.label_cls[t], int(i)): b
-            for t, i, b in zip(frame.track, frame.track_id, frame.boxes, strict=True)
+            for t, i, b in zip(
+                frame.track,
+                scene.tracks.track_id[frame.track],
+                frame.boxes,
+                strict=True,
+            )
         }
         assert len(boxes) == 5
         for label in boxes_at(5):
@@ -80,7 +85,11 @@ class TestScene:
         scene = source.make(3)
         frame = scene.frame(7)
         relative = frame.velocity_mps - frame.ego_velocity_mps
-        found = dict(zip(frame.track_id.tolist(), relative[:, 0], strict=True))
+        found = dict(
+            zip(
+                scene.tracks.track_id[frame.track].tolist(), relative[:, 0], strict=True
+            )
+        )
         names = [scene.tracks.label_cls[t] for t in frame.track]
         for name, velocity in zip(names, relative[:, 0], strict=True):
             if name == "Bus or Truck":
