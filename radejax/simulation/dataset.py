@@ -16,7 +16,7 @@ import logging
 import os
 import pathlib
 import pickle
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.core.workers import Submit, process_pool
+from radejax.core.workers import process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.dataset import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
@@ -40,6 +40,7 @@ from radejax.simulation.simulator import (
     SceneSource,
     SequenceSimulator,
     make_source,
+    simulate_radar,
 )
 
 __all__ = ["default_config", "simulate_dataset"]
@@ -49,7 +50,6 @@ _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 _FEW_FRAMES = 100  # done before worker processes have started
 
 _T = TypeVar("_T")
-_Prepared = tuple[int, FrameSpec, RadarInput, list[Label]]
 
 _log = logging.getLogger(__name__)
 
@@ -174,25 +174,22 @@ def _write_frames(
     if num_workers is None:
         num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
     compute = functools.partial(
-        tensor.simulate,
+        simulate_radar,
         grid=config.make_grid(),
         parameters=config.make_parameters(),
-        output="rows" if config.output == "tesseract" else "projection",
+        output=config.output,
     )
     with (
         tqdm(
             total=total, unit="frame", desc="simulate", disable=not progress
         ) as progress_bar,
-        _prepared(num_workers, missing, root, config, source) as frames,
+        contextlib.closing(
+            _prepared(num_workers, missing, root, config, source)
+        ) as frames,
     ):
         progress_bar.update(total - len(missing))
         computed = (
-            (
-                number,
-                spec,
-                compute(given.scatterers, given.noise_power, given.key),
-                labels,
-            )
+            (number, spec, compute(given), labels)
             for number, spec, given, labels in frames
         )
         # The device computes the next frame while this one is written.
@@ -282,30 +279,25 @@ class _Scenes:
         return simulator, renderer
 
 
-@contextlib.contextmanager
 def _prepared(
     num_workers: int, missing: Sequence[tuple[int, FrameSpec]], *of_scenes: Any
-) -> Iterator[Iterator[_Prepared]]:
-    """Sequence, frame, radar input and labels, in order; by `num_workers` processes."""
+) -> Generator[tuple[int, FrameSpec, RadarInput, list[Label]], None, None]:
+    """Yields sequence, frame, radar input and labels, in order.
+
+    Close it to end the processes: it starts `num_workers`, or works in this one if 0.
+    """
     if not num_workers:
         scenes = _Scenes(*of_scenes)
-        yield (
-            (number, spec, *scenes.prepare(number, spec)) for number, spec in missing
-        )
+        for frame in missing:
+            yield (*frame, *scenes.prepare(*frame))
         return
     with process_pool(num_workers, _start_worker, *of_scenes) as submit:
-        yield _by_workers(submit, missing, 2 * num_workers)
-
-
-def _by_workers(
-    submit: Submit, missing: Sequence[tuple[int, FrameSpec]], num_ahead: int
-) -> Iterator[_Prepared]:
-    started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
-    for frame, future in _started_ahead(started, num_ahead):
-        path = pathlib.Path(future.result())
-        given, labels = pickle.loads(path.read_bytes())
-        path.unlink()
-        yield (*frame, given, labels)
+        started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
+        for frame, future in _started_ahead(started, 2 * num_workers):
+            path = pathlib.Path(future.result())
+            given, labels = pickle.loads(path.read_bytes())
+            path.unlink()
+            yield (*frame, given, labels)
 
 
 def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:

@@ -10,6 +10,7 @@ import collections
 import dataclasses
 from typing import Literal
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
@@ -53,6 +54,26 @@ class RadarInput:
     key: UInt32[np.ndarray, "2"]
     snr_db: Float[np.ndarray, " N"]
     lit: Float[np.ndarray, " N"]
+
+
+def simulate_radar(
+    given: RadarInput,
+    grid: RadarGrid,
+    parameters: tensor.RadarParameters,
+    output: Literal["tesseract", "projection"],
+) -> Float[jax.Array, "..."]:
+    """Rows `[R, E, D, A]` of the 4D radar tensor, or the projection `[R, A, D+E]`.
+
+    The result is still on the device, where it may not be complete yet.
+    """
+    return tensor.simulate(
+        given.scatterers,
+        given.noise_power,
+        given.key,
+        grid=grid,
+        parameters=parameters,
+        output="rows" if output == "tesseract" else "projection",
+    )
 
 
 class SequenceSimulator:
@@ -136,16 +157,8 @@ class SequenceSimulator:
         output: Literal["tesseract", "projection"] = "projection",
     ) -> Float[np.ndarray, "..."]:
         """The 4D radar tensor `[D, R, E, A]` or the projection `[R, A, D+E]`."""
+        rows = np.asarray(simulate_radar(given, self.grid, self.parameters, output))
         is_whole = output == "tesseract"
-        result = tensor.simulate(
-            given.scatterers,
-            given.noise_power,
-            given.key,
-            grid=self.grid,
-            parameters=self.parameters,
-            output="rows" if is_whole else "projection",
-        )
-        rows = np.asarray(result)
         return rows.transpose(tensor.TESSERACT_OF_ROWS) if is_whole else rows
 
     def is_radar_visible(

@@ -13,13 +13,8 @@ from radejax.simulation.camera.details import Faces
 
 # A block in units of the half extents: x, y, z ranges; color role; share kept of the
 # length and width at its top (a taper).
-_Block = tuple[
-    tuple[float, float],
-    tuple[float, float],
-    tuple[float, float],
-    str,
-    tuple[float, float],
-]
+_Pair = tuple[float, float]
+_Block = tuple[_Pair, _Pair, _Pair, str, _Pair]
 
 _STRAIGHT = (1.0, 1.0)
 BLOCKS: dict[str, tuple[_Block, ...]] = {
