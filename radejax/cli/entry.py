@@ -117,6 +117,11 @@ def set_up_jax() -> None:
 class Program(click.Command):
     """A command that sets up memory first when it runs as a program."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.context_settings["help_option_names"] = ["-h", "--help"]
+        self.context_settings["show_default"] = True
+
     def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
         """Runs it with some arguments, by default those of this process."""
         if args is None:
@@ -136,8 +141,6 @@ class Command(Program):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.context_settings["help_option_names"] = ["-h", "--help"]
-        self.context_settings["show_default"] = True
         text = "Show tracebacks of user errors."
         self.params.append(click.Option(["--debug"], is_flag=True, help=text))
 

@@ -17,11 +17,7 @@ _COMMANDS = (
 )
 
 
-@click.group(
-    cls=entry.Group,
-    commands=_COMMANDS,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+@click.group(cls=entry.Group, commands=_COMMANDS)
 @click.version_option(package_name="radejax")
 def main() -> None:
     """3D object detection in 4D radar tensors: data, training, figures."""

@@ -114,11 +114,22 @@ class SequenceSimulator:
         ghosts = scattering.scatter_ghosts(objects, sequence.mirrors_m)
         kinds = zip(objects, static, ghosts, strict=True)
         found = scattering.FrameScattering(*map(np.concatenate, kinds))
-        count, is_mirrored = len(objects.power), np.ones(len(found.power), bool)
-        # The cross-section of the ground stands for what it returns as it lies there.
+        bounce = propagation.bounce(
+            found.position_m,
+            sequence.ground_m,
+            propagation.WEATHERS[sequence.weather].surface,
+            parameters.wavelength_m,
+        )
+        # The cross-section of the ground already includes reflection by the ground.
         is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
-        is_mirrored[count : count + len(is_ground)] = ~is_ground
-        found = self._on_the_way(found, is_mirrored)
+        count = len(objects.power)
+        bounce[count : count + len(is_ground)][is_ground] = 1.0
+        distance = np.linalg.norm(found.position_m, axis=1)
+        air = propagation.attenuation(sequence.weather, distance)
+        found = found._replace(
+            power=found.power * air * np.square(np.abs(bounce)),
+            phase_rad=found.phase_rad + np.angle(bounce),
+        )
         power = np.bincount(objects.owner, found.power[:count], len(frame.boxes))
         return RadarInput(
             scatterers=scattering.to_scatterers(
@@ -130,25 +141,6 @@ class SequenceSimulator:
             key=tensor.frame_key(self.seed, sequence.name, frame.index),
             snr_db=10.0 * np.log10(power + 1e-30) - parameters.noise_db,
             lit=lit,
-        )
-
-    def _on_the_way(
-        self, found: scattering.FrameScattering, is_mirrored: Bool[np.ndarray, " S"]
-    ) -> scattering.FrameScattering:
-        """Scatterers with what air and, where `is_mirrored`, road do to them."""
-        sequence = self.sequence
-        bounce = propagation.bounce(
-            found.position_m,
-            sequence.ground_m,
-            propagation.WEATHERS[sequence.weather].surface,
-            self.parameters.wavelength_m,
-        )
-        bounce = np.where(is_mirrored, bounce, 1.0)
-        distance = np.linalg.norm(found.position_m, axis=1)
-        air = propagation.attenuation(sequence.weather, distance)
-        return found._replace(
-            power=found.power * air * np.square(np.abs(bounce)),
-            phase_rad=found.phase_rad + np.angle(bounce),
         )
 
     def run(
