@@ -42,8 +42,8 @@ def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with one line instead of a traceback for the user's errors.
 
     Exit code 2 for wrong use (arguments, folders), 1 for corrupted data or a full disk, 130
-    for an interrupt: see `core.errors`. Where the caller closed standard error, what is
-    said goes nowhere instead of into the next file that is opened.
+    for an interrupt: see `core.errors`. Where the caller closed standard error, messages
+    are discarded; they would go into the next file that is opened.
 
     Args:
         debug: Let the traceback through.
@@ -107,7 +107,7 @@ def set_up_jax() -> None:
         home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
         folder = pathlib.Path(home, "radejax", "jax")
         jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Every program: the fifty small ones of a start take a second and 200 kB.
+    # Cache all programs: compiling the fifty small ones of a start takes a second.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
@@ -134,7 +134,7 @@ class Group(Program, click.Group):
 
 
 class Command(Program):
-    """A command whose errors of the user are one line and an exit code.
+    """A command that reports user errors in one line with an exit code.
 
     Every command has `--debug`, which lets their tracebacks through.
     """

@@ -17,8 +17,8 @@ _PREFIX = "--config."
 class _Command(entry.Command):
     """Also takes any field of the config: `--config.train.batch_size=4`.
 
-    The last one counts where a field is given twice, and `--config.logging.wandb` alone is
-    true.
+    The last one counts where a field is given twice; `--config.logging.wandb` without a
+    value sets true.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

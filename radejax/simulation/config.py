@@ -89,7 +89,7 @@ class SimulationConfig:
             Test scenes are not changed.
         grid: Arguments of `RadarGrid.reduced`, or "kradar".
         radar: Fields of `RadarParameters` that differ from its defaults.
-        output: "tesseract" for K-Radar's files, "projection" for the projections alone.
+        output: "tesseract" for K-Radar's files, "projection" for projections only.
         image_width: Of one of the two stereo images; 0 for none.
         image_height: The same.
         cover_lens: Let bad weather cover the lens, as often as in K-Radar.

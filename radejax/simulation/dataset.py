@@ -108,7 +108,7 @@ def expected_size(config: SimulationConfig, source: SceneSource) -> tuple[int, f
 
 
 def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
-    """True for a complete dataset of this config; an error for anything alien."""
+    """True for a complete dataset of this config; raises for any other content."""
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file, expected a folder for the dataset")
     marker = root / SIMULATION_MARKER
@@ -129,7 +129,7 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
 
 
 def _marker(config: SimulationConfig) -> dict[str, Any]:
-    """What an unfinished dataset says of itself; the fingerprint has the version."""
+    """Marker file of an unfinished dataset; the fingerprint includes the version."""
     return {
         "config": json.loads(config.to_json()),
         "finished": False,
@@ -201,7 +201,7 @@ def _write_frames(
 def _missing(
     root: pathlib.Path, config: SimulationConfig, source: SceneSource
 ) -> Iterator[tuple[int, FrameSpec]]:
-    """Sequence and frame without a label file; writes what a sequence has once."""
+    """Yields frames without a label file; writes the other files of a sequence."""
     for number in source.numbers:
         folder, specs = root / str(number), source.frames(number)
         kradar_write.write_description(
@@ -225,7 +225,7 @@ def _write_frame(
     output: jax.Array,
     labels: list[Label],
 ) -> None:
-    """Writes what the radar receives, then the labels."""
+    """Writes the radar data of one frame, then its labels."""
     folder, index = root / str(number), spec.indices[0]
     if config.output == "tesseract":
         path = folder / "radar_tesseract" / f"tesseract_{index:05d}.mat"
@@ -240,7 +240,7 @@ def _write_frame(
 
 
 class _Scenes:
-    """Makes everything of a frame except the radar's part, and writes its image."""
+    """Prepares the input of the radar and the labels of frames, and writes images."""
 
     def __init__(
         self, root: pathlib.Path, config: SimulationConfig, source: SceneSource
@@ -312,14 +312,14 @@ _scenes: Any = None
 
 
 def _start_worker(root: pathlib.Path, *of_scenes: Any) -> None:
-    """The device belongs to the parent: this process only has its CPU."""
+    """Only the parent uses the accelerator; this process uses the CPU."""
     global _scenes
     jax.config.update("jax_platforms", "cpu")
     _scenes = root, _Scenes(root, *of_scenes)
 
 
 def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
-    """File with radar input and labels, as results of workers must be short."""
+    """Writes a file, as results of workers must be short, and returns its path."""
     root, scenes = _scenes
     path = root / f".{number}_{spec.name}.tmp"
     path.write_bytes(pickle.dumps(scenes.prepare(number, spec)))

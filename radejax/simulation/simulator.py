@@ -31,10 +31,10 @@ from radejax.simulation.world.scene import (
 from radejax.simulation.world.traffic import make_sequence
 
 MIN_SNR_DB = 10.0
-"""An object is visible to the radar from this ratio of its power to the noise on."""
+"""Minimum ratio of power to noise of an object that is visible to the radar."""
 
 MIN_LIT = 0.15
-"""... and with this part of its power not blocked by other objects."""
+"""Minimum fraction of its power that other objects do not block."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class RadarInput:
         noise_power: Mean noise power.
         key: Seed of the noise.
         snr_db: Power of each box's scatterers over the receiver noise.
-        lit: Part of each box's power that no other box blocks.
+        lit: Fraction of each box's power that no other box blocks.
     """
 
     scatterers: tensor.Scatterers
@@ -218,7 +218,7 @@ class FrameSpec:
 
 
 class ProceduralSource:
-    """Invented sequences numbered from 1, the training ones first."""
+    """Procedural sequences numbered from 1, the training ones first."""
 
     def __init__(self, config: SimulationConfig) -> None:
         self._config = config

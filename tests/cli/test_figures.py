@@ -109,7 +109,7 @@ def test_the_region_is_that_of_the_evaluation_and_named(
     assert texts[1:] == ([expected] if expected else [])
 
 
-def test_frames_with_projections_alone_are_shown(tmp_path: pathlib.Path) -> None:
+def test_frames_with_projections_only_are_shown(tmp_path: pathlib.Path) -> None:
     config = default_config() | {"output": "projection", "frames_per_sequence": 1}
     config.update(train_sequences=1, test_sequences=0)
     root = simulate_dataset(config, tmp_path / "data", progress=False)

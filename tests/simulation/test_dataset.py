@@ -154,7 +154,7 @@ class TestRepeating:
         busy.unlink()  # was still there
         assert digests(root) == digests(tree)
 
-    def test_finished_data_set_is_reused_untouched(self, tree, monkeypatch):
+    def test_finished_dataset_is_reused_unchanged(self, tree, monkeypatch):
         monkeypatch.setattr(
             dataset, "_write_frames", lambda *a: pytest.fail("simulated again")
         )
@@ -162,7 +162,7 @@ class TestRepeating:
 
 
 class TestWrongUse:
-    def test_a_killed_worker_is_one_line(self, tmp_path, monkeypatch):
+    def test_a_killed_worker_raises_a_user_error(self, tmp_path, monkeypatch):
         root, write = tmp_path / "data", dataset._write_frame
 
         def write_and_kill(*frame):
@@ -175,11 +175,11 @@ class TestWrongUse:
             simulate_dataset(small_config(), root, num_workers=1, progress=False)
         assert 1 <= len(list(root.rglob("info_label_v2_1/*.txt"))) < 9
 
-    def test_other_config_names_the_field(self, tree):
+    def test_error_for_another_config_names_the_field(self, tree):
         with pytest.raises(UserError, match=r"another simulation config.*seed"):
             simulate_dataset(small_config(seed=5), tree, progress=False)
 
-    def test_alien_folder_is_left_alone(self, tmp_path):
+    def test_folder_with_other_files_is_rejected(self, tmp_path):
         (tmp_path / "holiday.txt").write_text("mine")
         with pytest.raises(UserError, match="not empty"):
             simulate_dataset(small_config(), tmp_path, progress=False)

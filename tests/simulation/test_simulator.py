@@ -124,7 +124,7 @@ def test_sensors_count_their_own_frames(source):
     assert len(offsets) > 1
 
 
-def test_vru_density_scale_are_added_to_training_scenes_alone():
+def test_vru_density_scale_changes_training_scenes_only():
     values = default_config() | {"train_sequences": 6, "test_sequences": 6}
     natural, added = (
         make_source(SimulationConfig.from_mapping(values | {"vru_density_scale": n}))

@@ -202,8 +202,8 @@ def make_panels(
         side = half_width * np.stack([np.cos(angle), np.sin(angle)], 1)
         a, b = position[:, :2] - side, position[:, :2] + side
         z = np.broadcast_to([ground_m + low, ground_m + high], a.shape)
-        corners = np.stack([a, b, b, a], 1), z[:, [0, 0, 1, 1], None]
-        panels.append(np.concatenate(corners, -1))
+        flat, height = np.stack([a, b, b, a], 1), z[:, [0, 0, 1, 1], None]
+        panels.append(np.concatenate([flat, height], -1))
         color = palette[frame.reflector_idx[chosen] * 7919 % len(palette)]
         if name in ("tree", "pole"):
             color = color + white * 0.6 * (_SNOWY - color)

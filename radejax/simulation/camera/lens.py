@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 
 @dataclasses.dataclass(frozen=True)
 class Air:
-    """What the air does to an image.
+    """Effect of the air on an image.
 
     Attributes:
         extinction_per_m: Haze: contrast falls with `exp(-extinction x distance)`.
@@ -119,7 +119,7 @@ def _blurred(image: Image.Image, factor: float) -> Image.Image:
 
 
 def _drop_mask(size, share: float, rng: np.random.Generator) -> Image.Image:
-    """Soft round patches that cover about a share of the image."""
+    """Soft round patches that cover about the fraction `share` of the image."""
     width, height = 160, 90
     mask = Image.new("L", (width, height), 0)
     draw = ImageDraw.Draw(mask)

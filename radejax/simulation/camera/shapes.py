@@ -11,8 +11,8 @@ from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details
 from radejax.simulation.camera.details import Faces
 
-# A block in units of the half extents: x, y, z ranges; color role; share kept of the
-# length and width at its top (a taper).
+# A block in units of the half extents: x, y, z ranges; color role; fraction of
+# the length and width that is kept at its top (a taper).
 _Pair = tuple[float, float]
 _Block = tuple[_Pair, _Pair, _Pair, str, _Pair]
 
@@ -159,8 +159,8 @@ def visible_polygons(
 
     Args:
         boxes: In the radar's frame.
-        classes: Names, one a box.
-        colors: Of `object_colors`.
+        classes: Class name of each box.
+        colors: Colors as `object_colors` returns them.
         calibration: The camera.
         light: Brightness and haze.
         roadside: Surroundings, see `details.make_panels`.
@@ -182,7 +182,7 @@ def visible_polygons(
 
 
 def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
-    """Of the camera in the radar's frame."""
+    """Position of the camera in the radar's frame."""
     return calibration.radar_from_lidar_m - (
         calibration.rotation.T @ calibration.translation_m
     )
@@ -238,7 +238,7 @@ def _project_faces(
     nearest, farthest = depth.min(1), depth.max(1)
     result: list[list[float]] = [[] for _ in faces]
     shown = ((places.max(1) >= 0) & (places.min(1) <= size)).all(1)
-    # Only these, and flat: pairs of numbers, each an object, take as long as the drawing.
+    # Only visible faces, as flat lists: making tuples would take as long as drawing.
     whole = np.flatnonzero(shown & ~(nearest < _NEAR_M))
     for index, points in zip(whole, _flat(places[whole], size), strict=True):
         result[index] = points

@@ -50,7 +50,7 @@ class ClassScattering:
         num_points: Scattering centers on the whole surface.
         glint: Power of the flash of a flat face at normal incidence, relative to its
             diffuse power.
-        micro: Share of moving parts.
+        micro: Fraction of scattering centers on moving parts.
     """
 
     rcs_dbsm: float
@@ -67,7 +67,7 @@ CLASS_SCATTERING = {
     "Motorcycle": ClassScattering(2.0, 3.0, 14, 1.0, 0.2),
     "Bicycle": ClassScattering(-2.0, 3.0, 14, 1.0, 0.35),
 }
-"""Our choice, see the module's text; points, glint and moving shares too."""
+"""All values are our choice, see the docstring of the module."""
 
 OCCLUDED_DB = -22.0
 """Two-way loss behind another object: what creeps around and under it still returns.
@@ -82,7 +82,7 @@ class ObjectScatterers(NamedTuple):
     """Scattering centers of all objects in one sequence, in the frames of their boxes.
 
     Attributes:
-        track: Which object each belongs to, ascending.
+        track: Index of the track that each belongs to, ascending.
         position: In units of the box's half extents.
         normal: Unit normal of the face.
         power_m2: Radar cross-section seen along the normal, without glint.
@@ -278,8 +278,8 @@ def to_scatterers(
 
     Args:
         found: Objects, surroundings, ghosts.
-        ego_velocity_mps: Of the radar over ground.
-        wavelength_m: Of the sensor.
+        ego_velocity_mps: Velocity of the radar over ground.
+        wavelength_m: Wavelength of the sensor.
 
     Returns:
         float32 NumPy arrays. The phase of an amplitude is that of the reflection plus

@@ -45,7 +45,7 @@ _RANGES = {
 
 @dataclasses.dataclass(frozen=True)
 class RadarParameters:
-    """What the sensor is beyond its axes; hashable, so static under `jax.jit`.
+    """Parameters of the sensor except its axes; hashable, so static under `jax.jit`.
 
     K-Radar publishes no link budget. The level is set so that the noise lies
     near the middle of the TPM's normalized scale and a car at 5 m near its upper end.

@@ -170,7 +170,7 @@ def infer_ego_speed(
     lower = np.where(seen & (heading > 0.9), approach, -np.inf).max(1, initial=-np.inf)
     upper = np.where(seen & (heading < -0.9), approach, np.inf).min(1, initial=np.inf)
     usual = float(np.mean(prior_mps))
-    known = lower > 0.3 * usual  # slow vehicles ahead alone say little
+    known = lower > 0.3 * usual  # slow vehicles ahead are weak evidence
     speed = np.where(known, lower, usual)
     speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
     padded = np.pad(speed, 10, mode="edge")

@@ -1,4 +1,4 @@
-"""What stands and moves around the ego vehicle in one sequence.
+"""The objects and surroundings of the ego vehicle in one sequence.
 
 A `Sequence` is a list of tracks (boxes that keep their identity, moving or parked) and
 of static reflectors in a fixed world frame, and the path of the ego vehicle through
@@ -98,9 +98,9 @@ class SceneFrame:
         velocity_mps: Over ground, along the ego axes.
         cls: Index into `CLASSES`.
         track: Index into the tracks of the sequence.
-        ego_velocity_mps: Of the radar over ground, along its own axes.
+        ego_velocity_mps: Velocity of the radar over ground, along its own axes.
         reflectors: Static surroundings near the ego, in this frame.
-        reflector_idx: Which reflectors of the sequence these are.
+        reflector_idx: Indices of these reflectors in the sequence.
         index: Index of the frame in its sequence.
     """
 
@@ -164,7 +164,7 @@ class Sequence:
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = _to_ego(fixed.position_m, pose)
         distance = np.hypot(points[:, 0], points[:, 1])
-        # Behind the radar its own vehicle shields; two meters off nothing stands.
+        # The ego vehicle blocks what is behind the radar; nothing stands within 2 m.
         seen = np.flatnonzero(
             (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
         )

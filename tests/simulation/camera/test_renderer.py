@@ -196,7 +196,7 @@ class TestImage:
 
 
 class TestSilhouettes:
-    def test_objects_alone_in_the_color_of_their_class_brighter_when_nearer(self):
+    def test_oracle_shows_only_objects_in_class_colors_brighter_when_nearer(self):
         boxes = [[40.0, 4.0, -0.15, 4.5, 1.9, 1.5, 0.2], POSES[2][1], POSES[4][1]]
         pair, images = camera.stereo_calibration(OFFSET, 320, 180), []
         for time, weather in (("day", "normal"), ("night", "heavysnow")):

@@ -29,7 +29,7 @@ def polygons(boxes, classes):
     )
 
 
-def test_far_objects_come_first_and_hidden_faces_not_at_all():
+def test_far_objects_come_first_and_hidden_faces_are_omitted():
     near = [10.0, 0.0, -0.1, 4.5, 1.9, 1.5, 0.0]
     far = [30.0, 1.0, -0.1, 4.5, 1.9, 1.5, 0.0]
     found = polygons([near, far], ["Sedan", "Sedan"])
@@ -40,7 +40,7 @@ def test_far_objects_come_first_and_hidden_faces_not_at_all():
     assert len([p for p in found if p.box == 0]) <= 9 + len(DETAILS["Sedan"])
 
 
-def test_details_are_painted_on_their_blocks_and_left_out_far_away():
+def test_details_are_painted_on_their_blocks_and_omitted_far_away():
     near = [12.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]  # we look at its rear
     colors = [p.color for p in polygons([near], ["Sedan"])]
     lamp = max(range(len(colors)), key=lambda i: colors[i][0] - colors[i][1])
@@ -51,7 +51,7 @@ def test_details_are_painted_on_their_blocks_and_left_out_far_away():
     assert len(polygons([far], ["Sedan"])) <= 9
 
 
-def test_objects_behind_or_beside_the_image_are_left_out():
+def test_objects_behind_or_outside_the_image_are_omitted():
     behind = [-12.0, 0.0, -0.1, 4.5, 1.9, 1.5, 0.0]
     beside = [5.0, 60.0, -0.1, 4.5, 1.9, 1.5, 0.0]
     assert polygons([behind, beside], ["Sedan", "Sedan"]) == []

@@ -76,7 +76,7 @@ def test_all_classes_and_sedans_everywhere():
     assert seen == set(range(5))
 
 
-def test_vru_density_scale_are_as_many_times_more():
+def test_vru_density_scale_multiplies_the_number_of_vrus():
     def counted(times):
         scenes = [
             sequence(environment, seed, 1, vru_density_scale=times)
