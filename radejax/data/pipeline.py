@@ -338,35 +338,20 @@ def _make_order(
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
     if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
-    seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_AddSeed())
+    seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_add_seed)
     batches = seeded.batch(
         rows, drop_remainder=options.drop_remainder, batch_fn=np.stack
     )
     # Of every global batch, its own rows: what is trained on, and in which order, does
     # not depend on the number of processes.
-    return batches if count == 1 else batches.map(_Share(index, count))
+    if count == 1:
+        return batches
+    return batches.map(lambda rows: np.array_split(rows, count)[index])
 
 
-class _AddSeed(grain.transforms.RandomMap):
-    """Gives every drawn frame a seed of its own for augmentation."""
-
-    def random_map(
-        self, element: int, rng: np.random.Generator
-    ) -> Int[np.ndarray, "2"]:
-        return np.array([element, rng.integers(2**62)], np.int64)
-
-
-class _Share(grain.transforms.Map):
-    """The rows of one process of a global batch."""
-
-    def __init__(self, index: int, count: int) -> None:
-        self._index, self._count = index, count
-
-    def __repr__(self) -> str:
-        return "_Share()"
-
-    def map(self, element: Int[np.ndarray, "B 2"]) -> Int[np.ndarray, "b 2"]:
-        return np.array_split(element, self._count)[self._index]
+def _add_seed(frame: int, rng: np.random.Generator) -> Int[np.ndarray, "2"]:
+    """A drawn frame and a seed of its own for augmentation."""
+    return np.array([frame, rng.integers(2**62)], np.int64)
 
 
 class _LoadBatch(grain.transforms.Map):

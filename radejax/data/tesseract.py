@@ -30,6 +30,7 @@ from jaxtyping import Float, Real
 
 from radejax.core.archives import read_npy, wrap_read_errors
 from radejax.core.errors import DataError
+from radejax.core.files import PathLike
 from radejax.data.projection import MAX_LEVEL, project_columns, project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -37,7 +38,7 @@ VARIABLE = "arrDREA"
 
 
 def read_tesseract(
-    path: str | os.PathLike, *, shape_drea: tuple[int, ...] | None = None
+    path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Real[np.ndarray, "D R E A"]:
     """A 4D radar tensor as it is stored: linear power, column-major.
 
@@ -57,7 +58,7 @@ def read_tesseract(
 
 
 def project_file(
-    path: str | os.PathLike, *, shape_drea: tuple[int, ...] | None = None
+    path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
     """`project_tensor` of a file; arguments and errors as in `read_tesseract`.
 
@@ -76,7 +77,7 @@ def project_file(
 
 
 def check_tesseract(
-    path: str | os.PathLike,
+    path: PathLike,
     *,
     shape_drea: tuple[int, ...] | None = None,
     deep: bool = False,
@@ -93,7 +94,7 @@ def check_tesseract(
 
 
 def read_projection_npy(
-    path: str | os.PathLike, *, projection_shape: tuple[int, ...] | None = None
+    path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
     """A projection as the released code writes it, channels moved last.
 
@@ -131,25 +132,22 @@ def read_projection_npy(
     return projection
 
 
-def read_frame(
-    path: str | pathlib.Path, grid: RadarGrid
-) -> Float[np.ndarray, "R A DE"]:
+def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """float32 projection of a radar tensor file or a released projection.
 
     Raises:
         FileNotFoundError: There is no such file.
         DataError: It is corrupted, or of another shape than the grid.
     """
-    if pathlib.Path(path).suffix == ".npy":
-        shape = grid.projection_shape
-        projection = read_projection_npy(path, projection_shape=shape)
-        return projection.astype(np.float32)
-    return project_file(path, shape_drea=grid.shape_drea)
+    if pathlib.Path(path).suffix != ".npy":
+        return project_file(path, shape_drea=grid.shape_drea)
+    projection = read_projection_npy(path, projection_shape=grid.projection_shape)
+    return projection.astype(np.float32)
 
 
 @contextlib.contextmanager
 def _opened(
-    path: str | os.PathLike, shape_drea: tuple[int, ...] | None
+    path: PathLike, shape_drea: tuple[int, ...] | None
 ) -> Iterator[tuple[io.FileIO, Layout]]:
     """The file, unbuffered, and where its tensor is.
 

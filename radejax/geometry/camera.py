@@ -236,18 +236,12 @@ class CameraCalibration(ArrayValues):
 
         A camera that looks straight ahead has yaw 90, pitch 0 and roll 90 degrees.
         """
-        rotation = (
-            _rotation(0, math.radians(roll_deg))
-            @ _rotation(1, math.radians(pitch_deg))
-            @ _rotation(2, math.radians(yaw_deg))
+        rx, ry, rz = (
+            _rotation(axis, math.radians(angle_deg))
+            for axis, angle_deg in enumerate((roll_deg, pitch_deg, yaw_deg))
         )
-        return cls(
-            intrinsics=np.asarray(intrinsics),
-            distortion=np.asarray(distortion),
-            rotation=rotation,
-            translation_m=np.asarray(translation_m),
-            **fields,
-        )
+        arrays = map(np.asarray, (intrinsics, distortion, rx @ ry @ rz, translation_m))
+        return cls(*arrays, **fields)
 
     @classmethod
     def from_kradar(cls, path: str | pathlib.Path, **fields: Any) -> CameraCalibration:
@@ -289,12 +283,8 @@ class CameraCalibration(ArrayValues):
         pitch = math.asin(np.clip(self.rotation[0, 2], -1.0, 1.0))
         yaw = math.atan2(-self.rotation[0, 1], self.rotation[0, 0])
         roll = math.atan2(-self.rotation[1, 2], self.rotation[2, 2])
-        numbers = [
-            *self.intrinsics,
-            *self.distortion,
-            *np.degrees([yaw, pitch, roll]),
-            *self.translation_m,
-        ]
+        angles_deg = np.degrees([yaw, pitch, roll])
+        numbers = *self.intrinsics, *self.distortion, *angles_deg, *self.translation_m
         lines = [f"{k}: {float(v)!r}" for k, v in zip(_KEYS, numbers, strict=True)]
         lines += [f"img_size_h: {self.height}", f"img_size_w: {self.width}"]
         return "\n".join(lines) + "\n"
@@ -302,11 +292,9 @@ class CameraCalibration(ArrayValues):
     def resized(self, width: int, height: int) -> CameraCalibration:
         """Calibration of the same image resized, edges onto edges."""
         scale = np.array([width / self.width, height / self.height] * 2)
+        intrinsics = self.intrinsics * scale
         return dataclasses.replace(
-            self,
-            width=width,
-            height=height,
-            intrinsics=self.intrinsics * scale,
+            self, width=width, height=height, intrinsics=intrinsics
         )
 
     # Use -----------------------------------------------------------------------------

@@ -173,16 +173,13 @@ class RadarGrid(ArrayValues):
         kinds = get_args(AzimuthMapping)
         known = azimuth_mapping in kinds
         require(known, "azimuth_mapping", azimuth_mapping, " or ".join(kinds))
+        first, last = self.azimuth_rad[0], self.azimuth_rad[-1]
         if azimuth_mapping == "true":
             range_m = self.range_m[0] + self.range_step_m * np.arange(num_range)
-            azimuth = self.azimuth_rad[0] + self.azimuth_step_rad * np.arange(
-                num_azimuth
-            )
+            azimuth = first + self.azimuth_step_rad * np.arange(num_azimuth)
         else:
             range_m = np.linspace(self.range_m[0], self.fov_range_m, num_range)
-            azimuth = np.linspace(
-                self.azimuth_rad[0], self.azimuth_rad[-1], num_azimuth
-            )
+            azimuth = np.linspace(first, last, num_azimuth)
         return dataclasses.replace(self, range_m=range_m, azimuth_rad=azimuth)
 
     # Sizes ---------------------------------------------------------------------------
@@ -342,9 +339,5 @@ class RadarGrid(ArrayValues):
     def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:
         """True where the sensor looks: in front, within maximum azimuth and range."""
         xp, x_m, y_m = as_floats(x_m, y_m)
-        azimuth = xp.arctan2(y_m, x_m)
-        return (
-            (xp.abs(azimuth) <= self.fov_azimuth_rad)
-            & (x_m >= 0)
-            & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)
-        )
+        is_ahead = (xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad) & (x_m >= 0)
+        return is_ahead & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)
