@@ -26,7 +26,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, NARROW_ROI
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
-"""Those that come along: in a checkout a link to the folder beside the package."""
+"""Folder of the bundled configs; in a checkout, a link to the one next to the package."""
 
 
 def parse_options(arg: str | None, *choices: Collection[str]) -> list[str | None]:

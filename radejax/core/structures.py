@@ -122,7 +122,7 @@ class Detections(struct.PyTreeNode):
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
     def __repr__(self) -> str:
-        """The shape alone: padded arrays are long, and traced ones have no values."""
+        """Show only the shape: padded arrays are long, traced ones have no values."""
         return f"Detections(boxes {getattr(self.boxes, 'shape', self.boxes)})"
 
     @property

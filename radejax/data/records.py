@@ -55,7 +55,7 @@ class Records:
     source: Mapping[str, Any]
 
     @classmethod
-    def open(cls, folder: str | os.PathLike) -> Records:
+    def open(cls, folder: files.PathLike) -> Records:
         """Records that exist.
 
         Raises:
@@ -82,7 +82,7 @@ class Records:
     @classmethod
     def create(
         cls,
-        folder: str | os.PathLike,
+        folder: files.PathLike,
         shape: Sequence[int],
         dtype: str,
         source: Mapping[str, Any],
@@ -164,9 +164,7 @@ class Records:
             )
 
 
-def open_projections(
-    folder: str | os.PathLike, grid: RadarGrid | None = None
-) -> Records:
+def open_projections(folder: files.PathLike, grid: RadarGrid | None = None) -> Records:
     """Projections of a folder.
 
     Args:
@@ -188,7 +186,7 @@ def open_projections(
 
 
 def open_embeddings(
-    folder: str | os.PathLike, image_config: Mapping[str, Any] | None = None
+    folder: files.PathLike, image_config: Mapping[str, Any] | None = None
 ) -> Records:
     """Features `[h, w, C]` of the front images of a folder.
 
@@ -273,7 +271,7 @@ class PreprocessReport:
 
 def preprocess(
     frames: LabelledFrames,
-    folder: str | os.PathLike,
+    folder: files.PathLike,
     *,
     dtype: str | None = None,
     shard: tuple[int, int] = (0, 1),

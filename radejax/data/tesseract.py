@@ -1,6 +1,6 @@
 """Readers of 4D radar tensors (MATLAB v5) and of the released `.npy` projections.
 
-Of MATLAB files only what the one real array of a radar tensor needs:
+Only the part of MATLAB's format that the one real array of a radar tensor needs is read:
 a file is a header of 128 bytes and elements: a tag (type, number of bytes) and content.
 A variable is an element of type 14, or of type 15, which is one of type 14 deflated. It
 contains, each with a tag of its own: flags, shape, name and values.

@@ -240,8 +240,13 @@ class CameraCalibration(ArrayValues):
             _rotation(axis, math.radians(angle_deg))
             for axis, angle_deg in enumerate((roll_deg, pitch_deg, yaw_deg))
         )
-        arrays = map(np.asarray, (intrinsics, distortion, rx @ ry @ rz, translation_m))
-        return cls(*arrays, **fields)
+        return cls(
+            intrinsics=np.asarray(intrinsics),
+            distortion=np.asarray(distortion),
+            rotation=rx @ ry @ rz,
+            translation_m=np.asarray(translation_m),
+            **fields,
+        )
 
     @classmethod
     def from_kradar(cls, path: str | pathlib.Path, **fields: Any) -> CameraCalibration:

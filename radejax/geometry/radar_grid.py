@@ -1,7 +1,7 @@
 """The sensor's axes and the mapping between bins and meters.
 
 Every conversion between bins of the radar tensor and positions in the ego frame goes
-through `RadarGrid`; no other module knows a bin size.
+through `RadarGrid`; no other module uses a bin size.
 """
 
 from __future__ import annotations
