@@ -291,10 +291,6 @@ _FIELDS: dict[str, Any] = {
         "num_threads": 2,
         # Probability of mirroring a frame left to right, from 0 to 1.
         "mirror_probability": 0.0,
-        # Standard deviation of a random gain in dB; at least 0.
-        "gain_db": 0.0,
-        # Standard deviation of a random gain at the last range in dB; at least 0.
-        "gain_slope_db": 0.0,
         # Sanity check: shuffles the labels of the training frames with this seed.
         "label_permutation_seed": placeholder(int),
     },

@@ -1,8 +1,7 @@
 """Augmentation of single frames: radar, boxes, image and camera stay in register.
 
-Off by default: the papers train without. Mirroring is exact on any grid whose azimuth
-axis is symmetric. Range-dependent gain imitates that received power varies with range
-for reasons that no label shows (weather, antenna, amplifier).
+Off by default, as the papers train without. Mirroring is exact on any grid whose azimuth
+axis is symmetric.
 """
 
 from __future__ import annotations
@@ -10,12 +9,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import chex
 import numpy as np
-from jaxtyping import Real
 
 from radejax.core.errors import UserError
-from radejax.data.projection import LOG_SCALE_DB, decode, encode
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -30,9 +26,6 @@ class Augmentation:
     Attributes:
         grid: Sensor axes of the projections.
         mirror_probability: Probability of swapping left and right.
-        gain_db: Standard deviation of a gain at all ranges, in decibels of power.
-        gain_slope_db: Standard deviation of a gain that grows linearly from 0 at the
-            sensor to this at the last range.
 
     Raises:
         UserError: Mirroring a grid that is not symmetric.
@@ -40,8 +33,6 @@ class Augmentation:
 
     grid: RadarGrid
     mirror_probability: float = 0.0
-    gain_db: float = 0.0
-    gain_slope_db: float = 0.0
 
     def __post_init__(self) -> None:
         azimuth = self.grid.azimuth_rad
@@ -53,18 +44,8 @@ class Augmentation:
             )
 
     def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
-        """A changed copy of a sample; the input is left as it is."""
-        # Draw everything always: one option must not change another's numbers.
-        is_mirrored = rng.random() < self.mirror_probability
-        gain_db, slope_db = rng.normal(size=2) * (self.gain_db, self.gain_slope_db)
-        if is_mirrored:
-            sample = mirror(sample)
-        if gain_db or slope_db:
-            projection = add_range_gain(
-                sample["projection"], self.grid, gain_db, slope_db
-            )
-            sample = {**sample, "projection": projection}
-        return sample
+        """The sample or a mirrored copy of it."""
+        return mirror(sample) if rng.random() < self.mirror_probability else sample
 
 
 def mirror(sample: Sample) -> Sample:
@@ -99,26 +80,3 @@ def mirror_camera(camera: Camera) -> Camera:
     return camera.replace(
         cam_from_ego=cam_from_ego, intrinsics=intrinsics, distortion=distortion
     )
-
-
-def add_range_gain(
-    projection: Real[np.ndarray, "R A DE"],
-    grid: RadarGrid,
-    gain_db: float,
-    slope_db: float,
-) -> Real[np.ndarray, "R A DE"]:
-    """A projection received with another gain: gain + slope * range / largest range.
-
-    Args:
-        projection: In the type of the records.
-        grid: Its sensor axes.
-        gain_db: At all ranges, decibels of power.
-        slope_db: At the last range, in addition.
-
-    Returns:
-        In the same type; 8-bit values are clipped to their scale.
-    """
-    chex.assert_shape(projection, grid.projection_shape)
-    db = gain_db + slope_db * grid.range_m / grid.range_m[-1]
-    shift = np.asarray(db / LOG_SCALE_DB, np.float32)[:, None, None]
-    return encode(decode(projection) + shift, projection.dtype.name)

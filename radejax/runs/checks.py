@@ -59,8 +59,6 @@ _DATA = {
     "azimuth_mapping": one_of("true", "stretched"),
     "num_threads": integer(0),
     "mirror_probability": number(0, 1),
-    "gain_db": number(0),
-    "gain_slope_db": number(0),
     "label_permutation_seed": or_none(integer(0)),
 }
 _TRAIN = {

@@ -194,12 +194,7 @@ class Data:
             order = np.random.default_rng(shuffled).permutation(len(table))
             boxes, classes = table.boxes[order], table.classes[order]
             table = dataclasses.replace(table, boxes=boxes, classes=classes)
-        augment = Augmentation(
-            self.records.grid,
-            options.mirror_probability,
-            options.gain_db,
-            options.gain_slope_db,
-        )
+        augment = Augmentation(self.records.grid, options.mirror_probability)
         loader = pipeline.LoaderOptions(
             train.batch_size // jax.process_count(),
             seed,

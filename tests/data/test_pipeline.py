@@ -192,7 +192,7 @@ def test_remainders(loader, batch_size):
 
 @pytest.mark.parametrize("step", [0, 3, 6, 7])
 def test_restored_in_mid_epoch_continues_with_the_next_batch(loader, data, step):
-    augment = Augmentation(data.grid, 0.5, gain_db=1, gain_slope_db=2)
+    augment = Augmentation(data.grid, 0.5)
     options = {"num_epochs": 3, "augment": augment}
     first = loader(**options)
     for _ in range(step):
