@@ -31,7 +31,6 @@ from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training import distributed
 from radejax.training.metric_logger import Scores
-from radejax.training.step import TrainState
 from radejax.visualize.draw import draw_frame, draw_scenes
 from radejax.visualize.style import Scene, save_figure
 
@@ -96,19 +95,17 @@ class Evaluation:
 
     def validate(
         self,
-        state: TrainState,
+        variables: Mapping[str, Any],
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
-        """Scores of a state's (averaged) parameters, during training.
+        """Scores of the variables of a model, during training.
 
         Every process computes the same numbers.
 
         Raises:
             distributed.Stopped: `should_stop`, asked at every batch, said so.
         """
-        predictions = self.predict(
-            state.eval_variables, progress=False, should_stop=should_stop
-        )
+        predictions = self.predict(variables, progress=False, should_stop=should_stop)
         options = dataclasses.replace(self._options, bootstrap=0)
         tables = self._truth, predictions, self._table
         _, results = evaluate_tables(*tables, options, per_weather=False)

@@ -167,9 +167,8 @@ class Checkpoints:
             except DataError as error:
                 _log.warning("%s", error)
             if distributed.all_agree(found is not None) and found is not None:
-                corrupted = [other for other in steps if other > step]
-                move_away = functools.partial(self._move_away, corrupted)
-                distributed.main_only(move_away)
+                newer = [other for other in steps if other > step]
+                distributed.main_only(functools.partial(self._move_away, newer))
                 self._manager.reload()
                 restored, description = found
                 data_iterator.set_state(description["position"])
@@ -268,13 +267,6 @@ class Checkpoints:
 
 def _best_of(metrics: Mapping[str, float]) -> float:
     return metrics[_BEST]
-
-
-def abstract_state(state: Any, sharding: Any) -> Any:
-    """Shapes, dtypes and wanted shardings of a state, to restore into."""
-    return jax.tree.map(
-        lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), state, sharding
-    )
 
 
 # Checksums ---------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from radejax.core.structures import Batch
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.training import distributed
-from radejax.training.checkpoints import Checkpoints, abstract_state
+from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_logger import MetricLogger, Scores
 from radejax.training.step import (
     Metrics,
@@ -40,9 +40,10 @@ _log = logging.getLogger(__name__)
 
 _STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
 
-Evaluate = Callable[[TrainState, Callable[[], bool]], Scores]
-"""Called with the state, and a function that returns whether to stop; it then raises
-`distributed.Stopped`. Every process must call that function equally often."""
+Evaluate = Callable[[Mapping[str, Any], Callable[[], bool]], Scores]
+"""Called with the variables of the model, averaged if they are, and a function that
+returns whether to stop; it then raises `distributed.Stopped`. Every process must call that
+function equally often."""
 
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
@@ -112,7 +113,7 @@ def train(
             distributed.stop_on_signal(mesh) as stop,
         ):
             run = _Run(
-                *(config, steps_per_epoch, loader, info, evaluate),
+                *(config, steps_per_epoch, num_steps, loader, info, evaluate),
                 *(checkpoints, logger, stop),
             )
             return run.take_steps(train_step, state, profile)
@@ -124,6 +125,7 @@ class _Run:
 
     config: ConfigDict
     steps_per_epoch: int
+    num_steps: int
     loader: Any
     info: Mapping[str, Any]
     evaluate: Evaluate | None
@@ -136,7 +138,7 @@ class _Run:
         self, train_step: TrainStep, state: TrainState, profile: str
     ) -> tuple[TrainState, bool]:
         """Takes the remaining steps, until a signal comes; returns what `train` does."""
-        step, num_steps = int(state.step), self._num_steps
+        step, num_steps = int(state.step), self.num_steps
         first, last = (step + n for n in self.config.logging.profile_steps)
         if profile and num_steps <= first:
             _log.warning("no trace: %d steps are left to train", num_steps - step)
@@ -166,7 +168,7 @@ class _Run:
         every = self.steps_per_epoch * train.evaluate_every_epochs
         if self.evaluate is not None and self._is_due(step, every):
             try:
-                scores = self.evaluate(state, self.stop)
+                scores = self.evaluate(state.eval_variables, self.stop)
                 self.logger.log_scores(step, scores)
             except distributed.Stopped:
                 _log.warning("the evaluation after step %d is skipped", step)
@@ -181,13 +183,9 @@ class _Run:
             self.checkpoints.save(step, kept, self.loader, info=self.info, best=best)
         return is_stopped
 
-    @property
-    def _num_steps(self) -> int:
-        return self.steps_per_epoch * self.config.train.num_epochs
-
     def _is_due(self, step: int, every: int) -> bool:
         """True every so many steps (never for 0) and, where done at all, at the end."""
-        return every > 0 and (step % every == 0 or step == self._num_steps)
+        return every > 0 and (step % every == 0 or step == self.num_steps)
 
     def _check_skipped(self, state: TrainState) -> None:
         """Warns of steps without a finite loss and gradient beyond those reported.
@@ -255,8 +253,8 @@ def _restore_or_initialize(
     given = jax.tree.map(np.asarray, given)  # the same on every process
     abstract = jax.eval_shape(create, *given)
     placement = distributed.state_sharding(abstract, mesh, parameters)
-    saved = abstract_state(abstract, placement).replace(frozen={})
-    restored = checkpoints.restore(saved, loader)
+    saved = jax.tree.map(lambda x, s: x.update(sharding=s), abstract, placement)
+    restored = checkpoints.restore(saved.replace(frozen={}), loader)
     if restored is None:
         return jax.jit(create, out_shardings=placement)(*given)
     state, saved_info, step = restored

@@ -90,7 +90,7 @@ def make_optimizer(
     """AdamW with torch's defaults, decaying every parameter as the papers' runs do.
 
     A step whose gradient is not finite changes nothing and is counted in the state, see
-    `optax.apply_if_finite`.
+    `optax.apply_if_finite`; any number of them may follow each other.
 
     Args:
         schedule: Learning rate by step.
@@ -108,13 +108,6 @@ def make_optimizer(
     optimizer: optax.GradientTransformation = optax.chain(*parts)
     if count > 1:
         optimizer = optax.MultiSteps(optimizer, count).gradient_transformation()
-    return skip_not_finite(optimizer)
-
-
-def skip_not_finite(
-    optimizer: optax.GradientTransformation,
-) -> optax.GradientTransformation:
-    """An optimizer that ignores gradients that are not finite, any number of them."""
     return optax.apply_if_finite(optimizer, np.iinfo(np.int32).max)
 
 
@@ -179,12 +172,10 @@ def split_parameters(
     params: Mapping[str, Any], is_frozen: Callable[[str], bool] | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Parameters that are trained, and those that are not, as two trees."""
-    if is_frozen is None:
-        return dict(params), {}
     flat = flax.traverse_util.flatten_dict(params, sep="/")
     parts: tuple[dict, dict] = ({}, {})
     for name, leaf in flat.items():
-        parts[is_frozen(name)][name] = leaf
+        parts[is_frozen is not None and is_frozen(name)][name] = leaf
     return tuple(flax.traverse_util.unflatten_dict(part, sep="/") for part in parts)
 
 
@@ -192,8 +183,6 @@ def merge_parameters(
     params: Mapping[str, Any], frozen: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Inverse of `split_parameters`."""
-    if not frozen:
-        return dict(params)
     trees = [flax.traverse_util.flatten_dict(t, sep="/") for t in (params, frozen)]
     return flax.traverse_util.unflatten_dict({**trees[0], **trees[1]}, sep="/")
 

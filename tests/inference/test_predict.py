@@ -104,15 +104,13 @@ def test_a_prediction_stops_where_it_is_told_to(setup):
         asked.append(True)
         return True
 
-    state = SimpleNamespace(eval_variables=setup.variables)
     with pytest.raises(distributed.Stopped):
-        Evaluation(setup.config, setup.data).validate(state, should_stop)
+        Evaluation(setup.config, setup.data).validate(setup.variables, should_stop)
     assert asked == [True]
 
 
 def test_scores_during_training_name_their_protocol(setup):
-    state = SimpleNamespace(eval_variables=setup.variables)
-    scores = Evaluation(setup.config, setup.data).validate(state)
+    scores = Evaluation(setup.config, setup.data).validate(setup.variables)
     name = "validation/map_3d_iou30/coco101/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
     assert all("/simulated" in key for key in scores.values)
@@ -121,5 +119,5 @@ def test_scores_during_training_name_their_protocol(setup):
     assert means == [scores.best]
     assert len(scores.figures) == 1
     mesh = distributed.make_mesh(1)
-    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(state)
+    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(setup.variables)
     assert alone.values == pytest.approx(scores.values)

@@ -18,7 +18,7 @@ import pytest
 
 from radejax.core.errors import DataError, DiskFullError
 from radejax.training import distributed
-from radejax.training.checkpoints import Checkpoints, abstract_state, array_checksums
+from radejax.training.checkpoints import Checkpoints, array_checksums
 
 # Restoring of corrupted files ends orbax's event loop while others are still read.
 pytestmark = pytest.mark.filterwarnings(
@@ -52,7 +52,9 @@ def _state(step: int) -> dict[str, Any]:
 def _abstract(state: Any = None) -> Any:
     whole = distributed.replicated(distributed.make_mesh(1))
     state = _state(0) if state is None else state
-    return abstract_state(state, jax.tree.map(lambda _: whole, state))
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), state
+    )
 
 
 def _restored_step(folder: pathlib.Path) -> int:
