@@ -26,7 +26,6 @@ import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
-import safetensors.numpy
 
 from radejax import models
 from radejax.core.archives import read_safetensors
@@ -222,28 +221,6 @@ def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], 
             f"found {len(found)}"
         )
     return found[0], source
-
-
-def write_state_dict(path: PathLike, tensors: Mapping[str, np.ndarray]) -> None:
-    """Writes tensors by name: `.safetensors`, or `.pth` or `.pt` by torch.
-
-    Raises:
-        UserError: The ending is another, or torch is not installed.
-    """
-    path = pathlib.Path(path)
-    if path.suffix == ".safetensors":
-        path.write_bytes(safetensors.numpy.save(dict(tensors)))
-    elif path.suffix in (".pth", ".pt"):
-        try:
-            import torch
-        except ImportError:
-            raise UserError(
-                f"{path}: writing {path.suffix} needs torch, which is not installed; "
-                "write .safetensors"
-            ) from None
-        torch.save({name: torch.from_numpy(x) for name, x in tensors.items()}, path)
-    else:
-        raise UserError(f"{path}: unknown ending; available: .pth, .pt, .safetensors")
 
 
 def to_numpy(tensor: Any) -> np.ndarray:

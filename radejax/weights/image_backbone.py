@@ -13,6 +13,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
+import safetensors.numpy
 
 from radejax import models
 from radejax.core.errors import UserError
@@ -26,7 +27,6 @@ from radejax.weights.convert import (
     shapes_of,
     to_torch,
     variable_shapes,
-    write_state_dict,
 )
 
 
@@ -172,4 +172,4 @@ def load_resnet(
 def save_resnet(params: Mapping[str, Any], path: PathLike) -> None:
     """Writes the parameters of a `ResNetTrunk` under torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
-    write_state_dict(path, to_torch(RESNET_RULES, trunk))
+    safetensors.numpy.save_file(to_torch(RESNET_RULES, trunk), path)

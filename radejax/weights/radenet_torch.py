@@ -21,7 +21,6 @@ from radejax.weights.convert import (
     to_torch_layout,
     torch_name,
     variable_shapes,
-    write_state_dict,
 )
 
 StateDict = Mapping[str, Any]
@@ -71,10 +70,11 @@ def read(
     return config, from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
 
-def save(
-    model: RadeNet, variables: Mapping[str, Any], path: PathLike | None = None
-) -> dict[str, np.ndarray]:
+def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """State dict that the official code loads: inverse of `load`.
+
+    To write a file, use `safetensors.numpy.save_file(state, path)`, or `torch.save` after
+    `torch.from_numpy` of every array.
 
     The official model has CBAM tensors even where it does not use them; a model without
     CBAM gets untrained ones, so that a strict load succeeds there.
@@ -82,14 +82,13 @@ def save(
     Args:
         model: The model the variables belong to.
         variables: `{"params": ...}`.
-        path: Where to write it, see `convert.write_state_dict`. None only returns it.
 
     Returns:
         NumPy arrays by official name.
 
     Raises:
         UserError: `cbam="paper"`, or a center or scale of the input, has no official
-            counterpart; or the file cannot be written.
+            counterpart.
     """
     if model.cbam == "paper":
         raise UserError(
@@ -107,8 +106,6 @@ def save(
         for name, shape in torch_shapes(model.clone(cbam="official")).items():
             is_scale = len(shape) == 1 and name.endswith("weight")
             state.setdefault(name, np.full(shape, float(is_scale), np.float32))
-    if path is not None:
-        write_state_dict(path, state)
     return state
 
 

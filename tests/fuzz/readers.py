@@ -5,12 +5,12 @@ import pathlib
 import shutil
 
 import numpy as np
+import safetensors.numpy
 
 from radejax.data.kradar import KRadar, conditions, dataset, labels, write
 from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.geometry.camera import CameraCalibration
 from radejax.weights import radenet_torch
-from radejax.weights.convert import write_state_dict
 
 from .. import small_models as small
 from ..data.conftest import make_labels, write_kradar
@@ -74,8 +74,11 @@ def _read_tensor(folder: Folder) -> None:
 def _weights(folder: Folder, suffix: str) -> None:
     detector = small.detector()
     state = radenet_torch.save(detector.model, detector.variables)
-    writer = write_pth if suffix == ".pth" else write_state_dict
-    writer(folder / f"a{suffix}", state)
+    path = folder / f"a{suffix}"
+    if suffix == ".pth":
+        write_pth(path, state)
+    else:
+        safetensors.numpy.save_file(state, path)
 
 
 def _read_weights(folder: Folder, suffix: str) -> None:

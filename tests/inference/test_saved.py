@@ -41,7 +41,7 @@ def _write_torch(path, **changes):
     inputs = np.zeros((1, 16, 16, 101), np.float32)
     shapes = jax.eval_shape(model.init, jax.random.key(0), inputs)
     variables = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), shapes)
-    radenet_torch.save(model, variables, path)
+    safetensors.numpy.save_file(radenet_torch.save(model, variables), path)
     return config
 
 

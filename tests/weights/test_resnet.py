@@ -1,7 +1,5 @@
 """ResNet-50 weights of torchvision."""
 
-import importlib.util
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -11,10 +9,8 @@ import pytest
 from radejax import models
 from radejax.core.archives import read_safetensors
 from radejax.core.config import load_config
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError
 from radejax.models.image import ResNetNeck, ResNetTrunk
-from radejax.weights import torch_file
-from radejax.weights.convert import write_state_dict
 from radejax.weights.image_backbone import load_resnet, save_resnet
 
 from ..torch_files import write_pth
@@ -165,14 +161,3 @@ def test_a_trunk_by_itself_is_written_and_read(tmp_path):
     assert names == {n for n in expected if not n.endswith("num_batches_tracked")}
     with pytest.raises(DataError, match=r"conv1.weight is float32.4, 3, 7, 7., expect"):
         load_resnet(path, MODEL)
-
-
-def test_torch_writes_what_it_reads_or_says_that_it_is_missing(tmp_path):
-    tensors = {"a": np.arange(6, dtype=np.float32)}
-    path = tmp_path / "a.pth"
-    if importlib.util.find_spec("torch") is None:
-        with pytest.raises(UserError, match=r"needs torch, .*write \.safetensors"):
-            write_state_dict(path, tensors)
-        return
-    write_state_dict(path, tensors)
-    np.testing.assert_array_equal(torch_file.read(path)["a"], tensors["a"])
