@@ -212,7 +212,7 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
         require_images(gone, inputs)
 
 
-def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path):
+def test_embeddings_of_another_kind_are_rejected(data, embeddings, make, tmp_path):
     config = small_config()
     config.model.image.standardize = False
     with pytest.raises(UserError, match=r"standardize is True there and False here"):
@@ -235,7 +235,7 @@ def test_embeddings_of_another_kind_are_refused(data, embeddings, make, tmp_path
         open_embeddings(tmp_path)
 
 
-def test_weights_that_do_not_fit_are_refused(data, tmp_path):
+def test_weights_that_do_not_fit_are_rejected(data, tmp_path):
     config = small_config()
     with pytest.raises(UserError, match="--image-backbone FOLDER"):
         image_backbone.load_image_backbone(None, build(config.model))

@@ -32,7 +32,7 @@ def test_a_run_without_words_runs_every_part() -> None:
     assert [line for line in everything if line in functions] == functions
 
 
-def test_an_unknown_part_is_refused_with_the_names_of_all() -> None:
+def test_an_unknown_part_is_rejected_with_the_names_of_all() -> None:
     done = subprocess.run(
         ["bash", str(CI), "lnt"], capture_output=True, text=True, check=False
     )

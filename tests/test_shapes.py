@@ -37,12 +37,12 @@ def test_fitting_arrays_pass(boxes: types.ModuleType) -> None:
     assert boxes.boxes8_from_7(np.zeros((2, 7)))[0].tolist() == [0] * 7 + [1]
 
 
-def test_a_wrong_shape_is_refused_by_name(boxes: types.ModuleType) -> None:
+def test_a_wrong_shape_is_rejected_by_name(boxes: types.ModuleType) -> None:
     with pytest.raises(TypeCheckError, match="parameter 'boxes'"):
         boxes.boxes8_from_7(np.zeros((2, 8)))
 
 
-def test_a_wrong_result_is_refused(
+def test_a_wrong_result_is_rejected(
     boxes: types.ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(boxes, "_checked", lambda boxes, width: boxes[..., 1:])
@@ -50,7 +50,7 @@ def test_a_wrong_result_is_refused(
         boxes.boxes8_from_7(np.zeros((2, 8))[:, :7])
 
 
-def test_a_field_of_a_wrong_shape_is_refused_by_name(checked: Checked) -> None:
+def test_a_field_of_a_wrong_shape_is_rejected_by_name(checked: Checked) -> None:
     scene = checked("radejax.simulation.world.scene")
     flat, kind = np.zeros(2), np.zeros(2, int)
     assert scene.Reflectors(np.zeros((2, 3)), flat, flat, kind).kind is kind

@@ -40,7 +40,7 @@ def test_every_public_module_is_in_the_reference() -> None:
     assert set(files) <= set(named)
 
 
-def test_a_site_without_a_public_name_is_refused(tmp_path: pathlib.Path) -> None:
+def test_a_site_without_a_public_name_is_rejected(tmp_path: pathlib.Path) -> None:
     names = list(pages.public_names())
     assert "radejax.geometry.rotated_iou.bev_iou" in names
     assert "radejax.inference.detector.Detector.from_workdir" in names

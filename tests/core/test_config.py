@@ -69,7 +69,7 @@ def test_every_dinorade_config_builds(words: str) -> None:
     assert config.loss.heatmap_sigma_bins == (3.0 if words == "official" else 0.75)
 
 
-def test_words_that_do_not_go_together_are_refused() -> None:
+def test_contradictory_options_are_rejected() -> None:
     with pytest.raises(UserError, match="'base' and 'stem' exclude each other"):
         _get("radenet", "base,stem")
     with pytest.raises(UserError, match=r"unknown config option 'big'; available"):
@@ -127,7 +127,7 @@ def test_a_text_becomes_the_value_of_a_field(
         ("train.learning_rate", "((((" * 300, "expected a value of type float"),
     ],
 )
-def test_other_texts_are_refused_by_name(name: str, text: str, message: str) -> None:
+def test_other_texts_are_rejected_by_name(name: str, text: str, message: str) -> None:
     with pytest.raises(UserError) as refused:
         override(base_config(), {name: text})
     assert message in str(refused.value)

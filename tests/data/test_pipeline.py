@@ -106,7 +106,7 @@ def test_every_epoch_has_every_frame_in_another_order(loader):
     assert list(itertools.chain(*in_order)) == [*range(12), *range(12)]
 
 
-def test_order_depends_on_the_seed_alone(loader):
+def test_order_depends_only_on_the_seed(loader):
     wanted = frames_of(loader(num_epochs=2))
     for options in ({"num_threads": 0}, {"num_threads": 5}):
         assert frames_of(loader(num_epochs=2, **options)) == wanted

@@ -396,7 +396,7 @@ def test_bfloat16_maps_and_saturated_or_missing_numbers():
         ("raw_yaw", "yes"),
     ],
 )
-def test_options_out_of_range_are_refused(name, value):
+def test_options_out_of_range_are_rejected(name, value):
     with pytest.raises(UserError, match=rf"config\.decode\.{name} is .*, expected"):
         D.DecodeOptions(**{name: value})
 
@@ -406,7 +406,7 @@ def test_options_are_those_of_the_config():
 
 
 @pytest.mark.wrong_types
-def test_wrong_shapes_are_refused():
+def test_wrong_shapes_are_rejected():
     logits, params, _, _ = scattered()
     run = partial(D.decode, max_detections=4, score_threshold=0.3)
     with pytest.raises(ValueError, match=r"maps have 20 x 12 .* the grid 256 x 107"):

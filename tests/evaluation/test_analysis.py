@@ -156,7 +156,7 @@ def _moved(found, column, change):
         (0, np.negative, r"60 of 60 predictions lie behind the sensor \(x < 0\)"),
     ],
 )
-def test_another_unit_or_frame_is_said(column, change, expected):
+def test_another_unit_or_frame_is_reported(column, change, expected):
     truth, found = _scene()
     assert _warnings(found, truth) == []
     lines = _warnings(_moved(found, column, change), truth)

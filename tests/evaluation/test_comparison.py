@@ -156,7 +156,7 @@ def test_predictions_that_were_stored_cut_say_so(stored_scene, tmp_path):
     assert {row["difference"] for row in rows} == {0.0}
 
 
-def test_what_cannot_be_compared_is_said(stored_scene, tmp_path):
+def test_incomparable_runs_are_reported(stored_scene, tmp_path):
     kitti.write_kitti(tmp_path, *stored_scene)
     once = dataclasses.replace(OPTIONS, bootstrap=0)
     for paths, options, message in (

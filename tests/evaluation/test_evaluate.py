@@ -518,7 +518,7 @@ def test_bad_rows_are_named():
     raises("frame 8, row 1: no such frame among the 2 frames", frame=[7, 8])
 
 
-def test_far_too_many_boxes_of_a_frame_are_refused_at_once():
+def test_far_too_many_boxes_of_a_frame_are_rejected_at_once():
     truth, found = truth_of(*[car()] * 2000), found_of(*[car()] * 20000)
     message = "frame 0: predictions and ground truths of Sedan are 40,000,000 pairs"
     with pytest.raises(DataError, match=message):

@@ -95,7 +95,7 @@ def test_it_learns_and_what_it_writes_is_a_frozen_backbone(
     )
 
 
-def test_a_model_without_camera_is_refused(tmp_path: pathlib.Path) -> None:
+def test_a_model_without_camera_is_rejected(tmp_path: pathlib.Path) -> None:
     command = ["--config", "quickstart", "--out", str(tmp_path / "x")]
     result = CliRunner().invoke(pretraining.main, command)
     assert result.exit_code != 0

@@ -14,7 +14,7 @@ def check(name: str, start: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_corrupted_inputs_are_read_or_refused(name: str) -> None:
+def test_corrupted_inputs_are_read_or_rejected(name: str) -> None:
     check(name, 0, READERS[name].count)
 
 

@@ -50,6 +50,6 @@ def test_corners_of_both_forms_agree_in_jax_and_numpy():
 
 @pytest.mark.wrong_types
 @pytest.mark.parametrize("function", [B.boxes8_from_7, B.boxes7_from_8, B.bev_corners])
-def test_wrong_width_is_refused(function):
+def test_wrong_width_is_rejected(function):
     with pytest.raises(ValueError, match=r"must be \[..., [78]\], got shape \(2, 5\)"):
         function(np.zeros((2, 5)))

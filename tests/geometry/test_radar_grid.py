@@ -149,12 +149,12 @@ def test_reduced_grid_looks_like_the_sensor():
         ({"fov_range_m": np.nan}, "fov_range_m must be positive and finite"),
     ],
 )
-def test_bad_axes_are_refused(changes, message):
+def test_bad_axes_are_rejected(changes, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(KRADAR, **changes)
 
 
 @pytest.mark.wrong_types
-def test_unknown_mapping_is_refused():
+def test_unknown_mapping_is_rejected():
     with pytest.raises(ValueError, match="is 'bent', expected true or stretched"):
         KRADAR.padded(8, "bent")

@@ -262,6 +262,6 @@ def test_numpy_boxes_are_compared_in_float64():
 
 
 @pytest.mark.wrong_types
-def test_bad_shapes_are_refused():
+def test_bad_shapes_are_rejected():
     with pytest.raises(ValueError, match=r"must be \[..., 7\] or \[..., 8\], got"):
         bev(np.zeros((2, 5)), np.zeros((2, 7)))

@@ -113,7 +113,7 @@ def test_boxes_of_an_exported_folder(tmp_path):
         load_model(tmp_path / "packed", step="best")
 
 
-def test_two_frames_of_one_name_are_refused(tmp_path):
+def test_two_frames_of_one_name_are_rejected(tmp_path):
     for disk in ("a", "b"):
         path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
         path.parent.mkdir(parents=True)

@@ -97,7 +97,7 @@ def test_a_detector_sees_no_frames_that_are_not_there(setup):
     assert seen == [3, 2]
 
 
-def test_a_prediction_stops_where_it_is_told_to(setup):
+def test_a_prediction_stops_when_asked(setup):
     asked = []
 
     def should_stop():

@@ -73,7 +73,7 @@ def test_a_run_that_has_not_trained_says_so(tmp_path):
         Detector.from_workdir(tmp_path)
 
 
-def test_classes_reordered_in_a_workdir_change_nothing_or_are_refused(tmp_path):
+def test_classes_reordered_in_a_workdir_change_nothing_or_are_rejected(tmp_path):
     """A checkpoint has its own config; a training compares its config with the folder's."""
     config, grid = small.radar_config(), small.small_grid()
     info = experiment.checkpoint_info(config, grid, {}, {})

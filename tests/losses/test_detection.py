@@ -403,12 +403,12 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
         ("weights", {}),
     ],
 )
-def test_options_out_of_range_are_refused(name, value):
+def test_options_out_of_range_are_rejected(name, value):
     with pytest.raises(UserError, match=rf"config\.loss\.{name} is .*, expected"):
         LossOptions(**{name: value})
 
 
-def test_wrong_shapes_are_refused():
+def test_wrong_shapes_are_rejected():
     maps, batch = small_scene(np.random.default_rng(9))
     with pytest.raises(ValueError, match="24 x 16 range x azimuth bins, the grid 256"):
         detection_loss(maps, batch, STRETCHED)

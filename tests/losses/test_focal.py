@@ -122,7 +122,7 @@ def test_batches_and_vmap_agree():
 
 
 @pytest.mark.wrong_types
-def test_unknown_sigma_is_refused():
+def test_unknown_sigma_is_rejected():
     with pytest.raises(ValueError, match="sigma_mode is 'round', expected one of"):
         F.gaussian_heatmap(
             jnp.zeros((1, 8)),

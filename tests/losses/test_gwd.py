@@ -296,6 +296,6 @@ def test_degenerate_boxes_give_finite_values_and_gradients(transform, dtype):
         ),
     ],
 )
-def test_bad_arguments_are_refused(call, message):
+def test_bad_arguments_are_rejected(call, message):
     with pytest.raises(ValueError, match=message):
         call(jnp.ones((2, 8)))

@@ -41,7 +41,7 @@ CHOICES = {
 
 
 @pytest.mark.parametrize("field", CHOICES)
-def test_an_unknown_name_is_refused_with_those_that_there_are(field: str) -> None:
+def test_an_unknown_name_is_rejected_with_those_that_there_are(field: str) -> None:
     config = small.camera_config().model.to_dict()
     section, _, name = field.rpartition(".")
     (config[section] if section else config)[name] = "wide"

@@ -237,7 +237,7 @@ def test_variants_differ_where_their_names_say():
 
 
 @pytest.mark.wrong_types
-def test_images_of_another_size_are_refused():
+def test_images_of_another_size_are_rejected():
     model, variables = model_and_variables()
     projection, image, camera = batch()
     short = lifting.reference_points(calibration().camera(), model.query_grid, 4, 8)
@@ -270,6 +270,6 @@ def test_images_of_another_size_are_refused():
         ({"image": 3}, r"config.model.image is 3, expected"),
     ],
 )
-def test_impossible_configs_are_refused(changes, message):
+def test_impossible_configs_are_rejected(changes, message):
     with pytest.raises(UserError, match=message):
         small(**changes)

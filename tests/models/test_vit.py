@@ -142,6 +142,6 @@ def test_bfloat16_stays_close():
 
 @pytest.mark.wrong_types
 @pytest.mark.parametrize("shape", [(1, 8, 10, 3), (1, 3, 8, 8), (8, 8, 3)])
-def test_images_of_a_wrong_shape_are_refused(shape):
+def test_images_of_a_wrong_shape_are_rejected(shape):
     with pytest.raises(AssertionError, match="expected"):
         ViT(**TINY).init(jax.random.key(0), jnp.zeros(shape))

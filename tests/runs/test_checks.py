@@ -130,7 +130,7 @@ def test_nothing_is_written_for_paths_that_do_not_exist(tmp_path: pathlib.Path) 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_batch_that_does_not_divide_is_refused_first(
+def test_a_batch_that_does_not_divide_is_rejected_first(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mesh = distributed.make_mesh(4)

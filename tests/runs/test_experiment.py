@@ -120,7 +120,7 @@ def test_labels_are_read_once(
 # Work folders ------------------------------------------------------------------------
 
 
-def test_a_work_folder_keeps_its_config_and_refuses_another(
+def test_a_work_folder_keeps_its_config_and_rejects_another(
     tmp_path: pathlib.Path,
 ) -> None:
     config = base_config()
@@ -146,7 +146,7 @@ def test_a_work_folder_keeps_its_config_and_refuses_another(
         pass
 
 
-def test_a_second_training_in_a_work_folder_is_refused(tmp_path: pathlib.Path) -> None:
+def test_a_second_training_in_a_work_folder_is_rejected(tmp_path: pathlib.Path) -> None:
     folder = tmp_path / "run"
     with (
         claimed(folder, base_config()),

@@ -91,7 +91,7 @@ def test_trainings_are_those_of_the_papers(
 
 @pytest.mark.parametrize("name", ["radenet", "dinorade"])
 @pytest.mark.parametrize("preset", ["", "paper", "official"])
-def test_a_word_for_sigma_changes_the_targets_alone(name: str, preset: str) -> None:
+def test_an_option_for_sigma_changes_only_the_targets(name: str, preset: str) -> None:
     plain = _get(name, preset).to_dict()
     fixed = {"sigma3": 3.0, "sigma0.75": 0.75}
     for word in (*fixed, "adaptive", "anisotropic"):

@@ -78,7 +78,7 @@ def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch: int) -
     assert len(floors) == 5
 
 
-def test_warm_up_longer_than_the_training_is_refused() -> None:
+def test_warm_up_longer_than_the_training_is_rejected() -> None:
     with pytest.raises(
         UserError, match=r"warmup_steps is 100, expected less than the 100"
     ):

@@ -168,7 +168,7 @@ class _PerBin(nn.Module):
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 4])
-def test_so_many_devices_send_gradients_alone(num_devices: int, tiny: Tiny) -> None:
+def test_many_devices_send_only_gradients(num_devices: int, tiny: Tiny) -> None:
     least = dataclasses.replace(tiny, model=_PerBin(), map_grid=tiny.grid)
     batch, optimizer = _batch(tiny, 8), optax.apply_if_finite(optax.sgd(0.1), 9)
     variables = least.model.init(RNG, to_float(batch.projection[:1]))

@@ -91,7 +91,7 @@ def test_predictions_carry_scores():
     assert texts_of(ax) == ["Bus or Truck 0.50"]
 
 
-def test_stereo_pair_is_refused_with_advice():
+def test_stereo_pair_is_rejected_with_advice():
     with pytest.raises(UserError, match="read_left_image"):
         camera.draw_camera(np.zeros((72, 256, 3), np.uint8), CALIBRATION)
 

@@ -45,7 +45,7 @@ def test_wrong_use_is_named(tmp_path, frames, name, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_mp4_without_ffmpeg_is_refused(tmp_path, monkeypatch):
+def test_mp4_without_ffmpeg_is_rejected(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match="ffmpeg"):
         recordings.animate([color_figure("white")], tmp_path / "a.mp4")

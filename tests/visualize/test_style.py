@@ -43,7 +43,7 @@ def test_save_makes_folders_and_leaves_no_parts(tmp_path):
     assert {p.name for p in path.parent.iterdir()} == {"b.png", "b.pdf"}
 
 
-def test_failed_save_keeps_the_old_picture(tmp_path, monkeypatch):
+def test_failed_save_keeps_the_old_figure(tmp_path, monkeypatch):
     figure = style.new_figure(2, 2)
     path = style.save_figure(figure, tmp_path / "b.png")
     before = path.read_bytes()
@@ -59,7 +59,7 @@ def test_failed_save_keeps_the_old_picture(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["b.png"]
 
 
-def test_unknown_suffix_is_refused(tmp_path):
+def test_unknown_suffix_is_rejected(tmp_path):
     with pytest.raises(UserError, match="png"):
         style.save_figure(style.new_figure(2, 2), tmp_path / "a.xyz")
 

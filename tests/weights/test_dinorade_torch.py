@@ -224,7 +224,7 @@ def test_a_folder_in_place_of_the_backbone(tiny, make, tmp_path):
     chex.assert_trees_all_equal(found, expected["params"])
 
 
-def test_other_content_is_refused(shared, tmp_path):
+def test_other_content_is_rejected(shared, tmp_path):
     with pytest.raises(UserError, match="depth is not a field of this model"):
         dinorade_torch.load(end_to_end_tensors(shared), depth=3)
     with pytest.raises(

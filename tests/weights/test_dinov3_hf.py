@@ -63,7 +63,7 @@ def test_a_folder_that_is_written_is_the_one_that_was_read(
         chex.assert_trees_all_equal(written, tensors)
 
 
-def test_the_first_layers_alone(golden, make, tensors):
+def test_only_the_first_layers(golden, make, tensors):
     # Without the final normalization's statistics, to see where an error starts.
     expected = np.load(golden / "dinorade_vit.npz")
     config = make.TINY_CONFIG | {"num_hidden_layers": 1}
@@ -158,7 +158,7 @@ def test_incomplete_or_corrupted_folders(folder, tmp_path):
         ({"num_attention_heads": 7}, "hidden_size is 96, expected a multiple of 4"),
     ],
 )
-def test_other_models_are_refused(change, message, make):
+def test_other_models_are_rejected(change, message, make):
     config = make.TINY_CONFIG | change
     config = {k: v for k, v in config.items() if v is not None}
     with pytest.raises(UserError, match=message):
@@ -173,7 +173,7 @@ def test_other_models_are_refused(change, message, make):
         (65536, "missing layer.100."),
     ],
 )
-def test_another_number_of_layers_is_refused(make, tensors, count, message):
+def test_another_number_of_layers_is_rejected(make, tensors, count, message):
     model = dinov3_hf.model_from_config(make.TINY_CONFIG | {"num_hidden_layers": count})
     with pytest.raises(DataError, match=f"x does not fit, .*{message}"):
         dinov3_hf.to_params(model, tensors, "x")

@@ -34,7 +34,7 @@ def test_embeddings_leave_the_last_stage_to_load(resnet):
         image_backbone.load_image_backbone(None, resnet, sha256)
 
 
-def test_embeddings_of_other_weights_are_refused(resnet):
+def test_embeddings_of_other_weights_are_rejected(resnet):
     sha256 = image_backbone.weights_sha256({"stem": np.arange(3.0) + 1})
     with pytest.raises(UserError, match=r"resnet50\.pth is not the image backbone"):
         image_backbone.load_image_backbone("resnet50.pth", resnet, sha256)
@@ -45,7 +45,7 @@ def test_embeddings_stand_for_all_of_a_transformer():
     assert image_backbone.load_image_backbone(None, model, "0" * 64) is None
 
 
-def test_weights_of_another_transformer_are_refused(monkeypatch):
+def test_weights_of_another_transformer_are_rejected(monkeypatch):
     model = build(load_config("dinorade").model)
     found = model.vit.clone(num_registers=3)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))

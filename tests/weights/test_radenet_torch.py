@@ -182,7 +182,7 @@ def test_paper_cbam_has_no_official_form(recipe):
         ({"backbone.fc.weight": np.zeros(3)}, r"not a state dict of RADE-Net"),
     ],
 )
-def test_something_else_is_refused(content, message):
+def test_something_else_is_rejected(content, message):
     with pytest.raises(DataError, match=message):
         radenet_torch.load(content)
 

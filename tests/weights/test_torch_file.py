@@ -99,7 +99,7 @@ def test_runs_no_code(tmp_path):
 
 
 @pytest.mark.parametrize("content", [{"config": Attack, "lr": 0.1}, np.float64(1)])
-def test_objects_of_other_classes_are_refused(tmp_path, content):
+def test_objects_of_other_classes_are_rejected(tmp_path, content):
     write_zip(tmp_path / "x.pth", pickle.dumps(content, protocol=2))
     with pytest.raises(DataError, match=r"save the state dict, torch\.save"):
         torch_file.read(tmp_path / "x.pth")
@@ -127,7 +127,7 @@ def tensor(size=6, shape=(2, 3), strides=(3, 1), offset=0, storage="FloatStorage
         ({"storage": "QInt8Storage"}, "QInt8Storage, which is not read"),
     ],
 )
-def test_corrupted_tensors_are_refused(tmp_path, changes, message):
+def test_corrupted_tensors_are_rejected(tmp_path, changes, message):
     data = np.arange(6, dtype="<f4").tobytes()
     write_zip(tmp_path / "x.pth", tensor(**changes), **{"0": data})
     with pytest.raises(DataError, match=rf"x\.pth: .*{message}"):
@@ -143,14 +143,14 @@ def test_corrupted_tensors_are_refused(tmp_path, changes, message):
         (b"PK\x03\x04garbage", "corrupted"),
     ],
 )
-def test_other_files_are_refused(tmp_path, content, message):
+def test_other_files_are_rejected(tmp_path, content, message):
     path = tmp_path / "x.pth"
     path.write_bytes(content)
     with pytest.raises(DataError, match=rf"x\.pth: .*{message}"):
         torch_file.read(path)
 
 
-def test_the_format_before_torch_1_6_is_refused(shared):
+def test_the_format_before_torch_1_6_is_rejected(shared):
     path = shared / "fixtures/torch_files/channel_attention_legacy.pth"
     with pytest.raises(DataError, match=r"write it with torch\.save"):
         torch_file.read(path)
@@ -194,7 +194,7 @@ REBUILD = b"ctorch._utils\n_rebuild_tensor_v2\n"
         b"",
     ],
 )
-def test_malformed_pickles_are_refused_at_once(tmp_path, pickled):
+def test_malformed_pickles_are_rejected_at_once(tmp_path, pickled):
     path = tmp_path / "x.pth"
     write_zip(path, pickled, **{"0": bytes(24)})
     with at_most(64 << 20), pytest.raises(DataError, match=r"x\.pth: "):

@@ -40,7 +40,7 @@ def test_rule_and_file(tmp_path):
     assert select(tmp_path, split=own)[0] == KEYS[8:]
 
 
-def test_a_frame_in_both_splits_is_told(tmp_path, caplog):
+def test_a_frame_in_both_splits_is_reported(tmp_path, caplog):
     write.write_splits(tmp_path / "split", KEYS[:4], KEYS[4:])
     assert not select(tmp_path, split="test")[1].summary().problems
     assert not caplog.text
