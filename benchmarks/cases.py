@@ -24,7 +24,7 @@ from case import Case, compiled, difference, timed, waiting
 from radejax.core.config import load_config
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
-from radejax.data.projection import project_jax, project_plain, project_tensor
+from radejax.data.projection import project_jax, project_tensor
 from radejax.data.tesseract import project_file
 from radejax.evaluation import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
@@ -45,13 +45,15 @@ def tpm(machine):
     tesseract = inputs.make_tesseract(GRID.shape_drea)
     columns = {
         "radejax": lambda: timed(lambda: project_tensor(tesseract)),
-        "released formula": lambda: timed(lambda: project_plain(tesseract)),
+        "released formula": lambda: timed(lambda: inputs.project_released(tesseract)),
         "plain read (sum)": lambda: timed(tesseract.sum),
     }
     yield Case(
         name="TPM on the host",
         columns=columns,
-        error=difference([project_tensor(tesseract)], [project_plain(tesseract)]),
+        error=difference(
+            [project_tensor(tesseract)], [inputs.project_released(tesseract)]
+        ),
         note="beside a plain read: the share of its bandwidth",
     )
     if machine["platform"] != "cpu":
@@ -68,7 +70,7 @@ def tpm(machine):
             }
             if not is_small:
                 columns["loadmat, released formula"] = lambda p=path: timed(
-                    lambda: project_plain(scipy.io.loadmat(p)["arrDREA"])
+                    lambda: inputs.project_released(scipy.io.loadmat(p)["arrDREA"])
                 )
             note = (
                 f"{tesseract.nbytes / 1e6:.0f} MB of cells, the file in the page cache"

@@ -19,7 +19,6 @@ from rival import ATTENTION
 from radejax import models
 from radejax.core.config import load_config
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
-from radejax.data.projection import project_plain
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import ReferencePoints, reference_points
@@ -365,7 +364,7 @@ def detector(machine):
 def released_chain(frames, network, maps):
     """Wall and CPU seconds of projection, network and loops over peaks, in turn."""
     parts = [
-        timed(lambda: [project_plain(frame) for frame in frames]),
+        timed(lambda: [inputs.project_released(frame) for frame in frames]),
         network(),
         timed(lambda: [inputs.loop_decode(*maps) for _ in frames]),
     ]

@@ -111,9 +111,9 @@ def embeddings(data, from_images, tmp_path_factory):
     variables = image_backbone.load_image_backbone(data.backbone, model)
     frames = opened(from_images)[1].frames
     arguments = (model, variables, config.model.image, frames, out)
-    counts = embed_dataset(*arguments, progress=False)
+    counts = embed_dataset(*arguments)
     assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
-    counts = embed_dataset(*arguments, progress=False)
+    counts = embed_dataset(*arguments)
     assert counts == {"frames": 12, "embedded": 0, "found": 12, "missing": 0}
     return out
 

@@ -92,7 +92,7 @@ def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
         UserError: It has neither tensor nor projection.
     """
     from radejax.core.structures import ROIS
-    from radejax.visualize.slices import draw_slices
+    from radejax.visualize.draw import draw_slices
 
     projection = frame.read_projection(grid)
     scene = radejax.frame_scene(frame, projection, grid, roi=ROIS.get(roi))

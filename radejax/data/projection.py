@@ -143,18 +143,6 @@ def to_log_scale(
     return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
 
 
-def project_plain(
-    tesseract: Real[np.ndarray, "D R E A"],
-) -> Float[np.ndarray, "R A D+E"]:
-    """The formula as released: logarithm of every cell, transpose, two maxima.
-
-    Slow; the reference that `project_tensor` is tested and timed against.
-    """
-    level = (10 * np.log10(tesseract + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
-    level = np.transpose(level, (1, 3, 2, 0))  # [R, A, E, D]
-    return np.concatenate([level.max(axis=2), level.max(axis=3)], axis=-1)
-
-
 @jax.jit
 def project_jax(
     tesseract: Real[jax.Array, "*frames D R E A"],

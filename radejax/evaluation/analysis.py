@@ -23,7 +23,7 @@ from radejax.evaluation.results import condition_masks
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
 OPERATING_SCORE = 0.3
-"""Precision, recall and worst frames are of predictions above it."""
+"""Score above which predictions count for precision, recall and the worst frames."""
 
 Masks = dict[str, tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " M"]]]
 """Objects and predictions of each subset."""
@@ -41,7 +41,7 @@ def matched_objects(
         [0]
     """
     match = data.match("plain", "free", space, iou)
-    assert isinstance(match, np.ndarray)  # K-Radar's rule alone gives something else
+    assert isinstance(match, np.ndarray)  # only K-Radar's rule gives another type
     return match
 
 
@@ -50,7 +50,7 @@ def subsets(
 ) -> dict[str, list[dict[str, Any]]]:
     """Numbers by distance and, as far as known, by weather, environment and time.
 
-    Distance is that on the ground. A prediction that found an object belongs to the
+    Distances are measured on the ground. A prediction that found an object belongs to the
     object's distance band, any other to its own: a detection does not become a false
     positive for lying just across a border.
 
@@ -84,7 +84,7 @@ def subsets(
 
 
 def _by_distance(data: EvaluationSet, match: Int[np.ndarray, " M"]) -> Masks:
-    """Bands of distance."""
+    """Masks of the distance bands."""
     of_gt = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
     of_pred = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
     is_found = match >= 0
@@ -128,7 +128,7 @@ def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
         Per class "count" and, as "<what>_mean" and "<what>_median": center_m (distance in
         the ground plane), z_m (absolute), length_m, width_m, height_m (absolute),
         heading_deg (absolute, 0 to 180), axis_deg (heading up to a half turn, 0 to 90),
-        and "reversed", the share of headings off by more than 90 degrees. NaN without
+        and "reversed", the fraction of headings off by more than 90 degrees. NaN without
         matches.
 
     Examples:

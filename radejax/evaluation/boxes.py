@@ -24,7 +24,7 @@ Columns = Mapping[str, np.ndarray]
 """A table of frames, ground truth or predictions: arrays by the name of the column."""
 
 AnyColumns = Mapping[str, ArrayLike]
-"""The same as users have it: lists are accepted."""
+"""A table as users pass it: lists are accepted as columns."""
 
 Roi = str | Sequence[float] | None
 """A region of interest: "narrow", "wide", (x0, x1, y0, y1, z0, z1), or None for all."""
@@ -88,7 +88,7 @@ def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
 
     Args:
         table: The columns.
-        name: Of the table in errors, such as "predictions".
+        name: Name of the table in errors, such as "predictions".
         scored: Whether a score is expected.
 
     Raises:
@@ -246,7 +246,7 @@ def tables_from_frames(
     Args:
         frames: Objects with sequence, name, weather, environment, time, is_simulated,
             boxes `[N, 7]` (radar frame) and classes `[N]` (names).
-        split: Of the dataset, for the frame table: "train", "test", "all" or a split
+        split: Split that the frame table names: "train", "test", "all" or a split
             file; None where it is not known.
 
     Returns:
@@ -329,8 +329,8 @@ def with_ids(
     Args:
         table: With a column frame; ids stay as they are.
         frames: Frame table to look names up in.
-        where: The table in errors.
-        skip: Leave out rows of frames that the frame table does not have, unless it has
+        where: Name of the table in errors.
+        skip: Skip rows of frames that the frame table does not have, unless it has
             none of them.
 
     Raises:

@@ -45,7 +45,7 @@ class Comparison:
         difference: B minus A.
         low: Lower end of the 95 % interval of the difference.
         high: Upper end.
-        p_value: Two-sided, from the share of resamples in which the sign turns.
+        p_value: Two-sided, from the fraction of resamples in which the sign changes.
         p_adjusted: The same after Holm's correction over all rows compared together.
         is_significant: Whether `p_adjusted` is below 0.05.
     """
@@ -84,7 +84,7 @@ def compare(
         protocol_names: Protocols to compare in.
         spaces: "bev", "3d".
         iou: IoU threshold.
-        score_threshold: Score threshold of both.
+        score_threshold: Score threshold of both runs.
         resamples: Number of resamples.
 
     Raises:
@@ -190,7 +190,7 @@ def compare_files(
         raise UserError("a comparison needs at least two runs")
     if options.bootstrap < 1:
         raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
-    # What one run has not stored must not count for another one.
+    # Predictions that one run did not store must not count for another run.
     threshold = max(options.score_threshold, *map(stored_from, paths))
     options = dataclasses.replace(
         options, score_threshold=threshold, min_score=threshold

@@ -23,7 +23,8 @@ T = TypeVar("T")
 SPACES = ("bev", "3d")
 
 MAX_PAIRS = 1_000_000
-"""Most pairs of predictions and objects per class and frame; 100 and 20 are many."""
+"""Most pairs of predictions and objects per class and frame; 100 predictions and 20
+objects are many."""
 
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
@@ -64,16 +65,6 @@ class Result(Curve):
     high: float | None = None
 
     @property
-    def is_defined(self) -> bool:
-        """Whether the class occurs at all; reports show `-` where it does not."""
-        return self.num_gt > 0
-
-    @property
-    def ap_or_none(self) -> float | None:
-        """AP, or None where the class does not occur, whatever the protocol defines."""
-        return self.ap if self.is_defined else None
-
-    @property
     def key(self) -> tuple[str, str, str, str, float]:
         """Protocol, condition, class, space and IoU threshold."""
         return self.protocol, self.condition, self.cls, self.space, self.iou
@@ -93,7 +84,7 @@ class Result(Curve):
         )
 
 
-def mean_ap(results: Sequence[Result]) -> float:
+def mean_ap(results: Sequence[Curve]) -> float:
     """Mean AP over the classes that occur; NaN if none does.
 
     Examples:
@@ -116,7 +107,7 @@ class EvaluationSet:
         score: Scores of `pred`.
         ground_truth: All objects as given.
         predictions: All predictions as given.
-        left_out: Counts of boxes that do not take part, by reason.
+        left_out: Counts of boxes that are excluded, by reason.
         roi: Name of the region.
         label_version: Label revision or None.
         is_simulated: Whether the frame table says that frames are simulated.
@@ -166,7 +157,7 @@ class EvaluationSet:
         self.pair_pred, self.pair_gt = matching.candidate_pairs(
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
-        # Shared by the results of all protocols, thresholds and frames.
+        # Results of `_once`, which all protocols, thresholds and frames share.
         self._shared: dict[tuple[Any, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
@@ -191,7 +182,7 @@ class EvaluationSet:
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
-        """The set of some frames, for many evaluations of a condition."""
+        """Evaluation set of some frames, for many evaluations of one condition."""
         ids = self.frame[is_chosen]
         tables = self.ground_truth, self.predictions
         return EvaluationSet(
@@ -282,13 +273,13 @@ class EvaluationSet:
 
         Args:
             protocol: Name of the protocol.
-            iou_thresholds: As in `evaluate`.
-            empty_frames: As in `evaluate`.
-            score_threshold: As in `evaluate`.
-            spaces: As in `evaluate`.
+            iou_thresholds: See `evaluate`.
+            empty_frames: See `evaluate`.
+            score_threshold: See `evaluate`.
+            spaces: See `evaluate`.
             weights: bool or int weight of every frame; a condition is a mask.
             curves: Keep the precision, recall and score arrays.
-            condition: Weather that the weights stand for.
+            condition: Name of the weather that the weights select.
         """
         chosen = protocols.get_protocol(protocol)
         empty_frames = chosen.resolve_empty_frames(empty_frames)

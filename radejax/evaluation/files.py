@@ -76,7 +76,7 @@ def read_table(
             raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
     else:
         raise UserError(
-            f"{path} is no .npz or .json file, and no folder of `radejax detect` or in "
+            f"{path} is neither a .npz or .json file nor a folder of `radejax detect` or in "
             "KITTI's layout"
         )
     table = {name: columns[name] for name in wanted}
@@ -225,7 +225,7 @@ def _load_ground_truth(
 
 
 def stored_from(path: PathLike) -> float:
-    """Score from which on predictions were stored, as their report says; or 0."""
+    """Lowest score of stored predictions according to their report, or 0."""
     path = pathlib.Path(path)
     if not (path / "metrics.json").is_file():
         return 0.0
@@ -239,9 +239,9 @@ def _read_frames(path: PathLike) -> Columns:
         columns = {name: np.asarray(values) for name, values in dict(content).items()}
         frame_ids(columns)
         if any(column.dtype.kind == "O" for column in columns.values()):
-            raise DataError("a column has values that are no numbers or words")
+            raise DataError("a column has values that are neither numbers nor text")
     except (TypeError, ValueError) as error:
-        raise DataError(f"{path} is no table of frames: {error}") from None
+        raise DataError(f"{path} is not a table of frames: {error}") from None
     return columns
 
 
@@ -261,7 +261,7 @@ def evaluate_files(
     warnings, low = [], stored_from(path)
     if low > max(LOW_SCORE, options.score_threshold):
         warnings.append(
-            f"{path} has predictions from score {low:g} on only, and every number is of "
+            f"{path} has only predictions from score {low:g} on, and every number is of "
             "these; `radejax evaluate` with --min-score stores lower ones"
         )
     options = dataclasses.replace(options, min_score=max(low, options.min_score))

@@ -43,7 +43,7 @@ GT_HEADER = "0.00 0 0 50 50 150 150"
 PRED_HEADER = "-1 -1 0 50 50 150 150"
 DUMMY = "dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"
 DESCRIPTION = ("time", "environment", "weather")
-"""What the lines of a file in `desc` tell, as columns of the frame table."""
+"""Columns of the frame table that the lines of a file in `desc` hold, in order."""
 
 BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # h w l y z x yaw of x y z l w h yaw
 
@@ -58,13 +58,13 @@ def write_kitti(
 ) -> int:
     """Writes folders that K-Radar's official evaluation script reads.
 
-    Every weather, environment and time of the frame table gets one beside "all".
+    Every weather, environment and time of the frame table gets a folder next to "all".
 
     Args:
-        folder: Where; a folder named after the score threshold is made in it.
+        folder: Output folder; a folder named after the score threshold is created in it.
         ground_truth: Columns as in `evaluation.evaluate`, or with frames by key as
             in a report's files, already reduced to the classes, region and field of view
-            that shall count.
+            that are to be counted.
         predictions: The same with scores.
         frames: Frame table; the position of a frame is the number of its file.
         score_threshold: Only predictions above it are written.
@@ -153,7 +153,7 @@ def read_kitti(folder: str | pathlib.Path) -> tuple[Columns, Columns, Columns]:
 
     Returns:
         Ground truth, predictions and frame table. The frame id is the number of the file;
-        the frame table has weather, environment and time where `desc` tells them.
+        the frame table has weather, environment and time where `desc` has them.
 
     Raises:
         UserError: Nothing to read in it, or several score thresholds.

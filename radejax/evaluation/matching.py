@@ -7,7 +7,6 @@ number of boxes in a group, not the number of boxes.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -156,8 +155,7 @@ def _is_new(*columns: Shaped[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
     return new
 
 
-@dataclasses.dataclass(frozen=True)
-class KradarMatches:
+class KradarMatches(NamedTuple):
     """K-Radar's two passes over all frames, independent of score thresholds.
 
     Attributes:

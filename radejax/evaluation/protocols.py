@@ -67,7 +67,7 @@ RECOMMENDED = "all_point"
 _ALL = (
     # K-Radar's revised evaluation as published, with length and width swapped.
     Protocol("kradar_r40", "swapped_lw", "kradar", "r40", "frame"),
-    # The same with the yaw right.
+    # The same without the swap, so that the yaw is correct.
     Protocol("kradar_r40_corrected", "rounded", "kradar", "r40", "frame"),
     # K-Radar's older evaluation: 11 of 41 samples, z as the top of a box.
     Protocol("kradar_r11", "swapped_lw_z_top", "kradar", "r11", "frame"),
@@ -117,6 +117,16 @@ class Curve:
     precision: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
     recall: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
     score: Float[np.ndarray, " K"] = dataclasses.field(repr=False)
+
+    @property
+    def is_defined(self) -> bool:
+        """Whether the class occurs at all; reports show `-` where it does not."""
+        return self.num_gt > 0
+
+    @property
+    def ap_or_none(self) -> float | None:
+        """AP, or None where the class does not occur, whatever the protocol defines."""
+        return self.ap if self.is_defined else None
 
 
 def score_thresholds(
@@ -209,7 +219,7 @@ def _sum_at_least(
     value: Real[np.ndarray, " E"],
     at: Float[np.ndarray, " K"],
 ) -> Real[np.ndarray, " K"]:
-    """Sum of `value` over entries with score >= at; scores fall."""
+    """Sum of `value` over entries with score >= at; scores are descending."""
     total = np.concatenate([[0], np.cumsum(value)])
     return total[np.searchsorted(-score, -at, side="right")]
 
@@ -224,7 +234,7 @@ def pooled_curve(
     """AP from all predictions sorted by descending score.
 
     Args:
-        score: Of the predictions, descending.
+        score: Scores of the predictions, descending.
         is_tp: True for true positives.
         weight: Weights of their frames.
         num_gt: Number of ground truths.
@@ -235,7 +245,7 @@ def pooled_curve(
         >>> round(pooled_curve(score, is_tp, np.ones(3), 2, "all_point").ap, 2)
         83.33
     """
-    counts = weight > 0  # a frame left out must not leave a point at recall 0 either
+    counts = weight > 0  # an excluded frame must not leave a point at recall 0
     score, is_tp, weight = score[counts], is_tp[counts], weight[counts]
     num_det = int(weight.sum())
     found = np.cumsum(is_tp * weight)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import importlib.resources
 import itertools
 import pathlib
@@ -48,8 +49,8 @@ class Report:
     Attributes:
         text: The console text.
         metrics: The content of metrics.json.
-        results: All APs.
-        folder: Where the files are.
+        results: All average precisions.
+        folder: Folder of the files.
     """
 
     text: str
@@ -81,7 +82,7 @@ def write_report(
         options: What to compute.
         run: Name of the run in tables.
         left_out: Counts of what loading skipped, by reason.
-        warnings: Of loading, to be printed.
+        warnings: Warnings of loading, to be printed.
         draw_frame: Called with (frame id, path of a figure to write) for each of the
             worst frames, or None.
 
@@ -117,7 +118,7 @@ def write_report(
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
     metrics = plain(metrics)
-    by_key = index(results)
+    by_key = {result.key: result for result in results}
     text = _console_text(metrics, by_key, options)
     built = _tables(metrics, by_key, options)
     with files.swapped_in(out_dir) as folder:
@@ -157,8 +158,8 @@ def _split(frames: Columns) -> str | None:
 def _tables(
     metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
 ) -> list[Table]:
-    """Those of the papers, then every protocol and IoU threshold, then details."""
-    ious = options.iou_thresholds
+    """Tables in the papers' layouts, of every protocol and IoU threshold, and details."""
+    ious, subsets = options.iou_thresholds, metrics["subsets"]
     built = []
     if not metrics["is_simulated"]:
         built += paper_tables(metrics["run"], results, options, metrics["split"])
@@ -166,7 +167,11 @@ def _tables(
         built.append(by_protocol(results, options, space, iou))
     for protocol, iou in itertools.product(options.protocols, ious):
         built.append(class_by_weather(results, options, protocol, iou))
-    return built + detail_tables(metrics)
+    built += [subset_table(subsets, kind) for kind in subsets if kind != "protocol"]
+    built.append(error_table(metrics["box_errors"]))
+    names = ["frame", "name", "sequence", "missed", "false", "found"]
+    worst = _table_of("Frames with the most mistakes", metrics["worst_frames"], names)
+    return [*built, worst]
 
 
 def _console_text(
@@ -287,11 +292,6 @@ def rendered(
     return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
 
 
-def index(results: Sequence[Result]) -> Results:
-    """Results by their key."""
-    return {result.key: result for result in results}
-
-
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
     """A value as the papers print it; `-` for one that does not exist."""
     if value is None or value != value:
@@ -361,17 +361,6 @@ def _with_interval(result: Result) -> str:
 # Behind the APs -----------------------------------------------------------------------
 
 
-def detail_tables(metrics: Mapping[str, Any]) -> list[Table]:
-    """Every table of what lies behind the APs, from the content of metrics.json."""
-    kinds = [kind for kind in metrics["subsets"] if kind != "protocol"]
-    names = ["frame", "name", "sequence", "missed", "false", "found"]
-    return [
-        *(subset_table(metrics["subsets"], kind) for kind in kinds),
-        error_table(metrics["box_errors"]),
-        _table_of("Frames with the most mistakes", metrics["worst_frames"], names),
-    ]
-
-
 def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
     """AP, precision and recall per subset and class that has boxes."""
     title = f"By {kind}, {subsets['protocol']}"
@@ -416,6 +405,9 @@ Cell = tuple[str, str, str, float]
 Place = dict[str, Any]
 """Some of the four by name, as keywords of a layout; the others are the usual ones."""
 
+_ABLATIONS = ["RADE-Net, Table III", "DinoRADE, Table 4"]
+"""Tables of ablated models, with which a run is not compared."""
+
 _BOTH: list[Place] = [{"space": space} for space in SPACES]
 _USUAL: Place = {"condition": "all", "cls": "Sedan", "space": "3d", "iou": 0.3}
 
@@ -430,7 +422,7 @@ class PublishedRow:
         modality: L lidar, C camera, R radar.
         label_version: K-Radar label revision.
         protocol: Evaluation protocol as far as known.
-        note: What a reader should know.
+        note: Remark for readers.
         values: APs as printed; the class "mean" is the paper's mAP.
     """
 
@@ -458,17 +450,16 @@ class PublishedRow:
             and options.label_version == self.label_version
             and roi_name(options.roi) == "narrow"
             and split == "test"
+            and self.source not in _ABLATIONS
         )
         classes = {cls for _, cls, *_ in self.values} - {"mean"}
-        differences = []
+        gaps: list[float | None] = []
         for cell, ap in zip(cells, ours, strict=True):
             printed = self.values.get(cell, "-")
             is_same = cell[1] != "mean" or classes == set(options.classes)
-            if not (is_comparable and is_same) or ap is None or printed == "-":
-                differences.append("-")
-            else:
-                differences.append(number(ap - float(printed), signed=True))
-        return differences
+            exists = is_comparable and is_same and printed != "-"
+            gaps.append(ap - float(printed) if exists and ap is not None else None)
+        return numbers(gaps, signed=True)
 
 
 def _read() -> tuple[PublishedRow, ...]:
@@ -500,49 +491,44 @@ def paper_tables(
 
     Args:
         run: Name of the run.
-        results: Of frames that are not simulated.
-        options: Of the evaluation.
+        results: Results of frames that are not simulated.
+        options: Options of the evaluation.
         split: Split of the frames, None if it is not known.
     """
     if 0.3 not in options.iou_thresholds:
         return []
     classes = [{"cls": cls} for cls in (*options.classes, "mean")]
     conditions = [{"condition": name} for name in CONDITIONS]
-    layouts: list[
-        tuple[str, Sequence[str], Sequence[Place], Sequence[Place], str | None]
-    ] = [
-        (
-            "Sedan by weather at IoU 0.3 (layout of Table I)",
-            ["RADE-Net, Table I", "DinoRADE, Table 1"],
-            _BOTH,
-            conditions,
-            split,
-        ),
-        (
+    layout = functools.partial(_layout, run, results, options, split)
+    built = [
+        layout(
             "Classes by weather at IoU 0.3 (layout of Table II)",
             ["RADE-Net, Table II", "DinoRADE, Table 2"],
             classes,
             _crossed(conditions, _BOTH),
-            split,
         ),
-        (
+        layout(
             "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
             ["DinoRADE, Table 3"],
             [{"condition": "all"}],
             _crossed(classes, _BOTH),
-            split,
-        ),
-        (
-            "Ablations, Sedan (layout of Table III)",
-            ["RADE-Net, Table III", "DinoRADE, Table 4"],
-            [{"cls": "Sedan"}],
-            _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
-            None,
         ),
     ]
     if "Sedan" not in options.classes:
-        layouts = layouts[1:3]
-    return [_layout(*layout, run, results, options) for layout in layouts]
+        return built
+    by_weather = layout(
+        "Sedan by weather at IoU 0.3 (layout of Table I)",
+        ["RADE-Net, Table I", "DinoRADE, Table 1"],
+        _BOTH,
+        conditions,
+    )
+    ablations = layout(
+        "Ablations, Sedan (layout of Table III)",
+        _ABLATIONS,
+        [{"cls": "Sedan"}],
+        _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
+    )
+    return [by_weather, *built, ablations]
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
@@ -550,26 +536,26 @@ def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
 
 
 def _layout(
+    run: str,
+    results: Results,
+    options: EvaluationOptions,
+    split: str | None,
     title: str,
     sources: Sequence[str],
     groups: Sequence[Place],
     columns: Sequence[Place],
-    split: str | None,
-    run: str,
-    results: Results,
-    options: EvaluationOptions,
 ) -> Table:
     """Published rows, each with the difference to it where there is one, then ours.
 
     Args:
-        title: Of the table.
-        sources: Papers and tables whose rows to print.
-        groups: What the rows of each group are of.
-        columns: What the columns are of.
-        split: Split of the frames; None for no differences.
         run: Name of the run.
-        results: Of the run.
-        options: Of the evaluation.
+        results: Results of the run.
+        options: Options of the evaluation.
+        split: Split of the frames, None if it is not known.
+        title: Title of the table.
+        sources: Papers and tables whose rows are printed.
+        groups: Condition, class, space or IoU threshold that each group of rows shares.
+        columns: The same of each column.
     """
     body: list[list[str]] = []
     for group in groups:

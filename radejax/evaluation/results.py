@@ -32,7 +32,7 @@ from radejax.evaluation.boxes import AnyColumns, Columns, Roi, roi_bounds
 from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 
 LEVEL = 0.95
-"""Of all intervals."""
+"""Confidence level of all intervals."""
 
 _RANGES = {
     "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
@@ -61,7 +61,7 @@ class EvaluationOptions:
         protocols: Names of protocols.
         score_threshold: Score threshold of all protocols except fixed ones (all_point).
         empty_frames: Frames to ignore, except in fixed protocols; see `evaluate`.
-        min_score: Predictions below are not stored, hence part of no number.
+        min_score: Predictions below are not stored and count nowhere.
         roi: Region of interest of ground truth and predictions.
         label_version: Label revision of the ground truth.
         bootstrap: Number of resamples of sequences for intervals; 0 for none.
@@ -95,10 +95,10 @@ class EvaluationOptions:
 
     @classmethod
     def from_config(cls, config: ConfigDict, **changes: Any) -> EvaluationOptions:
-        """How the config of a run says that it is evaluated.
+        """Options from the config of a run.
 
         Args:
-            config: Of the run; `evaluation`, `classes` and `data.label_version` are read.
+            config: Config of the run; `evaluation`, `classes` and `data.label_version` are read.
             **changes: Fields to replace.
 
         Raises:
@@ -208,8 +208,8 @@ def compute_results(
 ) -> list[Result]:
     """Results of every protocol over all frames and over masks of frames.
 
-    Intervals, where the sequences are given, are of all protocols over all frames and of
-    the main ones per weather. Conditions are resampled within their sequences; those of
+    Where the sequences are given, all protocols have intervals over all frames, and the
+    main ones also per weather. Conditions are resampled within their sequences; those of
     one sequence get none.
     """
     rows = []
@@ -270,7 +270,7 @@ def sequence_weights(
     Args:
         sequence: Sequence of every frame.
         resamples: Number of resamples B.
-        seed: Of the drawing; the same seed draws the same sequences.
+        seed: Random seed; the same seed draws the same sequences.
 
     Raises:
         UserError: Fewer than two sequences: there is nothing to resample.
@@ -301,18 +301,15 @@ def resample(
     """
     chosen = protocols.get_protocol(protocol)
     empty_frames = chosen.resolve_empty_frames(empty_frames)
-    ap = np.full((len(weights), len(data.classes) + 1), np.nan)
-    for row, weight in enumerate(weights):
+    samples = []
+    for weight in weights:
         by_class = data.frame_weights(empty_frames, weight)
-        for cls in range(len(data.classes)):
-            curve = data.curve(
-                chosen, space, iou, float(score_threshold), cls, by_class[:, cls]
-            )
-            if curve.num_gt:
-                ap[row, cls] = curve.ap
-        present = ap[row, ~np.isnan(ap[row])]
-        ap[row, -1] = present.mean() if present.size else np.nan
-    return ap
+        curves = [
+            data.curve(chosen, space, iou, score_threshold, cls, by_class[:, cls])
+            for cls in range(len(data.classes))
+        ]
+        samples.append([*(curve.ap_or_none for curve in curves), mean_ap(curves)])
+    return np.array(samples, np.float64)  # None becomes NaN
 
 
 def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:
@@ -335,7 +332,7 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
 
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:
-    """Counts of what is not part of the numbers, by reason."""
+    """Counts of boxes and frames that are excluded from the numbers, by reason."""
     fixed = [p for p in options.protocols if protocols.PROTOCOLS[p].is_fixed]
     threshold = max(options.score_threshold, options.min_score)
     is_kept = data.score > threshold

@@ -115,7 +115,6 @@ def embed_dataset(
     dtype: str = "float32",
     resize: bool = False,
     batch_size: int = 8,
-    progress: bool = True,
 ) -> dict[str, int]:
     """Write the backbone's features of every front image that has none yet.
 
@@ -129,7 +128,6 @@ def embed_dataset(
             half the size.
         resize: Resize images of another size than the model's.
         batch_size: Images at once.
-        progress: Show a progress bar.
 
     Returns:
         Counts: "frames", "embedded", "found", "missing" (frames without an image).
@@ -161,7 +159,7 @@ def embed_dataset(
         .batch(batch_size)
         .to_iter_dataset(grain.ReadOptions(2, prefetch_buffer_size=2))
     )
-    with tqdm.tqdm(total=len(images), desc="embed", disable=not progress) as bar:
+    with tqdm.tqdm(total=len(images), desc="embed") as bar:
         for i, batch in enumerate(batches):
             empty = [(0, batch_size - len(batch)), (0, 0), (0, 0), (0, 0)]
             features = np.asarray(embed(params, np.pad(batch, empty))).astype(dtype)

@@ -50,7 +50,7 @@ def draw_camera(
         calibration: The camera, with its offset from the LiDAR.
         ground_truth: Boxes in the radar frame, or None.
         predictions: Boxes with scores in the radar frame, or None.
-        ax: Where to draw; a new figure by default.
+        ax: Axes to draw on; a new figure by default.
         show_labels: Write class and score at the boxes.
         title: Title of the axes.
 
@@ -69,7 +69,7 @@ def draw_camera(
             "read_left_image) and CameraCalibration.resized for a resized image"
         )
     focal_x, focal_y = np.asarray(calibration.intrinsics)[:2]
-    aspect = float(focal_x / focal_y)  # squeezed images look natural
+    aspect = float(focal_x / focal_y)  # squeezed images are shown undistorted
     if ax is None:
         width = 9.0
         height = width * aspect * calibration.height / calibration.width

@@ -26,7 +26,7 @@ def draw_precision_recall(panels: Mapping[str, Mapping[str, Curve]]) -> Figure:
     """Draw precision over recall, one line per class, condition or model.
 
     Lines differ in color and in dash pattern; a name that has no curve in one panel
-    keeps its looks in the others.
+    keeps its color and pattern in the others.
 
     Args:
         panels: Title of each panel to its curves by name; at least one.

@@ -1,9 +1,14 @@
-"""Figures of radar frames: bird's-eye view, polar view, one frame, several scenes.
+"""Figures of radar frames: bird's-eye view, polar view, one frame, scenes, slices.
 
 The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map with
 the region of interest dashed, ground truth white with its class, predictions red with
 class and score, and the camera image. In the bird's-eye view x points up and y to the
 left, in meters, and every range-azimuth bin covers the ground that it measures.
+
+A projection `[R, A, D+E]` is two 3D maps side by side: range-azimuth-Doppler (maximum
+over elevation) and range-azimuth-elevation (maximum over Doppler). The Doppler axis
+wraps around at a few meters per second, so a position on it is an aliased radial
+velocity, never the velocity: figures of slices say so.
 """
 
 from __future__ import annotations
@@ -21,15 +26,16 @@ from matplotlib.lines import Line2D
 
 from radejax.core.errors import UserError
 from radejax.core.structures import ROIS
-from radejax.geometry.boxes import bev_corners
+from radejax.geometry.boxes import bev_corners, corners
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.camera import draw_camera
-from radejax.visualize.slices import bin_edges, to_polar
 from radejax.visualize.style import (
     COLOR_MAP,
+    GROUND_TRUTH,
     ROI_COLOR,
     Label,
     Scene,
+    color_limits_of,
     draw_labels,
     draw_lines,
     draw_tiles,
@@ -67,8 +73,8 @@ def draw_map(
     Args:
         values: `[R, A]`.
         grid: Grid of the map; padded maps need the padded grid.
-        ax: Where to draw; a new figure by default.
-        extent: What to show; by default the field of view.
+        ax: Axes to draw on; a new figure by default.
+        extent: Ground that is shown; by default the field of view.
         color_limits: Limits of the color bar; by default from the values shown.
         label: Text of the color bar; without one there is no color bar.
 
@@ -141,6 +147,18 @@ def _draw_ground(scene: Scene, **options: Any) -> Axes:
     # The sensor, pointing ahead.
     ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
     return ax
+
+
+def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
+    """Edges of a uniform axis of `n` bin centers, half a step outside."""
+    step = (centers[-1] - centers[0]) / (centers.size - 1)
+    return centers[0] + step * (np.arange(centers.size + 1) - 0.5)
+
+
+def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
+    """Azimuth in degrees, right positive, and range of ground positions."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
 def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
@@ -339,3 +357,70 @@ def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
         label = f"{named[0]} region" if named else "region of interest"
         handles.append(Line2D([], [], color=ROI_COLOR, lw=1.4, ls="--", label=label))
     return handles
+
+
+# Slices -------------------------------------------------------------------------------
+
+
+def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
+    """Figure of three slices on one color scale: azimuth, Doppler, elevation.
+
+    Ground truth is outlined where both axes are known. Labels have no Doppler: there a
+    bar at the left edge spans the ranges of each box.
+
+    Args:
+        scene: The frame; predictions, region and image are not drawn.
+        range_idx: Range bin of the azimuth-elevation slice; None: maximum.
+    """
+    grid, values = scene.grid, np.asarray(scene.projection, np.float32)
+    doppler, elevation = np.split(values, [grid.num_doppler], -1)
+    azimuth_deg, range_m = np.rad2deg(grid.azimuth_rad), grid.range_m
+    at_range = "max over range"
+    if range_idx is not None:
+        elevation = elevation[[range_idx]]
+        at_range = f"at {range_m[range_idx]:.1f} m"
+    azimuth = (azimuth_deg, "azimuth, right positive [deg]")
+    distance = (range_m, "range [m]")
+    speed = (grid.doppler_mps, "Doppler (aliased) [m/s]")
+    height = (np.rad2deg(grid.elevation_rad), "elevation bin value [deg]")
+    axes_of = {
+        "Range–azimuth, max over Doppler and elevation": (azimuth, distance),
+        "Range–Doppler (aliased), max over azimuth": (speed, distance),
+        f"Azimuth–elevation, {at_range}": (azimuth, height),
+    }
+    planes = values.max(-1), doppler.max(1), elevation.max(0).T
+    figure = new_figure(14.0, 4.2, layout="constrained")
+    axes = figure.subplots(1, 3)
+    limits = color_limits_of(values)
+    for ax, plane, title in zip(axes, planes, axes_of, strict=True):
+        (x, x_label), (y, y_label) = axes_of[title]
+        mesh = draw_tiles(ax, bin_edges(x), bin_edges(y), plane, limits)
+        ax.set(xlabel=x_label, ylabel=y_label, title=title)
+        figure.colorbar(mesh, ax=ax, label="normalized log power")
+    figure.suptitle(scene.title)
+    if scene.ground_truth is not None:
+        left, right = axes[1].get_xlim()
+        outlines = _outlines(scene.ground_truth.box, left + 0.02 * (right - left))
+        for ax, lines in zip(axes, outlines, strict=True):
+            # Most boxes are a few bins.
+            draw_lines(ax, lines, GROUND_TRUTH.color, 0.7 * GROUND_TRUTH.width)
+    return figure
+
+
+def _outlines(
+    boxes: Float[np.ndarray, "N 7"], left: float
+) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
+    """Lines of boxes in the three slices, bars at a Doppler of `left`."""
+    azimuth_range = [to_polar(outline) for outline in footprints(boxes, 8)]
+    bars, azimuth_elevation = [], []
+    for outline, points in zip(azimuth_range, corners(boxes), strict=True):
+        ground = to_polar(points[:, :2])
+        height = np.rad2deg(np.arctan2(points[:, 2], ground[:, 1]))
+        x0, x1 = ground[:, 0].min(), ground[:, 0].max()
+        y0, y1 = height.min(), height.max()
+        azimuth_elevation.append(
+            np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        )
+        ranges = outline[:, 1]
+        bars.append(np.array([[left, ranges.min()], [left, ranges.max()]]))
+    return azimuth_range, bars, azimuth_elevation

@@ -1,4 +1,4 @@
-"""What all figures share: colors, the frame to draw, axes helpers and saving.
+"""Shared parts of all figures: colors, the frame to draw, axes helpers and saving.
 
 Figures are plain `matplotlib.figure.Figure` objects: nothing here touches pyplot, its
 backend or its list of open figures, so drawing works without a display, in threads
@@ -125,7 +125,7 @@ class Scene:
 def styled_sets(
     ground_truth: Boxes | None, predictions: Boxes | None
 ) -> list[tuple[Style, Boxes]]:
-    """Those of both that are given, with their styles."""
+    """Ground truth and predictions, where given, with their styles."""
     pairs = (GROUND_TRUTH, ground_truth), (PREDICTION, predictions)
     return [(style, boxes) for style, boxes in pairs if boxes is not None]
 
@@ -243,7 +243,7 @@ def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> No
     The limits and the aspect of the axes must be final: space is computed in pixels.
 
     Args:
-        ax: Where to draw.
+        ax: Axes to draw on.
         labels: The most important first.
         font_size: Font size in points.
     """

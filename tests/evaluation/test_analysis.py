@@ -42,7 +42,7 @@ def data():
             (2, "Sedan", 10.0, 0),
         ],
         [
-            (0, "Sedan", 20.2, 0, 0.9),  # belongs to the object before 20 m
+            (0, "Sedan", 20.2, 0, 0.9),  # counted with the object before 20 m
             (0, "Sedan", 70.0, 0, 0.8),  # nothing there
             (1, "Sedan", 50.0, 0, 0.7),  # a bus taken for a car
             (2, "Sedan", 10.0, np.pi, 0.2),  # right, reversed, low score
@@ -115,7 +115,7 @@ def test_worst_frames_by_hand(data):
     assert [entry["sequence"] for entry in worst] == [5, 5, 5, 6]
 
 
-def test_nothing_at_all():
+def test_analysis_without_any_boxes():
     data = make([], [])
     assert analysis.worst_frames(data, FRAMES, 0.3) == []
     assert analysis.box_errors(data, 0.3)["Sedan"]["count"] == 0
@@ -163,7 +163,7 @@ def test_another_unit_or_frame_is_reported(column, change, expected):
     assert re.search(expected, lines[0]), lines
 
 
-def test_a_correction_takes_the_warning_away(tmp_path):
+def test_a_correction_removes_the_warning(tmp_path):
     truth, found = _scene()
     wrong = _moved(_moved(found, 6, np.rad2deg), 2, lambda z: z + 0.7)
     frames, options = {"frame": truth["frame"]}, EvaluationOptions(plots=False)

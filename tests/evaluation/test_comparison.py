@@ -136,7 +136,9 @@ def test_comparison_of_reports(stored, stored_scene, write_table):
     assert rows_of_three[: len(rows)] == rows
 
 
-def test_predictions_that_were_stored_cut_say_so(stored_scene, tmp_path):
+def test_a_warning_names_the_score_from_which_predictions_were_stored(
+    stored_scene, tmp_path
+):
     truth, found, frames = stored_scene
     kept = {k: v[found["score"] > 0.3] for k, v in found.items()}
     for name, table, min_score in (("old", kept, 0.3), ("new", found, 0.05)):
@@ -145,14 +147,14 @@ def test_predictions_that_were_stored_cut_say_so(stored_scene, tmp_path):
         thresholds = {r.protocol: r.score_threshold for r in made.results}
         assert thresholds == {"all_point": min_score, "kradar_r40": 0.3}
     old = evaluate_files(tmp_path / "old", tmp_path / "a", Source(), OPTIONS)
-    assert "has predictions from score 0.3 on only" in old.metrics["warnings"][0]
+    assert "has only predictions from score 0.3 on" in old.metrics["warnings"][0]
     assert "WARNING: " in old.text
     assert "/all_point/score>0.3/" in old.metrics["ap"][0]["name"]
     new = evaluate_files(tmp_path / "new", tmp_path / "b", Source(), OPTIONS)
     assert new.metrics["warnings"] == []
     runs = [tmp_path / "old", tmp_path / "new"]
     _, rows = compare_files(runs, None, Source(), OPTIONS)
-    # Both above what one has stored.
+    # Both runs are compared above the score from which one was stored.
     assert {row["difference"] for row in rows} == {0.0}
 
 

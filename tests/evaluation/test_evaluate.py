@@ -241,7 +241,7 @@ def test_equals_the_slow_implementation(reference, random_scene, seed, ties, dat
 
 @pytest.fixture(scope="module")
 def expected_of(shared):
-    """Function (name) -> content of a JSON file beside the K-Radar evaluation set."""
+    """Function (name) -> content of a JSON file next to the K-Radar evaluation set."""
     folder = shared / "fixtures" / "kradar_eval"
     return lambda name: json.loads((folder / f"{name}.json").read_text())
 

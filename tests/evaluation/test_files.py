@@ -19,7 +19,7 @@ def test_ground_truth_has_to_come_from_somewhere(stored):
     with pytest.raises(FileNotFoundError, match=r"none\.json"):
         files.load(folder / "none.json", source, ("Sedan",))
     (folder / "frames.json").write_text("[]")
-    with pytest.raises(DataError, match=r"frames\.json is no table of frames"):
+    with pytest.raises(DataError, match=r"frames\.json is not a table of frames"):
         files.load(folder / "found.json", source, ("Sedan",))
     (folder / "frames.json").write_text('{"frame": [1, 2], "name": ["a"]}')
     with pytest.raises(
@@ -208,7 +208,7 @@ def test_wrong_files_are_named(tmp_path):
 
     with pytest.raises(FileNotFoundError, match="No such file"):
         files.read_table(tmp_path / "none.json")
-    raises("a.txt", "", "a.txt is no .npz or .json file", UserError)
+    raises("a.txt", "", "a.txt is neither a .npz or .json file", UserError)
     raises("a.npz", "nonsense", "a.npz")
     raises("a.json", "{", "a.json is not valid JSON")
     good = {"frame": 0, "cls": "Sedan", "box": [1, 2, 3, 4, 5, 6, 7], "score": 1}

@@ -107,7 +107,7 @@ def test_kradar_passes_differ():
 
 def test_a_prediction_that_displaces_another_adds_nothing():
     # At 0.5, prediction 1 enters and takes ground truth 0 from prediction 0, which
-    # overlaps nothing else: ground truth 1, that only knows prediction 1, stays alone.
+    # overlaps nothing else: ground truth 1, that only overlaps prediction 1, stays unmatched.
     chosen = pairs((0, 0, 0.5), (1, 0, 0.9), (1, 1, 0.6))
     score = np.array([0.9, 0.5])
     match = matching.match_kradar(chosen, score, np.zeros(2, int), 0.3)

@@ -31,7 +31,7 @@ def written(scene, tmp_path_factory):
 
     def draw(frame, path):
         drawn[frame] = path.name
-        path.write_text("picture")
+        path.write_text("figure")
 
     options = EvaluationOptions(
         roi=None, plots=False, bootstrap=20, label_version="v2.1"
@@ -40,7 +40,7 @@ def written(scene, tmp_path_factory):
     return made, out, drawn
 
 
-def test_files_are_there_and_nothing_half_written(written):
+def test_report_folder_has_all_files_and_no_temporary_ones(written):
     made, out, drawn = written
     names = {p.name for p in out.iterdir()}
     assert names == {
@@ -50,7 +50,7 @@ def test_files_are_there_and_nothing_half_written(written):
     assert made.folder == out
     assert (out / "report.txt").read_text() == made.text
     assert [w["frame"] for w in made.metrics["worst_frames"]] == list(drawn)
-    # Named like other pictures of frames.
+    # Figures are named as other figures of frames are.
     assert {p.name for p in (out / "worst_frames").iterdir()} == {
         f"{frame // 3:02d}_{frame:05d}_{frame:05d}.png" for frame in drawn
     }
@@ -87,7 +87,7 @@ def test_json_and_csv_hold_the_numbers_of_evaluate(written, scene):
 
 
 def test_means_are_over_classes_that_occur(written):
-    table = report.index(written[0].results)
+    table = {row.key: row for row in written[0].results}
     for protocol in PROTOCOLS:
         for condition in ("all", "fog"):
             present = [
@@ -101,7 +101,7 @@ def test_means_are_over_classes_that_occur(written):
             assert mean == pytest.approx(np.mean(present))
 
 
-def test_tables_stand_beside_the_published_rows(written):
+def test_tables_include_the_published_rows(written):
     _, out, _ = written
     text = (out / "tables.md").read_text()
     for cell in ("85.4", "77.42", "64.06", "RADE-Net, Table II", "DinoRADE, Table 1"):
@@ -118,7 +118,7 @@ def test_tables_stand_beside_the_published_rows(written):
     assert re.search("% AP .* kradar_r40, score>0, skip=frame", latex)
 
 
-def test_sizes_of_an_untrained_network(scene, tmp_path):
+def test_invalid_sizes_are_rejected_or_kept_as_false_positives(scene, tmp_path):
     truth, found, frames = scene
     broken = {**found, "box": found["box"].copy()}
     broken["box"][5, 3] = -0.2
@@ -160,10 +160,10 @@ def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
     assert content() == before
     report.write_report(*in_few, few, out, OPTIONS, draw_frame=draw)
     assert (out / "notes.txt") in content()
-    assert len(list((out / "worst_frames").iterdir())) <= 3  # of this evaluation alone
+    assert len(list((out / "worst_frames").iterdir())) <= 3  # only of this evaluation
 
 
-def test_frames_with_ids_only(scene, tmp_path):
+def test_frame_table_may_have_only_ids(scene, tmp_path):
     truth, found, frames = scene
     only = {"frame": frames["frame"]}
     made = report.write_report(truth, found, only, tmp_path, OPTIONS)
@@ -171,7 +171,7 @@ def test_frames_with_ids_only(scene, tmp_path):
     assert "Total" in made.text
 
 
-def test_nothing_at_all(tmp_path, scene):
+def test_report_without_any_boxes(tmp_path, scene):
     truth, found = ({k: v[:0] for k, v in table.items()} for table in scene[:2])
     options = EvaluationOptions()
     made = report.write_report(truth, found, scene[2], tmp_path, options)
@@ -206,7 +206,7 @@ def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
     np.testing.assert_array_equal(lines[f"all, AP {whole.ap:.1f}"][0], whole.recall)
 
 
-def test_matplotlib_waits_until_something_is_drawn():
+def test_matplotlib_is_imported_only_to_draw():
     code = "import sys, radejax.evaluation.report as _; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert b"radejax.evaluation.report" in done.stdout

@@ -87,7 +87,7 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
     found = intervals(scene, {**frames, "weather": weather})
     has_interval = {key[0]: low is not None for key, (low, *_) in found.items()}
     assert has_interval == {"all": True, "fog": False, "rain": True}
-    # The intervals of a condition are those of its frames as a dataset of their own.
+    # The intervals of a condition are those of its frames evaluated as a separate dataset.
     rain = np.flatnonzero(weather == "rain")
     part = take({**frames, "weather": weather}, rain)
     tables = [take(table, np.isin(table["frame"], rain)) for table in scene[:2]]
@@ -98,7 +98,7 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
     assert all(low is None for low, *_ in whole.values())
 
 
-def test_what_was_left_out_is_counted(random_scene):
+def test_excluded_boxes_and_frames_are_counted(random_scene):
     truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
     data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
     counts = exclusion_counts(data, EvaluationOptions(score_threshold=0.3))

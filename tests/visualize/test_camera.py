@@ -49,7 +49,7 @@ def test_edges_by_hand():
     assert ax.get_ylim()[0] > ax.get_ylim()[1]
 
 
-def test_squeezed_images_look_natural():
+def test_squeezed_images_are_shown_undistorted():
     squeezed, image = CALIBRATION.resized(128, 18), np.zeros((18, 128, 3), np.uint8)
     sizes = []
     for given in ((IMAGE, CALIBRATION), (image, squeezed)):
@@ -97,7 +97,7 @@ def test_stereo_pair_is_rejected_with_advice():
 
 
 def test_real_frame(shared):
-    """The van of sequence 11 stands in the left third of the image, as in life."""
+    """The van of sequence 11 is drawn in the left third of the image."""
     folder = shared / "data/kradar"
     check = json.loads((folder / "frame_example/projection_check.json").read_text())
     calibration = CameraCalibration.from_kradar(folder / "calib/common/cam_front0.yml")

@@ -34,7 +34,7 @@ def test_lines_differ_and_the_legend_covers_none():
     renderer = canvas.get_renderer()
     legend = ax.get_legend().get_window_extent(renderer)
     assert legend.y1 < ax.get_window_extent(renderer).y0
-    assert legend.y0 > 0  # on the picture
+    assert legend.y0 > 0  # inside the figure
 
 
 def write_metrics(path, extra=""):

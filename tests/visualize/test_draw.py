@@ -9,7 +9,7 @@ from matplotlib.collections import QuadMesh
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize import draw, slices
+from radejax.visualize import draw
 from radejax.visualize.draw import draw_scenes
 from radejax.visualize.style import COLOR_MAP, Scene, footprints, save_figure
 
@@ -32,9 +32,9 @@ def pixels_of(figure) -> np.ndarray:
 
 def brightest_tile(figure, ax) -> np.ndarray:
     """Center, in display coordinates, of the pixels in the strongest color."""
-    picture = pixels_of(figure)
+    image = pixels_of(figure)
     frame = np.round(ax.get_window_extent().extents).astype(int)
-    inside = picture[frame[1] : frame[3], frame[0] : frame[2]]
+    inside = image[frame[1] : frame[3], frame[0] : frame[2]]
     color = np.round(255 * np.array(COLOR_MAP(1.0)[:3])).astype(int)
     rows, columns = np.nonzero((np.abs(inside - color) <= 2).all(-1))
     assert rows.size > 10
@@ -47,7 +47,7 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
     x, y = GRID.bin_to_ego(range_idx, azimuth_idx)
     _, polar = draw.draw_frame(scene).axes
     ax = draw.draw_bev(scene)
-    outline = slices.to_polar(np.array([x, y]))
+    outline = draw.to_polar(np.array([x, y]))
     # At 5 pixels a meter a bin is 10 pixels deep; its center is hit to one pixel.
     for axes, point in ((ax, (y, x)), (polar, outline)):
         tile = brightest_tile(axes.figure, axes)
@@ -145,7 +145,7 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 
 
 def test_map_shows_every_bin_of_a_partial_extent():
-    """Bins left out for speed must lie outside the picture."""
+    """Bins that are omitted for speed must lie outside the axes."""
     extent = (30.0, 60.0, -20.0, 5.0)
     values = np.arange(60.0)[:, None] + np.arange(54.0)[None] / 100
     ax = draw.draw_map(values, GRID, extent=extent)
