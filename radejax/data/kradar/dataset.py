@@ -431,7 +431,7 @@ class KRadar(LabelledFrames[Frame]):
         self.counts["objects with an odd availability flag"] = int(is_odd.sum())
         rules = {"class": np.isin(classes, self.classes)}
         if self._visibility is not None:
-            rules["visibility"] = np.isin(flags, self._visibility)
+            rules["visibility"] = np.isin(flags, list(self._visibility))
         if self._field_of_view:
             x_m, y_m = boxes[:, 0], boxes[:, 1]
             rules["field of view"] = self.grid.in_field_of_view(x_m, y_m)

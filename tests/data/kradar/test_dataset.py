@@ -74,6 +74,7 @@ def test_filters_can_be_changed(tmp_path):
     write.write_calibration(tmp_path / "1/info_calib/calib_radar_lidar.txt", 3, 5.0, -1)
     shifted = KRadar(tmp_path, visibility=("L1",))
     np.testing.assert_allclose(shifted[0].boxes[:, :3], [[7.0, 0.0, 0.5]])
+    assert KRadar(tmp_path, visibility={"L1"}).counts == shifted.counts
 
 
 def test_lines_without_a_star_count_where_they_are_to(tmp_path):
