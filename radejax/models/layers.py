@@ -49,7 +49,7 @@ def _cut(numbers: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 class Conv(nn.Module):
-    """Convolution padded by half its size, `[B, R, A, C]` -> `[B, R, A, C']`.
+    """Convolution padded by half its size, `[B, R, A, C]` -> `[B, r, a, C']`.
 
     Attributes:
         features: Output channels C'.
@@ -70,11 +70,11 @@ class Conv(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Features) -> Features:
+    def __call__(self, x: Features) -> Float[jax.Array, "B r a {self.features}"]:
         init = uniform_fan_in(self.size**2 * x.shape[-1])
         shape = (self.size, self.size, x.shape[-1], self.features)
         kernel = self.param("kernel", init, shape)
-        x, kernel = x.astype(self.dtype), kernel.astype(self.dtype)
+        x, kernel = jnp.asarray(x, self.dtype), jnp.asarray(kernel, self.dtype)
         if self.stride == 1:
             y = conv2d(x, kernel, self.dilation)
         elif self.size == 1:
