@@ -9,7 +9,7 @@ from radejax.simulation.camera.details import DETAILS, Faces
 from radejax.simulation.camera.renderer import stereo_calibration
 
 CALIBRATION = stereo_calibration((-2.54, 0.3, 0.7), 320, 180)[0]
-NO_ROADSIDE = Faces(*map(np.zeros, ((0, 4, 3), (0, 3), 0, 0, 0)))
+NO_ROADSIDE = Faces(*map(np.zeros, ((0, 4, 3), (0, 3), 0, 0)), np.zeros(0, int))
 DAY = shapes.Light(1.0, np.full(3, 128.0), 0.0, False)
 
 
