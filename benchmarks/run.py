@@ -25,9 +25,8 @@ import time
 import traceback
 from importlib import metadata
 
-os.environ.setdefault(
-    "XLA_PYTHON_CLIENT_PREALLOCATE", "false"
-)  # torch needs memory as well
+# torch needs memory of the GPU as well.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
 import page

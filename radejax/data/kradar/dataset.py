@@ -401,9 +401,8 @@ class KRadar(LabelledFrames[Frame]):
         kept = np.flatnonzero(self._filter(boxes, classes, flags))
         ends = np.searchsorted(kept, np.cumsum(sizes))
         frames = []
-        for (key, file), start, end in zip(
-            files.items(), [0, *ends], ends, strict=False
-        ):
+        bounds = itertools.pairwise([0, *ends])
+        for (key, file), (start, end) in zip(files.items(), bounds, strict=True):
             rows = kept[start:end]
             frame = Frame(
                 sequence=key[0],
@@ -429,13 +428,17 @@ class KRadar(LabelledFrames[Frame]):
         """True for the objects to keep; the others are counted by reason."""
         is_odd = np.isin(flags, VISIBILITY_FLAGS, invert=True)
         self.counts["objects with an odd availability flag"] = int(is_odd.sum())
-        rules = {"class": np.isin(classes, self.classes)}
+        is_kept = np.ones(len(classes), bool)
+        rules = {
+            "class": np.isin(classes, self.classes),
+            "visibility": is_kept.copy(),
+            "field of view": is_kept.copy(),
+        }
         if self._visibility is not None:
             rules["visibility"] = np.isin(flags, list(self._visibility))
         if self._field_of_view:
             x_m, y_m = boxes[:, 0], boxes[:, 1]
             rules["field of view"] = self.grid.in_field_of_view(x_m, y_m)
-        is_kept = np.ones(len(classes), bool)
         for rule, passes in rules.items():
             self.counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
             is_kept &= passes
