@@ -16,7 +16,7 @@ import time
 from case import Case
 
 _ROOT = pathlib.Path(__file__).resolve().parents[1]
-_FIRST_STEP = "after the start"  # of the line that training writes then
+_FIRST_STEP = " 1/12 ["  # The progress bar moves there when the first step has finished.
 _DETECT = f"""
 import sys
 sys.path.append({str(_ROOT / "benchmarks")!r})
@@ -66,7 +66,7 @@ def until(text, arguments, folder, programs):
     """Wall and CPU seconds of a Python process until it writes a text.
 
     Args:
-        text: Part of the line that ends the measurement; the process is stopped then.
+        text: Text that ends the measurement; the process is stopped then.
         arguments: Arguments of the interpreter.
         folder: Working directory.
         programs: Folder of the compilation cache.
@@ -82,12 +82,11 @@ def until(text, arguments, folder, programs):
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
     )
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if text in line:
+    output = ""
+    while chunk := process.stdout.read1():  # not lines: the bar's ends when it moves on
+        output += chunk.decode()
+        if text in output:
             seconds = time.perf_counter() - began
             process.kill()
             _, process.returncode, usage = os.wait4(process.pid, 0)
@@ -95,4 +94,4 @@ def until(text, arguments, folder, programs):
             return seconds, usage.ru_utime + usage.ru_stime
     process.wait()
     process.stdout.close()
-    raise RuntimeError(f"no {text!r} from {arguments}: {''.join(lines)[-2000:]}")
+    raise RuntimeError(f"no {text!r} from {arguments}: {output[-2000:]}")

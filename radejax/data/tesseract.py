@@ -88,9 +88,9 @@ def check_tesseract(
     """
     if deep:
         project_file(path, shape_drea=shape_drea)
-        return
-    with _opened(path, shape_drea):
-        pass
+    else:
+        with _opened(path, shape_drea):
+            pass
 
 
 def read_projection_npy(
@@ -191,6 +191,7 @@ _INT8, _INT32, _UINT32 = 1, 5, 6
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
 _HEAD = 512  # bytes of a variable before its values, more than any real array has
+_CHUNK = 1 << 16  # deflated bytes to inflate at a time: little enough for the cache
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,9 +268,14 @@ def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
         start, size = layout.deflated
         file.seek(start)
         inflater = zlib.decompressobj()
-        # A byte more than there may be: then the content is found to be too long.
-        content = inflater.decompress(file.read(size), layout.num_bytes + 1)
-        if not inflater.eof or len(content) != layout.num_bytes or inflater.unused_data:
+        content, filled = bytearray(layout.num_bytes), 0
+        for begin in range(0, size, _CHUNK):
+            part = inflater.decompress(file.read(min(_CHUNK, size - begin)))
+            content[filled : filled + len(part)] = part
+            filled += len(part)
+            if filled > layout.num_bytes or inflater.unused_data:
+                break  # before a corrupted file fills the memory
+        if not inflater.eof or filled != layout.num_bytes or inflater.unused_data:
             raise _corrupted(file, f"does not inflate to {layout.num_bytes} bytes")
         values = np.frombuffer(content, layout.dtype, count, layout.offset)
     if values.size < count:

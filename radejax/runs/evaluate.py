@@ -27,10 +27,12 @@ from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
+from radejax.losses.detection import LOSSES
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training import distributed
 from radejax.training.metric_logger import Scores
+from radejax.visualize import curves
 from radejax.visualize.draw import draw_frame, draw_scenes
 from radejax.visualize.style import Scene, save_figure
 
@@ -192,8 +194,11 @@ class Evaluation:
                 for name, i in figures.fullest_of_weathers(frames).items()
             ]
             save_figure(draw_scenes(scenes), folder / "scenes.png")
-        path = folder / "training.png"
-        figures.draw_curves(workdir, path, is_simulated=frames.is_simulated)
+        if (workdir / "metrics.jsonl").exists():
+            series = curves.read_metrics(workdir / "metrics.jsonl")
+            if losses := [name for name in LOSSES if name in series]:
+                figure = curves.draw_training(series, losses, workdir.name + suffix)
+                save_figure(figure, folder / "training.png")
 
     def _scene(self, predictions: Columns, index: int, **fields: Any) -> Scene:
         """The frame at a position of the split with its boxes and image.

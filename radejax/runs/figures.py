@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pathlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -16,10 +15,8 @@ from radejax.data.dataset import FrameSequence, LabelledFrame, front_view
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.projection import decode
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import LOSSES
 from radejax.runs.data import Data
-from radejax.visualize import curves
-from radejax.visualize.style import Scene, save_figure
+from radejax.visualize.style import Scene
 
 
 def frame_scene(
@@ -59,19 +56,6 @@ def spread(values: Any, count: int) -> list[Any]:
     """At most `count` items, evenly spaced."""
     places = np.linspace(0, len(values) - 1, min(count, len(values)))
     return [values[int(i)] for i in np.round(places)]
-
-
-def draw_curves(
-    workdir: pathlib.Path, path: pathlib.Path, *, is_simulated: bool = False
-) -> None:
-    """Draw the losses of a run, if it has any, over its steps into a file."""
-    if not (workdir / "metrics.jsonl").exists():
-        return
-    series = curves.read_metrics(workdir / "metrics.jsonl")
-    keys = [name for name in LOSSES if name in series]
-    if keys:
-        title = workdir.name + (", simulated" if is_simulated else "")
-        save_figure(curves.draw_training(series, keys, title), path)
 
 
 def frame_shares(

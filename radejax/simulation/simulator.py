@@ -227,7 +227,7 @@ class ProceduralSource:
         self.conditions = config.conditions
 
     def frames(self, number: int) -> list[FrameSpec]:
-        """Frames of the sequence `number`, in order."""
+        """Returns the frames of the sequence `number`, in order."""
         config = self._config
         rng = np.random.default_rng([config.seed, number, 3])
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
@@ -247,7 +247,7 @@ class ProceduralSource:
         return number <= self._config.train_sequences
 
     def make(self, number: int) -> Sequence:
-        """The scene of the sequence `number`."""
+        """Creates the scene of the sequence `number`."""
         environment, time, weather = self.conditions(number)
         times = self._config.vru_density_scale if self._is_training(number) else 1.0
         return make_sequence(
@@ -287,7 +287,7 @@ class LabelSource:
         return frame.environment, frame.time, frame.weather
 
     def frames(self, number: int) -> list[FrameSpec]:
-        """Frames of the sequence `number`, in order."""
+        """Returns the frames of the sequence `number`, in order."""
         config, frames = self._config, self._frames[number]
         names = [f.name for f in frames]
         train = set(split_by_rule(names, "train"))
@@ -305,7 +305,7 @@ class LabelSource:
         ]
 
     def make(self, number: int) -> Sequence:
-        """The scene of the sequence `number`."""
+        """Creates the scene of the sequence `number`."""
         return make_real_sequence(
             self._frames[number],
             radar_from_lidar_m=self._config.radar_from_lidar_m,

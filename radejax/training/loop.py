@@ -14,7 +14,6 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
-import optax
 from ml_collections import ConfigDict
 
 from radejax.core import files
@@ -98,13 +97,20 @@ def train(
     step_fn = make_train_step(
         model, optimizer, grid, loss=loss_options(config), ema_decay=options.ema_decay
     )
-    create = functools.partial(_create_state, config, model, optimizer)
-    given, mesh = (_empty_batch(loader), variables, pretrained), distributed.make_mesh()
+    create = functools.partial(
+        create_state,
+        optimizer=optimizer,
+        use_ema=options.ema_decay is not None,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
+    given = jax.tree.map(np.asarray, (_empty_batch(loader), variables, pretrained))
+    initial = functools.partial(_initial_variables, model, config.seed, *given)
+    mesh = distributed.make_mesh()
     with Checkpoints(
         folder / "checkpoints", max_to_keep=options.checkpoints_to_keep
     ) as checkpoints:
         state = _restore_or_initialize(
-            checkpoints, loader, info, create, given, mesh, options.parameter_sharding
+            checkpoints, loader, info, initial, create, mesh, options.parameter_sharding
         )
         train_step = _compile(step_fn, state, mesh, config.seed)
         num_steps = steps_per_epoch * options.num_epochs
@@ -207,32 +213,24 @@ class _Run:
         self.num_skipped = skipped
 
 
-def _create_state(
-    config: ConfigDict,
-    model: nn.Module,
-    optimizer: optax.GradientTransformation,
-    batch: Batch,
-    variables: Any,
-    pretrained: Any,
-) -> TrainState:
-    """The state of step 0; the batch has the shapes of the model's inputs."""
+def _initial_variables(
+    model: nn.Module, seed: int, batch: Batch, variables: Any, pretrained: Any
+) -> Any:
+    """Variables of step 0; the batch has the shapes of the model's inputs."""
     if variables is None:
-        keys = jax.random.split(jax.random.key(config.seed))
+        keys = jax.random.split(jax.random.key(seed))
         rngs = {"params": keys[0], "dropout": keys[1]}
-        variables = model.init(rngs, *batch.model_inputs(), train=False)
-    if pretrained is not None:
-        variables = with_pretrained(variables, pretrained)
-    is_frozen = getattr(model, "is_frozen", None)
-    use_ema = config.train.ema_decay is not None
-    return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
+        inputs = jax.eval_shape(batch.model_inputs)
+        variables = model.lazy_init(rngs, *inputs, train=False)
+    return variables if pretrained is None else with_pretrained(variables, pretrained)
 
 
 def _restore_or_initialize(
     checkpoints: Checkpoints,
     loader: Any,
     info: Mapping[str, Any],
-    create: Callable[..., TrainState],
-    given: tuple[Any, ...],
+    initial: Callable[[], Any],
+    create: Callable[[Any], TrainState],
     mesh: jax.sharding.Mesh,
     parameters: distributed.ParameterSharding,
 ) -> TrainState:
@@ -242,21 +240,23 @@ def _restore_or_initialize(
         checkpoints: Of the run.
         loader: Set to the position that was saved.
         info: Its "same" must be what was saved.
-        create: Makes the state before the first step.
-        given: Arguments of `create`.
+        initial: Returns the variables before the first step.
+        create: Makes the state before the first step from them.
         mesh: Devices that the state is placed on.
         parameters: How they are placed.
 
     Raises:
         UserError: The run would continue with other data or frozen weights.
     """
-    given = jax.tree.map(np.asarray, given)  # the same on every process
-    abstract = jax.eval_shape(create, *given)
+    abstract = jax.eval_shape(create, jax.eval_shape(initial))
     placement = distributed.state_sharding(abstract, mesh, parameters)
     saved = jax.tree.map(lambda x, s: x.update(sharding=s), abstract, placement)
     restored = checkpoints.restore(saved.replace(frozen={}), loader)
     if restored is None:
-        return jax.jit(create, out_shardings=placement)(*given)
+        # One operation at a time: in one program, each of a hundred random generators
+        # would be compiled on its own, which takes half as long as the training step.
+        drawn = jax.tree.map(np.asarray, initial())
+        return jax.jit(create, out_shardings=placement)(drawn)
     state, saved_info, step = restored
     found, same = saved_info.get("same", {}), info.get("same", {})
     if lines := files.differences(found, {k: same.get(k) for k in found}, ""):
@@ -266,8 +266,8 @@ def _restore_or_initialize(
         )
     _log.info("continuing from step %d", step)
     if abstract.frozen:  # not saved: these parameters come from where they came from
-        frozen = jax.jit(lambda *x: create(*x).frozen, out_shardings=placement.frozen)
-        state = state.replace(frozen=frozen(*given))
+        frozen = jax.jit(lambda x: create(x).frozen, out_shardings=placement.frozen)
+        state = state.replace(frozen=frozen(jax.tree.map(np.asarray, initial())))
     return state
 
 

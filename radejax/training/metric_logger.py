@@ -101,10 +101,10 @@ class MetricLogger:
 
     def advance(self, step: int, metrics: Any) -> None:
         """Moves the progress bar; the first step, which compiles, is not timed."""
-        self._bar.update(step - self._bar.n)
         if step == self._start + 1:
             jax.block_until_ready(metrics)
             self._restart_timer(step)
+        self._bar.update(step - self._bar.n)
 
     def _restart_timer(self, step: int) -> None:
         """Leaves the time since the last record out of the rate."""

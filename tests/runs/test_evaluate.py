@@ -150,7 +150,6 @@ def test_titles_of_scenes_say_whether_they_are_simulated(
     (tmp_path / "figures").mkdir()
     monkeypatch.setattr(evaluate, "draw_scenes", titles.extend)
     monkeypatch.setattr(evaluate, "save_figure", lambda *_: None)
-    monkeypatch.setattr(evaluate.figures, "draw_curves", lambda *_, **__: None)
     evaluation: Any = SimpleNamespace(
         _frames=frames,
         _options=SimpleNamespace(num_visualizations=1),
