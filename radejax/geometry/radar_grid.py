@@ -69,8 +69,8 @@ class RadarGrid(ArrayValues):
         fov_azimuth_rad: Maximum absolute azimuth of the field of view in radians.
 
     Raises:
-        ValueError: An axis has fewer than 2 bins, is not uniform and increasing or has a
-            magnitude above 10,000, or a limit of the field of view is not positive.
+        ValueError: An axis has fewer than 2 bins, is not uniform and increasing, or has a
+            value above 10,000; or a limit of the field of view is not in (0, 10,000].
 
     References:
         Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
