@@ -172,7 +172,7 @@ STRIDE = 16
 class FrozenBatchNorm(nn.Module):
     """Batch normalization with fixed statistics, which are stored as parameters.
 
-    All variables of a frozen backbone are thus in one collection that no step updates.
+    A frozen backbone thus has only parameters, and no forward pass updates any of them.
 
     Attributes:
         dtype: Dtype of the output.
