@@ -60,9 +60,9 @@ def greedy_suppression(overlaps: Bool[jax.Array, "*batch K K"], is_valid: Mask) 
     Instead of K sequential steps, each iteration updates all rows from the previous mask
     until the mask does not change. Row j depends only on the rows before it. After n
     iterations, the first n rows are therefore final, and the unique fixed point is the
-    result of the sequential algorithm. The number of iterations is about the length of the
-    longest chain of boxes in which each decides about the next. It is usually small and at
-    most about K.
+    result of the sequential algorithm. The number of iterations depends on the longest
+    chain of boxes in which each decides about the next; it is usually small and never
+    exceeds K.
 
     Args:
         overlaps: `[..., K, K]` bool, True for pairs of which only one may be kept.
