@@ -111,8 +111,8 @@ class DinoRade(RadeNet, kw_only=True):
     ) -> DetectionMaps:
         """Predicts detection maps from projections and images.
 
-        Predictions use the radar only for frames without an image (`camera.is_valid` or
-        `camera.has_image` is False) and if `image` and `camera` are None.
+        For frames without an image (`camera.is_valid` or `camera.has_image` is False), and
+        if `image` and `camera` are None, only the radar is used.
 
         Args:
             projection: `[B, R, A, D+E]` projections with the Doppler channels first, in
