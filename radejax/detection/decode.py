@@ -1,7 +1,7 @@
-"""From a detector's maps to boxes: peaks, box parameters, rotated NMS.
+"""Decoding of a detector's maps to boxes: heatmap peaks, box parameters and rotated NMS.
 
-Everything is one pure function of fixed shapes: K rows per frame, a mask of those in
-use, and the number of detections that were truncated.
+`decode` is a pure function with fixed shapes. It returns K rows per frame, a mask of the
+rows that contain a detection, and the number of truncated detections.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Boxes8 = Float[jax.Array, "*batch 8"]
 
 @dataclasses.dataclass(frozen=True)
 class DecodeOptions:
-    """Arguments of `decode` as `config.decode` has them.
+    """Arguments of `decode` that `config.decode` can set.
 
     Raises:
         UserError: A value is out of range.
@@ -61,15 +61,16 @@ def _is_roi(roi: Any) -> bool:
 
 
 class Peaks(struct.PyTreeNode):
-    """The strongest heatmap peaks of a batch, by descending score, before NMS.
+    """The highest heatmap peaks of a batch, by descending score, before NMS.
 
     Attributes:
         bins: `[B, P, 2]` int32 range and azimuth bins.
-        boxes: `[B, P, 8]` boxes decoded there, yaw vector as regressed.
-        scores: `[B, P]`; 0 where not `is_valid`.
-        classes: `[B, P]` int32.
-        is_valid: `[B, P]` bool.
-        num_found: `[B]` int32 peaks above the threshold (and in the region), in all.
+        boxes: `[B, P, 8]` boxes decoded at these bins, with the yaw vector as regressed.
+        scores: `[B, P]` scores, 0 where `is_valid` is False.
+        classes: `[B, P]` int32 class indices.
+        is_valid: `[B, P]` bool, True where a row contains a peak.
+        num_found: `[B]` int32 number of all peaks that pass the threshold and the region,
+            including those beyond P.
     """
 
     bins: jax.Array
@@ -94,37 +95,43 @@ def decode(
     raw_yaw: RawYaw = "nms",
     clip_sizes: bool = True,
 ) -> Detections:
-    """Boxes of a batch of detection maps.
+    """Decodes a batch of detection maps to boxes.
 
-    As released: a peak is a bin that is not exceeded in its 3 x 3 neighborhood of its
-    own class map and scores above the threshold; a bin gives at most one box, of its
-    best class (the first of equals); boxes outside the region are dropped; greedy
-    bird's-eye-view NMS.
+    As in the released code, a peak is a bin whose score passes the threshold and is not
+    exceeded in its 3 x 3 neighborhood in the map of the same class. A bin gives at most one
+    box, of the class with the highest score (the first of equals). Boxes whose center is
+    outside the region are removed, and greedy bird's-eye-view NMS follows.
 
     Args:
-        maps: Heatmap logits and box parameters, any float dtype; scores are computed
+        maps: Heatmap logits and box parameters in any float dtype; scores are computed
             in float32.
         grid: The grid of the maps.
-        max_detections: K, rows of the result; at most as many as the maps have bins.
-        score_threshold: Peaks must score above it.
-        nms_iou: Of two boxes overlapping this much or more the weaker is dropped.
-        pre_nms: Peaks that enter NMS at most, the strongest; default 2 K.
-        roi: `[6]` (x0, x1, y0, y1, z0, z1) in meters, bounds included, or None.
-        per_class_nms: Only boxes of the same class suppress each other.
-        threshold_inclusive: Peaks that score exactly the threshold count (the paper's
-            reading; the released code's is exclusive).
-        raw_yaw: Where the length of the regressed (sin, cos) scales the footprint of a
-            box: only in "nms"; "always", so that results have that length and width, and
-            a short vector shrinks a box in every overlap, as in the released NMS and
-            evaluator; "never".
-        clip_sizes: Sizes are `MIN_SIZE_M` at least; the released code's may be negative.
+        max_detections: Number K of rows in the result, which has fewer rows if fewer
+            peaks can enter NMS.
+        score_threshold: Score that a peak must reach.
+        nms_iou: IoU at or above which the box with the lower score is removed.
+        pre_nms: Maximum number of peaks that enter NMS, those with the highest scores;
+            2 K by default.
+        roi: `[6]` region (x0, x1, y0, y1, z0, z1) in meters, including its bounds, or
+            None to keep all boxes.
+        per_class_nms: Whether only boxes of the same class suppress each other.
+        threshold_inclusive: Whether a score equal to `score_threshold` passes, as in the
+            paper. In the released code, it does not.
+        raw_yaw: Where length and width of a box are multiplied by the length of its
+            regressed (sin, cos) vector. "nms" does so only for the overlaps in NMS,
+            "always" in the resulting boxes too, as in the released NMS and evaluator, and
+            "never" nowhere.
+        clip_sizes: Whether to clip sizes to at least `MIN_SIZE_M`. In the released code,
+            they may be negative.
 
     Returns:
-        Detections by descending score; equal scores in order of range, then azimuth.
-        `num_truncated` counts peaks beyond `pre_nms` and boxes after NMS beyond K.
+        Detections by descending score; those with equal scores are ordered by range bin,
+        then azimuth bin. `num_truncated` counts peaks beyond `pre_nms` and boxes beyond K
+        after NMS.
 
     Raises:
-        ValueError: Shapes of maps and grid differ, or a size is not positive.
+        ValueError: The shapes of maps and grid differ, no peak may enter NMS, `roi` does
+            not have shape [6], or `raw_yaw` is unknown.
 
     Examples:
         >>> grid = RadarGrid.reduced(
@@ -164,10 +171,17 @@ def suppress(
     per_class: bool = False,
     normalize_yaw: bool = False,
 ) -> Bool[jax.Array, "B P"]:
-    """Which peaks survive rotated NMS; arguments as for `decode`.
+    """Returns a mask of the peaks that survive rotated NMS.
 
-    `normalize_yaw` compares boxes of their regressed size, whatever the length of the
-    yaw vector.
+    Args:
+        peaks: Peaks by descending score.
+        nms_iou: IoU at or above which the box with the lower score is removed.
+        per_class: Whether only boxes of the same class suppress each other.
+        normalize_yaw: Whether to normalize the yaw vectors, so that their length does not
+            scale the boxes.
+
+    Returns:
+        `[B, P]` bool, True where a peak is kept.
 
     Examples:
         >>> boxes = jnp.array([[[0.0, 0, 0, 4, 2, 1, 0, 1], [0.5, 0, 0, 4, 2, 1, 0, 1]]])
@@ -190,9 +204,10 @@ def find_peaks(
     roi: Roi | None = None,
     threshold_inclusive: bool = True,
 ) -> Peaks:
-    """The strongest local maxima of the heatmaps with their boxes, before NMS.
+    """Returns the highest local maxima of the heatmaps with their boxes, before NMS.
 
-    Args and errors are those of `decode`; `max_peaks` is P, cut to the number of bins.
+    Arguments and errors are those of `decode`. `max_peaks` is P, which is at most the
+    number of bins.
 
     Examples:
         >>> grid = RadarGrid.reduced(
@@ -238,18 +253,18 @@ _rows_at = jax.vmap(lambda rows, indices: rows[indices])
 
 
 def _with_raw_footprint(boxes: Boxes8) -> Boxes8:
-    """Length and width multiplied by the length of the yaw vector."""
+    """Multiplies length and width by the length of the yaw vector."""
     norm = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
     return boxes.at[..., 3:5].multiply(norm)
 
 
 def _with_positive_sizes(boxes: Boxes8) -> Boxes8:
-    """Sizes clipped from below."""
+    """Clips sizes to at least `MIN_SIZE_M`."""
     return boxes.at[..., 3:6].max(MIN_SIZE_M)
 
 
 def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
-    """Maximum over each bin and its neighbors in range and azimuth."""
+    """Returns the maximum over each bin and its neighbors in range and azimuth."""
     for axis in (1, 2):
         size = values.shape[axis]
         pad = [(0, 0)] * values.ndim
@@ -265,7 +280,7 @@ def _in_roi(
     grid: RadarGrid,
     roi: Roi,
 ) -> Bool[jax.Array, "B R A"]:
-    """The box of a bin has its center in the region."""
+    """Returns True for bins whose box has its center in the region."""
     roi = jnp.asarray(roi, jnp.float32)
     if roi.shape != (6,):
         raise ValueError(f"roi must be [6]: x0, x1, y0, y1, z0, z1; got {roi.shape}")
@@ -278,7 +293,7 @@ def _in_roi(
 def _compact(
     peaks: Peaks, keep: Bool[jax.Array, "B P"], max_detections: int
 ) -> Detections:
-    """The kept peaks moved to the front, in order, as K rows."""
+    """Moves the kept peaks to the front, in order, and returns the first K rows."""
     order = jnp.argsort(~keep, axis=-1, stable=True)[:, :max_detections]
     is_valid = _rows_at(keep, order)
     boxes = _rows_at(peaks.boxes, order)

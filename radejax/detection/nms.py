@@ -21,26 +21,26 @@ def rotated_nms(
     *,
     classes: Int[jax.Array, "*batch K"] | None = None,
 ) -> Mask:
-    """Which boxes survive greedy bird's-eye-view non-maximum suppression.
+    """Returns a mask of the boxes that survive greedy bird's-eye-view NMS.
 
-    In order of the rows, a box is kept unless it overlaps a box kept before:
+    In the order of the rows, a box is kept unless it overlaps a box that was kept before:
 
         for j in range(K):
             keep[j] = valid[j] and not any(keep[i] and iou[i, j] >= t for i < j)
 
     Args:
-        boxes: `[..., K, 7]` or `[..., K, 8]`, by descending score; the yaw vector of
-            the latter scales the box, as in the released code (see `bev_iou`).
-        is_valid: `[..., K]` bool; False rows are neither kept nor suppress others.
-        iou_threshold: Boxes overlapping this much or more are suppressed.
-        classes: `[..., K]` class indices; given, only boxes of one class suppress each
-            other.
+        boxes: `[..., K, 7]` or `[..., K, 8]` boxes by descending score. The length of the
+            latter's yaw vector scales the box, as in the released code (see `bev_iou`).
+        is_valid: `[..., K]` bool, False for rows that are not kept and suppress no others.
+        iou_threshold: IoU at or above which the later box is suppressed.
+        classes: `[..., K]` class indices. If given, only boxes of the same class suppress
+            each other.
 
     Returns:
         `[..., K]` bool, True where a box is kept.
 
     Raises:
-        AssertionError: The arrays have not one row per box.
+        AssertionError: `is_valid` or `classes` does not have one row per box.
 
     Examples:
         >>> boxes = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [0.5, 0, 0, 4, 2, 1, 0]])
@@ -55,17 +55,18 @@ def rotated_nms(
 
 
 def greedy_suppression(overlaps: Bool[jax.Array, "*batch K K"], is_valid: Mask) -> Mask:
-    """The greedy choice for a given overlap relation, rows by descending score.
+    """Computes greedy suppression for given overlaps, with rows by descending score.
 
-    Instead of K steps one after the other, all rows are decided together from the
-    previous guess until nothing changes. Row j depends on rows before it only, so
-    after n rounds the first n rows are final, the fixed point is unique, and it is the
-    greedy answer. Rounds needed: the longest chain of boxes each suppressed by or
-    freed by the one before, a handful, never more than K.
+    Instead of K sequential steps, each iteration updates all rows from the previous mask
+    until the mask does not change. Row j depends only on the rows before it. After n
+    iterations, the first n rows are therefore final, and the unique fixed point is the
+    result of the sequential algorithm. The number of iterations depends on the longest
+    chain of boxes in which each decides about the next; it is usually small and never
+    exceeds K.
 
     Args:
-        overlaps: `[..., K, K]` bool, True where a pair may not both be kept.
-        is_valid: `[..., K]` bool.
+        overlaps: `[..., K, K]` bool, True for pairs of which only one may be kept.
+        is_valid: `[..., K]` bool, False for rows that are not kept and suppress no others.
 
     Returns:
         `[..., K]` bool, True where a row is kept.
@@ -98,7 +99,7 @@ def match_boxes(
     objects: Float[jax.Array, "N _"],
     is_object: Bool[jax.Array, " N"],
 ) -> tuple[Int[jax.Array, " K"], Bool[jax.Array, " K"]]:
-    """Match each prediction with the object it overlaps most on the ground plane.
+    """Matches each prediction with the object that it overlaps most on the ground plane.
 
     Args:
         predicted: `[K, 7]` or `[K, 8]` boxes.
@@ -107,11 +108,13 @@ def match_boxes(
         is_object: `[N]` bool, False for padding.
 
     Returns:
-        `[K]` int32 row of the object, 0 without one, and `[K]` bool, True where there is
-        one. Several predictions may have the same object.
+        `[K]` int32 row of the object that a prediction matches, 0 if it matches none, and
+        `[K]` bool, True where it matches one. Several predictions may match the same
+        object.
 
     Raises:
-        AssertionError: The arrays do not have one row per prediction and object.
+        AssertionError: A mask does not have one row per prediction or object, or the
+            inputs have a batch axis.
 
     Examples:
         >>> cars = jnp.array([[0.0, 0, 0, 4, 2, 1, 0], [9.0, 0, 0, 4, 2, 1, 0]])

@@ -1,8 +1,8 @@
 """Conversions and simple geometry of upright 3D boxes.
 
-A box is `[..., 7]`: x, y, z of its center, full length (along its heading), width and
-height, yaw; or `[..., 8]` with sin yaw and cos yaw in place of yaw, as networks regress
-it. Functions follow the type of their input: NumPy in, NumPy out; else JAX.
+A box is `[..., 7]` with x, y, z of its center, its full length (along its heading), width
+and height, and yaw; or `[..., 8]` with sin yaw and cos yaw in place of yaw, as networks
+regress it. Functions return NumPy arrays for NumPy input and JAX arrays otherwise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SIGN_WIDTH = (1.0, 1.0, -1.0, -1.0)
 
 
 def array_module(*values: Any) -> Any:
-    """NumPy where every value is NumPy's or Python's, else jax.numpy.
+    """Returns numpy if every value is a NumPy or Python object, otherwise jax.numpy.
 
     Examples:
         >>> array_module(np.ones(3), 2.0) is np, array_module(jnp.ones(3)) is jnp
@@ -37,7 +37,9 @@ def array_module(*values: Any) -> Any:
 
 
 def as_floats(*values: Any) -> tuple[Any, ...]:
-    """The array module, then the values: float64 on the host, at least float32 in JAX.
+    """Returns the array module followed by the values as floating-point arrays.
+
+    NumPy arrays are float64; JAX arrays have a common type of at least float32.
 
     Examples:
         >>> as_floats(1)[1].dtype, as_floats(jnp.ones(3, jnp.bfloat16))[1].dtype
@@ -52,7 +54,7 @@ def as_floats(*values: Any) -> tuple[Any, ...]:
 
 
 def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
-    """Boxes with sin and cos of yaw: `[..., 7]` -> `[..., 8]`.
+    """Converts boxes `[..., 7]` with a yaw angle to `[..., 8]` with sin and cos of yaw.
 
     Args:
         boxes: `[..., 7]` x, y, z, l, w, h, yaw; meters and radians.
@@ -61,7 +63,7 @@ def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
         `[..., 8]` x, y, z, l, w, h, sin yaw, cos yaw.
 
     Raises:
-        ValueError: The last axis is not 7 long.
+        ValueError: The last axis does not have length 7.
 
     Examples:
         >>> boxes8_from_7(np.array([1.0, 2, 3, 4, 2, 1, 0])).tolist()
@@ -74,9 +76,9 @@ def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
 
 
 def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
-    """Boxes with the yaw angle: inverse of `boxes8_from_7`.
+    """Converts boxes `[..., 8]` with sin and cos of yaw to `[..., 7]` with a yaw angle.
 
-    The length of the (sin, cos) vector does not matter; sin = cos = 0 gives yaw 0.
+    The (sin, cos) vector may have any length; sin = cos = 0 gives yaw 0.
 
     Args:
         boxes: `[..., 8]` x, y, z, l, w, h, sin yaw, cos yaw.
@@ -85,7 +87,7 @@ def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
         `[..., 7]` x, y, z, l, w, h, yaw in (-pi, pi].
 
     Raises:
-        ValueError: The last axis is not 8 long.
+        ValueError: The last axis does not have length 8.
 
     Examples:
         >>> boxes7_from_8(np.array([1.0, 2, 3, 4, 2, 1, 0, 5])).tolist()
@@ -98,7 +100,7 @@ def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
 
 
 def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
-    """Corners of the boxes' footprints, counter-clockwise from front left.
+    """Returns the corners of the boxes' footprints, counter-clockwise from front left.
 
     ```
         x (heading)
@@ -108,7 +110,7 @@ def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
     ```
 
     Args:
-        boxes: `[..., 7]`, or `[..., 8]` whose yaw vector is normalized first.
+        boxes: `[..., 7]` or `[..., 8]`; the yaw vector of the latter is normalized first.
 
     Returns:
         `[..., 4, 2]` x and y in meters.
@@ -131,10 +133,12 @@ def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
 
 
 def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
-    """Corners of boxes: the footprint's four at the bottom, then at the top.
+    """Returns the corners of boxes, the four at the bottom before the four at the top.
+
+    Both fours are in the order of `bev_corners`.
 
     Args:
-        boxes: `[..., 7]` or `[..., 8]`, as for `bev_corners`.
+        boxes: `[..., 7]` or `[..., 8]` boxes, as for `bev_corners`.
 
     Returns:
         `[..., 8, 3]` x, y, z in meters.
@@ -154,7 +158,7 @@ def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
 
 
 def _row(xp: Any, values: tuple[float, ...], like: Any) -> Any:
-    """`values` along a new last axis, of the rank and dtype of `like`."""
+    """Returns `values` along the last axis of an array with the rank and dtype of `like`."""
     return xp.asarray(values, like.dtype).reshape((1,) * (like.ndim - 1) + (-1,))
 
 

@@ -1,10 +1,11 @@
-"""Cameras: calibration files, and where points of the radar frame appear in the image.
+"""Camera calibration files and the projection of radar-frame points into the image.
 
-Frames: LiDAR and ego (radar) frames have parallel axes, x forward, y left, z up, and
-differ by a translation; the camera frame is x right, y down, z forward (depth). Pixels
-count from the upper left corner of the image, u to the right and v down.
+The LiDAR frame and the ego (radar) frame have parallel axes (x forward, y left, z up) and
+differ by a translation. In the camera frame, x points right, y down and z forward (depth).
+Pixel coordinates start at the upper left corner of the image, with u to the right and v
+down.
 
-`CameraCalibration` (NumPy, float64) is for the host; `Camera` is a pytree of the same
+`CameraCalibration` (NumPy, float64) is used on the host; `Camera` is a pytree of the same
 numbers for jitted code.
 """
 
@@ -46,7 +47,7 @@ _KEYS = _PINHOLE + _LENS + _ANGLES + _SHIFTS
 _MAX_PIXELS = 1 << 16
 _MAX_VALUE = 1e9  # far beyond pixels, coefficients and meters of any camera
 
-# Between the corners of `boxes.corners`.
+# Pairs of corner indices in the order of `boxes.corners`.
 _BOX_EDGES = np.array(
     [(i, (i + 1) % 4) for i in range(4)]
     + [(4 + i, 4 + (i + 1) % 4) for i in range(4)]
@@ -55,19 +56,21 @@ _BOX_EDGES = np.array(
 
 
 class Camera(struct.PyTreeNode):
-    """A calibrated camera as arrays, one or a batch of them: a pytree for jitted code.
+    """A pytree of one calibrated camera, or of a batch of them, for jitted code.
 
     Attributes:
         cam_from_ego: `[..., 3, 4]` rotation and translation, meters.
         intrinsics: `[..., 4]` fx, fy, cx, cy in pixels.
-        distortion: `[..., 5]` k1, k2, p1, p2, k3 (OpenCV's order); zeros for none.
+        distortion: `[..., 5]` k1, k2, p1, p2, k3 in OpenCV's order; zeros for an image
+            without distortion.
         max_radius: `[...]` largest tangent of the viewing angle at which the distortion
             is still one-to-one.
         size_px: `[..., 2]` width and height of the image.
         is_valid: `[...]` bool, False where the frame has no usable image.
     """
 
-    # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
+    # The leaves have type Any because JAX also builds this tree with shapes, partition
+    # specs or None in place of arrays.
     cam_from_ego: Any
     intrinsics: Any
     distortion: Any
@@ -79,23 +82,25 @@ class Camera(struct.PyTreeNode):
 def project(
     points_ego: Real[Any, "*points 3"], camera: Camera, *, depth_offset_m: float = 0.0
 ) -> tuple[Float[Any, "*points 2"], Float[Any, "*points"]]:
-    """Pixels and depth of points in the ego frame.
+    """Projects points of the ego frame into the image.
 
-    With `(x, y, z) = cam_from_ego (p, 1)`, the pixel is `fx d(x/z) + cx` and likewise
-    for v, where d is the lens distortion (Brown's model as in OpenCV).
+    With `(x, y, z) = cam_from_ego (p, 1)` and `(x', y') = d(x/z, y/z)`, the pixel is
+    `u = fx x' + cx`, `v = fy y' + cy`, where d is the lens distortion (Brown's model as
+    in OpenCV).
 
     Args:
         points_ego: `[..., 3]` meters.
-        camera: A single camera, or a batch of them whose axes are the points' first.
-        depth_offset_m: Added to the depth before the division; the released DinoRADE
-            adds 1e-6.
+        camera: A single camera, or a batch whose axes equal the leading axes of the points.
+        depth_offset_m: Offset added to the depth before the division; the released
+            DinoRADE adds 1e-6.
 
     Returns:
         Pixels `[..., 2]` (u, v) and depth `[...]` in meters. Where the depth is not
-        positive the pixels are finite but mean nothing.
+        positive, the pixels are finite but meaningless.
 
     Raises:
-        AssertionError: Points are not `[..., 3]`, or their first axes not the cameras'.
+        AssertionError: The points are not `[..., 3]`, or their leading axes differ from
+            those of the camera batch.
 
     Examples:
         >>> lens = np.array([100.0, 100, 320, 240])
@@ -111,7 +116,7 @@ def project(
 
 
 def stack_cameras(cameras: Sequence[Camera]) -> Camera:
-    """A batch from single cameras, float32 as the accelerator computes.
+    """Stacks single cameras into a batch, with float32 arrays (`is_valid` stays bool).
 
     Examples:
         >>> one = Camera(np.eye(3, 4), np.ones(4), np.zeros(5), 9.0, np.ones(2), True)
@@ -129,7 +134,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
 def to_camera(
     points: Real[Any, "*points 3"], camera: Camera
 ) -> Float[Any, "*points 3"]:
-    """Points `[..., 3]` of the ego frame in the camera frame, meters.
+    """Transforms points `[..., 3]` in meters from the ego frame to the camera frame.
 
     Examples:
         >>> raised = np.column_stack([np.eye(3), [0, 0, 2.0]])
@@ -143,14 +148,14 @@ def to_camera(
     ones = (1,) * (points.ndim - shift.ndim)  # several points a camera
     rotation = xp.reshape(rotation, batch + ones + (3, 3))
     shift = xp.reshape(shift, batch + ones + (3,))
-    # Products and sums rather than a matrix product, which accelerators may round.
+    # Accelerators may compute a matrix product in reduced precision, unlike this sum.
     return xp.sum(rotation * points[..., None, :], -1) + shift
 
 
 def to_pixels(
     points_cam: Float[Any, "*points 3"], camera: Camera, depth_offset_m: float
 ) -> Float[Any, "*points 2"]:
-    """Pixels `[..., 2]` of points `[..., 3]` of the camera frame, see `project`.
+    """Projects points `[..., 3]` of the camera frame to pixels `[..., 2]`; see `project`.
 
     Examples:
         >>> lens = np.array([100.0, 100, 320, 240])
@@ -173,7 +178,8 @@ def to_pixels(
     radial = 1.0 + square * (k1 + square * (k2 + square * k3))
     x_seen = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
     y_seen = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
-    # Past the fold the polynomial brings points back into the image: leave them out.
+    # Beyond `max_radius` the distortion polynomial would map points back into the image, so
+    # they are moved far outside it.
     folds = square > spread(camera.max_radius) ** 2
     x_seen, y_seen = xp.where(folds, x * 1e3, x_seen), xp.where(folds, y * 1e3, y_seen)
     return xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
@@ -181,16 +187,17 @@ def to_pixels(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CameraCalibration(ArrayValues):
-    """One camera's calibration, in float64. Compares and hashes by value.
+    """The calibration of one camera in float64, compared and hashed by value.
 
     Attributes:
         intrinsics: `[4]` fx, fy, cx, cy of the raw image, pixels.
         distortion: `[5]` k1, k2, p1, p2, k3 in OpenCV's order.
-        rotation: `[3, 3]` camera from LiDAR (or ego) axes.
-        translation_m: `[3]` in camera axes: `p_cam = rotation @ p_lidar + translation`.
+        rotation: `[3, 3]` rotation from LiDAR (or ego) axes to camera axes.
+        translation_m: `[3]` translation in camera axes, `p_cam = rotation @ p_lidar +
+            translation_m`.
         width: Image width in pixels.
         height: Image height in pixels.
-        radar_from_lidar_m: `[3]` shift with `p_ego = p_lidar + shift`.
+        radar_from_lidar_m: `[3]` translation, `p_ego = p_lidar + radar_from_lidar_m`.
 
     Raises:
         UserError: A value is not finite, or a size or focal length is not positive.
@@ -202,7 +209,7 @@ class CameraCalibration(ArrayValues):
     translation_m: Float[np.ndarray, "3"]
     width: int = 1280
     height: int = 720
-    # An array like the others once `__post_init__` is through.
+    # `__post_init__` converts the tuple to an array.
     radar_from_lidar_m: Float[np.ndarray, "3"] = RADAR_FROM_LIDAR_M  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -232,9 +239,10 @@ class CameraCalibration(ArrayValues):
         distortion: Sequence[float] = (0.0,) * 5,
         **fields: Any,
     ) -> CameraCalibration:
-        """Calibration from K-Radar's angles: rotation = Rx(roll) Ry(pitch) Rz(yaw).
+        """Creates a calibration from K-Radar's angles.
 
-        A camera that looks straight ahead has yaw 90, pitch 0 and roll 90 degrees.
+        The rotation is Rx(roll) Ry(pitch) Rz(yaw). A camera that looks straight ahead has
+        yaw 90, pitch 0 and roll 90 degrees.
         """
         rx, ry, rz = (
             _rotation(axis, math.radians(angle_deg))
@@ -250,16 +258,16 @@ class CameraCalibration(ArrayValues):
 
     @classmethod
     def from_kradar(cls, path: str | pathlib.Path, **fields: Any) -> CameraCalibration:
-        """Reads one of K-Radar's `cam_*.yml` files, per sequence or common.
+        """Reads one of K-Radar's `cam_*.yml` files, of one sequence or of all.
 
         Args:
-            path: The file: one `key: number` per line.
+            path: Path of the file, which has one `key: number` per line.
             **fields: Values for the remaining attributes, e.g. `radar_from_lidar_m`.
 
         Raises:
-            FileNotFoundError: There is no such file.
-            DataError: A line is not `key: number`, a key is missing or a value is not
-                possible; names the file.
+            FileNotFoundError: The file does not exist.
+            DataError: A line is not `key: number`, a key is missing or a value is out of
+                range. The message names the file.
         """
         path = pathlib.Path(path)
         if not path.is_file():
@@ -284,7 +292,7 @@ class CameraCalibration(ArrayValues):
             raise DataError(f"{path}: {error}") from None
 
     def to_kradar_text(self) -> str:
-        """The content of a K-Radar calibration file; `from_kradar` reads it back."""
+        """Returns the content of a K-Radar calibration file, which `from_kradar` reads."""
         pitch = math.asin(np.clip(self.rotation[0, 2], -1.0, 1.0))
         yaw = math.atan2(-self.rotation[0, 1], self.rotation[0, 0])
         roll = math.atan2(-self.rotation[1, 2], self.rotation[2, 2])
@@ -295,7 +303,7 @@ class CameraCalibration(ArrayValues):
         return "\n".join(lines) + "\n"
 
     def resized(self, width: int, height: int) -> CameraCalibration:
-        """Calibration of the same image resized, edges onto edges."""
+        """Returns the calibration of the image after resizing it, without cropping."""
         scale = np.array([width / self.width, height / self.height] * 2)
         intrinsics = self.intrinsics * scale
         return dataclasses.replace(
@@ -305,11 +313,11 @@ class CameraCalibration(ArrayValues):
     # Use -----------------------------------------------------------------------------
 
     def camera(self, image: ImageKind = "raw", *, is_valid: bool = True) -> Camera:
-        """The numbers jitted code needs to project onto one kind of image.
+        """Returns the pytree with which jitted code projects onto one kind of image.
 
         Args:
-            image: "raw" is the image as recorded, with lens distortion; "pinhole" the
-                same matrix without distortion, as the released DinoRADE projects.
+            image: "raw" is the image as recorded, with lens distortion; "pinhole" uses the
+                same intrinsics without distortion, as the released DinoRADE does.
             is_valid: False marks a frame without an image.
         """
         kinds = get_args(ImageKind)
@@ -329,9 +337,9 @@ class CameraCalibration(ArrayValues):
     def project_ego(
         self, points_ego: Real[np.ndarray, "*points 3"], image: ImageKind = "raw"
     ) -> tuple[Float[np.ndarray, "*points 2"], Float[np.ndarray, "*points"]]:
-        """Pixels `[..., 2]` and depth `[...]` in meters of ego-frame points `[..., 3]`.
+        """Projects ego-frame points `[..., 3]` to pixels `[..., 2]` and depth `[...]` in meters.
 
-        Pixels mean nothing where the depth is not positive; see `in_image`.
+        Pixels are meaningless where the depth is not positive; see `in_image`.
         """
         return project(np.asarray(points_ego, np.float64), self.camera(image))
 
@@ -340,31 +348,32 @@ class CameraCalibration(ArrayValues):
         pixels: Real[np.ndarray, "*points 2"],
         depth_m: Real[np.ndarray, "*points"],
     ) -> Bool[Any, "*points"]:
-        """True where projected points lie in front of the camera and in the image."""
+        """Returns True where projected points lie in front of the camera and in the image."""
         inside = (pixels >= 0) & (pixels < np.array([self.width, self.height]))
         return inside.all(-1) & (depth_m > 0)
 
     def project_boxes(
         self, boxes: Real[np.ndarray, "N 7"], near_m: float = 0.1
     ) -> tuple[Float[np.ndarray, "N 12 2 2"], Bool[np.ndarray, "N 12"]]:
-        """Edges of boxes as line segments on the raw image, for drawing.
+        """Projects the edges of boxes to line segments on the raw image, for drawing.
 
-        Edges that pass behind the camera are cut at the near plane.
+        Edges that pass behind the camera are clipped at the near plane.
 
         Args:
             boxes: `[N, 7]` x, y, z, l, w, h, yaw in the ego frame, full extents.
-            near_m: Smallest depth that is drawn.
+            near_m: Depth of the near plane in meters.
 
         Returns:
-            Segments `[N, 12, 2, 2]` in pixels of the raw image (edge, end, u and v; straight
-            lines all the same), and `[N, 12]` bool, False for edges out of sight.
+            Segments `[N, 12, 2, 2]` (box, edge, end, u and v) in pixels of the raw image,
+            and `[N, 12]` bool, False for edges entirely behind the near plane. Lens
+            distortion applies to the ends only; the segments between them are straight.
         """
         camera = self.camera()
         corners_cam = to_camera(corners(np.asarray(boxes, np.float64)), camera)
         ends = corners_cam[:, _BOX_EDGES]  # [N, 12, 2, 3]
         depth = ends[..., 2]
         is_visible = (depth > near_m).any(-1)
-        # Move an end behind the near plane along its edge, onto the plane.
+        # Ends behind the near plane move along their edge onto the plane.
         span = depth[..., ::-1] - depth
         safe = np.where(span == 0, 1.0, span)
         part = np.where(depth < near_m, (near_m - depth) / safe, 0.0)
@@ -373,16 +382,20 @@ class CameraCalibration(ArrayValues):
 
 
 def _fold_radius(distortion: Float[np.ndarray, "5"]) -> float:
-    """Smallest radius at which the radial distortion stops growing; large for none."""
+    """Returns the smallest radius at which the distorted radius stops growing.
+
+    If it grows everywhere, the result is 1e6.
+    """
     k1, k2, _, _, k3 = distortion
-    # In 1 / radius^2: the first coefficient is one, however small the others are.
+    # The polynomial is written in 1 / radius^2, so that its leading coefficient is 1 even
+    # if all the others are 0.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-12)]
     return 1 / math.sqrt(real.max()) if real.size else 1e6
 
 
 def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
-    """Right-handed rotation about a coordinate axis (0 x, 1 y, 2 z)."""
+    """Returns the right-handed rotation by `angle` radians about axis 0 (x), 1 (y) or 2 (z)."""
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix[i, i] = matrix[j, j] = math.cos(angle)
@@ -391,9 +404,9 @@ def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
 
 
 def _read_numbers(path: pathlib.Path) -> dict[str, float]:
-    """Values of a file of `key: number` lines.
+    """Reads a file of `key: number` lines.
 
-    No YAML library: in YAML 1.1, `1e-05` is text.
+    The files are not read with a YAML library because YAML 1.1 reads `1e-05` as text.
     """
     values = {}
     text = path.read_text(encoding="utf-8-sig", errors="replace")

@@ -1,7 +1,7 @@
-"""The sensor's axes and the mapping between bins and meters.
+"""The axes of the radar sensor and the mapping between bins and meters.
 
-Every conversion between bins of the radar tensor and positions in the ego frame goes
-through `RadarGrid`; no other module uses a bin size.
+`RadarGrid` performs every conversion between bins of the radar tensor and positions in the
+ego frame. No other module uses a bin size.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from radejax.core.errors import require
 from radejax.geometry.boxes import array_module, as_floats
 
 _AXES = ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps")
-_MAX_VALUE = 10_000.0  # far beyond the axes of any radar
+_MAX_VALUE = 10_000.0  # larger than any value on a radar's axes
 
 AzimuthMapping = Literal["true", "stretched"]
 Positions = float | Real[Any, "*#bins"]
@@ -34,7 +34,7 @@ class ArrayValues:
     """
 
     def freeze(self, name: str) -> np.ndarray:
-        """Makes a field a read-only float64 array of its own and returns it."""
+        """Replaces a field by a read-only float64 copy and returns the copy."""
         value = np.array(getattr(self, name), np.float64)
         value.setflags(write=False)
         object.__setattr__(self, name, value)
@@ -54,23 +54,23 @@ class ArrayValues:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RadarGrid(ArrayValues):
-    """Bin centers of a 4D radar tensor: four uniform, increasing axes.
+    """Bin centers of a 4D radar tensor on four uniform, increasing axes.
 
     Azimuth is positive to the right of boresight, `azimuth = -atan2(y, x)`, as in
     K-Radar. Doppler is the aliased radial velocity. Grids compare and hash by value,
     so they can be static arguments of jitted functions.
 
     Attributes:
-        range_m: `[R]` meters.
-        azimuth_rad: `[A]` radians.
-        elevation_rad: `[E]` radians.
-        doppler_mps: `[D]` meters per second.
-        fov_range_m: Objects farther than this are outside the field of view.
-        fov_azimuth_rad: Objects beyond plus or minus this azimuth are outside.
+        range_m: `[R]` ranges in meters.
+        azimuth_rad: `[A]` azimuths in radians.
+        elevation_rad: `[E]` elevations in radians.
+        doppler_mps: `[D]` radial velocities in meters per second.
+        fov_range_m: Maximum range of the field of view in meters.
+        fov_azimuth_rad: Maximum absolute azimuth of the field of view in radians.
 
     Raises:
-        ValueError: An axis has fewer than 2 bins, is not uniform and increasing, or is
-            beyond what a radar can have; says the limits.
+        ValueError: An axis has fewer than 2 bins, is not uniform and increasing, or has a
+            value above 10,000; or a limit of the field of view is not in (0, 10,000].
 
     References:
         Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
@@ -105,7 +105,7 @@ class RadarGrid(ArrayValues):
 
     @classmethod
     def kradar(cls) -> RadarGrid:
-        """The real sensor: 64 Doppler, 256 range, 37 elevation, 107 azimuth bins."""
+        """Returns K-Radar's grid: 64 Doppler, 256 range, 37 elevation and 107 azimuth bins."""
         return cls(
             range_m=0.462890625 * np.arange(256),
             azimuth_rad=np.deg2rad(np.arange(-53.0, 54.0)),
@@ -128,10 +128,10 @@ class RadarGrid(ArrayValues):
         max_elevation_deg: float = 18.0,
         max_doppler_mps: float = 1.932591,
     ) -> RadarGrid:
-        """A coarser sensor with axes like K-Radar's, for tests and quick starts.
+        """Returns a coarser grid with axes like K-Radar's, for tests and quick starts.
 
-        Range starts at 0; azimuth and elevation are symmetric; Doppler covers
-        `[-max, max)` as the output of an FFT does.
+        Range starts at 0, azimuth and elevation are symmetric, and Doppler covers
+        `[-max, max)` like the output of an FFT.
         """
         azimuth = np.deg2rad(max_azimuth_deg)
         elevation = np.deg2rad(max_elevation_deg)
@@ -148,25 +148,26 @@ class RadarGrid(ArrayValues):
 
     @classmethod
     def from_dict(cls, fields: Mapping[str, Any]) -> RadarGrid:
-        """Inverse of `to_dict`."""
+        """Creates the grid that `to_dict` has written."""
         return cls(**{f.name: fields[f.name] for f in dataclasses.fields(cls)})
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists and floats, exact through JSON."""
+        """Returns the fields as lists and floats, which JSON stores without rounding."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
     def padded(
         self, multiple: int = 8, azimuth_mapping: AzimuthMapping = "true"
     ) -> RadarGrid:
-        """Grid of maps whose range and azimuth are zero-padded to a multiple.
+        """Returns the grid of maps whose range and azimuth are zero-padded.
 
         Args:
-            multiple: Bins are appended at the far and right end up to a multiple.
-            azimuth_mapping: "true" continues the axes; bins keep their place.
+            multiple: The numbers of range and azimuth bins are increased to the next
+                multiple of this by bins at the far and right end.
+            azimuth_mapping: "true" continues the axes, so that bins keep their positions.
                 "stretched" reproduces the released RADE-Net: the padded azimuth bins
                 span the unpadded field of view, and the last range bin lies at the
-                nominal maximum range. Only for official checkpoints, which were
-                trained so: targets drift up to 5 columns from the data.
+                nominal maximum range. This displaces targets by up to 5 columns from the
+                data; use it only for official checkpoints, which were trained with it.
         """
         num_range = -(-self.num_range // multiple) * multiple
         num_azimuth = -(-self.num_azimuth // multiple) * multiple
@@ -224,14 +225,14 @@ class RadarGrid(ArrayValues):
     def bin_to_ego(
         self, range_bin: Positions, azimuth_bin: Positions
     ) -> Float[Any, "*bins 2"]:
-        """Positions of range-azimuth bins on the ground plane of the ego frame.
+        """Returns the positions of range-azimuth bins on the ground plane of the ego frame.
 
         Bin (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da, hence at
         x = r cos(a), y = -r sin(a).
 
         Args:
             range_bin: Position along range in bins, `[...]`; may be fractional.
-            azimuth_bin: Position along azimuth in bins, `[...]`.
+            azimuth_bin: Position along azimuth in bins, `[...]`; may be fractional.
 
         Returns:
             `[..., 2]` x (forward) and y (left) in meters; NumPy float64 for NumPy
@@ -243,15 +244,16 @@ class RadarGrid(ArrayValues):
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
 
     def ego_to_bin(self, x_m: Positions, y_m: Positions) -> Float[Any, "*bins 2"]:
-        """Fractional bins of ground positions: inverse of `bin_to_ego`.
+        """Returns the fractional bins of ground positions, as the inverse of `bin_to_ego`.
 
         Returns:
-            `[..., 2]` range and azimuth in bins; not clipped to the grid.
+            `[..., 2]` range and azimuth in bins, not clipped to the grid.
         """
         xp, x_m, y_m = as_floats(x_m, y_m)
-        # The order of operations decides which way exact half bins round. This one
-        # gives the released code's bins, and straight ahead the exact middle even in
-        # float32: azimuth is counted from the middle of the axis, not from its edge.
+        # The order of operations decides in which direction exact half bins are rounded.
+        # This order gives the bins of the released code. Azimuth is measured from the
+        # middle of the axis, so that a point straight ahead lies exactly in the middle
+        # even in float32.
         last_range, last_azimuth = self.num_range - 1, self.num_azimuth - 1
         range_span = float(self.range_m[-1] - self.range_m[0])
         azimuth_span = float(self.azimuth_rad[-1] - self.azimuth_rad[0])
@@ -263,9 +265,9 @@ class RadarGrid(ArrayValues):
         return xp.stack([range_bin, azimuth_bin], -1)
 
     def nearest_bin(self, x_m: Positions, y_m: Positions) -> Int[Any, "*bins 2"]:
-        """Integer bins nearest to ground positions, clipped to the grid.
+        """Returns the integer bins nearest to ground positions, clipped to the grid.
 
-        Halves round to even, as in the released ground-truth encoding.
+        Halves are rounded to even, as in the released ground-truth encoding.
 
         Returns:
             `[..., 2]` int32 range and azimuth indices.
@@ -277,7 +279,7 @@ class RadarGrid(ArrayValues):
         return xp.clip(xp.round(bins), 0, last).astype(xp.int32)
 
     def bin_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
-        """`[R, A, 2]` float64 x and y of every range-azimuth bin center, meters."""
+        """Returns x and y of every range-azimuth bin center in meters, `[R, A, 2]` float64."""
         return self.bin_to_ego(
             np.arange(self.num_range)[:, None], np.arange(self.num_azimuth)[None, :]
         )
@@ -287,18 +289,18 @@ class RadarGrid(ArrayValues):
         params: Float[jax.Array, "*bins 8"],
         bins: Int[jax.Array, "*bins 2"],
     ) -> Float[jax.Array, "*bins 8"]:
-        """Boxes described by the parameters of given bins of a detector's maps.
+        """Returns the boxes that a detector's maps describe at the given bins.
 
         Args:
-            params: `[..., 8]` raw dx, dy, z, l, w, h, sin, cos; dx and dy from the
-                center of the bin, in meters.
+            params: `[..., 8]` raw dx, dy, z, l, w, h, sin, cos of the bins, where dx and
+                dy are offsets from the center of the bin in meters.
             bins: `[..., 2]` integer range and azimuth bins.
 
         Returns:
             `[..., 8]` float32 x, y, z, l, w, h and the raw sin, cos.
 
         Raises:
-            AssertionError: Shapes are not these.
+            AssertionError: The shape of `params` or `bins` is wrong.
 
         Examples:
             >>> boxes = RadarGrid.kradar().boxes_at(
@@ -317,7 +319,7 @@ class RadarGrid(ArrayValues):
         return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
 
     def check_maps(self, heatmap: Any, box_params: Any) -> None:
-        """Raises `ValueError` where shapes of a detector's maps and the grid differ.
+        """Raises `ValueError` if the shapes of a detector's maps do not match the grid.
 
         Examples:
             >>> maps = jnp.zeros((1, 256, 107, 5)), jnp.zeros((1, 256, 107, 8))
@@ -337,7 +339,7 @@ class RadarGrid(ArrayValues):
             )
 
     def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:
-        """True where the sensor looks: in front, within maximum azimuth and range."""
+        """Returns True for positions in front of the radar within its azimuth and range."""
         xp, x_m, y_m = as_floats(x_m, y_m)
         is_ahead = (xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad) & (x_m >= 0)
         return is_ahead & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)

@@ -1,20 +1,20 @@
-"""Overlap of rotated boxes, exact and branch-free, for JAX and NumPy.
+"""Exact and branch-free overlap of rotated boxes for JAX and NumPy.
 
-Area by Green's theorem: half the integral of x dy - y dx along the boundary of the
-intersection. That boundary consists of the parts of each box's edges inside the other
-box, so
+By Green's theorem, the area of the intersection is half the integral of x dy - y dx along
+its boundary. That boundary consists of the parts of each box's edges inside the other box,
+so
 
     area = 1/2 sum over the edges of both boxes of
            (length of the edge inside the other box) x (distance of its line from O).
 
-No polygon is built and nothing is sorted; 16 edge pairs are a fixed sum of array
-expressions. What makes it exact for coincident edges is that both boxes use the same
-crossing point of a pair of edge lines: along (nearly) coincident lines that point may
-be anywhere, but what one edge loses the other gains. O is the center of the first
-box, which keeps coordinates small and float32 errors below 1e-6 of the area.
+No polygon is built and nothing is sorted: the 16 edge pairs are a fixed sequence of array
+expressions. The result is exact for coincident edges because both boxes use the same
+crossing point of a pair of edge lines. On (nearly) coincident lines, rounding may move that
+point arbitrarily far, but it shortens one edge by as much as it extends the other. O is the
+center of the first box, which keeps coordinates small and float32 errors below 1e-6 of the
+area.
 
-The same lines of code run on `jax.numpy` (float32, jit) and on NumPy (float64, for
-evaluation, which need not load JAX).
+The same code runs on `jax.numpy` (float32, jit) and on NumPy (float64, for evaluation).
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from jaxtyping import Float, Real
 
 from radejax.geometry.boxes import ArrayT, array_module, as_floats
 
-_FAR = 1e6  # meters; stands for infinity along a line, finite so that 0 * _FAR is 0
+_FAR = 1e6  # meters; represents infinity along a line, but finite so that 0 * _FAR is 0
 
 
 def bev_iou(
     a: Real[ArrayT, "*batch N _"], b: Real[ArrayT, "*batch M _"]
 ) -> Float[ArrayT, "*batch N M"]:
-    """Bird's-eye-view IoU of every box of `a` with every box of `b`.
+    """Computes the bird's-eye-view IoU of every box of `a` with every box of `b`.
 
-    Corresponding boxes are compared with a batch axis: `bev_iou(a[:, None], b[:, None])`.
+    To compare corresponding boxes only, add a batch axis: `bev_iou(a[:, None], b[:, None])`.
 
     Args:
-        a: `[..., N, 7]` boxes x, y, z, l, w, h, yaw; or `[..., N, 8]` with sin and
-            cos of yaw, whose length, when not 1, scales the box (as the released NMS
-            and metrics do).
-        b: `[..., M, 7]` or `[..., M, 8]`.
+        a: `[..., N, 7]` boxes x, y, z, l, w, h, yaw; or `[..., N, 8]` with sin and cos of
+            yaw. Length and width of the latter are multiplied by the length of the
+            (sin, cos) vector, as in the released NMS and metrics.
+        b: `[..., M, 7]` or `[..., M, 8]` boxes.
 
     Returns:
-        `[..., N, M]` in [0, 1]: NumPy in float64 for NumPy input, else JAX in float32.
-        Boxes of zero or negative size overlap nothing.
+        `[..., N, M]` IoU in [0, 1], a NumPy array in float64 for NumPy input, otherwise a
+        JAX array in float32. Boxes of zero or negative size have an IoU of 0.
 
     Raises:
-        ValueError: The last axis is neither 7 nor 8 long.
-        AssertionError: `a` and `b` differ in leading axes.
+        ValueError: The last axis does not have length 7 or 8.
+        AssertionError: `a` and `b` have different leading axes.
 
     Examples:
         >>> import jax.numpy as jnp
@@ -66,15 +66,16 @@ def bev_iou(
 def iou_3d(
     a: Real[ArrayT, "*batch N _"], b: Real[ArrayT, "*batch M _"], z_center: float = 0.5
 ) -> Float[ArrayT, "*batch N M"]:
-    """Volume IoU of every box of `a` with every box of `b`; arguments of `bev_iou`.
+    """Computes the volume IoU of every box of `a` with every box of `b`.
 
     Args:
-        a: `[..., N, 7]` or `[..., N, 8]` boxes.
+        a: `[..., N, 7]` or `[..., N, 8]` boxes, as for `bev_iou`.
         b: `[..., M, 7]` or `[..., M, 8]` boxes.
-        z_center: Where z lies in the height of a box: 0.5 in the middle, 1 at the top.
+        z_center: Position of z within the height of a box: 0 at the bottom, 0.5 in the
+            middle, 1 at the top.
 
     Returns:
-        `[..., N, M]` in [0, 1].
+        `[..., N, M]` IoU in [0, 1].
 
     Examples:
         >>> import jax.numpy as jnp
@@ -97,10 +98,10 @@ def iou_3d(
 def bev_intersection(
     a: Real[ArrayT, "*#pairs _"], b: Real[ArrayT, "*#pairs _"]
 ) -> Float[ArrayT, "*pairs"]:
-    """Area in square meters that the footprints of corresponding boxes share.
+    """Computes the area in square meters that the footprints of corresponding boxes share.
 
     Args:
-        a: `[..., 7]` or `[..., 8]` boxes, see `bev_iou`; leading axes broadcast.
+        a: `[..., 7]` or `[..., 8]` boxes, as for `bev_iou`; leading axes broadcast.
         b: `[..., 7]` or `[..., 8]` boxes.
 
     Examples:
@@ -116,7 +117,7 @@ def bev_intersection(
 def shared_height(
     a: Real[ArrayT, "*#pairs _"], b: Real[ArrayT, "*#pairs _"], z_center: float = 0.5
 ) -> Float[ArrayT, "*pairs"]:
-    """Height in meters that corresponding boxes share; 0 where they do not overlap.
+    """Computes the height in meters that boxes share, 0 where they do not overlap in height.
 
     Examples:
         >>> import numpy as np
@@ -132,7 +133,7 @@ def shared_height(
 
 
 def _all_pairs(a: Any, b: Any) -> tuple[Any, Any, Any]:
-    """The array module, then `[..., N, 1, 7 or 8]` and `[..., 1, M, 7 or 8]`."""
+    """Returns the array module, `a` as `[..., N, 1, _]` and `b` as `[..., 1, M, _]`."""
     xp, a, b = as_floats(a, b)
     chex.assert_equal_rank([a, b])
     chex.assert_equal_shape_prefix([a, b], a.ndim - 2)
@@ -140,7 +141,7 @@ def _all_pairs(a: Any, b: Any) -> tuple[Any, Any, Any]:
 
 
 def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
-    """Center x, y, length, width (not negative), sin and cos of heading: `[...]`."""
+    """Returns center x and y, non-negative length and width, sin and cos of the heading."""
     width = boxes.shape[-1] if boxes.ndim else 0
     if width not in (7, 8):
         raise ValueError(f"boxes must be [..., 7] or [..., 8], got {boxes.shape}")
@@ -156,7 +157,7 @@ def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
 
 
 def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
-    """Area common to two footprints, elementwise with broadcasting."""
+    """Computes the area common to two footprints, elementwise with broadcasting."""
     ax, ay, a_length, a_width, a_sin, a_cos = a
     bx, by, b_length, b_width, b_sin, b_cos = b
     # Center and heading of b in the frame of a.
@@ -165,8 +166,8 @@ def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
     y = a_cos * dy - a_sin * dx
     sin = a_cos * b_sin - a_sin * b_cos
     cos = a_cos * b_cos + a_sin * b_sin
-    # Edges as (direction, outward distance from the box's own center, half length);
-    # the box lies to the left of each edge. Directions by quarter turns.
+    # An edge has a direction, a distance from the center of its box and a half length. The
+    # directions differ by quarter turns, and the box lies to the left of each edge.
     zero, one = xp.zeros_like(sin), xp.ones_like(sin)
     a_direction = [(one, zero), (zero, one), (-one, zero), (zero, -one)]
     b_direction = [(cos, sin), (-sin, cos), (-cos, -sin), (sin, -cos)]
@@ -183,12 +184,13 @@ def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
             turn = ux * vy - uy * vx
             offset = gap_x * vy - gap_y * vx
             is_left = turn > 0
-            # Parallel lines cross infinitely far away, on the side that says whether
-            # edge i lies inside. On the very same line all of edge i counts: of two
-            # equal edges then one is counted, of two opposite ones both, which cancel.
+            # Parallel lines cross infinitely far away. The sign of the crossing says
+            # whether edge i lies inside. If both lines are identical, all of edge i
+            # counts: of two edges in the same direction only edge i is counted; two edges
+            # in opposite directions are both counted and cancel.
             divisor = xp.where(turn == 0, 1, turn)
             far = xp.where(offset >= 0, _FAR, -_FAR)
-            # turn == 0 is treated as not left: edge i is inside beyond the crossing.
+            # As turn == 0 is treated as not left, edge i is inside beyond the crossing.
             at_a = xp.where(turn == 0, -far, xp.clip(offset / divisor, -_FAR, _FAR))
             at_b = at_a * (ux * vx + uy * vy) - (gap_x * vx + gap_y * vy)
             a_high[i] = xp.where(is_left, xp.minimum(a_high[i], at_a), a_high[i])
@@ -208,6 +210,6 @@ def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
 
 
 def _ratio(xp: Any, shared: Any, size_a: Any, size_b: Any) -> Any:
-    """Intersection over union; 0 where both boxes are empty."""
+    """Computes intersection over union, 0 where both boxes are empty."""
     union = size_a + size_b - shared
     return shared / xp.where(union > 0, union, 1)

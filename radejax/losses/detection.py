@@ -1,4 +1,4 @@
-"""The training loss of both systems: focal, Gaussian Wasserstein and smooth L1."""
+"""The training loss of both detectors: focal, Gaussian Wasserstein and smooth L1 loss."""
 
 from __future__ import annotations
 
@@ -32,23 +32,27 @@ _MAX_PEAKS = 128
 
 @dataclasses.dataclass(frozen=True)
 class LossOptions:
-    """Options of `detection_loss`: the fields of `config.loss`, and `decoding`.
+    """Options of `detection_loss`, which are the fields of `config.loss` and `decoding`.
 
     Attributes:
-        heatmap_sigma_mode: Target shape, see `gaussian_heatmap`.
-        heatmap_sigma_bins: Standard deviation of targets in bins, for "fixed".
-        gwd_transform: See `gwd_loss`; "sqrt" in the paper, "none" as released.
-        gwd_tau: Likewise.
-        normalize_yaw: Scale the predicted yaw vector to length 1 for the GWD (released:
-            raw). Smooth L1 always sees it raw, which teaches the network its length.
-        assignment: "center": boxes at each object's own bin (as released); "nms": those
-            that survive NMS with the object that they overlap most (the paper).
-        weights: Weights of losses by their name in `LOSSES`; a loss without a weight is
-            not computed.
-        normalize: Divide each loss by its own value, held constant: gradients have the
-            ratio `weights`, the total is constant, losses of 0 add nothing.
-        decoding: Thresholds of peaks and of NMS, for "nms": the boxes that are compared
-            with objects are those that decoding would find.
+        heatmap_sigma_mode: Shape of the target Gaussians, see `gaussian_heatmap`.
+        heatmap_sigma_bins: Standard deviation of the target Gaussians in bins, for "fixed".
+        gwd_transform: Transform of the distance, see `gwd_loss`; "sqrt" in the paper,
+            "none" in the released code.
+        gwd_tau: Offset of the transformed distance, see `gwd_loss`.
+        normalize_yaw: Whether to normalize the predicted yaw vector for the GWD. The
+            released code does not. Smooth L1 always uses the raw vector, so that the
+            network learns to predict unit length.
+        assignment: "center" compares each object with the prediction at its own bin, as in
+            the released code. "nms" compares predictions that survive NMS with the object
+            that they overlap most, as in the paper.
+        weights: Weights of the losses by their name in `LOSSES`. A loss without a weight
+            is not computed.
+        normalize: Whether to divide each loss by its own value, without a gradient through
+            the divisor. Each loss that is not 0 then contributes its weight to the total,
+            whatever its value.
+        decoding: Thresholds of peaks and NMS for the assignment "nms", which should be
+            those of inference.
 
     Raises:
         UserError: A value is out of range.
@@ -91,24 +95,24 @@ def _are_weights(weights: Mapping[str, float]) -> bool:
 def detection_loss(
     maps: DetectionMaps, batch: Batch, grid: RadarGrid, **options: Any
 ) -> tuple[Float[jax.Array, ""], dict[str, Scalar]]:
-    """Weighted sum of the losses that `weights` names, and its terms; in float32.
+    """Computes the weighted sum of the losses in `weights`, and its terms, in float32.
 
-    Losses of boxes are means over the matched ones of a frame (0 without any), then over
-    all frames of the batch, sharded or not.
+    Box losses are averaged over the matched boxes of each frame (0 if it has none), then
+    over all frames of the batch, whether it is sharded or not.
 
     Args:
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
-        batch: Ground truth: `boxes`, `classes`, `is_valid` are read.
-        grid: The grid of the maps (padded where they are).
+        batch: Ground truth, of which `boxes`, `classes` and `is_valid` are used.
+        grid: The grid of the maps, padded if they are.
         **options: Fields of `LossOptions`.
 
     Returns:
-        Scalar total, and scalars by name: the raw losses, their `weighted_sum`,
-        `num_objects`, `num_positive` (bins), `num_matched` (boxes).
+        Scalar total, and a dictionary of scalars: the raw losses, their `weighted_sum`,
+        `num_objects`, `num_positive` (bins) and `num_matched` (boxes).
 
     Raises:
         UserError: An option is out of range.
-        ValueError: Shapes of maps, batch and grid disagree.
+        ValueError: The shapes of maps, batch and grid do not match.
 
     References:
         RADE-Net, equation (17).
@@ -130,7 +134,7 @@ def detection_loss(
             f"got {shape}"
         )
     is_valid = jnp.asarray(batch.is_valid)
-    # Padding rows may hold anything; NaN times 0 would reach the gradients.
+    # Padding rows may contain NaN, which a mask of zeros would not keep from the gradients.
     boxes = jnp.where(is_valid[..., None], batch.boxes.astype(jnp.float32), 0.0)
     target = gaussian_heatmap(
         boxes,
@@ -151,7 +155,8 @@ def detection_loss(
     pairs = Pairs(
         maps.heatmap_logits,
         target,
-        # One harmless box in place of both boxes of an unmatched row, without gradient.
+        # In unmatched rows, both boxes are replaced by the same constant box, so that the
+        # losses and their gradients are finite.
         jnp.where(row, predicted, 1.0),
         jnp.where(row, expected, 1.0),
         is_matched,
@@ -168,14 +173,15 @@ def detection_loss(
 
 
 class Pairs(NamedTuple):
-    """Predictions and what they are compared with.
+    """Predictions and their targets.
 
     Attributes:
         logits: `[B, R, A, C]` heatmap logits.
         target: `[B, R, A, C]` target heatmap.
-        predicted: `[B, N, 8]` predicted boxes; N objects, or peaks after NMS.
-        expected: `[B, N, 8]` their objects.
-        is_matched: `[B, N]` where a predicted box has an object.
+        predicted: `[B, N, 8]` predicted boxes, where N is the number of objects, or of
+            peaks for the assignment "nms".
+        expected: `[B, N, 8]` boxes of the matched objects.
+        is_matched: `[B, N]` bool, True where a predicted box is matched with an object.
     """
 
     logits: Maps
@@ -185,7 +191,7 @@ class Pairs(NamedTuple):
     is_matched: Mask
 
     def mean(self, values: Float[jax.Array, "B N"]) -> Float[jax.Array, ""]:
-        """Mean of `[B, N]` values over the matched boxes of each frame, then over frames."""
+        """Averages `[B, N]` values over the matched boxes of each frame, then over frames."""
         total = jnp.sum(jnp.where(self.is_matched, values, 0.0), axis=1)
         return jnp.mean(total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1))
 
@@ -217,10 +223,10 @@ LOSSES: dict[str, Callable[[Pairs, LossOptions], Float[jax.Array, ""]]] = {
 
 
 def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batch"]:
-    """Quadratic below 1, linear above: `[...]` -> `[...]`.
+    """Computes the smooth L1 loss, which is quadratic below 1 and linear above, elementwise.
 
-    `optax.huber_loss` has the same values, but forms gradients as (x - 1) + 1, which
-    loses the digits of small differences.
+    `optax.huber_loss` has the same values, but computes gradients as (x - 1) + 1, which
+    loses precision for small differences.
 
     Examples:
         >>> smooth_l1(jnp.array([0.5, 3.0])).tolist()
@@ -231,7 +237,7 @@ def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batc
 
 
 def _with_unit_yaw(boxes: Boxes8) -> Boxes8:
-    """Yaw vectors scaled to length 1; (0, 0) stays, with a finite gradient."""
+    """Normalizes yaw vectors; (0, 0) is unchanged and has a finite gradient."""
     yaw = boxes[..., 6:8]
     square = jnp.sum(yaw * yaw, axis=-1, keepdims=True)
     is_long = square > 1e-12
@@ -263,7 +269,7 @@ Assigned = tuple[
 def _at_centers(
     maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid
 ) -> Assigned:
-    """Predictions at the objects' own bins."""
+    """Assigns to each object the prediction at its own bin."""
     bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
     return _boxes_at(maps, bins, grid), boxes, is_valid
 
@@ -275,8 +281,8 @@ def _after_nms(
     is_valid: Mask,
     grid: RadarGrid,
 ) -> Assigned:
-    """Predictions that survive NMS, and the objects that they overlap."""
-    # Which boxes are compared is a choice, not a function to differentiate.
+    """Assigns to each prediction that survives NMS the object that it overlaps most."""
+    # The selection of boxes is not differentiable.
     peaks = find_peaks(
         jax.lax.stop_gradient(maps),
         grid,
@@ -294,7 +300,7 @@ def _after_nms(
 def _boxes_at(
     maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid
 ) -> Boxes8:
-    """Predicted boxes at given bins of every frame."""
-    # One gather per frame, so that a batch axis sharded over devices stays local.
+    """Returns the predicted boxes at given bins of every frame."""
+    # A gather per frame needs no communication if the batch is sharded over devices.
     gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
     return grid.boxes_at(gather(maps.box_params, bins), bins)

@@ -1,4 +1,4 @@
-"""Gaussian center-point targets and the focal loss that compares heatmaps with them."""
+"""Target heatmaps with Gaussians at object centers, and the focal loss of heatmaps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PerObject = Float[jax.Array, "*objects"]
 # rounds them: 1 - 1e-6 becomes 1 - 1.013e-6.
 _LOWEST = float(np.log(1e-6) - np.log1p(-1e-6))
 _HIGHEST = float(-np.log(17 * 2.0**-24) + np.log1p(-17 * 2.0**-24))
-_MIN_SIGMA = 1e-3  # bins; an object of zero size is a single bin
+_MIN_SIGMA = 1e-3  # bins; the target of an object of zero size is a single bin
 
 
 def gaussian_heatmap(
@@ -36,31 +36,34 @@ def gaussian_heatmap(
     sigma_mode: SigmaMode = "fixed",
     sigma_bins: float = 3.0,
 ) -> Float[jax.Array, "*batch R A C"]:
-    """Target heatmaps: per class the clipped sum of Gaussians at the objects' bins.
+    """Computes target heatmaps, per class the clipped sum of Gaussians at objects' bins.
 
-    With (i0, j0) the bin nearest to an object's center, bin (i, j) of its class gets
-    exp(-(i - i0)^2 / (2 sr^2) - (j - j0)^2 / (2 sa^2)), and sums are clipped to 1. A
-    Gaussian is separable, so all objects together are one matrix product of their
-    range profiles with their azimuth profiles; no `[N, R, A, C]` is built. The value at
-    an object's bin is exactly 1.
+    If (i0, j0) is the bin nearest to an object's center, the object adds
+    exp(-(i - i0)^2 / (2 sr^2) - (j - j0)^2 / (2 sa^2)) to bin (i, j) of its class. Sums are
+    clipped to 1, so the value at an object's bin is exactly 1. As Gaussians are separable,
+    the sum over objects is a matrix product of their range profiles and azimuth profiles,
+    which needs no array `[N, R, A, C]`.
 
     Args:
-        boxes: `[..., N, 7 or 8]` boxes in the ego frame, meters; only x, y, l, w count.
-        classes: `[..., N]` class indices; indices outside `[0, C)` draw nothing.
+        boxes: `[..., N, 7 or 8]` boxes in the ego frame in meters, of which x, y, l and w
+            are used.
+        classes: `[..., N]` class indices; objects with an index outside `[0, C)` are
+            ignored.
         is_valid: `[..., N]` bool, True where a box is an object.
         grid: The grid of the maps.
-        num_classes: C.
-        sigma_mode: "fixed": `sigma_bins` in both axes. "adaptive": 0.3 max(l, w) in both.
-            "anisotropic": l / 6 along range and w / 6 along azimuth. The latter two
-            read meters as bins, as released.
-        sigma_bins: Standard deviation for "fixed", in bins.
+        num_classes: Number C of classes.
+        sigma_mode: Standard deviations sr and sa along range and azimuth. "fixed" uses
+            `sigma_bins` for both, "adaptive" 0.3 max(l, w) for both, and "anisotropic"
+            l / 6 for sr and w / 6 for sa. The latter two use values in meters as bins, as
+            in the released code.
+        sigma_bins: Standard deviation in bins, for "fixed".
 
     Returns:
         `[..., R, A, C]` float32 in [0, 1].
 
     Raises:
         ValueError: `sigma_mode` is unknown.
-        AssertionError: Shapes of boxes, classes and mask do not fit together.
+        AssertionError: The shapes of boxes, classes and mask do not match.
 
     References:
         RADE-Net, section on the focal loss (sigma 3); DinoRADE (sigma 0.75).
@@ -81,43 +84,45 @@ def gaussian_heatmap(
     range_profile = _profile(bins[..., 0], sigma_range, grid.num_range)
     azimuth_profile = _profile(bins[..., 1], sigma_azimuth, grid.num_azimuth)
     one_hot = jax.nn.one_hot(classes, num_classes) * is_valid[..., None]
-    # Zero weight is not enough against NaN boxes in padding rows.
+    # Padding rows may contain NaN, which multiplication by zero does not remove.
     range_profile = jnp.where(is_valid[..., None], range_profile, 0.0)
     azimuth_profile = jnp.where(is_valid[..., None], azimuth_profile, 0.0)
     columns = azimuth_profile[..., :, None] * one_hot[..., None, :]  # [..., N, A, C]
-    # Reduced precision would lose the ones at the centers on accelerators.
+    # In an accelerator's reduced precision, values at the centers might not be exactly 1.
     heatmap = jnp.einsum(
         "...nr,...nac->...rac",
         range_profile,
         columns,
         precision=jax.lax.Precision.HIGHEST,
     )
-    # Computed once: where compilers join it with what uses it, sums that are nearly one
-    # are positive for one user and not for the next (jax 0.10.0 on CPUs).
+    # The barrier prevents the compiler from fusing the sum separately into each of its
+    # uses. Rounding then differs, and a sum near 1 counts as positive in one use but not
+    # in another (jax 0.10.0 on CPUs).
     return jax.lax.optimization_barrier(jnp.minimum(heatmap, 1.0))
 
 
 def focal_loss(
     logits: Maps, target: Maps, alpha: float = 2, beta: float = 4
 ) -> Float[jax.Array, ""]:
-    """Center-point focal loss of a batch of heatmaps, averaged over positive bins.
+    """Computes the focal loss of a batch of heatmaps, averaged over positive bins.
 
-    With p the probability: -(1 - p)^alpha log p where the target t is 1, elsewhere
-    -(1 - t)^beta p^alpha log(1 - p); the sum divided by the number of positive bins,
-    or the mean over all bins where the batch has none. p is clipped to
-    [1e-6, 1 - 1e-6] as released, with no gradient beyond.
+    For the predicted probability p, the loss of a bin is -(1 - p)^alpha log p where the
+    target t is 1, and -(1 - t)^beta p^alpha log(1 - p) elsewhere. The sum is divided by the
+    number of bins with target 1, or by the number of all bins if there are none. As in the
+    released code, p is clipped to [1e-6, 1 - 1e-6], with no gradient outside.
 
     Args:
-        logits: `[B, R, A, C]`, any float dtype; computed in float32.
-        target: `[B, R, A, C]` in [0, 1], from `gaussian_heatmap`.
-        alpha: Exponent on the error of the prediction.
-        beta: Exponent that spares bins near a center.
+        logits: `[B, R, A, C]` heatmap logits of any float dtype; the loss is computed in
+            float32.
+        target: `[B, R, A, C]` target in [0, 1], from `gaussian_heatmap`.
+        alpha: Exponent that reduces the weight of well-classified bins.
+        beta: Exponent that reduces the weight of bins near a center.
 
     Returns:
-        Scalar float32.
+        Scalar float32 loss.
 
     Raises:
-        AssertionError: Logits and target differ in shape.
+        AssertionError: `logits` and `target` have different shapes.
 
     References:
         Law and Deng, CornerNet, arXiv:1808.01244, equation (1).
@@ -137,10 +142,10 @@ def focal_loss(
 def focal_loss_per_bin(
     logits: Bins, target: Bins, alpha: float = 2, beta: float = 4
 ) -> Bins:
-    """The terms that `focal_loss` sums: `[...]` and `[...]` -> `[...]` float32.
+    """Computes the float32 loss of each bin, which `focal_loss` averages.
 
-    log p and log(1 - p) are taken from the logits: log(1 - sigmoid(x)) rounds to 0 or
-    -inf in float32 where log_sigmoid(-x) is accurate.
+    log p and log(1 - p) are computed from the logits, because log(1 - sigmoid(x)) rounds to
+    0 or -inf in float32 where log_sigmoid(-x) is accurate.
 
     Examples:
         >>> loss = focal_loss_per_bin(jnp.zeros(3), jnp.array([1.0, 0.0, 0.5]))
@@ -148,7 +153,7 @@ def focal_loss_per_bin(
         [0.1733, 0.1733, 0.0108]
     """
     logits = logits.astype(jnp.float32)
-    # Unlike jnp.clip, full gradient on the bounds themselves, as the released clamp.
+    # Unlike jnp.clip, this has the full gradient on the bounds, like the released clamp.
     logits = jnp.where(logits < _LOWEST, _LOWEST, logits)
     logits = jnp.where(logits > _HIGHEST, _HIGHEST, logits)
     target = target.astype(jnp.float32)
@@ -160,7 +165,7 @@ def focal_loss_per_bin(
 def _sigmas(
     boxes: Float[jax.Array, "*objects _"], sigma_mode: str, sigma_bins: float
 ) -> tuple[PerObject, PerObject]:
-    """Standard deviations along range and azimuth, in bins: `[..., N]` each."""
+    """Returns the standard deviations along range and azimuth in bins, `[..., N]` each."""
     modes = get_args(SigmaMode)
     require(sigma_mode in modes, "sigma_mode", sigma_mode, f"one of {modes}")
     length, width = boxes[..., 3], boxes[..., 4]
@@ -176,7 +181,7 @@ def _sigmas(
 def _profile(
     center: Int[jax.Array, "*objects"], sigma: PerObject, size: int
 ) -> Float[jax.Array, "*objects {size}"]:
-    """Unnormalized Gaussians over `size` bins: `[...]` centers -> `[..., size]`."""
+    """Computes unnormalized Gaussians over `size` bins, `[...]` centers -> `[..., size]`."""
     bins = jnp.arange(size, dtype=jnp.float32)
     bins = bins.reshape((1,) * center.ndim + (size,))
     distance = (bins - center[..., None]) / sigma[..., None]
@@ -184,6 +189,9 @@ def _profile(
 
 
 def _power(base: jax.Array, exponent: float) -> jax.Array:
-    """Whole exponents by multiplication: exact, and with finite gradients at 0."""
+    """Computes a power, by multiplication if the exponent is a whole number.
+
+    The result is then exact and has a finite gradient at 0.
+    """
     whole = int(exponent)
     return base**whole if whole == exponent else base**exponent

@@ -1,26 +1,29 @@
 """Gaussian Wasserstein distance between rotated boxes on the ground plane.
 
-A box stands for a Gaussian with mean (x, y) and covariance S^2, where the square root S
-has half the length along the heading and half the width across it:
+A box is represented by a Gaussian with mean (x, y) and covariance S^2. The matrix S has
+half the length along the heading and half the width across it as eigenvalues. The squared
+distance between two boxes is
 
     d = |mu1 - mu2|^2 + tr(S1^2) + tr(S2^2) - 2 T,   T = tr (S1 S2^2 S1)^(1/2)
 
-Three things make it usable as a loss in float32:
+Three measures make it usable as a loss in float32:
 
-* The matrix root goes through an eigendecomposition whose derivative is taken in the
-  eigenbasis (the Sylvester equation S dS + dS S = dM), which has no difference of
-  eigenvalues in a denominator: right for square boxes and for boxes turned by 90 deg.
+* The matrix root is computed by an eigendecomposition, and its derivative in the
+  eigenbasis (from the Sylvester equation S dS + dS S = dM). The derivative has no
+  difference of eigenvalues in a denominator, so it is also correct for square boxes and
+  for boxes rotated by 90 deg.
 * tr(S1^2) + tr(S2^2) and 2 T are large and nearly equal for similar boxes. With
   P = S1 S2, their difference is |S1 - S2|_F^2 - 2 (T - tr P), and
 
       T - tr P = ((P_xy - P_yx)^2 + 4 max(-det P, 0)) / (T + tr P),
 
-  where no two large numbers are subtracted.
+  which avoids the difference of large numbers.
 * sqrt(d) is smoothed below 1e-6 m, so its gradient is finite at zero distance.
 
-The released code puts the width along the heading and the length across. Turning both
-Gaussians by 90 deg about their own means changes no term of d, whatever the length of
-the yaw vectors, so distance and gradients are the same; here length is along heading.
+In the released code, the width is along the heading and the length across it; here, the
+length is along the heading. This corresponds to a rotation of both Gaussians by 90 deg
+about their means, which changes no term of d for any length of the yaw vectors, so distance
+and gradients are the same.
 
 References:
     Yang et al., Rethinking Rotated Object Detection with Gaussian Wasserstein Distance
@@ -45,23 +48,26 @@ Entry = Float[jax.Array, "*batch"]
 _Matrix = tuple[jax.Array, jax.Array, jax.Array]  # xx, xy, yy
 
 _MIN_EIGENVALUE = 1e-12  # as released
-_SMOOTHING_M = 1e-6  # scale below which sqrt(d) is rounded off
+_SMOOTHING_M = 1e-6  # scale below which sqrt(d) is smoothed
 
 
 def gwd(a: Boxes8, b: Boxes8) -> PerPair:
-    """Squared 2-Wasserstein distance between the Gaussians of corresponding boxes.
+    """Computes the squared 2-Wasserstein distance between corresponding boxes' Gaussians.
+
+    As in the released code, the yaw vectors are not normalized, and eigenvalues are clamped
+    at 1e-12.
 
     Args:
-        a: `[..., 8]` boxes x, y, z, l, w, h, sin yaw, cos yaw in meters; z and h do
-            not count; the yaw vector is used as it is, not normalized. Eigenvalues
-            are clamped at 1e-12, as released.
-        b: `[..., 8]`.
+        a: `[..., 8]` boxes x, y, z, l, w, h, sin yaw, cos yaw in meters; z and h are not
+            used.
+        b: `[..., 8]` boxes like `a`.
 
     Returns:
-        `[...]` square meters, not negative, in float32 (float64 for float64 input).
+        `[...]` non-negative squared distances in square meters, in float32 (float64 for
+        float64 input).
 
     Raises:
-        ValueError: The last axis is not 8 long.
+        ValueError: The last axis does not have length 8.
 
     Examples:
         >>> car = jnp.array([10.0, 2.0, 0.0, 4.0, 2.0, 1.5, 0.0, 1.0])
@@ -79,20 +85,20 @@ def gwd(a: Boxes8, b: Boxes8) -> PerPair:
 def gwd_loss(
     a: Boxes8, b: Boxes8, tau: float = 1.65, transform: Transform = "sqrt"
 ) -> PerPair:
-    """1 - 1 / (tau + f(d)) for corresponding boxes, d the distance `gwd`.
+    """Computes the loss 1 - 1 / (tau + f(d)) for corresponding boxes, where d is `gwd`.
 
     Args:
         a: `[..., 8]` boxes, see `gwd`.
-        b: `[..., 8]`.
-        tau: Offset; a perfect box costs 1 - 1 / tau (0.394 at 1.65).
-        transform: f: "none" d (the released training), "sqrt" sqrt(d) (the paper),
-            "log1p" log(1 + d).
+        b: `[..., 8]` boxes, see `gwd`.
+        tau: Offset tau; the loss of equal boxes is 1 - 1 / tau (0.394 for 1.65).
+        transform: Function f. "none" is d (as in the released code), "sqrt" is sqrt(d)
+            (as in the paper) and "log1p" is log(1 + d).
 
     Returns:
-        `[...]` loss per box.
+        `[...]` loss per pair of boxes.
 
     Raises:
-        ValueError: `transform` is unknown, or shapes are not `[..., 8]`.
+        ValueError: `transform` is unknown, or the shape of `a` or `b` is not `[..., 8]`.
 
     References:
         RADE-Net, section on the Gaussian Wasserstein distance loss.
@@ -106,8 +112,8 @@ def gwd_loss(
     require(transform in _TRANSFORMS, "transform", transform, f"one of {_TRANSFORMS}")
     distance = gwd(a, b)
     if transform == "sqrt":
-        # d grows with the square of the error, so d / sqrt(d) has a finite limit;
-        # the smoothing makes its derivative 0 there instead of 0 / 0.
+        # d is quadratic in the error near 0, so the derivative of sqrt(d) is bounded but
+        # evaluates to 0 / 0 at d = 0. With smoothing, it is 0 there.
         distance = jnp.sqrt(distance + _SMOOTHING_M**2) - _SMOOTHING_M
     elif transform == "log1p":
         distance = jnp.log1p(distance)
@@ -115,7 +121,7 @@ def gwd_loss(
 
 
 def _root_entries(boxes: Boxes8) -> _Matrix:
-    """xx, xy and yy of the symmetric S."""
+    """Returns the entries xx, xy and yy of the symmetric matrix S."""
     length, width = boxes[..., 3] / 2, boxes[..., 4] / 2
     sin, cos = boxes[..., 6], boxes[..., 7]
     return (
@@ -126,10 +132,11 @@ def _root_entries(boxes: Boxes8) -> _Matrix:
 
 
 def _root_differences(a: Boxes8, b: Boxes8) -> _Matrix:
-    """Differences of `_root_entries` of two boxes.
+    """Computes the difference of the `_root_entries` of two boxes.
 
-    Expanded into differences of box parameters, which are 0 for equal boxes, whereas a
-    compiler that fuses a product with a subtraction rounds the two sides unequally.
+    It is written in differences of box parameters, so that it is exactly 0 for equal boxes.
+    If the entries themselves were subtracted, a compiler that fuses a product with the
+    subtraction could round the two entries differently.
     """
     sin_a, cos_a, sin_b, cos_b = a[..., 6], a[..., 7], b[..., 6], b[..., 7]
     length, width = (a[..., 3] - b[..., 3]) / 2, (a[..., 4] - b[..., 4]) / 2
@@ -147,9 +154,10 @@ def _root_differences(a: Boxes8, b: Boxes8) -> _Matrix:
 
 
 def _shape_distance(a: Boxes8, b: Boxes8) -> PerPair:
-    """tr(S1^2) + tr(S2^2) - 2 T, without cancellation."""
+    """Computes tr(S1^2) + tr(S2^2) - 2 T without cancellation."""
     (a_xx, a_xy, a_yy), (b_xx, b_xy, b_yy) = _root_entries(a), _root_entries(b)
-    # P = S1 S2, and P P^T; as scalars, never in an accelerator's low precision.
+    # P = S1 S2 and P P^T are written out because accelerators may compute a matrix product
+    # in reduced precision.
     p_xx, p_xy = a_xx * b_xx + a_xy * b_xy, a_xx * b_xy + a_xy * b_yy
     p_yx, p_yy = a_xy * b_xx + a_yy * b_xy, a_xy * b_xy + a_yy * b_yy
     root = trace_of_root_2x2(
@@ -159,10 +167,10 @@ def _shape_distance(a: Boxes8, b: Boxes8) -> PerPair:
     )
     xx, xy, yy = _root_differences(a, b)
     gap = xx**2 + 2 * xy**2 + yy**2
-    # P_xy - P_yx from differences of entries: exactly 0 for equal boxes.
+    # P_xy - P_yx is computed from differences of entries, so it is 0 for equal boxes.
     skew = a_xy * (xx - yy) - (a_xx - a_yy) * xy
     trace, det = p_xx + p_yy, p_xx * p_yy - p_xy * p_yx
-    # Where tr P is not positive, for negative sizes, nothing cancels in T - tr P.
+    # If tr P is not positive, which requires negative sizes, T - tr P has no cancellation.
     is_positive = trace > 0
     total = jnp.where(is_positive, root + trace, 1)
     excess = jnp.where(
@@ -173,20 +181,21 @@ def _shape_distance(a: Boxes8, b: Boxes8) -> PerPair:
 
 @jax.custom_jvp
 def trace_of_root_2x2(xx: Entry, xy: Entry, yy: Entry) -> Entry:
-    """Trace of the symmetric root of [[xx, xy], [xy, yy]], elementwise.
+    """Computes the trace of the square root of the matrix [[xx, xy], [xy, yy]], elementwise.
 
-    By eigendecomposition, with eigenvalues l clamped at 1e-12. The derivative of the
-    root S of M solves S dS + dS S = dM; in the eigenbasis dS_ij = dM_ij / (sqrt(l_i) +
-    sqrt(l_j)). Its trace needs only the diagonal and is finite and right for equal
-    eigenvalues, where differentiating eigenvectors divides by their difference.
+    The root is computed by eigendecomposition, with eigenvalues l clamped at 1e-12. The
+    derivative of the root S of M solves S dS + dS S = dM, so in the eigenbasis it is
+    dS_ij = dM_ij / (sqrt(l_i) + sqrt(l_j)). The trace needs only the diagonal of dS. It is
+    also correct for equal eigenvalues, unlike the derivative through the eigenvectors,
+    which divides by the difference of the eigenvalues.
 
     Args:
-        xx: `[...]` entry of a positive semi-definite matrix, as are the others.
-        xy: `[...]`.
-        yy: `[...]`.
+        xx: `[...]` first diagonal entry of a positive semi-definite matrix.
+        xy: `[...]` off-diagonal entry.
+        yy: `[...]` second diagonal entry.
 
     Returns:
-        `[...]` sum of the roots of the eigenvalues.
+        `[...]` sum of the square roots of the eigenvalues.
 
     Examples:
         >>> round(float(trace_of_root_2x2(*jnp.array([4.0, 0.0, 9.0]))), 4)
@@ -208,10 +217,10 @@ def _trace_of_root_2x2_jvp(
 def _roots_and_axes(
     xx: jax.Array, xy: jax.Array, yy: jax.Array
 ) -> tuple[list[jax.Array], jax.Array, jax.Array]:
-    """Roots of the two eigenvalues, and the first eigenvector (cos, sin).
+    """Returns the square roots of the two eigenvalues and the first eigenvector (cos, sin).
 
-    One Jacobi rotation diagonalises a 2x2 matrix exactly, elementwise and without a
-    LAPACK call per matrix; a multiple of the identity keeps its axes.
+    One Jacobi rotation diagonalizes a 2x2 matrix exactly, without a LAPACK call per matrix.
+    For a multiple of the identity, the rotation angle is 0.
     """
     angle = jnp.arctan2(2 * xy, xx - yy) / 2
     cos, sin = jnp.cos(angle), jnp.sin(angle)
@@ -223,7 +232,7 @@ def _roots_and_axes(
 def _diagonal_in_basis(
     xx: jax.Array, xy: jax.Array, yy: jax.Array, cos: jax.Array, sin: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Diagonal of a symmetric matrix seen from axes turned by an angle."""
+    """Returns the diagonal of a symmetric matrix in axes rotated by an angle."""
     mixed = 2 * sin * cos * xy
     first = cos * cos * xx + mixed + sin * sin * yy
     return first, sin * sin * xx - mixed + cos * cos * yy

@@ -1,4 +1,4 @@
-"""Detectors from their configs, and what can be asked of any of them."""
+"""Construction of detectors from their configs, and functions for all detectors."""
 
 from __future__ import annotations
 
@@ -18,18 +18,20 @@ from radejax.models.vit import ViT
 
 
 def build(config: Mapping[str, Any]) -> nn.Module:
-    """The model that `config.model` describes.
+    """Creates the model that `config.model` describes.
 
     Args:
         config: A mapping with `name`, "radenet" or "dinorade", and exactly the fields of
-            that model. Those of RADE-Net are attributes of `RadeNet`, `cbam` may be
-            "off"; DinoRADE has the sections `image`, `fusion` and `query_grid` as well.
+            that model. The fields of RADE-Net are the attributes of `RadeNet`, where `cbam`
+            may be "off". DinoRADE additionally has the sections `image`, `fusion` and
+            `query_grid`.
 
     Returns:
-        A Flax module, without parameters.
+        A Flax module without parameters.
 
     Raises:
-        UserError: The name is unknown, a field is missing, unknown or out of range.
+        UserError: The name is unknown, or a field is missing, unknown or out of range or
+            has the wrong type.
     """
     fields = _plain(config)
     fields.setdefault("name", None)
@@ -46,7 +48,7 @@ def build(config: Mapping[str, Any]) -> nn.Module:
 
 
 def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
-    """Attributes of `DinoRade` from the fields of its config."""
+    """Converts the fields of DinoRADE's config to attributes of `DinoRade`."""
     image, fusion, grid = (fields.pop(k) for k in ("image", "fusion", "query_grid"))
     shared = {"num_groups", "dtype", "remat"}
     vit_fields = _own_fields(ViT) - shared
@@ -70,7 +72,7 @@ def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(config: Any) -> Any:
-    """Dictionaries and tuples, whatever mappings and sequences a config is made of."""
+    """Converts mappings to dictionaries and lists to tuples, recursively."""
     if isinstance(config, list | tuple):
         return tuple(map(_plain, config))
     if isinstance(config, Mapping) or hasattr(config, "items"):
@@ -83,7 +85,7 @@ def _own_fields(module: Any) -> set[str]:
 
 
 def _check_keys(fields: Any, expected: Collection[str], section: str) -> None:
-    """Raise `UserError` naming fields that are unknown or missing."""
+    """Raises a `UserError` that names an unknown or missing field, if there is one."""
     if not isinstance(fields, Mapping):
         raise UserError(f"config.model.{section[:-1]} is {fields!r}, expected fields")
     for text, names in (
@@ -95,17 +97,17 @@ def _check_keys(fields: Any, expected: Collection[str], section: str) -> None:
 
 
 def has_camera(model: nn.Module) -> bool:
-    """Whether a model takes images."""
+    """Returns whether a model takes images."""
     return isinstance(model, DinoRade)
 
 
 def map_grid(grid: RadarGrid, model: Any, azimuth_mapping: AzimuthMapping) -> RadarGrid:
-    """Grid of the maps that a model makes from projections on `grid`.
+    """Returns the grid of the maps that a model predicts from projections on `grid`.
 
     Args:
-        grid: Of the sensor.
-        model: Pads to `pad_multiple` and, if `crop_output`, crops again.
-        azimuth_mapping: See `RadarGrid.padded`.
+        grid: Grid of the sensor.
+        model: Model, whose `pad_multiple` and `crop_output` are used.
+        azimuth_mapping: Mapping of the padded bins, see `RadarGrid.padded`.
     """
     padded = grid.padded(model.pad_multiple, azimuth_mapping)
     if not model.crop_output:

@@ -1,4 +1,4 @@
-"""U-shaped encoder and decoder over the range-azimuth plane, with attention on the skips.
+"""U-Net over the range-azimuth plane, with attention in the skip connections.
 
 References:
     RADE-Net, section III-C, figure 3 and equations (6) to (9); Woo et al., CBAM,
@@ -33,10 +33,10 @@ REDUCTION = 16
 
 
 class ChannelAttention(nn.Module):
-    """Scales channels by what a small network makes of their maximum and mean.
+    """Scales channels by factors computed from their global maximum and global mean.
 
-    The same two-layer network sees the global maximum and the global average; the
-    sigmoid of the sum is the factor.
+    The same two-layer network is applied to the maximum and to the mean. The factors are
+    the sigmoid of the sum of both outputs.
 
     Attributes:
         dtype: Dtype of the computation and the output.
@@ -57,12 +57,14 @@ class ChannelAttention(nn.Module):
 
 
 class SpatialAttention(nn.Module):
-    """Attention of every bin, in (0, 1).
+    """Computes the spatial attention weight of every bin, in (0, 1).
 
-    A 7x7 convolution over two maps: maximum and mean of the channels.
+    The weight is the sigmoid of a 7x7 convolution over two maps, the maximum and the mean
+    of the channels.
 
     Attributes:
-        mean_first: The paper concatenates [mean, max], the released code [max, mean].
+        mean_first: Whether to concatenate [mean, max], as in the paper, instead of
+            [max, mean], as in the released code.
         dtype: Dtype of the computation and the output.
     """
 
@@ -78,13 +80,12 @@ class SpatialAttention(nn.Module):
 
 
 class CBAM(nn.Module):
-    """Channel attention, then spatial attention, on a skip connection.
-
-    "official", the released block: `ConvGNSiLU`, both attentions, plus the output of
-    the first convolution, `ConvGNSiLU`. "paper": the attentions alone.
+    """Channel attention followed by spatial attention, in a skip connection.
 
     Attributes:
-        kind: "official" or "paper".
+        kind: "paper" applies both attentions only. "official", the block of the released
+            code, has a `ConvGNSiLU` before them, adds the output of this convolution to
+            theirs, and ends with another `ConvGNSiLU`.
         num_groups: Groups of the normalizations of the official block.
         dtype: Dtype of the computation and the output.
     """
@@ -108,14 +109,15 @@ class CBAM(nn.Module):
 
 
 class InputStem(nn.Module):
-    """Encodes Doppler and elevation channels apart before they are mixed.
+    """Encodes Doppler and elevation channels separately before mixing them.
 
-    1x1 convolutions to `features` and `features / 2` channels, then a 3x3
-    convolution; all with normalization and SiLU and without bias.
+    A 1x1 convolution encodes Doppler to `features` channels and another encodes elevation
+    to `features / 2` channels. A 3x3 convolution mixes both. All convolutions have
+    normalization and SiLU and no bias.
 
     Attributes:
         features: Output channels.
-        doppler_bins: The first so many channels are Doppler, the rest elevation.
+        doppler_bins: Number of Doppler channels, which precede the elevation channels.
         num_groups: Groups of the normalizations.
         dtype: Dtype of the computation and the output.
     """
@@ -138,19 +140,19 @@ class InputStem(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Projection `[B, R, A, D+E]` -> features `[B, R, A, decoder_width]`.
+    """U-Net, projection `[B, R, A, D+E]` -> features `[B, R, A, decoder_width]`.
 
-    Encoder level i halves the map after `widths[i]` channels; the decoder doubles it
-    and joins the attended skip of the same level. R and A must be multiples of
-    2 ** len(widths).
+    Encoder level i has `widths[i]` channels and then halves the resolution. Each decoder
+    stage doubles it and concatenates the skip connection of the same level. R and A must
+    be multiples of 2 ** len(widths).
 
     Attributes:
-        doppler_bins: Doppler channels of the input; only the stem tells them apart.
+        doppler_bins: Number of Doppler channels of the input, used by `InputStem` only.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage.
         num_groups: Groups of the normalizations.
-        cbam: Attention on the skips, or None.
-        input_stem: `InputStem` instead of one 3x3 convolution.
+        cbam: Kind of the `CBAM` in the skip connections; None for skips without attention.
+        input_stem: Whether to use `InputStem` instead of one 3x3 convolution.
         dtype: Dtype of the computation and the output.
         remat: Recompute blocks in the backward pass instead of storing them.
     """

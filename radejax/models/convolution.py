@@ -1,10 +1,10 @@
 """Stride-1 convolution of channels-last maps with a fast weight gradient on CPUs.
 
-XLA's own weight gradient on a CPU is a convolution whose window is the whole map; on
-the finest maps of RADE-Net it is the slowest part of a training step. There the sum
-over bins is done in blocks instead: the shifted copies of a few rows stay in the cache
-and meet the output's gradient in one matrix product. Other platforms, small
-convolutions and 1x1 kernels keep XLA's.
+On a CPU, XLA computes the weight gradient as a convolution whose window is the whole map.
+On the finest maps of RADE-Net, this is the slowest part of a training step. This module
+instead sums over blocks of rows. The shifted copies of a block stay in the cache, and one
+matrix product multiplies them with the gradient of the output. Other platforms, small
+convolutions and 1x1 kernels use XLA's gradient.
 """
 
 from __future__ import annotations
@@ -33,21 +33,20 @@ def conv2d(
     kernel: Float[jax.Array, "k k C F"],
     dilation: int = 1,
 ) -> Float[jax.Array, "B R A F"]:
-    """Convolution with stride 1 and zero padding that keeps the map's size.
+    """Computes a convolution with stride 1 and zero padding that keeps the map's size.
 
-    Differentiable in reverse mode once, like every function with a hand-written
-    transpose.
+    The function has a custom VJP, so it can be differentiated in reverse mode only.
 
     Args:
-        x: `[B, R, A, C]`.
-        kernel: `[k, k, C, F]`, k odd, of the dtype of `x`.
-        dilation: Distance of taps in bins.
+        x: `[B, R, A, C]` map.
+        kernel: `[k, k, C, F]` kernel with odd k, in the dtype of `x`.
+        dilation: Dilation of the kernel in bins.
 
     Returns:
         `[B, R, A, F]` in the dtype of `x`.
 
     Raises:
-        AssertionError: Channels of map and kernel differ.
+        AssertionError: Map and kernel have different numbers of channels.
     """
     chex.assert_shape(kernel, (None, None, x.shape[-1], None))
     return plain_conv2d(x, kernel, dilation)
@@ -56,10 +55,10 @@ def conv2d(
 def product(
     x: Float[jax.Array, "*batch C"], kernel: Float[jax.Array, "C F"]
 ) -> Float[jax.Array, "*batch F"]:
-    """Product along the last axis as one product of two matrices.
+    """Multiplies the last axis of `x` by a matrix, as one product of two matrices.
 
-    The same as `x @ kernel`, whose gradients XLA computes 1.5 to 4 times slower on a CPU
-    where x has more axes.
+    The result equals `x @ kernel`. If `x` has more than two axes, XLA computes the
+    gradients of `x @ kernel` 1.5 to 4 times slower on a CPU.
     """
     flat = x.reshape(-1, x.shape[-1]) @ kernel
     return flat.reshape(*x.shape[:-1], kernel.shape[-1])
@@ -68,7 +67,10 @@ def product(
 def plain_conv2d(
     x: jax.Array, kernel: jax.Array, dilation: int = 1, stride: int = 1
 ) -> jax.Array:
-    """Convolution of any stride, padded by half the kernel's size, by XLA alone."""
+    """Computes a convolution padded by half the kernel's size, with XLA's gradients.
+
+    `stride` has no effect on 1x1 kernels.
+    """
     if kernel.shape[:2] == (1, 1):
         return product(x, kernel[0, 0])
     padding = dilation * (kernel.shape[0] // 2)
@@ -121,13 +123,13 @@ def blocked_kernel_gradient(
     size: int,
     dilation: int,
 ) -> Float[jax.Array, "{size} {size} C F"]:
-    """Gradient of `conv2d` by its kernel, summed over blocks of rows.
+    """Computes the gradient of `conv2d` with respect to its kernel, over blocks of rows.
 
     Args:
         x: `[B, R, A, C]` input of the convolution.
-        grad: `[B, R, A, F]` gradient by its output.
-        size: Taps k per axis.
-        dilation: Distance of taps in bins.
+        grad: `[B, R, A, F]` gradient with respect to the output.
+        size: Kernel size k per axis.
+        dilation: Dilation of the kernel in bins.
 
     Returns:
         `[k, k, C, F]` in the dtype of `x`, accumulated in float32.
@@ -136,10 +138,11 @@ def blocked_kernel_gradient(
     padding = dilation * (size // 2)
     num_blocks = -(-r // max(1, _BLOCK_BINS // a))
     rows = -(-r // num_blocks)
-    # Rows that fill up the last block are zero and add nothing.
+    # The last block is padded with rows of zeros, which do not change the sum.
     fill = num_blocks * rows - r
     x = jnp.pad(x, ((0, 0), (0, fill), (0, 0), (0, 0)))
-    # The product wants bins innermost in its left side: turned around once, row by row.
+    # The left operand of the product needs bins innermost, so the gradient is transposed
+    # once here.
     grad = jnp.pad(
         grad.swapaxes(2, 3), ((0, 0), (padding, padding + fill), (0, 0), (0, 0))
     )
@@ -149,7 +152,7 @@ def blocked_kernel_gradient(
         image, start = i // num_blocks, i % num_blocks * rows
         block = jax.lax.dynamic_slice(x, (image, start, 0, 0), (1, rows, a, c))[0]
         block = jnp.pad(block, ((0, 0), (padding, padding), (0, 0)))
-        # Taps along azimuth shift the map, those along range the gradient's whole rows.
+        # Taps along azimuth shift the map; taps along range shift rows of the gradient.
         taps = jnp.concatenate([block[:, o : o + a] for o in offsets], -1)
         turned = [
             jax.lax.dynamic_slice(

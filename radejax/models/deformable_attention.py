@@ -1,15 +1,15 @@
-"""Attention that samples a few learned places of a map around a reference point.
+"""Deformable attention, which samples a map at learned offsets from reference points.
 
-DinoRADE's queries of one radar bin are multiples of its feature, and their results are
-averaged. Therefore linear layers run once per bin, the average is taken while sampling,
-and the output projection after it, which is ten times less work than attention for
-every query. With one query per bin, scale 1 and weight 1 this is Deformable DETR's
-attention to one map.
+In DinoRADE, the queries of a radar bin are multiples of the bin's feature, and the results
+of the queries are averaged. The linear layers are therefore computed once per bin, and the
+output projection after the average. With ten queries per bin, this is ten times less work
+than attention for every query. With one query per bin, scale 1 and weight 1, the module
+equals Deformable DETR's attention to one map.
 
-Bins are sampled in chunks, and the backward pass samples again, so that memory depends
-on the chunk and not on the number of queries. Locations are (x, y) with 0..1 from edge
-to edge of the map; the center of the top-left pixel is at half a pixel, and samples
-outside the map read zero.
+Bins are sampled in chunks, and the backward pass samples again, so that the memory in use
+depends on the chunk size and not on the number of queries. Locations are (x, y) in 0..1
+from edge to edge of the map, so the center of the top-left pixel is half a pixel from
+either edge. Samples outside the map are zero.
 
 References:
     Zhu et al., Deformable DETR, arXiv:2010.04159.
@@ -35,14 +35,14 @@ _CHUNK_SIZES = {"cpu": 448, "default": 8192}
 
 
 class Linear(nn.Module):
-    """Linear layer, `[..., C]` -> its product `[..., C']` and its bias `[C']` apart.
+    """Linear layer that returns its product `[..., C']` and its bias `[C']` separately.
 
     Attributes:
         features: Output channels C'.
         kernel_init: Initializer of the kernel.
         bias_init: Initializer of the bias.
         dtype: Dtype of the product.
-        precision: Of the product, as in `jax.lax.dot`.
+        precision: Precision of the product, as in `jax.lax.dot`.
     """
 
     features: int
@@ -62,14 +62,14 @@ class Linear(nn.Module):
 
 
 class DeformableAttention(nn.Module):
-    """Multi-head deformable cross-attention with its four linear layers.
+    """Multi-head deformable cross-attention, including its four linear layers.
 
     Attributes:
         features: Channels C of queries, values and output.
         num_heads: Attention heads; must divide C.
         num_points: Samples per head and query.
-        chunk_size: Bins at a time; 0 chooses by platform.
-        dtype: Dtype of values and output; locations and weights are float32.
+        chunk_size: Bins per chunk; 0 selects a default for the platform.
+        dtype: Dtype of values and output; locations and weights are at least float32.
     """
 
     features: int
@@ -87,20 +87,20 @@ class DeformableAttention(nn.Module):
         query_weights: Float[jax.Array, "#B N E"],
         value: Float[jax.Array, "B H W C"],
     ) -> Float[jax.Array, "B N C"]:
-        """Mean attention over the E queries `scale * feature` of each bin.
+        """Computes the weighted sum of the attention of each bin's queries.
 
         Args:
-            feature: `[B, N, C]`.
-            scale: `[B, N, E]`; 0 for a query that is zeroed.
-            reference: `[B or 1, N, E, 2]` points in 0..1.
-            query_weights: `[B or 1, N, E]` weights of the mean.
-            value: `[B, H, W, C]`.
+            feature: `[B, N, C]` features of the bins.
+            scale: `[B, N, E]` factors; query e of bin n is `scale[n, e] * feature[n]`.
+            reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
+            query_weights: `[B or 1, N, E]` weights of the queries in the sum.
+            value: `[B, H, W, C]` map to sample.
 
         Returns:
-            `[B, N, C]`: the weighted sum of the attention of the queries.
+            `[B, N, C]` attention of the bins.
         """
         heads, points = self.num_heads, self.num_points
-        # Where to look needs all its digits, whatever the dtype of the features.
+        # Sampling locations need full precision, whatever the dtype of the features.
         place = functools.partial(
             Linear,
             precision="highest",
@@ -128,13 +128,14 @@ class DeformableAttention(nn.Module):
             logit_bias.reshape(heads, points),
             chunk_size=self.chunk_size,
         )  # [B, N, heads, D]
-        # The projection is linear: once per bin, its bias as often as the mean counts.
+        # As the projection is linear, it is applied to the sum over the queries, with the
+        # bias multiplied by the sum of their weights.
         out, bias = linear(name="output_proj")(out.reshape(*batch, -1))
         total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
         return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
     def _ring(self, key: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> Any:
-        """Heads look in different directions, point i at distance i + 1."""
+        """Initializes the offsets: one direction per head, point i at i + 1 pixels."""
         del key
         angle = 2 * math.pi * np.arange(self.num_heads) / self.num_heads
         way = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -159,25 +160,26 @@ def lifted_attention(
     *,
     chunk_size: int,
 ) -> Float[jax.Array, "B N heads D"]:
-    """Weighted mean over a bin's E queries of their attention, per head.
+    """Computes the weighted sum of the attention of each bin's E queries, per head.
 
-    Query e of bin n is `scale[n, e]` times the bin's feature, so its offsets are
-    `scale * offsets + offset_bias` and its attention logits likewise, where `offsets`
-    and `logits` are linear images of the feature without bias.
+    Query e of bin n is `scale[n, e]` times the bin's feature. Its offsets are therefore
+    `scale * offsets + offset_bias` and its attention logits `scale * logits + logit_bias`,
+    where `offsets` and `logits` are linear functions of the feature, without bias.
 
     Args:
-        value: `[B, H, W, heads, D]`.
-        offsets: `[B, N, heads, P, 2]` in pixels (x, y).
-        logits: `[B, N, heads, P]`.
-        scale: `[B, N, E]`.
+        value: `[B, H, W, heads, D]` map to sample.
+        offsets: `[B, N, heads, P, 2]` sampling offsets in pixels (x, y), without bias.
+        logits: `[B, N, heads, P]` attention logits, without bias.
+        scale: `[B, N, E]` factors of the queries.
         reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
-        query_weights: `[B or 1, N, E]` weights of the mean.
-        offset_bias: `[heads, P, 2]`.
-        logit_bias: `[heads, P]`.
-        chunk_size: Bins at a time; 0 chooses by the platform that it is compiled for.
+        query_weights: `[B or 1, N, E]` weights of the queries in the sum.
+        offset_bias: `[heads, P, 2]` bias of the offsets.
+        logit_bias: `[heads, P]` bias of the logits.
+        chunk_size: Bins per chunk; 0 selects a default for the platform that the function
+            is compiled for.
 
     Returns:
-        `[B, N, heads, D]`.
+        `[B, N, heads, D]` attention of the bins.
     """
     b = value.shape[0]  # symbolic in exports
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
@@ -185,7 +187,7 @@ def lifted_attention(
 
     def sample(arrays: tuple[jax.Array, ...]) -> jax.Array:
         value, offsets, logits, scale, *own = arrays
-        # Geometry is per sample, or one for the whole batch.
+        # The geometry is either per sample or shared by the whole batch.
         geometry = own or (reference[0], query_weights[0])
 
         def head(arrays: tuple[jax.Array, ...]) -> jax.Array:
@@ -200,22 +202,23 @@ def lifted_attention(
         arrays += tuple(
             jnp.broadcast_to(x, (b, *x.shape[1:])) for x in (reference, query_weights)
         )
-    if b == 1:  # a loop of one step is still a loop to the compiler
+    if b == 1:  # the compiler does not remove a loop of one step
         return jnp.moveaxis(sample(tuple(x[0] for x in arrays)), 0, 1)[None]
     return jnp.moveaxis(jax.lax.map(sample, arrays), 1, 2)
 
 
 # One sample, one head ----------------------------------------------------------------
 #
-# The backward pass is written out so that the gradient of the map is added up in
-# place; transposing the loop would allocate and add a whole map per chunk.
+# The backward pass is written by hand, so that the gradient of the map is accumulated in
+# place. The automatic transpose of the loop would allocate and add a whole map per chunk.
 
 
 def _by_chunk(function: Callable[..., Any], chunk_size: int, *arrays: Any) -> Any:
-    """`function(chunk_size, *arrays)`; a chunk size of 0 is the platform's.
+    """Calls `function(chunk_size, *arrays)`, where 0 stands for the platform's chunk size.
 
-    Chosen where nothing is differentiated: a program lowered for another platform than
-    the tracing machine's gets that platform's.
+    The platform is that for which the program is lowered, which may differ from the tracing
+    machine's. The forward and the backward pass call this separately, because the choice of
+    the platform is not differentiated.
     """
     if chunk_size:
         return function(chunk_size, *arrays)
@@ -230,8 +233,11 @@ def _by_chunk(function: Callable[..., Any], chunk_size: int, *arrays: Any) -> An
 def _lifted_head(
     chunk_size: int, value: jax.Array, per_bin: Arrays, biases: Arrays
 ) -> jax.Array:
-    """`[N, D]` of one head: value `[H, W, D]`; offsets, logits, scale, reference and
-    weights of the queries, and the two biases as in `lifted_attention`."""
+    """Computes the attention `[N, D]` of one head of one sample.
+
+    `value` is `[H, W, D]`, `per_bin` contains offsets, logits, scale, reference and
+    query weights, and `biases` the two biases, all as in `lifted_attention`.
+    """
     return _by_chunk(_head_forward, chunk_size, value, per_bin, biases)
 
 
@@ -303,7 +309,7 @@ _lifted_head.defvjp(_lifted_head_forward, _lifted_head_backward)
 def _lifted_samples(
     size: tuple[int, ...], per_bin: Arrays, biases: Arrays
 ) -> tuple[Float[jax.Array, "n E P 4"], Int[jax.Array, "n E P 4"]]:
-    """Shares and pixel indices of a chunk of n bins."""
+    """Returns the weights and indices of the pixels that a chunk of n bins samples."""
     offsets, logits, scale, reference, query_weights = per_bin
     offset_bias, logit_bias = biases
     height, width = size
@@ -326,13 +332,16 @@ def _corners(
     height: int,
     width: int,
 ) -> tuple[Int[jax.Array, "*places 4"], Float[jax.Array, "*places 4"]]:
-    """Row-major indices and bilinear shares `[..., 4]` of the pixels around a place.
+    """Returns indices and bilinear weights `[..., 4]` of the four pixels around a location.
 
     Args:
-        x: `[...]` in pixels, 0 at the center of the first.
-        y: `[...]` likewise.
-        height: Of the map.
-        width: Of the map.
+        x: `[...]` columns in pixels, 0 at the center of the first.
+        y: `[...]` rows in pixels, 0 at the center of the first.
+        height: Rows of the map.
+        width: Columns of the map.
+
+    Returns:
+        Row-major indices, and weights that are 0 for pixels outside the map.
     """
     x_low, y_low = jnp.floor(x), jnp.floor(y)
     x_part, y_part = x - x_low, y - y_low
@@ -345,29 +354,32 @@ def _corners(
                 y_part if step_y else 1 - y_part
             )
             share.append(jnp.where(is_inside, part, 0.0))
-            # Outside the share is zero and any index will do. NaN is outside, too:
-            # no index may ever lie beyond the map, see `_rows`.
+            # Outside the map, the weight is zero and the index is set to 0, because
+            # `_rows` requires valid indices. NaN counts as outside.
             place = jnp.where(is_inside, row * width + column, 0.0)
             index.append(place.astype(jnp.int32))
     return jnp.stack(index, -1), jnp.stack(share, -1)
 
 
 def wide_dtype(dtype: Any) -> Any:
-    """Dtype for sums and locations: float32 for half precision, else unchanged."""
+    """Returns the dtype for sums and locations: float32 for half precision, else `dtype`."""
     return jnp.promote_types(dtype, jnp.float32)
 
 
 def _rows(
     pixels: Float[jax.Array, "pixels D"], index: Int[jax.Array, "n ..."]
 ) -> Float[jax.Array, "n _ D"]:
-    """Pixels by indices, `[n, E P 4, D]`."""
-    # Indices are in the map by construction; not checking them again is faster.
+    """Returns the pixels at the given indices as `[n, E P 4, D]`."""
+    # `_corners` returns only indices inside the map, and a check would cost time.
     rows = pixels.at[index.reshape(-1)].get(mode="promise_in_bounds")
     return rows.reshape(len(index), -1, pixels.shape[-1])
 
 
 def _to_chunks(arrays: Any, size: int) -> Any:
-    """`[N, ...]` -> `[chunks, size, ...]`, padded with zeros; one chunk if N is less."""
+    """Splits `[N, ...]` into `[chunks, size, ...]`, padded with zeros.
+
+    If N is less than `size`, there is one chunk of N.
+    """
     bins = len(jax.tree.leaves(arrays)[0])
     size = min(size, bins)
 

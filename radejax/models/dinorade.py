@@ -1,4 +1,4 @@
-"""DinoRADE: a radar detector that looks up its queries in a camera image.
+"""DinoRADE, a radar-camera detector whose radar queries sample features of the image.
 
 References:
     Leitgeb et al., DinoRADE, arXiv:2604.08074.
@@ -33,16 +33,18 @@ _SCOPE = f"{IMAGE_BACKBONE}/"
 
 
 class DinoRade(RadeNet, kw_only=True):
-    """Radar-camera detector: a RADE-Net whose features are fused with an image.
+    """Radar-camera detector that fuses the features of a RADE-Net with those of an image.
 
     Attributes:
         vit: The image transformer, or None for a ResNet-50.
-        fusion: Fusion of the two maps; takes groups, dtype and remat of this module.
-        query_grid: Centers of the radar queries.
-        image_size: Height and width of the images.
-        freeze: No gradients through the image backbone.
-        resnet_width: Channels of the ResNet's stem, where there is one.
-        standardize_image: ImageNet's mean and deviation; False scales to [0, 1].
+        fusion: Fusion of radar and camera map. Its `num_groups`, `dtype` and `remat` are
+            replaced by those of this module.
+        query_grid: Axes of the centers of the radar queries.
+        image_size: Height and width of the images in pixels.
+        freeze: Whether to stop gradients at the output of the image backbone.
+        resnet_width: Channels of the ResNet's stem; not used with a `vit`.
+        standardize_image: Whether to normalize images by ImageNet's mean and standard
+            deviation; if False, they are scaled to [0, 1].
     """
 
     vit: ViT | None
@@ -107,25 +109,28 @@ class DinoRade(RadeNet, kw_only=True):
         camera: Camera | ReferencePoints | None = None,
         train: bool = False,
     ) -> DetectionMaps:
-        """Predicts from projections and images.
+        """Predicts detection maps from projections and images.
 
-        Frames without an image (`camera.is_valid` or `has_image` False) and calls
-        without images or camera are predicted from the radar only.
+        For frames without an image (`camera.is_valid` or `camera.has_image` is False), and
+        if `image` and `camera` are None, only the radar is used.
 
         Args:
-            projection: `[B, R, A, D+E]`, Doppler channels first; any float dtype.
-            image: `[B, H, W, 3]` uint8 RGB (floats: normalized already), or what
-                `embed` made of it, `[B, h, w, C]`.
-            camera: Where the cameras look: a batch of `Camera`, or reference points
-                computed before, one for all frames or one per frame.
-            train: Batch statistics and dropout instead of the running ones.
+            projection: `[B, R, A, D+E]` projections with the Doppler channels first, in
+                any float dtype.
+            image: `[B, H, W, 3]` RGB images, either uint8 or floats that are normalized
+                already; or their features `[B, h, w, C]` from `embed`.
+            camera: A `Camera`, or reference points that were computed before, for all
+                frames or for each.
+            train: Whether to use batch statistics and dropout instead of running
+                statistics.
 
         Returns:
-            Maps on the padded bins, or on the projection's if `crop_output`.
+            Maps on the padded bins, or on the projection's bins if `crop_output`.
 
         Raises:
-            UserError: The image has another size than `image_size`, or image and
-                camera do not fit together.
+            UserError: The projection has the wrong channels, the image has a size other
+                than `image_size`, only one of image and camera is given, or the reference
+                points do not match the projection.
         """
         padded = self._padded(projection)
         camera_map = reference = None
@@ -143,13 +148,16 @@ class DinoRade(RadeNet, kw_only=True):
         return self._maps(x, projection)
 
     def embed(self, image: Real[jax.Array, "B H W 3"]) -> Float[jax.Array, "B h w C"]:
-        """What the image backbone makes of images: `__call__` takes it in their place.
+        """Computes the image backbone's features, which `__call__` accepts instead of images.
 
         Args:
-            image: `[B, H, W, 3]` uint8 RGB, or floats normalized already.
+            image: `[B, H, W, 3]` RGB images, uint8 or floats that are normalized already.
 
         Returns:
-            `[B, h, w, C]` float32: patch tokens, or the ResNet's third stage.
+            `[B, h, w, C]` float32 patch tokens, or output of the ResNet's third stage.
+
+        Raises:
+            UserError: The image has a size other than `image_size`.
         """
         if tuple(image.shape[1:]) != (*self.image_size, 3):
             raise UserError(
@@ -174,7 +182,7 @@ class DinoRade(RadeNet, kw_only=True):
 
     @nn.nowrap
     def is_frozen(self, name: str) -> bool:
-        """Whether a parameter, "image_backbone/...", is not to be trained."""
+        """Returns whether a parameter, given as a path like "image_backbone/...", is frozen."""
         return self.freeze and name.startswith(_SCOPE)
 
     def _reference(

@@ -1,8 +1,8 @@
-"""Refines the radar map with what the camera sees where each radar query looks.
+"""Fusion of the radar map with camera features at the projections of the radar queries.
 
 References:
-    DinoRADE, sections 3.3 to 3.5. Where the released code differs from the paper, both
-    are there: `weighting`, `gate`, `out_of_view`.
+    DinoRADE, sections 3.3 to 3.5. Where the released code differs from the paper, the
+    options `weighting`, `gate` and `out_of_view` select either.
 """
 
 from __future__ import annotations
@@ -31,25 +31,29 @@ GateKind = Literal["channel", "bin"]
 
 
 class Fusion(nn.Module):
-    """Weighted lifting, deformable attention to the camera, gated sum with the radar.
+    """Weighted lifting, deformable attention to the camera map, and gated sum with the radar.
 
     Attributes:
-        num_heads: Heads of the attention.
+        num_heads: Number of attention heads.
         num_points: Samples per head and query.
-        num_elevation: Elevation segments E.
-        weighting: Elevation weights: "mlp" (paper), "cnn" (released) or "off".
-        gate: "channel": one number per channel that weighs the radar (paper); "bin":
-            one per bin that weighs the camera (released).
-        out_of_view: Queries outside the image: "drop" leaves them out of the mean, and a
-            bin without any keeps its radar feature; "official" zeroes them, but they
-            still attend at the image border and count.
-        necks: A dilated neck on each map before the attention. The released settings
-            have them, and only with them are there the paper's 31 M parameters.
-        dropout: Rate on the fused map.
+        num_elevation: Number E of elevation segments.
+        weighting: Network for the elevation weights, "mlp" (paper), "cnn" (released code)
+            or "off"; see `WeightingNetwork`.
+        gate: "channel" predicts a weight of the radar for every channel of a bin, as in
+            the paper. "bin" predicts one weight of the camera per bin, as in the released
+            code.
+        out_of_view: Treatment of queries outside the image. "drop" excludes them from the
+            mean over a bin's queries, and a bin without valid queries keeps its radar
+            feature. "official" sets them to zero, but they still sample the image border
+            and enter the mean.
+        necks: Whether to apply a dilated neck to each map before the attention. The
+            released settings have these necks, and the paper's 31 M parameters include
+            them.
+        dropout: Dropout rate of the fused map.
         num_groups: Groups of the necks' normalizations.
-        chunk_size: Bins attended at a time; 0 chooses by platform.
+        chunk_size: Bins per chunk of the attention; 0 selects a default for the platform.
         dtype: Dtype of the computation and the output.
-        remat: Recompute the necks in the backward pass.
+        remat: Recompute the necks in the backward pass instead of storing their blocks.
     """
 
     num_heads: int = 4
@@ -89,20 +93,21 @@ class Fusion(nn.Module):
         *,
         train: bool = False,
     ) -> Map:
-        """Fuses the maps of a batch.
+        """Fuses radar and camera maps.
 
-        Sows the camera's share of the fused map, averaged over channels, as
-        intermediate "camera_share" `[B, R, A]`.
+        The weight of the camera in the fused map, averaged over channels, is sown as
+        the intermediate "camera_share" `[B, R, A]`.
 
         Args:
             radar: `[B, R, A, C]` features of the radar backbone.
             elevation: `[B, R, A, D]` elevation channels of the projection.
             camera: `[B, h, w, C]` camera map, or None to use the radar only.
-            reference: Places of the R x A x E queries in the image.
-            train: Whether dropout drops; needs the "dropout" random stream.
+            reference: Reference points of the R x A x E queries, or None to use the radar
+                only.
+            train: Whether to apply dropout, which needs the "dropout" random stream.
 
         Returns:
-            `[B, R, A, C]`.
+            `[B, R, A, C]` fused map.
         """
         b, r, a, c = radar.shape
         if self.necks:
@@ -139,7 +144,7 @@ class Fusion(nn.Module):
         return DilatedNeck(self.num_groups, self.dtype, self.remat, name=name)
 
     def _camera_share(self, radar: Map, seen: Map) -> Float[jax.Array, "B R A #C"]:
-        """Weight of the camera, of every channel or of all."""
+        """Returns the weight of the camera per bin, for every channel or for all together."""
         c = radar.shape[-1]
         x = jnp.concatenate([radar, seen], -1)
         if self.gate == "bin":
@@ -151,7 +156,7 @@ class Fusion(nn.Module):
     def _has_camera(
         self, reference: ReferencePoints, mean: Float[jax.Array, "B R A E"]
     ) -> Bool[jax.Array, "_ R A 1"]:
-        """True where a bin has anything to take from the camera."""
+        """Returns True for bins with queries in the mean, in frames that have an image."""
         has_camera = mean.sum(-1, keepdims=True) > 0
         if reference.has_image is None:
             return has_camera

@@ -1,12 +1,12 @@
-"""Necks, which widen the receptive field, and heads, which predict.
+"""Necks, which enlarge the receptive field, and heads, which predict the maps.
 
-Heads are decoupled: a class heatmap and eight box parameters per bin.
+Separate heads predict a class heatmap and eight box parameters per bin.
 
 References:
-    RADE-Net, sections III-D and III-E, and equation (12). "Sigmoid after each
-    convolution" there is a slip: the released code has GroupNorm and SiLU between
-    convolutions and one sigmoid at the end of the heatmap head, which lives in losses
-    and decoding here.
+    RADE-Net, sections III-D and III-E, and equation (12). The paper's "Sigmoid after each
+    convolution" is an error: the released code has GroupNorm and SiLU between convolutions
+    and one sigmoid at the end of the heatmap head. Here, losses and decoding apply that
+    sigmoid.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from radejax.models.layers import Conv, ConvGNSiLU, Features, GroupNorm, Map
 
 
 class DilatedResidual(nn.Module):
-    """Dilated `ConvGNSiLU`, convolution, normalization, plus the input, SiLU.
+    """Dilated `ConvGNSiLU`, convolution and normalization, with a residual, then SiLU.
 
     Attributes:
-        dilation: Distance of the first convolution's taps in bins.
+        dilation: Dilation of the first convolution in bins.
         num_groups: Groups of the normalizations.
         dtype: Dtype of the computation and the output.
     """
@@ -52,7 +52,7 @@ class DilatedResidual(nn.Module):
 
 
 class Neck(nn.Module):
-    """What every neck has; it keeps shape and width.
+    """Base class of the necks, which keep the shape of a map.
 
     Attributes:
         num_groups: Groups of the normalizations.
@@ -66,7 +66,7 @@ class Neck(nn.Module):
 
 
 class DilatedNeck(Neck):
-    """Three `DilatedResidual`, of dilation 1, 2 and 3."""
+    """Three `DilatedResidual` blocks with dilations 1, 2 and 3."""
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
@@ -77,7 +77,7 @@ class DilatedNeck(Neck):
 
 
 class PlainNeck(Neck):
-    """Three `ConvGNSiLU`."""
+    """Three `ConvGNSiLU` blocks."""
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
@@ -95,14 +95,14 @@ NUM_BOX_PARAMS = 8
 
 
 class Head(nn.Module):
-    """What every head has: `[B, R, A, C]` -> `[B, R, A, features]`, float32.
+    """Base class of the heads, `[B, R, A, C]` -> `[B, R, A, features]` in float32.
 
     Attributes:
         features: Output channels.
         num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
-        initial_bias: What the output's initial biases scatter around.
+        initial_bias: Constant added to the initial biases of the last convolution.
     """
 
     features: int
@@ -112,7 +112,7 @@ class Head(nn.Module):
     initial_bias: float = 0.0
 
     def convolve(self, x: Features, widths: Sequence[int]) -> Features:
-        """`ConvGNSiLU` of these widths, then a 1x1 convolution in float32."""
+        """Applies `ConvGNSiLU` blocks of the given widths and a 1x1 convolution in float32."""
         block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
         for i, width in enumerate(widths, 1):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"conv_{i}")(x)
@@ -121,7 +121,7 @@ class Head(nn.Module):
 
 
 class ExpandedHead(Head):
-    """Three blocks of the input's width."""
+    """Head with three blocks that have as many channels as the input."""
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
@@ -129,7 +129,7 @@ class ExpandedHead(Head):
 
 
 class DefaultHead(Head):
-    """One block of half the input's width and at most 64 channels."""
+    """Head with one block that has half as many channels as the input, at most 64."""
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
@@ -141,16 +141,16 @@ HEADS: dict[str, type[Head]] = {"expanded": ExpandedHead, "default": DefaultHead
 
 
 class Heads(nn.Module):
-    """Features `[B, R, A, C]` -> `DetectionMaps`, float32.
+    """Heatmap head and box head, features `[B, R, A, C]` -> `DetectionMaps` in float32.
 
     Attributes:
         num_classes: Channels of the heatmap.
-        kind: Of `HEADS`.
+        kind: Name of the heads' type in `HEADS`.
         num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
-        heatmap_prior: Confidence that an untrained model gives every bin: 0.5 as
-            released; less (CenterNet: 0.1) starts nearer to a mostly empty scene.
+        heatmap_prior: Approximate score of every bin in an untrained model, 0.5 in the
+            released code. A lower value (0.1 in CenterNet) suits mostly empty scenes.
     """
 
     num_classes: int

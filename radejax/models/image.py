@@ -1,12 +1,12 @@
-"""From images to camera maps: normalization, ResNet-50, and the necks of both backbones.
+"""Image normalization, ResNet-50, and the necks that compute camera maps for both backbones.
 
-Images are normalized inside the jitted model, as frames travel as uint8. The ResNet's trunk
-(stem and the first three stages) is frozen and its last stage trained, so they are modules
-of their own; `radejax.weights.image_backbone` reads both from torchvision's file.
+Images are transferred as uint8 and normalized inside the jitted model. The trunk of the
+ResNet (stem and first three stages) is frozen and its last stage is trained, so they are
+separate modules. `radejax.weights.image_backbone` reads both from torchvision's file.
 
 References:
-    DinoRADE, section 3.2; layers of the neck as in the released code. He et al., Deep
-    residual learning, arXiv:1512.03385; strides as in torchvision.
+    DinoRADE, section 3.2. The layers of the neck are those of the released code.
+    He et al., Deep residual learning, arXiv:1512.03385. Strides are those of torchvision.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ _IMAGENET = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
 def normalize(
     image: Real[jax.Array, "B H W 3"], *, standardize: bool = True
 ) -> Float[jax.Array, "B H W 3"]:
-    """Colors to the scale that ImageNet-trained backbones expect.
+    """Normalizes images to the scale that ImageNet-trained backbones expect.
 
     Args:
-        image: `[B, H, W, 3]` RGB: uint8 in 0..255, or floats, which are taken as
-            normalized already and returned as they are.
-        standardize: Subtract ImageNet's mean and divide by its deviation. The
-            released DinoRADE only scales to [0, 1] for its ResNet.
+        image: `[B, H, W, 3]` RGB, either uint8 in 0..255 or floats. Floats are assumed to
+            be normalized and are returned unchanged.
+        standardize: Whether to subtract ImageNet's mean and divide by its standard
+            deviation. The released DinoRADE only scales to [0, 1] for its ResNet.
 
     Returns:
-        `[B, H, W, 3]` float32, or the given floats.
+        `[B, H, W, 3]` float32 for uint8 input, otherwise the input.
     """
     if jnp.issubdtype(image.dtype, jnp.floating):
         return image
@@ -55,16 +55,17 @@ def normalize(
     return (scaled - mean) / std
 
 
-# Which of the four taps even and odd outputs see, ordered along the input.
+# Kernel taps that contribute to even (row 0) and odd (row 1) outputs, in input order.
 _PHASE_TAPS = np.array([[3, 1], [2, 0]])
 
 
 class TransposedConv(nn.Module):
     """Transposed 4x4 convolution, stride 2, padding 1: `[B,H,W,C]` -> `[B,2H,2W,C']`.
 
-    Every output sees 2x2 inputs through one of four kernels, by its parity: one matrix
-    product of four neighbors to four times the channels, interleaved. As a convolution,
-    of a dilated input or to four times the channels, its weight gradient alone takes
+    Every output depends on 2x2 inputs through one of four kernels, selected by the parity
+    of its row and column. All four are therefore computed by one matrix product, from the
+    channels of four neighbors to 4 C' channels, which are then interleaved. With a
+    convolution instead, of a dilated input or to 4 C' channels, the weight gradient takes
     seconds on a CPU.
 
     Attributes:
@@ -80,7 +81,7 @@ class TransposedConv(nn.Module):
         self, x: Float[jax.Array, "B H W _"]
     ) -> Float[jax.Array, "B 2*H 2*W {self.features}"]:
         b, height, width, channels = x.shape
-        # torch counts the fan-in of a transposed convolution over its outputs.
+        # torch computes the fan-in of a transposed convolution from its output channels.
         init = uniform_fan_in(16 * self.features)
         kernel = self.param("kernel", init, (4, 4, channels, self.features))
         bias = self.param("bias", init, (self.features,)).astype(self.dtype)
@@ -105,8 +106,9 @@ class TransposedConv(nn.Module):
 class CameraNeck(nn.Module):
     """Image tokens `[B, h, w, C]` -> camera map `[B, 4h, 4w, features]`.
 
-    A linear layer, two doublings by transposed convolutions and a 3x3 convolution, the
-    last three with batch normalization and ReLU.
+    The layers are a linear layer, two transposed convolutions that each double the
+    resolution, and a 3x3 convolution. The convolutions are each followed by batch
+    normalization and ReLU.
 
     Attributes:
         features: Output channels.
@@ -124,9 +126,10 @@ class CameraNeck(nn.Module):
 
         Args:
             tokens: `[B, h, w, C]` patch tokens.
-            has_image: `[B]` bool; frames without image stay out of the statistics.
-            train: Normalize by the batch and update the running statistics
-                (collection "batch_stats").
+            has_image: `[B]` bool, False for frames that are excluded from the batch
+                statistics because they have no image.
+            train: Whether to normalize by batch statistics and update the running
+                statistics (collection "batch_stats").
         """
         x = Dense(self.features, dtype=self.dtype, name="proj")(tokens)
         layers: dict[str, Any] = {"up_1": TransposedConv, "up_2": TransposedConv}
@@ -138,18 +141,19 @@ class CameraNeck(nn.Module):
 
 
 def counted_frames(has_image: HasImage) -> Bool[jax.Array, "B 1 1 1"]:
-    """Mask of the frames that enter batch statistics.
+    """Returns the mask of the frames that enter the batch statistics.
 
-    A batch without any image must not divide by zero; its map is not used.
+    In a batch without any image, all frames enter, to avoid a division by zero. Its camera
+    map is not used.
     """
     return (has_image | ~has_image.any())[:, None, None, None]
 
 
 def batch_norm(name: str, dtype: Any, train: bool) -> nn.BatchNorm:
-    """Batch normalization as torch has it by default (momentum 0.1, epsilon 1e-5).
+    """Returns batch normalization with torch's defaults (momentum 0.1, epsilon 1e-5).
 
-    torch's running variance is the unbiased one; over a camera map they are equal to
-    five digits.
+    Unlike here, torch's running variance is unbiased. Over a camera map, the two variances
+    agree to five digits.
     """
     return nn.BatchNorm(
         use_running_average=not train,
@@ -166,9 +170,9 @@ STRIDE = 16
 
 
 class FrozenBatchNorm(nn.Module):
-    """Batch normalization by fixed statistics, which are parameters here.
+    """Batch normalization with fixed statistics, which are stored as parameters.
 
-    So a frozen backbone is all in one collection, and nothing updates it.
+    A frozen backbone thus has only parameters, and no forward pass updates any of them.
 
     Attributes:
         dtype: Dtype of the output.
@@ -202,13 +206,13 @@ def _normalized(
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1 convolutions plus the input; the 3x3 one has the stride.
+    """Residual block of 1x1, 3x3 and 1x1 convolutions; the 3x3 convolution has the stride.
 
     Attributes:
-        features: Channels inside; the output has four times as many.
-        stride: Step of the block.
-        is_first: The first block of a stage projects its input.
-        frozen: Fixed statistics, else batch normalization.
+        features: Channels of the first two convolutions; the output has four times as many.
+        stride: Stride of the block.
+        is_first: Whether the block is the first of its stage, which projects its input.
+        frozen: Whether to normalize with fixed statistics instead of batch normalization.
         dtype: Dtype of the computation and the output.
     """
 
@@ -235,13 +239,14 @@ class Bottleneck(nn.Module):
 
 
 class ResNetTrunk(nn.Module):
-    """Stem and first three stages: maps of a 16th of the size, rounded up.
+    """Stem and first three stages of a ResNet, with a stride of 16 in total.
 
     Attributes:
         width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
-        depths: Blocks of the three stages.
-        frozen: Fixed statistics, as in a detector; else batch normalization, to learn
-            the weights of such a trunk (`frozen_params`).
+        depths: Number of blocks in each of the three stages.
+        frozen: Whether to normalize with fixed statistics, as in a detector. Otherwise the
+            trunk has batch normalization, for training the weights that `frozen_params`
+            converts.
         dtype: Dtype of the computation; the output is float32.
     """
 
@@ -271,19 +276,19 @@ class ResNetTrunk(nn.Module):
 
 
 def frozen_params(variables: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameters of a frozen trunk from the variables of one that is not."""
+    """Converts the variables of a trunk with `frozen=False` to parameters of a frozen one."""
     flat = flax.traverse_util.flatten_dict(dict(variables["params"]))
     stats = flax.traverse_util.flatten_dict(dict(variables["batch_stats"]))
     return flax.traverse_util.unflatten_dict(flat | stats)
 
 
 class ResNetNeck(nn.Module):
-    """Last stage and a 1x1 convolution: maps of half the size, rounded up.
+    """Last stage of a ResNet, with stride 2, and a 1x1 convolution.
 
     Attributes:
         features: Output channels.
         width: Channels of the ResNet's stem, 64 in ResNet-50.
-        depth: Blocks of the stage.
+        depth: Number of blocks in the stage.
         dtype: Dtype of the computation and the output.
     """
 
@@ -296,7 +301,7 @@ class ResNetNeck(nn.Module):
     def __call__(
         self, x: Tokens, has_image: HasImage, *, train: bool = False
     ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
-        """As `CameraNeck`: frames without an image do not enter the statistics."""
+        """Runs the neck; the arguments are those of `CameraNeck`, with x the trunk's output."""
         mask = counted_frames(has_image)
         for i in range(self.depth):
             x = Bottleneck(

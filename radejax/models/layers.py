@@ -1,8 +1,8 @@
 """Convolution, normalization and resampling layers with torch's default initializers.
 
-Maps are `[B, R, A, C]`, channels last. Parameters are float32; `dtype` is the dtype
-of the computation and of the output. Statistics of the normalization are float32 in
-any dtype. Every layer here equals its torch counterpart to rounding.
+Maps are `[B, R, A, C]`, channels last. Parameters are float32; `dtype` is the dtype of the
+computation and of the output. Normalization statistics are float32 for every `dtype`. Every
+layer equals its torch counterpart up to rounding.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ Features = Float[jax.Array, "B R A _"]
 
 
 def uniform_fan_in(fan_in: int) -> Initializer:
-    """torch's default for weights and biases: uniform within 1 / sqrt(fan_in).
+    """Returns torch's default initializer, uniform within plus or minus 1 / sqrt(fan_in).
 
-    Kaiming-uniform with a = sqrt(5), as `torch.nn.Conv2d` and `Linear` have it.
+    `torch.nn.Conv2d` and `Linear` use it for weights (as Kaiming-uniform with a = sqrt(5))
+    and for biases.
     """
     bound = 1.0 / math.sqrt(fan_in)
 
     def init(key: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> jax.Array:
-        # The first numbers are the same however many are drawn: a few generators serve
-        # all shapes.
+        # The first numbers do not depend on how many are drawn. Rounding the count up
+        # therefore changes no weight, but lets many shapes share a compiled generator.
         size = math.prod(shape)
         count = max(2**14, 4 ** math.ceil(math.log(size, 4)))
         return _cut(jax.random.uniform(key, (count,), dtype, -bound, bound), shape)
@@ -44,20 +45,20 @@ def uniform_fan_in(fan_in: int) -> Initializer:
 
 @functools.partial(jax.jit, static_argnums=1)
 def _cut(numbers: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """The first of them in a shape."""
+    """Returns the first numbers in the given shape."""
     return numbers[: math.prod(shape)].reshape(shape)
 
 
 class Conv(nn.Module):
-    """Convolution padded by half its size, `[B, R, A, C]` -> `[B, r, a, C']`.
+    """Convolution padded by half the kernel's size, `[B, R, A, C]` -> `[B, r, a, C']`.
 
     Attributes:
         features: Output channels C'.
-        size: Taps per axis, odd. 1 is a matrix product.
-        dilation: Distance of taps in bins.
-        stride: Step per axis; needs a dilation of 1 if above 1.
-        use_bias: Add a vector per output channel.
-        initial_bias: What the initial biases scatter around.
+        size: Odd kernel size per axis; size 1 is computed as a matrix product.
+        dilation: Dilation of the kernel in bins.
+        stride: Stride per axis; a stride above 1 requires a dilation of 1.
+        use_bias: Whether to add a bias per output channel.
+        initial_bias: Constant added to the initial biases, which torch draws around 0.
         dtype: Dtype of the computation and the output.
     """
 
@@ -114,8 +115,9 @@ class Dense(nn.Module):
 class Upsample(nn.Module):
     """Transposed 2x2 convolution with stride 2, `[B, R, A, C]` -> `[B, 2R, 2A, C']`.
 
-    Taps do not overlap, so it is one matrix product and a reshape. As a dilated
-    convolution its weight gradient alone takes a second per frame on a CPU.
+    The outputs of neighboring inputs do not overlap, so the layer is computed as one matrix
+    product and a reshape. With a dilated convolution, the weight gradient takes a second
+    per frame on a CPU.
 
     Attributes:
         features: Output channels C'.
@@ -128,11 +130,11 @@ class Upsample(nn.Module):
     @nn.compact
     def __call__(self, x: Features) -> Float[jax.Array, "B 2*R 2*A {self.features}"]:
         b, r, a, c = x.shape
-        # torch counts the fan-in of a transposed convolution over its outputs.
+        # torch computes the fan-in of a transposed convolution from its output channels.
         init = uniform_fan_in(4 * self.features)
         kernel = self.param("kernel", init, (2, 2, c, self.features))
         bias = self.param("bias", init, (self.features,)).astype(self.dtype)
-        # Channels stay innermost: einsum's own order would turn the whole map around.
+        # Unlike einsum, this keeps channels innermost and does not transpose the whole map.
         matrix = kernel.astype(self.dtype).transpose(2, 0, 1, 3).reshape(c, -1)
         y = product(x.astype(self.dtype), matrix).reshape(b, r, a, 2, -1)
         y = y.swapaxes(2, 3).reshape(b, 2 * r, 2 * a, -1)
@@ -140,19 +142,19 @@ class Upsample(nn.Module):
 
 
 def max_pool(x: Map) -> Float[jax.Array, "B R//2 A//2 C"]:
-    """Maximum over 2x2 bins."""
+    """Returns the maximum over blocks of 2x2 bins."""
     b, r, a, c = x.shape
     return x.reshape(b, r // 2, 2, a // 2, 2, c).max((2, 4))
 
 
 class GroupNorm(nn.Module):
-    """Group normalization over bins and the channels of a group, then scale and bias.
+    """Group normalization over bins and the channels of a group, with scale and bias.
 
-    Sums run per channel first and are joined into groups after, so that the map is
-    read with channels innermost.
+    Sums are computed per channel and then combined into groups, so that the map is read
+    with channels innermost.
 
     Attributes:
-        num_groups: Groups of channels; must divide the channels.
+        num_groups: Number of groups; must divide the number of channels.
         dtype: Dtype of the output; statistics are float32.
     """
 
@@ -182,13 +184,13 @@ class GroupNorm(nn.Module):
 
 
 class ConvGNSiLU(nn.Module):
-    """Convolution, group normalization, SiLU; `[B, R, A, C]` -> `[B, R, A, C']`.
+    """Convolution, group normalization and SiLU, `[B, R, A, C]` -> `[B, R, A, C']`.
 
     Attributes:
         features: Output channels C'.
         num_groups: Groups of the normalization.
-        size: Taps per axis.
-        dilation: Distance of taps in bins.
+        size: Odd kernel size per axis.
+        dilation: Dilation of the kernel in bins.
         use_bias: Whether the convolution has a bias.
         dtype: Dtype of the computation and the output.
     """
@@ -215,9 +217,9 @@ class ConvGNSiLU(nn.Module):
 
 
 class DoubleConvResidual(nn.Module):
-    """Two `ConvGNSiLU` plus the input, which is added after the activation.
+    """Two `ConvGNSiLU` with a residual connection, which is added after the activation.
 
-    Where widths differ the input goes through a 1x1 convolution.
+    If the numbers of channels differ, the shortcut has a 1x1 convolution.
 
     Attributes:
         features: Output channels.

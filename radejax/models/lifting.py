@@ -1,8 +1,8 @@
-"""From radar bins to three-dimensional queries and their places in the image.
+"""Lifting of radar bins to three-dimensional queries with reference points in the image.
 
-A bin of the range-azimuth map becomes E queries, one per elevation segment. Each is a
-multiple of the bin's feature, by a weight learned from the elevation spectrum, and has
-a reference point: where its center appears in the camera image.
+Each bin of the range-azimuth map becomes E queries, one per elevation segment. A query is
+the bin's feature multiplied by a weight that is learned from the elevation spectrum. Its
+reference point is the projection of its center into the camera image.
 
 References:
     DinoRADE, sections 3.3 and 3.4, equations (1) and (2).
@@ -40,17 +40,18 @@ _OFFICIAL_DEPTH_OFFSET_M = 1e-6
 
 
 class ReferencePoints(struct.PyTreeNode):
-    """Where the queries of a radar map appear in the image.
+    """Positions of a radar map's queries in the image.
 
     Attributes:
-        points: `[B or 1, R, A, E, 2]` (x, y) in 0..1 from edge to edge of the image;
-            clipped to the border outside.
+        points: `[B or 1, R, A, E, 2]` (x, y) in 0..1 from edge to edge of the image.
+            Points outside the image are clipped to its border.
         is_valid: `[B or 1, R, A, E]` bool, True where the query's center is in front
             of the camera and in the image.
-        has_image: `[B]` bool, False for frames without a usable image; None for all.
+        has_image: `[B]` bool, False for frames without a usable image; None if all frames
+            have one.
     """
 
-    # Any leaf passes, see `radejax.geometry.camera.Camera`.
+    # The leaves have type Any for the reason given in `radejax.geometry.camera.Camera`.
     points: Any
     is_valid: Any
     has_image: Any = None
@@ -58,17 +59,17 @@ class ReferencePoints(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class LiftingAxes:
-    """Centers of the queries: uniform axes in range, azimuth and elevation.
+    """Uniform axes of the query centers in range, azimuth and elevation.
 
-    Hashable, so that it can be part of a module.
+    Instances are hashable, so that they can be attributes of a module.
 
     Attributes:
-        range_m: First bin center and step, meters.
-        azimuth_deg: First bin center and step; positive to the right.
-        elevation_deg: From and to of the span that `num_elevation` segments divide,
-            positive up. (18, -18) for a tensor whose elevation axis points down: code
-            bases disagree about K-Radar's.
-        num_elevation: Segments E.
+        range_m: First bin center and step in meters.
+        azimuth_deg: First bin center and step in degrees, positive to the right.
+        elevation_deg: Start and end in degrees, positive up, of the interval that is
+            divided into `num_elevation` segments. Use (18, -18) for a tensor whose
+            elevation axis points down; code bases disagree about K-Radar's.
+        num_elevation: Number E of elevation segments.
     """
 
     range_m: tuple[float, float]
@@ -84,7 +85,7 @@ class LiftingAxes:
 
     @classmethod
     def of_grid(cls, grid: RadarGrid, num_elevation: int = 10) -> LiftingAxes:
-        """Axes through the true bin centers; padding continues them."""
+        """Returns axes through the bin centers of the grid, which continue into padding."""
         degrees = np.rad2deg
         return cls(
             range_m=(float(grid.range_m[0]), grid.range_step_m),
@@ -98,7 +99,7 @@ class LiftingAxes:
 
     @classmethod
     def official(cls) -> LiftingAxes:
-        """Axes of the released code: 256 and 112 bins that divide the field of view."""
+        """Returns the released code's axes, 256 range and 112 azimuth bins in the FOV."""
         return cls(
             range_m=(118 / 256 / 2, 118 / 256),
             azimuth_deg=(-53 + 106 / 112 / 2, 106 / 112),
@@ -109,10 +110,11 @@ class LiftingAxes:
     def centers_ego(
         self, num_range: int, num_azimuth: int, xp: Any = np
     ) -> Float[Any, "{num_range} {num_azimuth} {self.num_elevation} 3"]:
-        """Query centers `[R, A, E, 3]` in the ego frame, meters.
+        """Returns the query centers `[R, A, E, 3]` in the ego frame in meters.
 
-        They are an outer product of small tables: with `jax.numpy` as `xp`, in float32,
-        a program has no constant of millions of numbers. NumPy's are float64.
+        They are computed as an outer product of small tables, so that with `jax.numpy` as
+        `xp` a compiled program does not contain all centers as a constant. The result is
+        float64 for NumPy and float32 for JAX.
         """
         range_m = self.range_m[0] + self.range_m[1] * np.arange(num_range)
         azimuth = np.deg2rad(
@@ -136,20 +138,21 @@ def reference_points(
     num_azimuth: int,
     out_of_view: OutOfViewRule = "drop",
 ) -> ReferencePoints:
-    """Projects the centers of all queries of a map.
+    """Projects the centers of all queries of a map into the image.
 
-    NumPy cameras are computed on the host in float64, JAX ones in the program in
-    float32, each sample with its own camera.
+    The projection runs on the host in float64 for a NumPy camera, and in the program in
+    float32 for a JAX camera.
 
     Args:
-        camera: One camera, or a batch of them.
-        axes: Centers of the queries.
-        num_range: Range bins R of the map, padding included.
-        num_azimuth: Azimuth bins A.
-        out_of_view: "official" counts only the middle of the image as valid, as released.
+        camera: One camera for all samples, or a batch with one camera per sample.
+        axes: Axes of the query centers.
+        num_range: Range bins R of the map, including padding.
+        num_azimuth: Azimuth bins A of the map, including padding.
+        out_of_view: "official" treats the left and right `MARGIN_PX` columns of the image
+            as out of view and adds 1e-6 m to the depth, as in the released code.
 
     Returns:
-        Points and mask with a leading axis of 1 or B.
+        Reference points, whose leading axis is 1 for one camera and B for a batch.
     """
     is_batch = np.ndim(camera.max_radius) > 0
     on_host = isinstance(camera.intrinsics, np.ndarray)
@@ -167,7 +170,7 @@ def reference_points(
     is_valid = (depth > 0) & (u >= margin) & (u < width - margin)
     is_valid = is_valid & (v >= 0) & (v < height)
     points = xp.stack([u / width, v / height], -1)
-    # Frames without an image may have a camera of zeros: keep their gradients finite.
+    # Cameras of frames without an image may be all zeros. Their gradients must be finite.
     points = xp.nan_to_num(points, nan=0.0, posinf=1.0, neginf=0.0)
     return ReferencePoints(
         points=xp.clip(points, 0.0, 1.0).astype(np.float32),
@@ -179,10 +182,10 @@ def reference_points(
 def query_weights(
     is_valid: Bool[jax.Array, "*bins E"], out_of_view: OutOfViewRule
 ) -> Float[jax.Array, "*bins E"]:
-    """Weights of the mean over a bin's queries.
+    """Returns the weights of the mean over a bin's queries.
 
-    "drop": equal over the valid ones, all zero where none is. "official": equal over
-    all, valid or not.
+    With "drop", valid queries have equal weights, and invalid queries have weight zero.
+    With "official", all queries have equal weights, whether they are valid or not.
     """
     if out_of_view == "official":
         return jnp.full(is_valid.shape, 1.0 / is_valid.shape[-1], jnp.float32)
@@ -191,13 +194,14 @@ def query_weights(
 
 
 class WeightingNetwork(nn.Module):
-    """Elevation channels `[B, R, A, D]` -> weights `[B, R, A, E]` that sum to one.
+    """Elevation channels `[B, R, A, D]` -> weights `[B, R, A, E]`, a softmax over segments.
 
     Attributes:
-        num_elevation: Segments E.
-        kind: "mlp" is two layers per bin, as the paper says (it prints no widths);
-            "cnn" three 3x3 convolutions and a 1x1 one, as released; "off" weighs all
-            segments alike, by 1: the plain copies of the ablation.
+        num_elevation: Number E of elevation segments.
+        kind: "mlp" has two layers per bin, as in the paper, which does not state their
+            widths. "cnn" has three 3x3 convolutions and a 1x1 convolution, as in the
+            released code. "off" returns the weight 1 for every segment instead of a
+            softmax, for the ablation in which all queries of a bin are equal.
         dtype: Dtype of the computation; the weights are float32.
     """
 

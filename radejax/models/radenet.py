@@ -1,7 +1,7 @@
-"""RADE-Net: from radar projections to heatmap and box parameters.
+"""RADE-Net, which predicts a heatmap and box parameters from radar projections.
 
 References:
-    Leitgeb et al., RADE-Net; architecture as in the released code.
+    Leitgeb et al., RADE-Net. The architecture is that of the released code.
 """
 
 from __future__ import annotations
@@ -35,29 +35,32 @@ block, or also all but the ends of backbone, neck and heads."""
 
 
 class RadeNet(nn.Module):
-    """Radar-only detector: backbone, neck and two heads.
+    """Radar-only detector with a backbone, a neck and two heads.
 
-    Maps are zero-padded at the far and right end to a multiple of `pad_multiple`;
-    the output keeps the padding unless `crop_output`.
+    Projections are zero-padded at the far and right end to a multiple of `pad_multiple`.
+    The output includes the padding unless `crop_output` is True.
 
     Attributes:
         num_classes: Channels of the heatmap.
-        doppler_bins: First channels of the projection.
-        elevation_bins: Remaining channels of the projection.
+        doppler_bins: Number of Doppler channels, the first of the projection.
+        elevation_bins: Number of elevation channels, which follow the Doppler channels.
         widths: Channels of the encoder levels, finest first.
-        decoder_width: Channels of the last decoder stage, neck and heads.
+        decoder_width: Channels of the last decoder stage and of the neck.
         num_groups: Groups of every normalization; must divide every width.
         cbam: "official", "paper" or None; see `radejax.models.backbone.CBAM`.
-        input_stem: Encode Doppler and elevation apart first.
-        backbone, neck, heads: Of `BACKBONES`, `NECKS` and `HEADS`.
-        pad_multiple: Multiple of 2 ** len(widths).
-        crop_output: Cut the maps back to the projection's bins.
-        dtype: "float32" or "bfloat16", of the computation; outputs are float32.
-        remat: One of `REMAT`: less memory, more time, the same gradients.
-        heatmap_prior: Confidence of an untrained model; see `radejax.models.heads.Heads`.
-        input_center: Taken off the projection; 0 as in the paper. Noise is about 0.545.
-        input_scale: What that is multiplied with; 1 as in the paper. An echo 10 dB above
-            the noise is 0.054 above it: at 25 it is 1.4, of the order layers expect.
+        input_stem: Whether to encode Doppler and elevation separately first.
+        backbone, neck, heads: Names in `BACKBONES`, `NECKS` and `HEADS`.
+        pad_multiple: Multiple to which range and azimuth are padded; must be a multiple of
+            2 ** len(widths).
+        crop_output: Whether to crop the maps to the projection's bins.
+        dtype: Dtype of the computation, "float32" or "bfloat16"; outputs are float32.
+        remat: One of `REMAT`, to save memory in the backward pass by recomputation.
+        heatmap_prior: Score of bins in an untrained model; see `radejax.models.heads.Heads`.
+        input_center: Value subtracted from the projection; 0 in the paper. Noise is about
+            0.545.
+        input_scale: Factor applied after the subtraction; 1 in the paper. An echo 10 dB
+            above the noise differs from it by 0.054, and with a factor of 25 by 1.4, which
+            is a usual magnitude of a network's input.
     """
 
     num_classes: int
@@ -124,25 +127,25 @@ class RadeNet(nn.Module):
 
     @nn.compact
     def __call__(self, projection: Projection, *, train: bool = False) -> DetectionMaps:
-        """Predicts from projections.
+        """Predicts detection maps from projections.
 
         Args:
-            projection: `[B, R, A, D+E]` as `radejax.data.projection` makes them,
-                Doppler channels first; any float dtype.
-            train: Has no effect; for the signature that all models share.
+            projection: `[B, R, A, D+E]` projections from `radejax.data.projection`, with
+                the Doppler channels first, in any float dtype.
+            train: Has no effect; all models have this argument.
 
         Returns:
-            Maps on the padded bins, or on the projection's if `crop_output`.
+            Maps on the padded bins, or on the projection's bins if `crop_output`.
 
         Raises:
-            UserError: It is not a batch of projections of the model's channels.
+            UserError: The projection is not a batch or has the wrong number of channels.
         """
         del train
         features = self._features(self._padded(projection))
         return self._maps(features, projection)
 
     def _padded(self, projection: Projection) -> Float[jax.Array, "B Rp Ap DE"]:
-        """The projection less `input_center`, scaled, in the model's dtype, padded."""
+        """Centers and scales the projection, casts it to the model's dtype and pads it."""
         channels = self.doppler_bins + self.elevation_bins
         if projection.ndim != 4 or projection.shape[-1] != channels:
             raise UserError(
@@ -151,7 +154,7 @@ class RadeNet(nn.Module):
                 f"{projection.shape}"
             )
         if (self.input_center, self.input_scale) != (0.0, 1.0):
-            # Before the cast: bfloat16 has steps of 0.7 dB at the noise's 0.545.
+            # This precedes the cast, because bfloat16 has steps of 0.7 dB near the noise.
             projection = projection.astype(jnp.float32) - self.input_center
             projection = projection * self.input_scale
         r, a = (-n % self.pad_multiple for n in projection.shape[1:3])
@@ -159,7 +162,7 @@ class RadeNet(nn.Module):
         return jnp.pad(projection.astype(self.dtype), padding)
 
     def _features(self, padded: Projection) -> Map:
-        """Features of the backbone."""
+        """Applies the backbone."""
         return self._stage(BACKBONES[self.backbone])(
             doppler_bins=self.doppler_bins,
             widths=self.widths,
@@ -173,7 +176,7 @@ class RadeNet(nn.Module):
     def _maps(
         self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection
     ) -> DetectionMaps:
-        """Neck and heads, on the projection's bins if `crop_output`."""
+        """Applies neck and heads, and crops the maps if `crop_output`."""
         neck = self._stage(NECKS[self.neck])(**self._shared(), name="neck")
         heads = self._stage(Heads)(
             num_classes=self.num_classes,

@@ -1,11 +1,11 @@
-"""Vision transformer with rotary position embedding, as DINOv3 has it.
+"""Vision transformer with rotary position embedding, as in DINOv3.
 
-Own module because no kept-up package offers a Linen DINOv3 that reads the files users
-have: Equimo is Equinox and needs Python 3.12, bonsai is NNX and pinned to an old jax.
+No maintained package has a DINOv3 for Linen that reads the published weight files: Equimo
+uses Equinox and requires Python 3.12, and bonsai uses NNX and is pinned to an old jax.
 
 References:
-    Simeoni et al., DINOv3, arXiv:2508.10104; names and numerics checked against
-    Hugging Face transformers' `DINOv3ViTModel`.
+    Simeoni et al., DINOv3, arXiv:2508.10104. Names and numerics are checked against
+    `DINOv3ViTModel` of Hugging Face transformers.
 """
 
 from __future__ import annotations
@@ -29,27 +29,29 @@ PerHead = Float[jax.Array, "B T heads D"]
 Rope = tuple[Float[jax.Array, "patches D"], Float[jax.Array, "patches D"]]
 """Cosines and sines of the rotary embedding, D channels of a head."""
 
-_BLOCK = 256  # queries at a time: the scores of a head stay in cache
+_BLOCK = 256  # queries per block, so that the scores of a head stay in the cache
 _INIT = nn.initializers.truncated_normal(0.02)
 
 
 class ViT(nn.Module):
-    """Images `[B, H, W, 3]` -> tokens `[B, 1 + registers + patches, C]`.
+    """Vision transformer, images `[B, H, W, 3]` -> tokens `[B, 1 + registers + patches, C]`.
 
-    Tokens are the class token, the registers, then the patches row by row, after the
-    final normalization. Any height and width that the patch size divides will do.
+    The tokens are the class token, the registers and the patches in row-major order, after
+    the final normalization. Height and width can be any multiples of the patch size.
 
     Attributes:
-        hidden_size: Channels C of the tokens.
-        num_layers: Transformer blocks.
-        num_heads: Attention heads; must divide C into a multiple of 4.
+        hidden_size: Channels C of the tokens, a multiple of 4 times `num_heads`.
+        num_layers: Number of transformer blocks.
+        num_heads: Number of attention heads.
         mlp_dim: Hidden channels of each block's MLP.
-        patch_size: Pixels of a patch's side.
-        num_registers: Learned tokens beside the class token.
-        gated_mlp: SwiGLU, as in the larger DINOv3 models, instead of a GELU MLP.
+        patch_size: Height and width of a patch in pixels.
+        num_registers: Number of learned tokens in addition to the class token.
+        gated_mlp: Whether to use a SwiGLU MLP, as in the larger DINOv3 models, instead of
+            a GELU MLP.
         layer_scale: Initial value of the learned scales of the residual branches.
-        attention: "auto" picks by platform; see `attend`.
-        dtype: Dtype of the computation; statistics and tokens are float32.
+        attention: Implementation of the attention, see `attend`.
+        dtype: Dtype of the computation; normalization statistics and the returned tokens
+            are float32.
         remat: Recompute blocks in the backward pass instead of storing them.
     """
 
@@ -82,14 +84,14 @@ class ViT(nn.Module):
 
     @property
     def num_prefix(self) -> int:
-        """Tokens before the first patch."""
+        """Number of tokens before the first patch."""
         return 1 + self.num_registers
 
     @nn.compact
     def __call__(
         self, image: Float[jax.Array, "B H W 3"]
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
-        """Tokens of normalized float images `[B, H, W, 3]`, float32."""
+        """Computes float32 tokens of normalized float images `[B, H, W, 3]`."""
         rows, columns = (n // self.patch_size for n in image.shape[1:3])
         height, width = rows * self.patch_size, columns * self.patch_size
         chex.assert_shape(image, (None, height, width, 3))
@@ -97,7 +99,7 @@ class ViT(nn.Module):
         head_dim = self.hidden_size // self.num_heads
         rope = rotary_angles(rows, columns, head_dim)
         block = nn.remat(Block, prevent_cse=False) if self.remat else Block
-        # One traced block for all layers: parameters carry a leading layer axis.
+        # One block is traced for all layers; its parameters have a leading layer axis.
         layers = nn.scan(
             block,
             variable_axes={"params": 0},
@@ -120,9 +122,9 @@ class ViT(nn.Module):
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
-        """Patches through one linear layer, learned tokens in front."""
+        """Embeds patches by a linear layer and prepends the learned tokens."""
         b, size = image.shape[0], self.patch_size
-        # Patches do not overlap: the convolution is a product with flat patches.
+        # As patches do not overlap, the convolution is a product with flattened patches.
         patches = image.reshape(b, rows, size, columns, size, 3)
         patches = patches.transpose(0, 1, 3, 2, 4, 5).reshape(b, rows * columns, -1)
         patches = nn.Dense(
@@ -135,7 +137,7 @@ class ViT(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention and MLP with scaled residuals; attributes as in `ViT`."""
+    """Transformer block with scaled residual branches; its attributes are those of `ViT`."""
 
     num_heads: int
     mlp_dim: int
@@ -184,7 +186,7 @@ class Block(nn.Module):
 
 
 def _layer_norm(dtype: Any, name: str) -> nn.LayerNorm:
-    # The fast variance E[x^2] - E[x]^2 loses digits where the mean is large.
+    # The fast variance E[x^2] - E[x]^2 is imprecise if the mean is large.
     return nn.LayerNorm(1e-5, dtype=dtype, use_fast_variance=False, name=name)
 
 
@@ -192,20 +194,20 @@ def _layer_norm(dtype: Any, name: str) -> nn.LayerNorm:
 
 
 def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) -> Rope:
-    """Cosines and sines of the rotary position embedding of a grid of patches.
+    """Computes the rotary position embedding of a grid of patches.
 
-    The angle of channel i at coordinate p is `2 pi p / theta^(4 i / head_dim)`, with
-    patch centers in [-1, 1] along each axis; the first quarter of a head's channels
-    encodes the row, the second the column, and the second half repeats both.
+    The coordinates p of patch centers are in [-1, 1] along each axis. The first quarter of
+    a head's channels encodes the row, the second quarter the column, and the second half
+    repeats both. Channel i of a quarter has the angle `2 pi p / theta^(4 i / head_dim)`.
 
     Args:
-        rows: Patches along the height.
-        columns: Patches along the width.
+        rows: Number of patches along the height.
+        columns: Number of patches along the width.
         head_dim: Channels of a head, a multiple of 4.
         theta: Base of the wavelengths.
 
     Returns:
-        Two arrays `[rows * columns, head_dim]`, float32.
+        Cosines and sines of the angles, two float32 arrays `[rows * columns, head_dim]`.
     """
     frequency = theta ** -(np.arange(head_dim // 4) * 4.0 / head_dim)
 
@@ -214,7 +216,8 @@ def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) 
         return 2.0 * np.pi * position[:, None] * frequency  # [count, head_dim / 4]
 
     def table(function: Any) -> jax.Array:
-        # Small tables here, the full one in the program: no large constants in it.
+        # Only the tables per axis are constants of the compiled program, which expands
+        # them to the full table.
         by_row = jnp.asarray(function(axis_angles(rows)), jnp.float32)
         by_column = jnp.asarray(function(axis_angles(columns)), jnp.float32)
         shape = (rows, columns, head_dim // 4)
@@ -226,7 +229,7 @@ def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) 
 
 
 def rotate(x: PerHead, rope: Rope, num_prefix: int) -> PerHead:
-    """Turns the patch tokens; the prefix stays."""
+    """Applies the rotary embedding to the patch tokens and leaves the prefix unchanged."""
     prefix, patches = x[:, :num_prefix], x[:, num_prefix:]
     cos, sin = (a[None, :, None].astype(jnp.float32) for a in rope)
     wide = patches.astype(jnp.float32)
@@ -241,21 +244,29 @@ def rotate(x: PerHead, rope: Rope, num_prefix: int) -> PerHead:
 def attend(
     query: PerHead, key: PerHead, value: PerHead, kind: AttentionKind = "auto"
 ) -> PerHead:
-    """Softmax attention, without mask.
+    """Computes softmax attention without a mask.
 
-    "blocked" takes one head and a block of queries at a time: scores stay in cache,
-    six times faster on a CPU than "xla", which is `jax.nn.dot_product_attention` with
-    the whole score matrix in memory. "cudnn" is its flash form, for half precision
-    on an NVIDIA GPU. "auto" is "cudnn" where that runs, "blocked" on CPUs, else
-    "xla". All are exact.
+    Args:
+        query: `[B, T, heads, D]` queries.
+        key: `[B, T, heads, D]` keys.
+        value: `[B, T, heads, D]` values.
+        kind: Implementation; all of them are exact. "xla" is
+            `jax.nn.dot_product_attention` with the whole score matrix in memory. "blocked"
+            processes one head and a block of queries at a time, so that scores stay in the
+            cache, and is six times faster than "xla" on a CPU. "cudnn" is flash attention
+            for half precision on NVIDIA GPUs. "auto" selects "blocked" on CPUs, "cudnn"
+            for half precision on NVIDIA GPUs, and "xla" otherwise.
+
+    Returns:
+        `[B, T, heads, D]` weighted sums of the values.
     """
     plain = jax.nn.dot_product_attention
     if kind == "auto":
         is_half = query.dtype in (jnp.bfloat16, jnp.float16)
         flash = {}
-        if is_half and jax.default_backend() == "gpu":  # else it cannot be traced
+        if is_half and jax.default_backend() == "gpu":  # tracing "cudnn" needs a GPU
             flash["cuda"] = functools.partial(plain, implementation="cudnn")
-        # Decided when lowered, so that one traced program serves several platforms.
+        # The choice is made at lowering, so that a traced program runs on each platform.
         return jax.lax.platform_dependent(
             query, key, value, cpu=_attend_blocked, default=plain, **flash
         )
@@ -278,8 +289,8 @@ def _attend_blocked(query: PerHead, key: PerHead, value: PerHead) -> PerHead:
     def one_head(arrays: tuple[jax.Array, ...]) -> jax.Array:
         blocks, keys, values = arrays  # [n, d, block], [T, d], [d, T]
 
-        # Queries along the last axis: maximum and sum over keys are then sums of rows,
-        # which a CPU computes many at a time.
+        # With queries along the last axis, maximum and sum over keys are elementwise
+        # operations on rows, which a CPU vectorizes.
         @jax.checkpoint  # the backward pass must not store the scores
         def one_block(x: jax.Array) -> jax.Array:
             scores = (keys @ x).astype(jnp.float32)  # [T, block]
