@@ -68,8 +68,8 @@ def mirror_camera(camera: Camera) -> Camera:
     """Returns the camera whose image of the mirrored scene is the mirrored image.
 
     With M = diag(-1, 1, 1) in the camera frame, p_cam' = M [R | t] (x, -y, z, 1) and
-    u' = W - u. The distortion coefficient p2 changes its sign, as its term is odd under
-    this reflection.
+    u' = W - u. The distortion coefficient p2 changes its sign: its term in the distorted
+    x, p2 (r^2 + 2 x^2), is even in x, and its term in y, 2 p2 x y, is odd.
     """
     cam_from_ego = np.array(camera.cam_from_ego)
     cam_from_ego[..., 0, :] *= -1
