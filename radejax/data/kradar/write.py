@@ -102,7 +102,7 @@ def write_tesseract(
 
     Args:
         path: File to write, `radar_tesseract/tesseract_<radar index>.mat`.
-        tesseract: Linear power; the dtype is kept.
+        tesseract: Linear power; float32 values are stored as float32.
         compress: Whether to compress the file with zlib, which makes reading 10 times
             slower.
     """
