@@ -1,4 +1,4 @@
-"""The command `radejax train`, which is also `train.py`."""
+"""The command `radejax train`, which `train.py` also runs."""
 
 from __future__ import annotations
 
