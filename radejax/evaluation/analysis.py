@@ -126,6 +126,8 @@ def _numbers(
 def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
     """Computes mean and median errors per class of boxes matched in the bird's-eye view.
 
+    Predictions with a score of 0 are left out.
+
     Returns:
         For each class, the number of matches "count" and, as "<error>_mean" and
         "<error>_median": center_m (distance in the ground plane), z_m, length_m, width_m,

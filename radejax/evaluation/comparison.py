@@ -90,7 +90,8 @@ def compare(
         resamples: Number of resamples.
 
     Raises:
-        UserError: The runs differ in classes, frames or ground truth.
+        UserError: The runs differ in classes, frames or ground truth, or there are fewer
+            than two sequences.
     """
     _check_same_truth(data_a, data_b)
     weights = sequence_weights(sequence, resamples=resamples, seed=0)
