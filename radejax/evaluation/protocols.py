@@ -164,7 +164,7 @@ def score_thresholds(
     total = int(ends[-1]) if ends.size else 0
     if total == 0 or num_gt == 0:
         return np.zeros(0)
-    current = np.cumsum([0.0, *[1.0 / 40.0] * 40])  # summed step by step, for the original rounding
+    current = np.cumsum([0.0, *[1.0 / 40.0] * 40])  # sequential, as in the original
     # The inequality changes at i = c n - 3/2. The exact index is found by evaluating it
     # with the original rounding in a window around this value.
     low = np.maximum(np.ceil(current * num_gt - 1.5).astype(np.int64) - 4, 0)

@@ -143,7 +143,7 @@ def write_report(
             (folder / "worst_frames").mkdir()
             for entry in metrics["worst_frames"]:
                 name = f"frame_{entry['frame']}"
-                if {"name", "sequence"} <= set(entry):  # named like other figures of frames
+                if {"name", "sequence"} <= set(entry):  # as in other figures
                     name = f"{entry['sequence']:02d}_{entry['name']}"
                 draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")
     return Report(text, metrics, results, pathlib.Path(out_dir))
