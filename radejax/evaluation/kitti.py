@@ -156,7 +156,7 @@ def read_kitti(folder: str | pathlib.Path) -> tuple[Columns, Columns, Columns]:
         The frame table has weather, environment and time if there is a folder `desc`.
 
     Raises:
-        UserError: There is no folder `preds`, or there are several score thresholds.
+        UserError: The folder `preds` is missing, or there are several score thresholds.
         DataError: A line is malformed; the message names the file and the line.
     """
     root = _find_root(pathlib.Path(folder))

@@ -25,8 +25,9 @@ Curve = tuple[Any, Any] | None
 def draw_precision_recall(panels: Mapping[str, Mapping[str, Curve]]) -> Figure:
     """Draw precision over recall, one line per class, condition or model.
 
-    Lines differ in color and in dash pattern. A name has the same color and pattern in
-    all panels, even if it has no curve in some of them.
+    Lines differ in color and in dash pattern, which depend on the position of the curve
+    in its panel. Use None for missing curves, so that a name has the same color and
+    pattern in all panels.
 
     Args:
         panels: Curves by name for the title of each panel; at least one panel.

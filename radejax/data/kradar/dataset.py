@@ -607,8 +607,8 @@ def find_own_labels(
     """Finds the label files in the sequences' own folders.
 
     For every sequence, the first subfolder that contains label files is used:
-    `info_label_v2_1` (with the given version), then `info_label`. Version v2.0 may also
-    be in `info_label_v2`.
+    `info_label_<version>`, such as `info_label_v2_1`, then `info_label_v2` for version
+    v2.0, then `info_label`.
     """
     subfolders = [f"info_label_{version.replace('.', '_')}", "info_label"]
     if version == "v2.0":
@@ -641,7 +641,7 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
         files = [(file.relative_to(path), file) for file in sorted(path.rglob("*.txt"))]
     else:
         with wrap_read_errors(path, "a folder or a zip file of labels"):
-            archive = zipfile.ZipFile(path)  # open for as long as its members are used
+            archive = zipfile.ZipFile(path)  # stays open while its members are used
         files = [
             (pathlib.PurePosixPath(name), zipfile.Path(archive, name))
             for name in archive.namelist()
