@@ -1,4 +1,4 @@
-"""`radejax simulate`, `data check`, `preprocess` and `embed`: datasets for training."""
+"""Commands that prepare datasets: `simulate`, `data check`, `preprocess` and `embed`."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
 
 
 def _shard(text: str) -> tuple[int, int]:
-    """Part i of n, i from 0."""
+    """Parses "i/n" as the shard (i, n), with i counted from 0."""
     index, _, count = text.partition("/")
     if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
         raise click.BadParameter(f"{text!r}, expected i/n with i from 0 to n - 1")
@@ -197,7 +197,7 @@ def embed(
     settings = radejax.load_config(config)
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
-    assert variables is not None  # as there is a path
+    assert variables is not None  # because a path is given
     if not roots:
         settings = located(settings)
         simulate_missing(settings)

@@ -1,4 +1,4 @@
-"""`radejax detect` and `export`: run a trained model, or write it for other programs."""
+"""Commands that run or export a trained model: `radejax detect` and `export`."""
 
 from __future__ import annotations
 

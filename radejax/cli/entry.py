@@ -1,6 +1,6 @@
-"""What the commands and the examples share: options, errors, logging, JAX's set-up.
+"""Options, error handling, logging and JAX set-up of the commands and the examples.
 
-JAX and absl are imported by the function that uses them: `--help` should not wait.
+JAX and absl are only imported in the function that uses them, so that `--help` is fast.
 """
 
 from __future__ import annotations
@@ -39,17 +39,18 @@ _WRONG_PATH = (
 
 @contextlib.contextmanager
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
-    """Ends the program with one line instead of a traceback for the user's errors.
+    """Ends the program with a one-line message instead of a traceback for user errors.
 
-    Exit code 2 for wrong use (arguments, folders), 1 for corrupted data or a full disk, 130
-    for an interrupt: see `core.errors`. Where the caller closed standard error, messages
-    are discarded; they would go into the next file that is opened.
+    The exit code is 2 for wrong use (arguments, folders), 1 for corrupted data or a full
+    disk and 130 for an interrupt (see `core.errors`). If the caller closed standard
+    error, messages are discarded, as they could otherwise be written to another file that
+    has its file descriptor.
 
     Args:
-        debug: Let the traceback through.
+        debug: Whether to show the traceback.
     """
     if sys.stderr is None:
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, for the program's life
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, open until exit
     try:
         yield
     except (ValueError, OSError, KeyboardInterrupt) as error:
@@ -61,7 +62,7 @@ def exit_codes(*, debug: bool = False) -> Iterator[None]:
 
 
 def _exit_code(error: BaseException) -> int | None:
-    """None for an error that is not the user's."""
+    """Returns the exit code of a user error, or None for any other error."""
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
     if not isinstance(error, OSError):
@@ -84,10 +85,10 @@ def _message(error: BaseException) -> str:
 
 
 def set_up_jax() -> None:
-    """Logging at level info without noise, and a compilation cache that persists.
+    """Sets up logging at level info and JAX's persistent compilation cache.
 
-    Compiled programs are kept in the folder that the environment variable
-    JAX_COMPILATION_CACHE_DIR names, or the user's cache folder.
+    Compiled programs are stored in the folder given by the environment variable
+    JAX_COMPILATION_CACHE_DIR, or in the user's cache folder.
     """
     import jax
     from absl import flags
@@ -100,14 +101,15 @@ def set_up_jax() -> None:
         log.addHandler(handler)
         log.setLevel(logging.INFO)
         log.propagate = False
-    # Orbax logs every step it takes; its errors are raised as well.
+    # Orbax logs every step. Its log is not needed, as its errors are also raised.
     absl_logging.set_verbosity(absl_logging.FATAL)
-    flags.FLAGS.mark_as_parsed()  # grain's worker processes read one of theirs
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # which JAX reads itself
+    flags.FLAGS.mark_as_parsed()  # grain's worker processes read an absl flag
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # JAX reads the variable itself
         home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
         folder = pathlib.Path(home, "radejax", "jax")
         jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Cache all programs: compiling the fifty small ones of a start takes a second.
+    # Small programs are cached too: compiling the fifty at the start of a run takes a
+    # second.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
@@ -115,7 +117,7 @@ def set_up_jax() -> None:
 
 
 class Program(click.Command):
-    """A command that sets up memory first when it runs as a program."""
+    """A command that sets up huge pages before it runs as the main program."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -123,20 +125,20 @@ class Program(click.Command):
         self.context_settings["show_default"] = True
 
     def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
-        """Runs it with some arguments, by default those of this process."""
+        """Runs the command with the given arguments, by default those of this process."""
         if args is None:
             memory.restart_with_huge_pages()
         return super().main(args, *others, **options)
 
 
 class Group(Program, click.Group):
-    """Commands of one program."""
+    """The group of commands of one program."""
 
 
 class Command(Program):
     """A command that reports user errors in one line with an exit code.
 
-    Every command has `--debug`, which lets their tracebacks through.
+    Every command has the option `--debug`, which shows their tracebacks instead.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -147,7 +149,7 @@ class Command(Program):
     def format_options(
         self, ctx: click.Context, formatter: click.HelpFormatter
     ) -> None:
-        """Write the options in the groups of `together`, "Options" for the others."""
+        """Writes the options by the group given to `together`, otherwise "Options"."""
         groups: dict[str, list[tuple[str, str]]] = {}
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
@@ -164,7 +166,7 @@ class Command(Program):
 
 
 def echo_result(as_json: bool, values: Any, text: str) -> None:
-    """Prints the result for a machine or for a person."""
+    """Prints a result as JSON or as text."""
     click.echo(json.dumps(values) if as_json else text)
 
 
@@ -188,13 +190,13 @@ def several(
     metavar: str = "A,B,...",
     **settings: Any,
 ) -> Callable[[Any], Any]:
-    """An option that takes several: `--data A,B --data C` gives A, B and C.
+    """Returns an option for several values: `--data A,B --data C` gives A, B and C.
 
     Args:
-        *names: As `click.option` takes them.
-        kind: What each of them is made.
-        metavar: An example.
-        **settings: Of `click.option`.
+        *names: Names of the option, as for `click.option`.
+        kind: Function that converts the text of each value.
+        metavar: Example of the values, shown in the help.
+        **settings: Other arguments of `click.option`.
     """
 
     def split(
@@ -217,7 +219,12 @@ def several(
 def together(
     *options: Callable[[Any], Any], group: str = "Options"
 ) -> Callable[[Any], Any]:
-    """Several options as one decorator, in the order and with a heading of the help."""
+    """Returns a decorator that adds several options in order.
+
+    Args:
+        *options: Decorators of the options.
+        group: Heading of the options in the help.
+    """
 
     def decorate(command: Any) -> Any:
         count = len(getattr(command, "__click_params__", ()))
@@ -231,12 +238,12 @@ def together(
 
 
 def out_file(default: str, meaning: str) -> Callable[[Any], Any]:
-    """An option of the file to write."""
+    """Returns the option `--out` for the file to write."""
     return click.option("--out", type=FILE, default=default, help=meaning)
 
 
 def batch_size(default: int, meaning: str) -> Callable[[Any], Any]:
-    """An option of the number of frames at once."""
+    """Returns the option `--batch-size`."""
     return click.option("--batch-size", type=COUNT, default=default, help=meaning)
 
 

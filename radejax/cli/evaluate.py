@@ -1,4 +1,4 @@
-"""`radejax evaluate`, `score` and `compare`: APs of a run, of files, and of several."""
+"""Commands that evaluate runs and prediction files: `evaluate`, `score` and `compare`."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def evaluate(
         other["roots"] = other.pop("data")
     entry.set_up_jax()
     report = evaluate_run(workdir, other=other or None, **given)
-    assert report is not None  # as this is the only process
+    assert report is not None  # because this is the only process
     # The tables have been logged to standard error.
     entry.echo_result(as_json, report.metrics, f"Written to {report.folder}")
 
@@ -199,7 +199,7 @@ def compare(
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:
-    """The options that were given; the region "none" as None."""
+    """Returns the options that were given, with None for the region "none"."""
     given = {name: value for name, value in options.items() if value is not None}
     if "sequence_numbers" in given:
         given["sequences"] = given.pop("sequence_numbers")
@@ -209,7 +209,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _source_and_settings(options: dict[str, Any], bootstrap: int) -> tuple[Any, Any]:
-    """`Source` and `EvaluationOptions` of the options that are their fields."""
+    """Builds `Source` and `EvaluationOptions` from the options that are their fields."""
     from radejax.evaluation.files import Source
     from radejax.evaluation.results import EvaluationOptions
 

@@ -1,4 +1,4 @@
-"""`radejax overlay`, `view` and `demo`: frames, labels and detections to look at."""
+"""Commands that draw frames, labels and detections: `overlay`, `view` and `demo`."""
 
 from __future__ import annotations
 
@@ -86,10 +86,10 @@ def overlay(
 
 
 def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
-    """Figure of one frame: slices of the projection, or radar map and camera image.
+    """Draws one frame: slices of the projection, or the radar map and camera image.
 
     Raises:
-        UserError: It has neither tensor nor projection.
+        FileNotFoundError: The frame has neither a tensor nor a projection.
     """
     from radejax.core.structures import ROIS
     from radejax.visualize.draw import draw_slices
@@ -140,7 +140,10 @@ def view(
 
 
 def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:
-    """`Scene` of each frame with radar data, read as it is needed."""
+    """Yields the `Scene` of each frame, which is read when it is requested.
+
+    All frames must have radar data. With a detector, the scenes contain its predictions.
+    """
     for frame in frames:
         projection, time_s = frame.read_projection(grid), frame.header.timestamp_s
         scene = radejax.frame_scene(frame, projection, grid, time_s=time_s)
@@ -173,7 +176,7 @@ def demo(out: pathlib.Path, seed: int) -> None:
     from radejax.simulation.config import default_config
     from radejax.visualize.style import figure_format, save_figure
 
-    figure_format(out)  # before the frame is simulated
+    figure_format(out)  # checks the ending before the frame is simulated
     entry.set_up_jax()
     simulation = default_config() | {
         "seed": seed,

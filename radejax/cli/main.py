@@ -1,4 +1,4 @@
-"""`radejax`: the command line. Commands import what they run last."""
+"""The `radejax` command line. Commands import heavy modules only when they run."""
 
 from __future__ import annotations
 

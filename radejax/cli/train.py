@@ -1,4 +1,4 @@
-"""`radejax train` and `train.py`: from data to metrics, by a config and its fields."""
+"""The command `radejax train`, which `train.py` also runs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _PREFIX = "--config."
 
 
 class _Command(entry.Command):
-    """Also takes any field of the config: `--config.train.batch_size=4`.
+    """A command that also takes any config field, such as `--config.train.batch_size=4`.
 
-    The last one counts where a field is given twice; `--config.logging.wandb` without a
-    value sets true.
+    If a field is given twice, the last value is used. A field without a value, such as
+    `--config.logging.wandb`, is set to true.
     """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Click's words; fields and their texts go to `ctx.meta["fields"]`."""
+        """Parses the arguments; stores config fields as text in `ctx.meta["fields"]`."""
         words = [word for word in args if not word.startswith(_PREFIX)]
         fields = [word.removeprefix(_PREFIX) for word in args if word not in words]
         pairs = (field.partition("=") for field in fields)
@@ -122,17 +122,18 @@ def join_processes(
     num_processes: int | None = None,
     process_id: int | None = None,
 ) -> None:
-    """Joins the other processes of a run; to be called before anything uses JAX.
+    """Joins the other processes of a run.
 
-    Under Slurm, Open MPI, Kubernetes and on TPU pods JAX finds the arguments itself.
+    It must be called before anything uses JAX. Under Slurm, Open MPI, Kubernetes and on
+    TPU pods, JAX finds the arguments itself.
 
     Args:
-        coordinator: "host:port" of process 0, with a port that is free there.
-        num_processes: Of the run.
-        process_id: Of this process, from 0.
+        coordinator: "host:port" of process 0, with a free port on its host.
+        num_processes: Number of processes of the run.
+        process_id: Index of this process, counted from 0.
 
     Raises:
-        UserError: JAX finds no cluster, or the coordinator is not reached.
+        UserError: JAX finds no cluster, or the coordinator cannot be reached.
     """
     import jax
 

@@ -1,7 +1,7 @@
-"""Augmentation of single frames: radar, boxes, image and camera stay in register.
+"""Augmentation of single frames, consistent for radar, boxes, image and camera.
 
-Off by default, as the papers train without. Mirroring is exact on any grid whose azimuth
-axis is symmetric.
+It is off by default, as the papers train without augmentation. Mirroring is exact on
+every grid whose azimuth axis is symmetric.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Sample = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Augmentation:
-    """Random augmentation of one frame: call it with a sample and a generator.
+    """Random augmentation, called with the sample of one frame and a random generator.
 
     Attributes:
         grid: Sensor axes of the projections.
         mirror_probability: Probability of swapping left and right.
 
     Raises:
-        UserError: Mirroring a grid that is not symmetric.
+        UserError: Mirroring is enabled for a grid whose azimuth axis is not symmetric.
     """
 
     grid: RadarGrid
@@ -44,20 +44,20 @@ class Augmentation:
             )
 
     def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
-        """The sample or a mirrored copy of it."""
+        """Returns the sample or a mirrored copy of it."""
         return mirror(sample) if rng.random() < self.mirror_probability else sample
 
 
 def mirror(sample: Sample) -> Sample:
-    """Swap left and right: y to -y in the radar frame, u to W - u in the image.
+    """Swaps left and right: y becomes -y in the radar frame and u becomes W - u in the image.
 
-    Radial velocity, elevation and range do not change. Padded boxes stay zero.
+    Radial velocity, elevation and range do not change. Padding boxes remain zero.
     """
     camera, image, boxes = sample.get("camera"), sample.get("image"), sample["boxes"]
     return {
         **sample,
         "projection": sample["projection"][:, ::-1],
-        # y and sin yaw change sign.
+        # y and sin yaw change their sign.
         "boxes": boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype),
         "image": None if image is None else image[:, ::-1],
         "camera": None if camera is None else mirror_camera(camera),
@@ -65,10 +65,11 @@ def mirror(sample: Sample) -> Sample:
 
 
 def mirror_camera(camera: Camera) -> Camera:
-    """The camera that sees a mirrored world as the mirrored image.
+    """Returns the camera whose image of the mirrored scene is the mirrored image.
 
-    With M = diag(-1, 1, 1) on camera axes: p_cam' = M [R | t] (x, -y, z, 1), and
-    u' = W - u. The lens term p2 is odd in x.
+    With M = diag(-1, 1, 1) in the camera frame, p_cam' = M [R | t] (x, -y, z, 1) and
+    u' = W - u. The distortion coefficient p2 changes its sign: its term in the distorted
+    x, p2 (r^2 + 2 x^2), is even in x, and its term in y, 2 p2 x y, is odd.
     """
     cam_from_ego = np.array(camera.cam_from_ego)
     cam_from_ego[..., 0, :] *= -1

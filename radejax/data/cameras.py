@@ -1,4 +1,4 @@
-"""Front images and cameras of frames, as models and drawings want them."""
+"""Front images and cameras of frames for models and figures."""
 
 from __future__ import annotations
 
@@ -37,21 +37,24 @@ IMAGE_SIZE = (720, 1280)
 def read_left_image(
     path: pathlib.Path, size: tuple[int, int] = IMAGE_SIZE, *, resize: bool = False
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Left half of a front image (a stereo pair, or left only).
+    """Reads the left image from a front image file (a stereo pair or the left image only).
 
     Args:
-        path: Image file. An image more than twice as wide as high is a stereo pair.
+        path: Image file. With `resize`, an image that is more than twice as wide as high
+            is a stereo pair; otherwise, one that is twice as wide as `size`.
         size: Height and width of the result.
-        resize: Bring other sizes to `size`, averaging where they are larger.
+        resize: Whether to resize images of other sizes to `size` with a box filter.
 
     Raises:
-        DataError: The file is corrupted, or of another size and not `resize`.
+        DataError: The file is corrupted, or the image has another size and `resize` is
+            False.
     """
     from PIL import Image
 
     height, width = size
     try:
-        # From memory: of a file, a chunk that claims 4 GB is asked for whole.
+        # Pillow decodes from memory: reading from a file, it would try to allocate the
+        # size that a corrupted chunk claims, up to 4 GB.
         with Image.open(io.BytesIO(path.read_bytes())) as file:
             found = file.size
             if not resize and found not in ((2 * width, height), (width, height)):
@@ -67,29 +70,30 @@ def read_left_image(
             return np.asarray(image)
     except DataError:
         raise
-    except Exception as error:  # Pillow's decoders raise nearly anything
+    except Exception as error:  # Pillow's decoders raise many types of exceptions
         raise DataError(f"{path}: corrupted image ({error})") from None
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraOptions:
-    """How images and calibrations are used: `config.data.camera`.
+    """Options for images and calibrations (`config.data.camera`).
 
     Attributes:
-        projection: "raw" or "pinhole", see `CameraCalibration.camera`.
-        radar_from_lidar_m: t of `p_radar = p_lidar + t` for all frames; None: each
-            frame's own.
-        radar_from_lidar_z_m: z of each frame's own t, which boxes are not moved by;
-            None: as the sensors are mounted. Unused with `radar_from_lidar_m`.
-        calibration: "sequence" for each sequence's own file, where it has one;
-            "common" for `cam_front0.yml` everywhere, as released.
-        resize: Image files of another size than the model's are resized, and their
-            calibration with them; otherwise they are an error.
-        allow_missing: Frames without an image are predicted from the radar only and
-            counted; otherwise they are an error.
+        projection: "raw" or "pinhole" (see `CameraCalibration.camera`).
+        radar_from_lidar_m: Translation t of `p_radar = p_lidar + t` for all frames, or
+            None for each frame's own.
+        radar_from_lidar_z_m: z of each frame's own t in the camera projection, or None
+            for the z of the mounting positions. The boxes are not moved by it. Unused
+            with `radar_from_lidar_m`.
+        calibration: "sequence" for the calibration file of each sequence, if it has one;
+            "common" for `cam_front0.yml` in all sequences, as in the released code.
+        resize: Whether to resize images (and their calibrations) of another size than
+            the model's; otherwise such an image is an error.
+        allow_missing: Whether frames without an image or a calibration are predicted
+            from the radar only; otherwise such a frame is an error.
 
     Raises:
-        UserError: An option is out of its range.
+        UserError: An option has an invalid value.
     """
 
     projection: ImageKind = "raw"
@@ -104,11 +108,16 @@ class CameraOptions:
 
     @classmethod
     def from_config(cls, data: Mapping[str, Any]) -> CameraOptions:
-        """Options of `config.data`; the defaults where it has no camera."""
+        """Returns the options in `config.data`, or the defaults if it has no camera."""
         return cls(**data.get("camera", {}))
 
     def shift(self, own_m: Any, own_z_m: float) -> tuple[float, ...]:
-        """t of `p_radar = p_lidar + t` from a frame's own t and the height in it."""
+        """Returns the translation t of `p_radar = p_lidar + t` for one frame.
+
+        Args:
+            own_m: The frame's own t.
+            own_z_m: z of the frame's t according to the mounting positions.
+        """
         if self.radar_from_lidar_m is not None:
             return tuple(map(float, self.radar_from_lidar_m))
         z = self.radar_from_lidar_z_m
@@ -116,7 +125,10 @@ class CameraOptions:
 
 
 def no_camera(image_size: tuple[int, int]) -> Camera:
-    """Stands for the camera of a frame that has none: finite numbers, not valid."""
+    """Returns a placeholder camera for frames without one.
+
+    All its values are finite, and its `is_valid` is False.
+    """
     height, width = image_size
     calibration = CameraCalibration(
         intrinsics=np.array([width, width, width / 2, height / 2]),

@@ -1,7 +1,7 @@
-"""What a run needs from a dataset: its frames, their radar, images and labels.
+"""Interface of datasets: frames with their radar tensors, images and labels.
 
-`radejax.data.kradar` reads K-Radar; docs/extending.md has another reader. Readers derive
-from the two classes below.
+`radejax.data.kradar` reads K-Radar; docs/extending.md shows another reader. Readers are
+derived from `LabelledFrame` and `LabelledFrames`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from radejax.geometry.radar_grid import RadarGrid
 
 @dataclasses.dataclass
 class Summary:
-    """What reading a dataset found.
+    """Summary of reading a dataset.
 
     Attributes:
-        counts: What was read and what was skipped, by reason.
-        problems: Everything missing or malformed: kind, and message with file and line.
-        notes: Assumptions that were made where a file is missing.
+        counts: Numbers of items that were read and skipped, by reason.
+        problems: Kind and message (with file and line) of everything that is missing or
+            malformed.
+        notes: Assumptions about missing files, and other remarks that are not problems.
     """
 
     counts: collections.Counter[str] = dataclasses.field(
@@ -41,11 +42,11 @@ class Summary:
     notes: list[str] = dataclasses.field(default_factory=list)
 
     def problem_counts(self) -> dict[str, int]:
-        """Number of problems of every kind."""
+        """Returns the number of problems of every kind."""
         return dict(collections.Counter(kind for kind, _ in self.problems))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
+        """Returns the summary as JSON values."""
         return {
             "counts": dict(self.counts),
             "problem_counts": self.problem_counts(),
@@ -54,7 +55,7 @@ class Summary:
         }
 
     def to_text(self, max_problems: int = 3) -> str:
-        """Lines for a terminal: all counts, the first problems of every kind."""
+        """Returns all counts and the first problems of every kind as text."""
         lines = [f"{n:>9,}  {what}" for what, n in self.counts.items() if n]
         lines += [f"note: {note}" for note in self.notes]
         for kind, number in self.problem_counts().items():
@@ -68,22 +69,25 @@ class Summary:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LabelledFrame:
-    """One frame; it is pickled, as other processes project it.
+    """One labelled frame.
+
+    Frames must be picklable, as other processes compute their projections.
 
     Attributes:
         sequence: Number of the sequence.
         name: Name that is unique in the sequence.
-        boxes: x, y, z, l, w, h, yaw in the radar frame: meters, radians.
+        boxes: x, y, z, l, w, h, yaw in the radar frame, in meters and radians.
         classes: Class names of `boxes`.
-        environment, time, weather: Conditions, by which results are tabulated.
-        radar_path: File of the radar tensor; None where it is missing.
-        camera_path: Image of the (left) front camera; None where it is missing.
-        camera_calibration_path: Its calibration, or None.
-        radar_from_lidar_m: Offset from where the calibration is measured to where boxes
-            are (`p_radar = p_lidar + t`): x, y, z; zeros where the two are the same.
-        radar_from_lidar_z_m: The z of the offset between the sensors as they are
-            mounted, whatever z was added to the boxes.
-        is_simulated: Nothing of the frame was measured.
+        environment, time, weather: Conditions by which results are tabulated.
+        radar_path: File of the radar tensor, or None if it is missing.
+        camera_path: Image of the (left) front camera, or None if it is missing.
+        camera_calibration_path: Calibration file of the camera, or None.
+        radar_from_lidar_m: Translation x, y, z from the frame of the camera calibration
+            to the frame of the boxes (`p_radar = p_lidar + t`); zeros if both are the
+            same.
+        radar_from_lidar_z_m: z of this translation according to the mounting positions
+            of the sensors, which may differ from the z that was added to the boxes.
+        is_simulated: Whether the frame is simulated.
     """
 
     sequence: int
@@ -102,15 +106,15 @@ class LabelledFrame:
 
     @property
     def key(self) -> str:
-        """Name that is unique in a dataset: `"1/00033_00001"`."""
+        """Name that is unique in a dataset, such as `"1/00033_00001"`."""
         return f"{self.sequence}/{self.name}"
 
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-        """Read the float32 projection; see `tesseract.read_frame`.
+        """Reads the float32 projection (see `tesseract.read_frame`).
 
         Raises:
             FileNotFoundError: The frame has no radar file.
-            DataError: It is corrupted, or of another shape than the grid.
+            DataError: The file is corrupted, or its shape does not match the grid.
         """
         if self.radar_path is None:
             raise FileNotFoundError("no radar tensor in any root")
@@ -119,7 +123,7 @@ class LabelledFrame:
     def read_calibration(
         self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
-        """Read the camera's calibration, with the frame's own offset or another."""
+        """Reads the camera calibration, with the frame's own translation or a given one."""
         assert self.camera_calibration_path is not None  # callers check it
         return CameraCalibration.from_kradar(
             self.camera_calibration_path,
@@ -134,11 +138,13 @@ _F = TypeVar("_F", bound=LabelledFrame)
 
 
 class LabelledFrames(Sequence[_F]):
-    """The frames of a dataset in a fixed order; a reader adds how they are found.
+    """The frames of a dataset in a fixed order.
+
+    Readers of a format are subclasses that find and read the frames.
 
     Attributes:
-        grid: Axes of the radar.
-        is_simulated: The dataset is simulated.
+        grid: Sensor axes of the radar.
+        is_simulated: Whether the dataset is simulated.
     """
 
     def __init__(
@@ -159,15 +165,24 @@ class LabelledFrames(Sequence[_F]):
         return self._frames[index]
 
     def summary(self) -> Summary:
-        """What was read, skipped, missing and malformed."""
+        """Returns a summary of what was read, skipped, missing and malformed."""
         return self._summary
 
     def of_split(self, split: str | None) -> Self:
-        """The frames of "train", "test" or another part; `UserError` for none that is."""
+        """Returns the frames of a split, such as "train" or "test".
+
+        Raises:
+            UserError: There is no such split.
+        """
         raise NotImplementedError
 
     def without(self, left_out: Collection[str], reason: str) -> Self:
-        """Return all frames but those of some keys, which are counted for a reason."""
+        """Returns the dataset without some frames.
+
+        Args:
+            left_out: Keys of the frames to leave out.
+            reason: Reason under which they are counted in the summary.
+        """
         other = copy.copy(self)
         other._summary = copy.deepcopy(self._summary)
         other._frames = [frame for frame in self if frame.key not in left_out]
@@ -186,10 +201,10 @@ ignore those that it has no use for."""
 
 
 def data_set(name: str) -> Callable[..., LabelledFrames]:
-    """The reader of a format.
+    """Returns the reader of a format.
 
     Args:
-        name: A name of `DATA_SETS`, or "module:Class".
+        name: A key of `DATA_SETS`, or "module:Class".
 
     Raises:
         UserError: There is no such name, or the class cannot be imported.
@@ -209,10 +224,10 @@ def data_set(name: str) -> Callable[..., LabelledFrames]:
 def front_view(
     frame: LabelledFrame,
 ) -> tuple[UInt8[np.ndarray, "H W 3"] | None, CameraCalibration | None]:
-    """Left front image of a frame and its calibration, to draw.
+    """Returns the left front image of a frame and its calibration for drawing.
 
-    Images of another size than the calibration's are resized to it. None where there is
-    none.
+    The image is resized to the image size of the calibration, or to `IMAGE_SIZE` without
+    one. Missing items are None, and both are None without an image.
 
     Raises:
         DataError: A file is corrupted.

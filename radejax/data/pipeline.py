@@ -1,7 +1,8 @@
-"""From records and labels to batches: shuffled, sharded, padded, resumable.
+"""Data pipeline from records and labels to shuffled, sharded and padded batches.
 
 Frames are drawn by index, so that a batch depends only on (seed, epoch, position) and
-never on threads; the state of the iterator is one number.
+never on the number of threads. The pipeline can be resumed: the state of the iterator is
+one number.
 """
 
 from __future__ import annotations
@@ -32,15 +33,16 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class CameraInputs:
-    """What a model sees beside the radar: an image and a camera for every frame.
+    """Camera inputs of a model: an image and a camera for every frame.
 
     Attributes:
-        cameras: One per frame, NumPy float64; `is_valid` is False where there is none.
-        image_size: Height and width of the images that the model sees.
-        options: That they were made with.
-        features: What an image backbone made of the images, in their place, or None.
-        sources: Path of every frame's front image, or key of its features; None where
-            there is none.
+        cameras: One camera per frame, NumPy float64. `is_valid` is False if the frame
+            has no image or no calibration.
+        image_size: Height and width of the images that the model receives.
+        options: Options that the cameras were created with.
+        features: Features from an image backbone that replace the images, or None.
+        sources: For every frame, the path of its front image or the key of its
+            features; None for frames without either.
     """
 
     cameras: tuple[Camera, ...]
@@ -50,13 +52,13 @@ class CameraInputs:
     sources: Sequence[Any]
 
     def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
-        """Black images `[count, H, W, 3]` uint8, or zero features."""
+        """Returns black images `[count, H, W, 3]` uint8, or features that are zero."""
         if self.features is not None:
             return np.zeros((count, *self.features.shape), self.features.dtype)
         return np.zeros((count, *self.image_size, 3), np.uint8)
 
     def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
-        """Image (or features) of one frame; black if it is missing."""
+        """Returns the image or features of one frame; zeros if they are missing."""
         source = self.sources[index]
         if source is None:
             return self.empty_images(1)[0]
@@ -71,19 +73,22 @@ def camera_inputs(
     options: CameraOptions,
     features: Records | None = None,
 ) -> CameraInputs:
-    """Cameras of left front images, each calibration file read once.
+    """Returns the left front images and cameras of frames.
+
+    Every calibration file is read only once.
 
     Args:
         frames: Frames of a dataset.
-        image_size: Height and width of the images that the model sees.
-        options: With `allow_missing`, frames without an image or a calibration get a
-            black image and a camera whose `is_valid` is False, and how many is logged.
-        features: Output of `radejax embed`, see `open_embeddings`; the image files may
-            then be gone.
+        image_size: Height and width of the images that the model receives.
+        options: Camera options. With `allow_missing`, frames without an image or a
+            calibration have a camera whose `is_valid` is False and, without an image, a
+            black image; their number is logged.
+        features: Output of `radejax embed` (see `open_embeddings`), or None. With
+            features, the image files are not read.
 
     Raises:
-        UserError: A frame has no image or calibration, and not `allow_missing`; the
-            calibration is of images of another size, and not `resize`; or an image is
+        UserError: A frame has no image or calibration and `allow_missing` is False; a
+            calibration is for another image size and `resize` is False; or an image is
             not among the features.
         DataError: A calibration file is corrupted.
     """
@@ -132,7 +137,7 @@ def _camera(
     image_size: tuple[int, int],
     options: CameraOptions,
 ) -> Camera:
-    """The camera of one frame, for images of the model's size."""
+    """Returns the camera of one frame for images of the model's size."""
     calibration = frame.read_calibration(radar_from_lidar_m)
     height, width = image_size
     if (calibration.height, calibration.width) != (height, width):
@@ -149,12 +154,12 @@ def _camera(
 def require_images(
     frames: FrameSequence, inputs: CameraInputs | None, split: str = "train"
 ) -> None:
-    """`UserError` if no frame has both an image and a calibration.
+    """Raises a `UserError` if no frame has both an image and a calibration.
 
     Args:
         frames: Frames of the split.
-        inputs: Inputs of these frames; None for models without a camera.
-        split: Its name, for the message.
+        inputs: Camera inputs of these frames, or None for models without a camera.
+        split: Name of the split for the error message.
     """
     if inputs is None or any(camera.is_valid for camera in inputs.cameras):
         return
@@ -173,13 +178,13 @@ def require_images(
 
 @dataclasses.dataclass(frozen=True)
 class FrameTable:
-    """Labels of a dataset as arrays of fixed shape, F frames with up to N objects.
+    """Labels of a dataset as arrays of fixed shape: F frames with up to N objects.
 
     Attributes:
-        records: Projections, of these frames at least.
+        records: Projections of these frames and possibly others.
         keys: Key of each frame's record.
-        boxes: float32 x, y, z, l, w, h, sin yaw, cos yaw; zeros as padding.
-        classes: int32 class indices; -1 as padding.
+        boxes: float32 x, y, z, l, w, h, sin yaw, cos yaw, padded with zeros.
+        classes: int32 class indices, padded with -1.
         images: Images and cameras of the frames, or None for radar-only models.
     """
 
@@ -201,20 +206,20 @@ def make_table(
     classes: Sequence[str] = CLASSES,
     images: CameraInputs | None = None,
 ) -> FrameTable:
-    """Labels of the frames, padded, next to their records.
+    """Builds the padded label table of the frames, with their records.
 
     Args:
-        records: Projections, of these frames at least.
+        records: Projections of these frames and possibly others.
         frames: Labelled frames, normally a split of a `KRadar`.
-        max_objects: Rows N of every frame; more objects are an error.
-        classes: Class names in the order of the class indices; objects of other
-            classes are not targets and are left out.
-        images: Of the same frames in the same order, see `camera_inputs`; None for
-            radar-only models.
+        max_objects: Number of rows N of every frame.
+        classes: Class names in the order of the class indices. Objects of other classes
+            are not targets and are left out.
+        images: Camera inputs of the same frames in the same order (see
+            `camera_inputs`), or None for radar-only models.
 
     Raises:
-        UserError: A frame has more than `max_objects` objects (the message says how
-            many would do), or has no record, or there are no frames.
+        UserError: A frame has more than `max_objects` objects (the message states the
+            required number), a frame has no record, or there are no frames.
     """
     if not len(frames):
         raise UserError("no frames: the dataset or the split is empty")
@@ -243,19 +248,22 @@ def make_table(
 
 @dataclasses.dataclass(frozen=True)
 class LoaderOptions:
-    """How frames are drawn, and how batches are prepared.
+    """Options for drawing frames and preparing batches.
 
     Attributes:
-        batch_size: Frames of a batch of this process.
-        seed: Seed of order and augmentation.
-        shuffle: A new order every epoch; otherwise the order of the table.
-        num_epochs: None repeats without end.
-        drop_remainder: Leave out the last, smaller batch of an epoch.
-        pad_remainder: Fill the last, smaller batch of an epoch with empty frames of
-            index -1 instead, so that all processes have as many batches.
-        num_threads: Threads that prepare batches; 0 prepares them in the caller's.
-        process_index: This host of several; None asks JAX.
-        process_count: Number of hosts; None asks JAX.
+        batch_size: Number of frames per batch of this process.
+        seed: Seed of the order and the augmentation.
+        shuffle: Whether every epoch has a new random order; otherwise the frames are
+            drawn in the order of the table.
+        num_epochs: Number of epochs, or None to repeat without end.
+        drop_remainder: Whether to leave out the last, smaller batch of an epoch.
+        pad_remainder: Whether to fill the last, smaller batch of an epoch with empty
+            frames of index -1 instead, so that all processes have the same number of
+            batches.
+        num_threads: Number of threads that prepare batches; 0 prepares them in the
+            calling thread.
+        process_index: Index of this process, or None for that of JAX.
+        process_count: Number of processes, or None for that of JAX.
     """
 
     batch_size: int
@@ -272,26 +280,27 @@ class LoaderOptions:
 def make_loader(
     table: FrameTable, options: LoaderOptions, *, augment: Augmentation | None = None
 ) -> grain.DatasetIterator[Batch]:
-    """A checkpointable iterator over batches of NumPy arrays.
+    """Returns a checkpointable iterator over batches of NumPy arrays.
 
-    `Batch.projection` has the type of the records; `structures.to_float` turns it into
-    network input on the device. `Batch.frame` is the index into the table's frames.
+    `Batch.projection` has the dtype of the records; `structures.to_float` converts it to
+    the network input on the device. `Batch.frame` is the index into the table's frames.
 
-    Epochs do not mix: by default every epoch leaves out the last
-    `len(table) % batch_size` frames of its own order.
+    A batch never contains frames of two epochs. By default every epoch leaves out the
+    last frames of its order that do not fill a batch of all processes.
 
     Args:
-        table: Records, labels and images, see `make_table`.
-        options: Batch size, order, threads.
-        augment: Applied to every frame, or None.
+        table: Records, labels and images (see `make_table`).
+        options: Batch size, order and threads.
+        augment: Augmentation that is applied to every frame, or None.
 
     Returns:
-        Iterator with `get_state` and `set_state`; `grain.checkpoint.CheckpointSave`
-        saves it with orbax. Restored, it continues with exactly the next batch, with
-        any number of threads.
+        An iterator with `get_state` and `set_state`, which
+        `grain.checkpoint.CheckpointSave` saves with orbax. A restored iterator continues
+        with exactly the next batch, for any number of threads.
 
     Raises:
-        UserError: There are fewer frames than one batch needs.
+        UserError: There are fewer frames than one batch of all processes, and the
+            remainder is dropped and not padded.
     """
     threads = grain.ReadOptions(
         num_threads=options.num_threads,
@@ -303,10 +312,10 @@ def make_loader(
 
 
 def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
-    """`UserError` for fewer frames than one batch.
+    """Raises a `UserError` if there are fewer frames than one batch of all processes.
 
     Args:
-        num_frames: Frames that there are.
+        num_frames: Number of frames.
         batch_size: Batch size of one process.
         count: Number of processes.
     """
@@ -321,9 +330,9 @@ def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
 def _make_order(
     num_frames: int, options: LoaderOptions
 ) -> grain.MapDataset[Int[np.ndarray, "B 2"]]:
-    """Batches of frame index and augmentation seed of one process.
+    """Returns the batches of one process as pairs of frame index and augmentation seed.
 
-    Frame indices from `num_frames` on are padding.
+    Frame indices of `num_frames` and above are padding.
     """
     index, count = options.process_index, options.process_count
     if index is None or count is None:
@@ -333,7 +342,8 @@ def _make_order(
         total = -(-num_frames // rows) * rows
     elif options.drop_remainder:
         check_enough(num_frames, options.batch_size, count)
-    # grain's shuffle in epoch e of seed s is that of epoch e - 1 of seed s + 1.
+    # grain shuffles epoch e of seed s in the same way as epoch e - 1 of seed s + 1. The
+    # seed is therefore hashed, so that runs with consecutive seeds have unrelated orders.
     spread = np.random.SeedSequence(options.seed).generate_state(2)
     dataset = grain.MapDataset.range(total).seed(int(spread[0]))
     if options.shuffle:
@@ -342,20 +352,20 @@ def _make_order(
     batches = seeded.batch(
         rows, drop_remainder=options.drop_remainder, batch_fn=np.stack
     )
-    # Of every global batch, its own rows: what is trained on, and in which order, does
-    # not depend on the number of processes.
+    # Every process takes its own rows of each global batch, so that the frames of a
+    # training step and their order do not depend on the number of processes.
     if count == 1:
         return batches
     return batches.map(lambda rows: np.array_split(rows, count)[index])
 
 
 def _add_seed(frame: int, rng: np.random.Generator) -> Int[np.ndarray, "2"]:
-    """A drawn frame and a seed of its own for augmentation."""
+    """Returns the index of a drawn frame and a random seed for its augmentation."""
     return np.array([frame, rng.integers(2**62)], np.int64)
 
 
 class _LoadBatch(grain.transforms.Map):
-    """Reads the frames of a batch, each straight into its place."""
+    """Reads the frames of a batch directly into the arrays of the batch."""
 
     def __init__(self, table: FrameTable, augment: Augmentation | None) -> None:
         self._table, self._augment = table, augment
@@ -384,7 +394,7 @@ class _LoadBatch(grain.transforms.Map):
         return batch.replace(camera=stack_cameras(cameras)) if images else batch
 
     def _sample(self, index: int) -> dict[str, Any]:
-        """One frame; image and camera None where they are not asked for."""
+        """Returns one frame; image and camera are None for radar-only models."""
         table, images = self._table, self._table.images
         return {
             "projection": table.records[table.keys[index]],
@@ -394,7 +404,7 @@ class _LoadBatch(grain.transforms.Map):
         }
 
     def _empty(self, size: int) -> Batch:
-        """Nothing but padding."""
+        """Returns a batch that contains only padding."""
         records, images = self._table.records, self._table.images
         rows = (size, self._table.boxes.shape[1])
         return Batch(

@@ -1,9 +1,9 @@
-"""Tensor max projection: from a 4D tesseract to the image that the networks see.
+"""Tensor max projection of a 4D tesseract to the input of the networks.
 
 The released formula takes the logarithm of every cell and then two maxima. The
-logarithm is monotonic, so the maxima can come first: 101 logarithms per range-azimuth
-bin instead of 64 x 37. What is left is one pass over the tensor, which reads each cell
-from memory once when it goes in the tensor's own memory order.
+logarithm is monotonic, so the maxima can be taken first, which needs 101 logarithms per
+range-azimuth bin instead of 64 x 37. The projection is then one pass over the tensor,
+which reads each cell from memory only once if it follows the tensor's memory order.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ MAX_LEVEL = 100.0
 def project_tensor(
     tesseract: Real[np.ndarray, "D R E A"], *, dtype: Any = np.float32
 ) -> Float[np.ndarray, "R A D+E"]:
-    """Tensor max projection of a 4D radar tensor, in one pass over its memory.
+    """Computes the tensor max projection of a 4D radar tensor in one pass over memory.
 
-    Channels are the maximum over elevation of every Doppler bin, then the maximum over
-    Doppler of every elevation bin, both on a normalized logarithmic scale:
+    The channels are the maximum over elevation for every Doppler bin, followed by the
+    maximum over Doppler for every elevation bin, both on a normalized logarithmic scale:
     p = (10 log10(power + 1e-10) + 1.2) / 184.3.
 
     Args:
-        tesseract: Linear power; any real dtype and memory order, read
-            fastest as `scipy.io.loadmat` lays it out (column-major) or C-contiguous.
-        dtype: Of the result. The logarithm is computed in float32, or in float64 for
-            float64 input.
+        tesseract: Linear power of any real dtype and memory order. Column-major (as
+            `scipy.io.loadmat` returns it) and C-contiguous arrays are the fastest.
+        dtype: Type of the result. The logarithm is computed in float32, or in float64
+            for float64 input.
 
     Returns:
         The projection.
 
     Raises:
-        UserError: The tesseract does not have four axes of at least one bin.
+        UserError: The tesseract is not real or does not have four axes of at least one
+            bin.
 
     References:
-        RADE-Net paper, section III-A; the constants are those of the released
+        RADE-Net paper, section III-A; the constants are from the released
         create_projections.py.
 
     Examples:
@@ -79,13 +80,15 @@ def project_columns(
     *,
     dtype: Any = np.float32,
 ) -> Float[np.ndarray, "R A DE"]:
-    """`project_tensor` for a tesseract that arrives column by column, as files store it.
+    """Computes `project_tensor` of a tesseract that is passed as slabs of one azimuth.
+
+    Files store a tesseract in this order.
 
     Args:
-        columns: For every azimuth a C-contiguous slab of linear power.
-            A slab is used up before the next is asked for: the buffer may be the same.
-        shape_drea: Of the whole tesseract.
-        dtype: Of the result.
+        columns: C-contiguous slabs of linear power, one for every azimuth. All slabs may
+            use the same buffer, as each is processed before the next is requested.
+        shape_drea: Shape of the whole tesseract.
+        dtype: Type of the result.
     """
     projection = _empty(shape_drea, dtype)
     for column, out in zip(columns, projection.swapaxes(0, 1), strict=True):
@@ -103,12 +106,13 @@ def _project_slab(
     reduce: Callable[[np.ndarray], np.ndarray],
     out: Float[np.ndarray, "_ DE"],
 ) -> None:
-    """Write the projection of one azimuth or one range, computed in its precision.
+    """Writes the projection of one azimuth or one range into `out`.
 
-    Non-negative floats order like the unsigned integers of the same bits, which NumPy
-    reduces twice as fast, as it need not watch for NaN; a NaN is the largest either
-    way. A sign bit, which power never has, wins the integer maximum and so is seen:
-    that slab is reduced again as floats.
+    It is computed in the precision of the slab. Non-negative floats have the same order
+    as the unsigned integers with the same bits. NumPy reduces integers twice as fast,
+    because it does not need to handle NaN; a positive NaN is the largest value in both
+    cases. Power has no sign bit. If a slab has one nevertheless, the integer maximum has
+    it too, and the slab is reduced again as floats.
     """
     unsigned = np.dtype(f"u{slab.dtype.itemsize}")
     power = reduce(slab.view(unsigned))
@@ -118,26 +122,26 @@ def _project_slab(
 
 
 def _column_maxima(column: Real[np.ndarray, "E R D"]) -> Real[np.ndarray, "R D+E"]:
-    """Maxima of one azimuth, a C-contiguous slab."""
+    """Returns the maxima of one azimuth, given as a C-contiguous slab."""
     elevation, range_, doppler = column.shape
     maxima = np.empty((range_, doppler + elevation), column.dtype)
     # For many short contiguous rows reduceat has a fraction of reduce's overhead.
     rows, starts = column.reshape(elevation, -1), np.arange(range_) * doppler
     np.maximum.reduceat(rows, starts, axis=1, out=maxima[:, doppler:].T)
-    # Backwards: the elevations that were read last are still in the cache.
+    # Reversed order, because the elevations that were read last are still in the cache.
     maxima[:, :doppler] = column[::-1].max(axis=0)
     return maxima
 
 
 def _row_maxima(row: Real[np.ndarray, "D E A"]) -> Real[np.ndarray, "A D+E"]:
-    """Maxima of one range, a slab in any memory order."""
+    """Returns the maxima of one range, given as a slab in any memory order."""
     return np.concatenate([row.max(axis=1).T, row.max(axis=0).T], axis=-1)
 
 
 def to_log_scale(
     power: Float[np.ndarray, "*cells"], out: Float[np.ndarray, "*cells"] | None = None
 ) -> Float[np.ndarray, "*cells"]:
-    """Linear power to the normalized decibels that the networks see."""
+    """Converts linear power to the normalized decibels of the network input."""
     level = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
     return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
@@ -147,9 +151,9 @@ def to_log_scale(
 def project_jax(
     tesseract: Real[jax.Array, "*frames D R E A"],
 ) -> Float[jax.Array, "*frames R A D+E"]:
-    """`project_tensor` for accelerators, float32.
+    """Computes `project_tensor` in float32 on an accelerator.
 
-    Leading axes are frames. Jit-compiled; maxima first, as on the host.
+    The leading axes are frames. The function is jit-compiled.
     """
     chex.assert_axis_dimension_gteq(tesseract, -4, 1)
     over_elevation = jnp.moveaxis(tesseract.max(axis=-2), -3, -1)  # [..., R, A, D]
@@ -167,10 +171,10 @@ ENCODINGS = ("float16", "uint8", "float32")
 def encode(
     projection: Float[np.ndarray, "*axes"], encoding: str
 ) -> Real[np.ndarray, "*axes"]:
-    """Convert a float projection to the type of the records.
+    """Converts a float projection to the type of the records.
 
-    uint8 stores round(255 p) of p clipped to [0, 1]. p = 0 is a power of 0.76, far below
-    the noise of K-Radar, and p = 1 one of 1.6e18, far above its echoes.
+    uint8 stores round(255 p) with p clipped to [0, 1]. p = 0 corresponds to a power of
+    0.76, far below the noise of K-Radar, and p = 1 to 2.0e18, far above its echoes.
     """
     if encoding == "uint8":
         return np.rint(np.clip(projection, 0.0, 1.0) * 255.0).astype(np.uint8)
@@ -178,7 +182,7 @@ def encode(
 
 
 def decode(stored: Real[np.ndarray, "*axes"]) -> Float[np.ndarray, "*axes"]:
-    """Inverse of `encode` on the host: float32."""
+    """Converts records to float32 projections on the host; inverse of `encode`."""
     if stored.dtype == np.uint8:
         return stored.astype(np.float32) / np.float32(255.0)
     return stored.astype(np.float32)

@@ -1,9 +1,9 @@
-"""Records: one array per frame, `FOLDER/<key>.npy`; `records.json` describes them.
+"""Records: one array per frame in `FOLDER/<key>.npy`, described by `records.json`.
 
 Projections of radar tensors (`preprocess`) and embeddings of front images
-(`radejax embed`) are kept in this way. A file is written under a temporary name and
-renamed: where it exists, its frame is done. Records have no labels, so another label
-revision only preprocesses the frames that are missing.
+(`radejax embed`) are stored as records. A file is written under a temporary name and
+renamed, so that the record of a frame is complete if its file exists. Records contain no
+labels. For another label revision, only frames without a record are preprocessed.
 """
 
 from __future__ import annotations
@@ -39,14 +39,15 @@ _SMALL_JOB_BINS = 3e9  # about 50 of K-Radar's tensors, a few seconds
 
 @dataclasses.dataclass(frozen=True)
 class Records:
-    """The records of a folder; may be shared by threads and pickled.
+    """The records of a folder, which can be shared by threads and pickled.
 
     Attributes:
-        folder: Where they are.
+        folder: Folder of the records.
         shape: Shape of every array.
         dtype: Type of every array: "float16", "float32" or "uint8".
-        source: What they were made with, as JSON has it: the radar's "grid" of
-            projections, configuration and weights of embeddings.
+        source: JSON values that describe how the records were created: the radar "grid"
+            for projections; the configuration and weights of the backbone for
+            embeddings.
     """
 
     folder: pathlib.Path
@@ -56,7 +57,7 @@ class Records:
 
     @classmethod
     def open(cls, folder: files.PathLike) -> Records:
-        """Records that exist.
+        """Opens existing records.
 
         Raises:
             FileNotFoundError: There is no such folder.
@@ -87,10 +88,11 @@ class Records:
         dtype: str,
         source: Mapping[str, Any],
     ) -> Records:
-        """Records of a new folder, or of one that has the same kind of records.
+        """Creates records in a new folder, or opens existing ones of the same kind.
 
         Raises:
-            UserError: The folder has other records; names what differs.
+            UserError: The dtype is unknown, or the folder has records of another kind;
+                the message lists the differences.
         """
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
         wanted = {"shape": list(shape), "dtype": dtype, "source": source}
@@ -99,7 +101,7 @@ class Records:
 
     @functools.cached_property
     def grid(self) -> RadarGrid:
-        """Sensor axes of projections.
+        """The sensor axes of projections.
 
         Raises:
             DataError: The records are not projections, or `records.json` is corrupted.
@@ -115,7 +117,7 @@ class Records:
             ) from None
 
     def keys(self) -> set[str]:
-        """Keys of the frames that have a record now; reads the folder."""
+        """Lists the folder and returns the keys of all frames that have a record."""
         return {
             path.relative_to(self.folder).as_posix().removesuffix(".npy")
             for path in self.folder.rglob("*.npy")
@@ -123,11 +125,11 @@ class Records:
         }
 
     def path(self, key: str) -> pathlib.Path:
-        """File of the record of the frame `key`."""
+        """Returns the file of the record of the frame `key`."""
         return self.folder / f"{key}.npy"
 
     def __getitem__(self, key: str) -> Real[np.ndarray, "..."]:
-        """Array of the frame `key`.
+        """Reads the array of the frame `key`.
 
         Raises:
             FileNotFoundError: The frame has no record.
@@ -142,19 +144,19 @@ class Records:
             return array
         except FileNotFoundError:
             raise
-        except Exception as error:  # NumPy raises nearly anything
+        except Exception as error:  # NumPy raises many types for corrupted files
             raise DataError(
                 f"{path}: corrupted record ({one_line(error)}), expected a {self.dtype} "
                 f"array of shape {self.shape}; delete the file and write it again"
             ) from None
 
     def write(self, key: str, array: Real[np.ndarray, "..."]) -> None:
-        """Writes the record of a frame: whole or not at all."""
+        """Writes the record of a frame atomically."""
         with files.atomic_write(self.path(key)) as file:
             np.save(file, array, allow_pickle=False)
 
     def require(self, frames: FrameSequence) -> None:
-        """`UserError` unless every frame has a record; names the first without one."""
+        """Raises a `UserError` that names the first frame without a record, if any."""
         keys = self.keys()
         missing = [frame.key for frame in frames if frame.key not in keys]
         if missing:
@@ -165,15 +167,16 @@ class Records:
 
 
 def open_projections(folder: files.PathLike, grid: RadarGrid | None = None) -> Records:
-    """Projections of a folder.
+    """Opens the projections in a folder.
 
     Args:
-        folder: What `preprocess` wrote.
-        grid: Grid that they must have; None takes any.
+        folder: Folder that `preprocess` wrote.
+        grid: Required grid, or None for any grid.
 
     Raises:
         FileNotFoundError: There is no such folder.
-        DataError: `records.json` is corrupted.
+        DataError: `records.json` is corrupted or, if a grid is required, describes other
+            records.
         UserError: The projections have another grid.
     """
     records = Records.open(folder)
@@ -188,11 +191,11 @@ def open_projections(folder: files.PathLike, grid: RadarGrid | None = None) -> R
 def open_embeddings(
     folder: files.PathLike, image_config: Mapping[str, Any] | None = None
 ) -> Records:
-    """Features `[h, w, C]` of the front images of a folder.
+    """Opens the front image features `[h, w, C]` in a folder.
 
     Args:
-        folder: What `radejax embed` wrote.
-        image_config: `config.model.image` that they must fit, or None.
+        folder: Folder that `radejax embed` wrote.
+        image_config: `config.model.image` that the features must match, or None.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -214,14 +217,14 @@ def open_embeddings(
 
 
 def embedding_fields(image_config: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of `config.model.image` that embeddings depend on, as JSON has it."""
+    """Returns the part of `config.model.image` that embeddings depend on, in JSON types."""
     irrelevant = ("freeze", "attention", "layer_scale")
     plain = {k: v for k, v in dict(image_config).items() if k not in irrelevant}
     return json.loads(json.dumps(plain))
 
 
 def describe_grid(grid: RadarGrid) -> str:
-    """Sizes and extent of a grid in a few words."""
+    """Returns a short description of the size and extent of a grid."""
     sizes = " x ".join(map(str, grid.shape_drea))
     return (
         f"{sizes} bins (Doppler, range, elevation, azimuth) to {grid.range_m[-1]:.2f} m, "
@@ -235,12 +238,13 @@ def describe_grid(grid: RadarGrid) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class PreprocessReport:
-    """What one call of `preprocess` did.
+    """Result of one call of `preprocess`.
 
     Attributes:
-        num_frames: Frames of this shard.
-        num_found: Of these, done earlier.
-        skipped: Frames whose radar tensor is missing or corrupted: key to reason.
+        num_frames: Number of frames in this shard.
+        num_found: Number of these frames that already had a record.
+        skipped: Reasons for skipping frames (their radar tensor is missing or
+            corrupted), by key.
         seconds: Wall time.
     """
 
@@ -251,11 +255,11 @@ class PreprocessReport:
 
     @property
     def num_written(self) -> int:
-        """Records that were written."""
+        """Number of records that were written."""
         return self.num_frames - self.num_found - len(self.skipped)
 
     def to_text(self) -> str:
-        """Lines for a terminal."""
+        """Returns the report as text for a terminal."""
         rate = self.num_written / self.seconds if self.seconds else 0.0
         lines = [
             f"{self.num_frames:,} frames: {self.num_found:,} were done, "
@@ -284,19 +288,21 @@ def preprocess(
     call tries them again. Several processes may work on different shards of a folder.
 
     Args:
-        frames: Normally a `KRadar` without a split: records serve every split and label
-            revision.
-        folder: Folder of the records; made if needed.
-        dtype: "float16", "uint8" or "float32"; None takes that of the records that
-            exist, else "float16".
-        shard: `(i, n)` takes every n-th frame from the i-th on, i from 0.
-        num_workers: Processes; 0 works in this one. None takes one per core, or this
-            process where the work is done before others have started.
-        progress: Show a progress bar.
+        frames: Labelled frames, normally a `KRadar` without a split, as the records can
+            be used for every split and label revision.
+        folder: Folder of the records, which is created if needed.
+        dtype: "float16", "uint8" or "float32". None uses the dtype of existing records,
+            or "float16" without any.
+        shard: `(i, n)` selects every n-th frame starting with frame i, counted from 0.
+        num_workers: Number of worker processes; 0 works in the calling process. None
+            starts one per core, or none for small jobs that would end before the
+            workers have started.
+        progress: Whether to show a progress bar.
 
     Raises:
-        UserError: The folder has other records, a wrong shard, no frames, or a worker
-            process was killed.
+        UserError: There are no frames, the shard or the dtype is invalid, the folder has
+            records of another kind, or a worker process was killed.
+        DataError: `records.json` is corrupted.
     """
     began, folder = time.perf_counter(), pathlib.Path(folder)
     if not len(frames):
@@ -330,7 +336,12 @@ def preprocess(
 def _write_all(
     records: Records, frames: Sequence[LabelledFrame], num_workers: int
 ) -> Generator[tuple[str, str], None, None]:
-    """Key of every frame, and why it was skipped, in the order in which they end."""
+    """Writes the records of frames.
+
+    Yields:
+        The key of every frame and the reason if it was skipped (otherwise ""), in the
+        order of completion.
+    """
     if not num_workers or not frames:
         yield from (_write(records, frame) for frame in frames)
         return
@@ -342,7 +353,7 @@ def _write_all(
 
 
 def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
-    """Writes the record of one frame; returns its key and why it was skipped, or ""."""
+    """Writes the record of one frame; returns its key and the reason if it was skipped."""
     try:
         projection = frame.read_projection(records.grid)
     except (DataError, OSError) as error:

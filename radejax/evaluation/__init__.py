@@ -1,7 +1,7 @@
 """Average precision of 3D detections, in every protocol that K-Radar papers use.
 
-`evaluate` computes the APs of one protocol from column arrays. To ask several questions
-about the same predictions (protocols, weathers, resamples), build an `EvaluationSet`.
+`evaluate` computes the APs of one protocol from column arrays. For several evaluations of
+the same predictions (protocols, weathers, resamples), build an `EvaluationSet`.
 """
 
 from __future__ import annotations
@@ -30,33 +30,34 @@ def evaluate(
     spaces: Sequence[str] = SPACES,
     label_version: str | None = None,
 ) -> list[Result]:
-    """Average precision per class, space and IoU threshold in one protocol.
+    """Computes the average precision per class, space and IoU threshold in one protocol.
 
     Args:
         ground_truth: Columns frame `[N]` int, box `[N, 7]` x, y, z, l, w, h, yaw (meters,
             radians, radar frame, full extents, z at mid-height) and cls `[N]` names. The
-            order of boxes within a frame matters to K-Radar's protocols.
+            results of K-Radar's protocols depend on the order of boxes within a frame.
         predictions: The same columns and score `[M]` in [0, 1].
         classes: Classes to evaluate. `empty_frames` considers only these.
         iou_thresholds: A match needs an IoU above the threshold.
         protocol: One of `protocols.PROTOCOLS`.
-        frames: Columns of the frame table, at least frame `[F]`; None takes the frames
-            that occur. Boxes of other frames are an error.
-        empty_frames: Frames to ignore: "class" those without an object of the class,
-            "frame" those without an object of any class, "none" no frames, "protocol"
-            as the protocol does.
-        score_threshold: Predictions need a score above this. 0 keeps all (in K-Radar's
-            protocols all above 0).
-        roi: Keep only boxes with their center in this region.
+        frames: Columns of the frame table, at least frame `[F]`. None uses the frames
+            that occur in the other tables. Boxes of other frames are an error.
+        empty_frames: Frames to ignore: "class" for frames without an object of the
+            class, "frame" for frames without an object of any class, "none" for no
+            frames, "protocol" for the default of the protocol.
+        score_threshold: Predictions need a score above this threshold. 0 keeps all
+            predictions (in K-Radar's protocols, all with a score above 0).
+        roi: Region of interest; only boxes with their center in it are kept.
         spaces: "bev" and "3d", or one of them.
-        label_version: Label revision, part of the results' names.
+        label_version: Label revision, which is part of the names of the results.
 
     Returns:
         One `Result` per space, IoU threshold and class, in that nesting.
 
     Raises:
-        UserError: Unknown protocol, space, region or empty-frame rule; missing columns.
-        DataError: A bad row; names the table, frame and row.
+        UserError: A protocol, space, region or empty-frame rule is unknown, or a column
+            is missing.
+        DataError: A row is invalid; the message names the table, frame and row.
 
     References:
         K-Radar evaluation: Paek et al., arXiv:2206.08171, and its issues 28, 36, 81.

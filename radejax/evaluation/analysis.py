@@ -1,8 +1,8 @@
-"""Where a detector is good and where it fails: subsets, box errors, worst frames.
+"""Analysis of the strengths and failures of a detector: subsets, box errors, worst frames.
 
-All of it uses the matches of `all_point` (every prediction, by descending score, takes
-the best free object of its class) at one IoU threshold. The sanity checks at the end
-report what is wrong with predictions as a whole.
+All functions use the matches of the protocol `all_point` at one IoU threshold: by
+descending score, every prediction is matched to the best unmatched object of its class.
+The sanity checks at the end report systematic errors of the predictions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Masks = dict[str, tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " M"]]]
 def matched_objects(
     data: EvaluationSet, space: str, iou: float
 ) -> Int[np.ndarray, " M"]:
-    """Ground truth that each prediction found, or -1 (recommended protocol).
+    """Returns the object that each prediction matches in `all_point`, or -1.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -48,16 +48,18 @@ def matched_objects(
 def subsets(
     data: EvaluationSet, frames: Columns, iou: float
 ) -> dict[str, list[dict[str, Any]]]:
-    """Numbers by distance and, as far as known, by weather, environment and time.
+    """Computes metrics by distance and, as far as known, weather, environment and time.
 
-    Distances are measured on the ground. A prediction that found an object belongs to the
-    object's distance band, any other to its own: a detection does not become a false
-    positive for lying just across a border.
+    Distances are measured in the ground plane. A matched prediction belongs to the
+    distance band of its object, any other prediction to the band of its own distance, so
+    that a detection just across the border of a band does not become a false positive.
 
     Returns:
-        By kind, an entry per subset and class: the kind with the name of the subset,
-        "cls", "ap" (exact, 3D, 0 to 100, NaN without objects), "precision" and "recall"
-        above the operating score, "num_gt" objects, and "num_det" predictions above it.
+        For each kind of subset, one entry per subset and class. An entry contains the
+        name of the subset (under the name of the kind), "cls", "ap" (`all_point`, 3D, 0
+        to 100, NaN without objects), "precision" and "recall" above the operating score,
+        the number of objects "num_gt", and the number of predictions above the operating
+        score "num_det".
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -84,7 +86,7 @@ def subsets(
 
 
 def _by_distance(data: EvaluationSet, match: Int[np.ndarray, " M"]) -> Masks:
-    """Masks of the distance bands."""
+    """Returns the masks of the distance bands."""
     of_gt = np.hypot(data.gt.box[:, 0], data.gt.box[:, 1])
     of_pred = np.hypot(data.pred.box[:, 0], data.pred.box[:, 1])
     is_found = match >= 0
@@ -104,7 +106,7 @@ def _numbers(
     in_pred: Bool[np.ndarray, " M"],
     match: Int[np.ndarray, " M"],
 ) -> dict[str, float]:
-    """AP, precision, recall and counts of one class in one subset."""
+    """Computes AP, precision, recall and counts of one class in one subset."""
     order = data.by_score[cls]
     order = order[in_pred[order]]
     score, is_tp = data.score[order], match[order] >= 0
@@ -122,14 +124,16 @@ def _numbers(
 
 
 def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
-    """Errors of boxes matched in the bird's-eye view: medians and means per class.
+    """Computes mean and median errors per class of boxes matched in the bird's-eye view.
+
+    Predictions with a score of 0 are left out.
 
     Returns:
-        Per class "count" and, as "<what>_mean" and "<what>_median": center_m (distance in
-        the ground plane), z_m (absolute), length_m, width_m, height_m (absolute),
-        heading_deg (absolute, 0 to 180), axis_deg (heading up to a half turn, 0 to 90),
-        and "reversed", the fraction of headings off by more than 90 degrees. NaN without
-        matches.
+        For each class, the number of matches "count" and, as "<error>_mean" and
+        "<error>_median": center_m (distance in the ground plane), z_m, length_m, width_m,
+        height_m (absolute), heading_deg (absolute, 0 to 180) and axis_deg (heading modulo
+        a half turn, 0 to 90); and "reversed", the fraction of headings with an error of
+        more than 90 degrees. The errors are NaN without matches.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -172,13 +176,14 @@ def _or_nan(
 def worst_frames(
     data: EvaluationSet, frames: Columns, iou: float
 ) -> list[dict[str, Any]]:
-    """Frames with the most mistakes above the operating score, in 3D.
+    """Finds the frames with the most errors in 3D above the operating score.
 
     Returns:
-        Up to 10 entries, worst first: "index" in the frame table, "frame" id, "missed"
-        objects, "false" predictions, "found" and, as far as known, "name" and "sequence".
-        Ties: more missed first, then the order of the frame table. Frames without a
-        mistake are never listed.
+        Up to 10 entries, worst first: the "index" in the frame table, the "frame" id, the
+        numbers of "missed" objects, "false" predictions and "found" objects and, as far
+        as known, "name" and "sequence". Frames with the same number of errors are sorted
+        by the number of missed objects, then by the frame table. Frames without an error
+        are not listed.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -221,7 +226,7 @@ MIN_OBJECTS = 10
 
 
 def sanity_checks(data: EvaluationSet) -> list[str]:
-    """Warnings about another unit, frame or height of the predicted boxes.
+    """Returns warnings if predicted boxes seem to use another unit, frame or height.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -246,7 +251,7 @@ def sanity_checks(data: EvaluationSet) -> list[str]:
 
 
 def _constant_offset(data: EvaluationSet) -> list[str]:
-    """The median offset of the best prediction near each object, if it is constant."""
+    """Warns if the best prediction near each object has a nearly constant offset."""
     by_score = np.argsort(data.score[data.pair_pred], kind="stable")
     best = np.full(len(data.gt), -1)
     best[data.pair_gt[by_score]] = data.pair_pred[by_score]

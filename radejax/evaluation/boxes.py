@@ -1,4 +1,4 @@
-"""Tables of ground truth, predictions and frames: column arrays, checked once.
+"""Tables of ground truth, predictions and frames as column arrays.
 
 A frame is named by its id in the frame table (an integer) or by its key "sequence/name",
 such as "1/00033_00001" (K-Radar's label file, with or without .txt).
@@ -31,10 +31,10 @@ Roi = str | Sequence[float] | None
 
 
 def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
-    """Bounds (x0, x1, y0, y1, z0, z1) of a named or given region of interest.
+    """Returns the bounds (x0, x1, y0, y1, z0, z1) of a named or given region of interest.
 
     Raises:
-        UserError: An unknown name, or not six increasing bounds.
+        UserError: The name is unknown, or the bounds are not three increasing pairs.
 
     Examples:
         >>> roi_bounds([0, 72, -6.4, 6.4, -2, 6])
@@ -55,7 +55,7 @@ def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
 
 
 def in_roi(box: Real[np.ndarray, "N 7"], roi: Roi) -> Bool[np.ndarray, " N"]:
-    """True for boxes whose centers are inside the region, bounds included.
+    """Returns a mask of boxes whose centers are inside the region, bounds included.
 
     Examples:
         >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [20.0, 40, 0, 4, 2, 1.5, 0]])
@@ -70,7 +70,7 @@ def in_roi(box: Real[np.ndarray, "N 7"], roi: Roi) -> Bool[np.ndarray, " N"]:
 
 
 def roi_name(roi: Roi) -> str:
-    """A short name of a region for the names of results.
+    """Returns a short name of a region for the names of results.
 
     Examples:
         >>> roi_name("narrow"), roi_name(None), roi_name([0, 72, -6, 6, -2, 6])
@@ -84,16 +84,16 @@ def roi_name(roi: Roi) -> str:
 
 
 def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
-    """Boxes from columns frame, box, cls and, for predictions, score.
+    """Reads boxes from the columns frame, box, cls and, for predictions, score.
 
     Args:
-        table: The columns.
+        table: Columns by name.
         name: Name of the table in errors, such as "predictions".
         scored: Whether a score is expected.
 
     Raises:
         UserError: A column is missing or has the wrong shape or type.
-        DataError: A value that no box may have; names the table, frame and row.
+        DataError: A value is invalid; the message names the table, frame and row.
 
     Examples:
         >>> table = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -127,7 +127,7 @@ def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
 
 
 def _frame_column(table: AnyColumns, name: str) -> Int[np.ndarray, " N"]:
-    """Frame ids of a table as int64."""
+    """Returns the frame ids of a table as int64."""
     ids = np.asarray(table["frame"])
     if ids.ndim != 1 or (ids.size and ids.dtype.kind not in "iu"):
         raise UserError(
@@ -138,7 +138,7 @@ def _frame_column(table: AnyColumns, name: str) -> Int[np.ndarray, " N"]:
 
 
 def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
-    """Ids of a frame table, checked to be integers without repetition.
+    """Returns the ids of a frame table, checked to be unique integers.
 
     Examples:
         >>> frame_ids({"frame": np.array([7, 9])}).tolist()
@@ -162,10 +162,10 @@ def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
 def class_indices(
     boxes: Boxes, classes: Sequence[str], name: str
 ) -> Int[np.ndarray, " N"]:
-    """Index of each box into `classes`, -1 for known classes that are not among them.
+    """Returns the index of each box into `classes`, or -1 for K-Radar's other classes.
 
     Raises:
-        DataError: A class name that is neither evaluated nor one of K-Radar's.
+        DataError: A class name is neither evaluated nor one of K-Radar's.
 
     Examples:
         >>> box = np.ones((2, 7))
@@ -189,10 +189,10 @@ def class_indices(
 def frame_positions(
     frame: Int[np.ndarray, " N"], ids: Int[np.ndarray, " F"], name: str
 ) -> Int[np.ndarray, " N"]:
-    """Positions of frames in the table of ids.
+    """Returns the positions of frames in the array `ids`.
 
     Raises:
-        DataError: A frame that the table does not have.
+        DataError: A frame is not in `ids`.
 
     Examples:
         >>> frame_positions(np.array([9, 7, 7]), np.array([7, 9]), "predictions").tolist()
@@ -210,7 +210,7 @@ def frame_positions(
 
 
 def take(table: AnyColumns, rows: Shaped[np.ndarray, " K"]) -> Columns:
-    """Rows of a table, by position or mask.
+    """Selects rows of a table by position or mask.
 
     Examples:
         >>> table = {"frame": np.array([0, 1, 1]), "cls": np.array(["a", "b", "c"])}
@@ -223,7 +223,7 @@ def take(table: AnyColumns, rows: Shaped[np.ndarray, " K"]) -> Columns:
 def columns_of(
     rows: Sequence[tuple[int | str, str, Sequence[float], float]],
 ) -> Columns:
-    """Columns of rows of frame, class, box and score.
+    """Converts rows of frame, class, box and score to columns.
 
     Examples:
         >>> columns_of([(7, "Sedan", (20, 0, 0, 4, 2, 1.5, 0), 0.9)])["frame"].tolist()
@@ -241,16 +241,17 @@ def columns_of(
 def tables_from_frames(
     frames: Iterable[Any], split: str | None = None
 ) -> tuple[Columns, Columns]:
-    """Ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
+    """Builds ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
 
     Args:
         frames: Objects with sequence, name, weather, environment, time, is_simulated,
             boxes `[N, 7]` (radar frame) and classes `[N]` (names).
-        split: Split that the frame table names: "train", "test", "all" or a split
-            file; None where it is not known.
+        split: Split to store in the frame table: "train", "test", "all" or a split file;
+            None if it is not known.
 
     Returns:
-        Ground-truth columns and frame columns; the frame id is the position.
+        The ground-truth columns and the frame columns. The frame id is the position in
+        `frames`.
 
     Examples:
         >>> truth, frames = tables_from_frames([], "test")
@@ -276,10 +277,10 @@ def tables_from_frames(
 
 
 def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
-    """Write boxes as columns in a .npz file; `files.read_table` reads them.
+    """Writes boxes as columns to a .npz file, which `files.read_table` reads.
 
-    Frames are written by key where the frame table has names, which survives another
-    selection or order of frames, and by id otherwise.
+    Frames are written by key if the frame table has names, and by id otherwise. Keys
+    remain valid for another selection or order of frames.
 
     Examples:
         >>> import pathlib, tempfile
@@ -304,7 +305,7 @@ def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
 
 
 def frame_keys(frames: Columns) -> list[str]:
-    """Key "sequence/name" of every frame; the id where these are not known.
+    """Returns the key "sequence/name" of every frame, or its name or id if that is missing.
 
     Examples:
         >>> frame_keys({"frame": [0], "sequence": [5], "name": ["00012_00001.txt"]})
@@ -324,17 +325,17 @@ def frame_keys(frames: Columns) -> list[str]:
 def with_ids(
     table: Columns, frames: Columns | None, where: str, *, skip: bool = False
 ) -> Columns:
-    """A table whose frames are named by id, key or "sequence/radar", with ids.
+    """Replaces the frame names of a table (keys or "sequence/radar") by frame ids.
 
     Args:
-        table: With a column frame; ids stay as they are.
-        frames: Frame table to look names up in.
+        table: Table with a column frame. Integer ids are not changed.
+        frames: Frame table in which names are looked up.
         where: Name of the table in errors.
-        skip: Skip rows of frames that the frame table does not have, unless it has
-            none of them.
+        skip: Whether to skip rows of frames that are not in the frame table, unless all
+            rows would be skipped.
 
     Raises:
-        DataError: A name that the frame table does not have.
+        DataError: A frame name is not in the frame table.
 
     Examples:
         >>> frames = {"frame": np.array([7]), "name": np.array(["5/00012_00001"])}
@@ -351,7 +352,7 @@ def with_ids(
         ids = np.asarray(frames["frame"]).tolist()
         by_key = dict(zip(frame_keys(frames), ids, strict=True))
         by_radar = {key.rpartition("_")[0]: i for key, i in by_key.items()}
-        known = by_key | by_radar | by_key  # keys first, and they win
+        known = by_key | by_radar | by_key  # keys come first and take precedence
     is_known = np.array([name in known for name in names])
     if skip and is_known.any():
         table = take(table, is_known)

@@ -1,6 +1,7 @@
-"""Comparisons of runs on the same frames: `radejax compare`.
+"""Comparisons of runs on the same frames (`radejax compare`).
 
-Both runs of a comparison see the same resampled sequences, see `evaluation.results`.
+Both runs of a comparison are evaluated on the same resampled sequences (see
+`evaluation.results`).
 """
 
 from __future__ import annotations
@@ -33,20 +34,21 @@ from radejax.evaluation.results import (
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Run B against run A in one metric.
+    """Comparison of run B with run A in one metric.
 
     Attributes:
         cls: Class name or "mean".
         space: "bev" or "3d".
         iou: IoU threshold.
         protocol: Name of the protocol.
-        ap_a: AP of run A, all frames.
-        ap_b: AP of run B.
-        difference: B minus A.
+        ap_a: AP of run A over all frames.
+        ap_b: AP of run B over all frames.
+        difference: AP of run B minus AP of run A.
         low: Lower end of the 95 % interval of the difference.
-        high: Upper end.
-        p_value: Two-sided, from the fraction of resamples in which the sign changes.
-        p_adjusted: The same after Holm's correction over all rows compared together.
+        high: Upper end of this interval.
+        p_value: Two-sided p-value from the fraction of resamples in which the difference
+            has the less frequent sign.
+        p_adjusted: p-value after Holm's correction over all rows compared together.
         is_significant: Whether `p_adjusted` is below 0.05.
     """
 
@@ -75,24 +77,25 @@ def compare(
     score_threshold: float = 0.0,
     resamples: int = 2000,
 ) -> list[Comparison]:
-    """Paired comparison of two runs: both see the same resampled sequences.
+    """Compares two runs on the same resampled sequences (paired comparison).
 
     Args:
-        data_a: Run A.
-        data_b: Run B on the same ground truth and frames.
+        data_a: Evaluation set of run A.
+        data_b: Evaluation set of run B with the same ground truth and frames.
         sequence: Sequence of every frame.
-        protocol_names: Protocols to compare in.
-        spaces: "bev", "3d".
+        protocol_names: Protocols of the compared APs.
+        spaces: "bev", "3d" or both.
         iou: IoU threshold.
         score_threshold: Score threshold of both runs.
         resamples: Number of resamples.
 
     Raises:
-        UserError: The runs differ in classes, frames or ground truth.
+        UserError: The runs differ in classes, frames or ground truth, or there are fewer
+            than two sequences.
     """
     _check_same_truth(data_a, data_b)
     weights = sequence_weights(sequence, resamples=resamples, seed=0)
-    # The first row weights every frame once: the APs themselves.
+    # The first row counts every frame once, which gives the APs over all frames.
     weights = np.concatenate([np.ones_like(weights[:1]), weights])
     rows = []
     for protocol, space in itertools.product(protocol_names, spaces):
@@ -115,7 +118,10 @@ def compare(
 def _difference(
     samples_a: Float[np.ndarray, " B"], samples_b: Float[np.ndarray, " B"]
 ) -> tuple[float, float, float, float, float, float]:
-    """APs, difference, interval and p-value; the first samples are over all frames."""
+    """Returns both APs, their difference, its interval and its p-value.
+
+    The first sample of each run is its AP over all frames; the others are resamples.
+    """
     ap_a, ap_b = float(samples_a[0]), float(samples_b[0])
     gaps = samples_b[1:] - samples_a[1:]
     gaps = gaps[~np.isnan(gaps)]
@@ -126,7 +132,7 @@ def _difference(
 
 
 def _holm(p_values: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
-    """P-values adjusted for their number (Holm's step-down)."""
+    """Adjusts p-values for their number with Holm's step-down method."""
     order = np.argsort(p_values, kind="stable")
     scaled = np.minimum(1, np.arange(p_values.size, 0, -1) * p_values[order])
     adjusted = np.empty_like(scaled)
@@ -135,7 +141,7 @@ def _holm(p_values: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
 
 
 def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
-    """Raises unless two sets have the same classes, frames and ground truth."""
+    """Raises a `UserError` unless both sets have the same classes, frames and objects."""
     for name, one, other in (
         ("classes", data_a.classes, data_b.classes),
         ("frames", data_a.frame, data_b.frame),
@@ -150,7 +156,7 @@ def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
 
 
 def comparison_table(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
-    """Two runs and which of their differences are significant."""
+    """Returns the table of the differences of two runs and their significance."""
     header = ["Class", "Protocol", "AP", "IoU", "A", "B", "B - A", "95 %", "p"]
     body = []
     for row in rows:
@@ -171,26 +177,28 @@ def compare_files(
     source: Source,
     options: EvaluationOptions,
 ) -> tuple[str, list[dict[str, Any]]]:
-    """Compare runs on the same frames: each with the first.
+    """Compares each run with the first one on the same frames.
 
     Args:
-        paths: Predictions or report folders, at least two; the first is run A.
-        out_dir: Where to write comparison.txt and comparison.json, or None.
-        source: Ground truth, unless the paths bring their own.
+        paths: Predictions or report folders of at least two runs. The first is run A.
+        out_dir: Folder for comparison.txt and comparison.json, or None.
+        source: Source of the ground truth for paths that do not contain it.
         options: Classes, protocols, IoU thresholds, region, score threshold and number
-            of resamples of sequences (`bootstrap`).
+            of resamples of sequences (`bootstrap`). The first two main protocols and the
+            first IoU threshold are compared.
 
     Returns:
-        The tables as text, and the fields of all comparisons (B is the second run first).
+        The tables as text, and the fields of all comparisons in the order of the runs.
 
     Raises:
-        UserError: Fewer than two runs, or runs on different frames or ground truth.
+        UserError: There are fewer than two runs or no resamples, the runs have different
+            frames or ground truth, or the sequences of the frames are not known.
     """
     if len(paths) < 2:
         raise UserError("a comparison needs at least two runs")
     if options.bootstrap < 1:
         raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
-    # Predictions that one run did not store must not count for another run.
+    # Predictions below the lowest stored score of one run must not count for another run.
     threshold = max(options.score_threshold, *map(stored_from, paths))
     options = dataclasses.replace(
         options, score_threshold=threshold, min_score=threshold
@@ -221,7 +229,7 @@ def compare_files(
 def _load_run(
     path: PathLike, source: Source, options: EvaluationOptions
 ) -> tuple[EvaluationSet, np.ndarray]:
-    """A run ready to be compared, and the sequence of each of its frames."""
+    """Returns the evaluation set of a run and the sequence of each of its frames."""
     truth, found, frames, _ = load(path, source, options.classes)
     if "sequence" not in frames:
         raise UserError(

@@ -1,4 +1,4 @@
-"""Ground truth and predictions, paired once and evaluated many times."""
+"""Ground truth and predictions that are paired once and evaluated many times."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Result(Curve):
-    """One average precision, its curve, and everything that it depends on.
+    """One average precision with its curve and the settings it was computed with.
 
     Attributes:
-        cls: Class name; in reports also "mean", over the classes that occur.
+        cls: Class name; in reports also "mean" for the mean over the classes that occur.
         space: "bev" or "3d".
-        iou: IoU threshold; a match needs more.
+        iou: IoU threshold; a match needs an IoU above it.
         protocol: Name of the protocol.
-        num_frames: Frames that take part.
-        score_threshold: Predictions need a score above this.
+        num_frames: Number of frames that were evaluated.
+        score_threshold: Score threshold; predictions need a score above it.
         empty_frames: Frames that were ignored: "class", "frame" or "none".
         roi: Name of the region of interest.
         label_version: Label revision of the ground truth, if known.
@@ -47,7 +47,7 @@ class Result(Curve):
         condition: "all", or a weather.
         low: Lower end of the 95 % bootstrap interval; None if it was not computed, NaN if
             the class does not occur.
-        high: Upper end.
+        high: Upper end of this interval.
     """
 
     cls: str
@@ -71,10 +71,10 @@ class Result(Curve):
 
     @property
     def metric(self) -> str:
-        """Name with everything the number depends on but the class and the frames.
+        """Name that states all settings of the AP except the class and the frames.
 
-        Such as ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow, then
-        /simulated where the frames are.
+        For example ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow,
+        followed by /simulated for simulated frames.
         """
         return (
             f"ap_{self.space}_iou{100 * self.iou:.4g}/{self.protocol}"
@@ -85,7 +85,7 @@ class Result(Curve):
 
 
 def mean_ap(results: Sequence[Curve]) -> float:
-    """Mean AP over the classes that occur; NaN if none does.
+    """Computes the mean AP over the classes that occur, or NaN if none does.
 
     Examples:
         >>> mean_ap([])
@@ -96,21 +96,21 @@ def mean_ap(results: Sequence[Curve]) -> float:
 
 
 class EvaluationSet:
-    """Ground truth and predictions, checked, sorted and paired once.
+    """Ground truth and predictions that are checked, sorted and paired once.
 
     Attributes:
         classes: Class names.
-        frame: `[F]` frame ids, in the order of the frame table.
-        gt: Objects of the classes inside the region, by frame, class and then the given
-            order, with positions in `frame` and in `classes` as their frame and cls.
-        pred: Predictions of the classes inside the region, likewise.
+        frame: `[F]` frame ids in the order of the frame table.
+        gt: Objects of the classes inside the region, sorted by frame, class and input
+            order. Their frame and cls are positions in `frame` and in `classes`.
+        pred: Predictions of the classes inside the region, in the same form as `gt`.
         score: Scores of `pred`.
         ground_truth: All objects as given.
         predictions: All predictions as given.
-        left_out: Counts of boxes that are excluded, by reason.
+        left_out: Numbers of boxes that are excluded, by reason.
         roi: Name of the region.
-        label_version: Label revision or None.
-        is_simulated: Whether the frame table says that frames are simulated.
+        label_version: Label revision, or None if it is not known.
+        is_simulated: Whether any frame is simulated according to the frame table.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class EvaluationSet:
         roi: Roi = None,
         label_version: str | None = None,
     ) -> None:
-        """See `evaluate` for the arguments."""
+        """Creates an evaluation set; see `evaluate` for the arguments."""
         self.classes = tuple(classes)
         is_repeated = len(set(self.classes)) < len(self.classes)
         if isinstance(classes, str) or not self.classes or is_repeated:
@@ -157,11 +157,14 @@ class EvaluationSet:
         self.pair_pred, self.pair_gt = matching.candidate_pairs(
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
-        # Results of `_once`, which all protocols, thresholds and frames share.
+        # Cache of `_once`, which all protocols, thresholds and frame weights share.
         self._shared: dict[tuple[Any, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
-        """Sorted boxes of the classes in the region, and their rows; counts the others."""
+        """Returns the sorted boxes of the classes in the region, and their rows.
+
+        The other boxes are counted in `left_out`.
+        """
         position = boxes.frame_positions(table.frame, self.frame, name)
         cls = boxes.class_indices(table, self.classes, name)
         is_class, is_inside = cls >= 0, boxes.in_roi(table.box, self._roi)
@@ -177,12 +180,12 @@ class EvaluationSet:
         return Boxes(position[row], table.box[row], cls[row], score), row
 
     def _count(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
-        """Number of boxes of every class in every frame."""
+        """Returns the number of boxes of every class in every frame."""
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
-        """Evaluation set of some frames, for many evaluations of one condition."""
+        """Returns the evaluation set of some frames, such as those of one condition."""
         ids = self.frame[is_chosen]
         tables = self.ground_truth, self.predictions
         return EvaluationSet(
@@ -196,18 +199,18 @@ class EvaluationSet:
     # Shared work ---------------------------------------------------------------------
 
     def _once(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Result of a method for some arguments, computed at the first call."""
+        """Returns the result of a method, which is cached for equal arguments."""
         key = (function.__name__, *arguments)
         if key not in self._shared:
             self._shared[key] = function(*arguments)
         return self._shared[key]
 
     def overlap(self, geometry: str, space: str) -> Float[np.ndarray, " P"]:
-        """IoU of the candidate pairs under a protocol's geometry."""
+        """Returns the IoU of the candidate pairs in the geometry of a protocol."""
         return self._once(self._overlap, geometry)[SPACES.index(space)]
 
     def _overlap(self, geometry: str) -> Float[np.ndarray, "2 P"]:
-        """BEV and 3D IoU of the candidate pairs, of one intersection each."""
+        """Computes BEV and 3D IoU of the candidate pairs from the same intersections."""
         truth, found = self.gt.box, self.pred.box
         if geometry != "plain":
             truth = np.round(truth, 2)
@@ -216,7 +219,7 @@ class EvaluationSet:
             truth, found = truth[:, swap], found[:, swap]
         z_center = 1.0 if geometry == "swapped_lw_z_top" else 0.5
         values = np.zeros((2, self.pair_gt.size))
-        # A pair has about 32 temporary arrays.
+        # The IoU of a pair needs about 32 temporary values.
         for rows in matching.chunks(np.full(self.pair_gt.size, 32)):
             a, b = found[self.pair_pred[rows]], truth[self.pair_gt[rows]]
             area = bev_intersection(a, b)
@@ -229,13 +232,17 @@ class EvaluationSet:
             )
         if geometry == "plain":
             return values
-        # The original stores overlaps in single and compares them in double precision.
+        # K-Radar's code stores IoUs in single precision and compares them in double.
         return values.astype(np.float32).astype(np.float64)
 
     def match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
-        """Matches of all frames and classes: `KradarMatches` or each one's object or -1."""
+        """Returns the matches of all frames and classes.
+
+        They are `KradarMatches` for the rule "kradar"; otherwise the matched object of
+        every prediction, or -1.
+        """
         if geometry == "swapped_lw_z_top" and space == "bev":
-            geometry = "swapped_lw"  # z plays no part
+            geometry = "swapped_lw"  # z has no effect
         return self._once(self._match, geometry, rule, space, iou)
 
     def _match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
@@ -251,7 +258,7 @@ class EvaluationSet:
 
     @functools.cached_property
     def by_score(self) -> list[Int[np.ndarray, " _"]]:
-        """Predictions of every class by descending score, ties by the given order."""
+        """Predictions of every class by descending score; ties are in input order."""
         order = np.lexsort((self._pred_row, -self.score))
         return [order[self.pred.cls[order] == c] for c in range(len(self.classes))]
 
@@ -269,7 +276,7 @@ class EvaluationSet:
         curves: bool = True,
         condition: str = "all",
     ) -> list[Result]:
-        """Results in one protocol, over all frames or over weighted ones.
+        """Computes the results of one protocol over all frames or over weighted frames.
 
         Args:
             protocol: Name of the protocol.
@@ -277,9 +284,14 @@ class EvaluationSet:
             empty_frames: See `evaluate`.
             score_threshold: See `evaluate`.
             spaces: See `evaluate`.
-            weights: bool or int weight of every frame; a condition is a mask.
-            curves: Keep the precision, recall and score arrays.
-            condition: Name of the weather that the weights select.
+            weights: bool or int weight of every frame, such as the mask of a condition.
+                None counts every frame once.
+            curves: Whether to keep the precision, recall and score arrays.
+            condition: Name of the condition that the weights select.
+
+        Raises:
+            UserError: The protocol, a space, an IoU threshold or the empty-frame rule is
+                invalid.
         """
         chosen = protocols.get_protocol(protocol)
         empty_frames = chosen.resolve_empty_frames(empty_frames)
@@ -321,7 +333,7 @@ class EvaluationSet:
     def frame_weights(
         self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None
     ) -> Int[np.ndarray, "F C"]:
-        """Weights of the frames for every class, 0 for frames that are ignored."""
+        """Returns the weights of the frames for every class; ignored frames have 0."""
         counts = np.ones(self.frame.size) if weights is None else np.asarray(weights)
         counts = counts.astype(np.int64)[:, None]
         if empty_frames == "class":
@@ -339,8 +351,8 @@ class EvaluationSet:
         cls: int,
         weight: Int[np.ndarray, " F"],
     ) -> Curve:
-        """Curve and AP of one class over weighted frames."""
-        # Protocols that match alike share their rankings.
+        """Computes the curve and AP of one class over weighted frames."""
+        # Protocols with the same geometry and matching share their rankings.
         matched_by = protocol.geometry, protocol.matching, space, iou
         ranked = self._once(self._ranking, matched_by, score_threshold, cls)
         num_gt = int(weight @ self.gt_count[:, cls])
@@ -359,11 +371,12 @@ class EvaluationSet:
     def _ranking(
         self, matched_by: tuple[str, str, str, float], threshold: float, cls: int
     ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """What a curve of one class needs for any weights of the frames.
+        """Returns the inputs of a curve of one class that do not depend on frame weights.
 
-        Scores, descending, their frames, and whether the predictions match. In K-Radar's
-        protocols the counts that they add instead: to the matches of the first pass, to
-        the true positives of the second, and to the predictions.
+        They are the scores in descending order, their frames, and whether the predictions
+        match. For K-Radar's protocols, there are three such lists with counts in place of
+        matches: for the matches of the first pass, the changes of the true positives of
+        the second pass, and the predictions.
         """
         match = self.match(*matched_by)
         mine = self.by_score[cls]
@@ -375,7 +388,7 @@ class EvaluationSet:
             ]
         else:
             counted = [(mine, match[mine] >= 0)]
-            threshold = threshold or -1.0  # a threshold of 0 keeps scores of 0 too
+            threshold = threshold or -1.0  # a threshold of 0 also keeps scores of 0
         ranked = []
         for pred, count in counted:
             keep = (self.pred.cls[pred] == cls) & (self.score[pred] > threshold)

@@ -1,8 +1,8 @@
-"""Ground truth, predictions and frames from files, and their report: `radejax score`.
+"""Evaluation of ground truth, predictions and frames from files (`radejax score`).
 
-Formats: .npz (reports), .json with a list of records (what `radejax detect` writes, one
-file or a folder of them), and folders in K-Radar's KITTI layout (`evaluation.kitti`). A
-table has the columns frame, cls, box and, for predictions, score.
+Supported formats are .npz (written by reports), .json with a list of records (one file or
+a folder of files, as written by `radejax detect`), and folders in K-Radar's KITTI layout
+(`evaluation.kitti`). A table has the columns frame, cls, box and, for predictions, score.
 """
 
 from __future__ import annotations
@@ -41,22 +41,25 @@ LOW_SCORE = 0.1
 def read_table(
     path: PathLike, frames: Columns | None = None, *, scored: bool = True
 ) -> Columns:
-    """Read predictions (or, not `scored`, ground truth) from a file or folder.
+    """Reads predictions or ground truth from a file or folder.
 
     Args:
-        path: A .npz or .json file, a folder in KITTI's layout, or the folder of `radejax
-            detect`, of which frames that the table does not have are ignored.
-        frames: Frame table to look frames up in; None leaves integer ids as they are.
-        scored: Whether a score is expected.
+        path: A .npz or .json file, a folder in KITTI's layout, or a folder of `radejax
+            detect`. For folders, boxes of frames that are not in the frame table are
+            ignored.
+        frames: Frame table in which frame names are looked up, or None if the frames have
+            integer ids.
+        scored: Whether the file contains predictions with scores; otherwise it contains
+            ground truth.
 
     Returns:
-        Columns frame, box, cls and score, as `evaluation.evaluate` takes them.
+        Columns frame, box, cls and, if `scored`, score, as for `evaluation.evaluate`.
 
     Raises:
-        FileNotFoundError: Names the file.
-        UserError: An unknown kind of file.
-        DataError: A missing column, a value that is not a number, an unknown frame; names
-            the file and the row.
+        FileNotFoundError: There is no such file.
+        UserError: The kind of file is unknown.
+        DataError: A column is missing, a value is not a number, or a frame is unknown;
+            the message names the file and the row.
     """
     path = pathlib.Path(path)
     wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
@@ -64,7 +67,7 @@ def read_table(
     if _is_kitti(path):
         columns = read_kitti(path)[1 if scored else 0]
         if frames is not None and (path / "frames.json").is_file():
-            # Of `radejax detect`, whose frame table names the numbered files.
+            # The frame table that `radejax detect` writes maps file numbers to frames.
             names = _read_frames(path / "frames.json")["name"]
             columns = {**columns, "frame": names[columns["frame"]]}
     elif path.is_dir() or path.suffix == ".json":
@@ -84,12 +87,12 @@ def read_table(
 
 
 def _is_kitti(path: pathlib.Path) -> bool:
-    """Whether a folder is in KITTI's layout and not one of `radejax detect`'s .json."""
+    """Returns whether a path is a folder in KITTI's layout, not one of .json files."""
     return path.is_dir() and ((path / "preds").is_dir() or not any(path.glob("*.json")))
 
 
 def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
-    """Frame, class, box and score of every record of a file, checked."""
+    """Yields the checked frame, class, box and score of every record of a file."""
     content = files.read_json(path)
     for row, record in enumerate(content if isinstance(content, list) else [content]):
         values = record if isinstance(record, dict) else {}
@@ -100,7 +103,8 @@ def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
         is_good = (
             type(frame) in (int, str)
             and type(cls) is str
-            # An array of names is as wide as its longest name.
+            # The width of a NumPy array of names is that of its longest name, so that one
+            # long name could exhaust the memory.
             and max(len(str(frame)), len(cls)) <= 200
             and len(numbers) == 8
             and all(type(number) in (int, float) for number in numbers)
@@ -118,19 +122,19 @@ def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Where ground truth and frames come from.
+    """Source of the ground truth and frames, and corrections of the predictions.
 
     Attributes:
         data: Root folders of K-Radar, or none.
-        labels: Folder or zip of a label revision.
+        labels: Folder or zip file of a label revision, or None.
         label_version: v1.0, v1.1, v2.0 or v2.1.
         split: "train", "test", a split file, or "all" for every frame.
-        ground_truth: File of ground truth instead, or the folder of a report or a run;
-            `frames.json` in the same folder is its frame table.
-        sequences: Only frames of these; all if empty.
-        weather: Likewise.
-        z_offset_m: Added to the z of predictions.
-        yaw_degrees: Whether yaws of predictions are degrees.
+        ground_truth: Ground-truth file to use instead of labels, or the folder of a
+            report or a run. `frames.json` in the same folder is its frame table.
+        sequences: Sequences of the frames to evaluate; all if empty.
+        weather: Weathers of the frames to evaluate; all if empty.
+        z_offset_m: Offset that is added to the z of predictions.
+        yaw_degrees: Whether the yaws of predictions are in degrees.
     """
 
     data: tuple[str, ...] = ()
@@ -147,18 +151,22 @@ class Source:
 def load(
     path: PathLike, source: Source, classes: Sequence[str]
 ) -> tuple[Columns, Columns, Columns, dict[str, int]]:
-    """Ground truth, predictions, frame table and counts of what loading skipped.
+    """Loads predictions and their ground truth.
 
     Args:
-        path: Predictions: a .npz or .json file, the folder of `radejax detect`, one in
-            KITTI's layout, or that of an earlier report.
-        source: Ground truth; a KITTI folder and a report bring their own.
+        path: Predictions: a .npz or .json file, a folder of `radejax detect`, a folder in
+            KITTI's layout, or the folder of an earlier report.
+        source: Source of the ground truth. A report contains its own; a KITTI folder may.
         classes: Classes to load from labels.
 
+    Returns:
+        Ground truth, predictions, frame table, and counts of what was read and skipped.
+
     Raises:
-        UserError: No ground truth anywhere, or no frame of the chosen part.
-        FileNotFoundError: Names what is missing.
-        DataError: Malformed content.
+        UserError: There is no ground truth, or no frame of the chosen sequences or
+            weathers.
+        FileNotFoundError: A file or folder does not exist.
+        DataError: A file has malformed content.
     """
     path = pathlib.Path(path)
     if (path / "predictions.npz").is_file():
@@ -197,7 +205,7 @@ def load(
 def _load_ground_truth(
     path: pathlib.Path, source: Source, classes: Sequence[str]
 ) -> tuple[Columns, Columns | None, dict[str, int]]:
-    """Ground truth, the frame table if there is one, and counts of skipped labels."""
+    """Returns ground truth, the frame table or None, and counts of labels."""
     if source.ground_truth:
         truth = pathlib.Path(source.ground_truth)
         of_report = (truth / "ground_truth.npz", truth / "evaluation/ground_truth.npz")
@@ -225,7 +233,7 @@ def _load_ground_truth(
 
 
 def stored_from(path: PathLike) -> float:
-    """Lowest score of stored predictions according to their report, or 0."""
+    """Returns the minimum score of stored predictions in their report, or 0 without one."""
     path = pathlib.Path(path)
     if not (path / "metrics.json").is_file():
         return 0.0
@@ -233,7 +241,7 @@ def stored_from(path: PathLike) -> float:
 
 
 def _read_frames(path: PathLike) -> Columns:
-    """A frame table as `report.write_report` writes it."""
+    """Reads a frame table that `report.write_report` wrote."""
     content = files.read_json(path)
     try:
         columns = {name: np.asarray(values) for name, values in dict(content).items()}
@@ -256,7 +264,7 @@ def evaluate_files(
     *,
     run: str = "radejax",
 ) -> Report:
-    """Evaluate predictions in files and write the report; see `load` for errors."""
+    """Evaluates predictions in files and writes the report; see `load` for errors."""
     truth, found, frames, left_out = load(path, source, options.classes)
     warnings, low = [], stored_from(path)
     if low > max(LOW_SCORE, options.score_threshold):

@@ -1,16 +1,16 @@
-"""KITTI text folders as K-Radar's tools write and read them.
+"""Folders of KITTI text files in the layout of K-Radar's tools.
 
     <folder>/<score threshold>/<condition>/{preds,gts,desc}/000012.txt and val.txt
 
-with condition "all" or a tag of the frame (weather, environment, time). The number of a
+The condition is "all" or a tag of the frame (weather, environment, time). The number of a
 file is the frame's position in the dataset. A line is
 
     sed 0.00 0 0 50 50 150 150 h w l y z x yaw          (ground truth, 2 decimals)
     sed -1 -1 0 50 50 150 150 h w l y z x yaw score     (prediction)
 
 and a frame without predictions has one line "dummy". Frames without ground truth are not
-written. K-Radar's evaluator then compares every box with length and width swapped (its issue
-81): its reader does that, the numbers in the files are the plain ones.
+written. The files contain length and width unchanged; it is the reader of K-Radar's
+evaluator that swaps them for every box (its issue 81).
 
 References:
     K-Radar, pipelines/pipeline_detection_v1_0.py and utils/util_pipeline.py.
@@ -45,7 +45,7 @@ DUMMY = "dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"
 DESCRIPTION = ("time", "environment", "weather")
 """Columns of the frame table that the lines of a file in `desc` hold, in order."""
 
-BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # h w l y z x yaw of x y z l w h yaw
+BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # from x y z l w h yaw to h w l y z x yaw
 
 
 def write_kitti(
@@ -62,20 +62,20 @@ def write_kitti(
 
     Args:
         folder: Output folder; a folder named after the score threshold is created in it.
-        ground_truth: Columns as in `evaluation.evaluate`, or with frames by key as
-            in a report's files, already reduced to the classes, region and field of view
-            that are to be counted.
-        predictions: The same with scores.
-        frames: Frame table; the position of a frame is the number of its file.
-        score_threshold: Only predictions above it are written.
+        ground_truth: Columns as for `evaluation.evaluate`, or with frame keys as in the
+            files of a report. They must only contain objects of the classes, region and
+            field of view to evaluate.
+        predictions: Columns of the predictions in the same form, with scores.
+        frames: Frame table. The position of a frame is the number of its file.
+        score_threshold: Score threshold; only predictions above it are written.
 
     Returns:
-        Number of frames written; those without ground truth are skipped, as K-Radar's
-        tools do.
+        The number of frames written. Frames without ground truth are skipped, as in
+        K-Radar's tools.
 
     Raises:
-        UserError: A class K-Radar has no key for, or no frame with ground truth.
-        DataError: A frame that the table does not have.
+        UserError: K-Radar has no key for a class, or no frame has ground truth.
+        DataError: A frame is not in the frame table.
     """
     ids = frame_ids(frames)
     if not len(ground_truth["frame"]):
@@ -111,9 +111,9 @@ def write_kitti(
 
 
 def prediction_texts(detections: Detections) -> list[str]:
-    """One text per frame as K-Radar's tools write predictions, without a final newline.
+    """Formats the predictions of each frame as one text in the format of K-Radar's tools.
 
-    A frame without detections gets the line "dummy".
+    The texts have no final newline. A frame without detections has the line "dummy".
 
     Raises:
         UserError: K-Radar has no key for one of the classes.
@@ -124,7 +124,7 @@ def prediction_texts(detections: Detections) -> list[str]:
 
 
 def _lines(table: Columns, *, scored: bool) -> dict[int, list[str]]:
-    """Lines by frame, as ground truth or as predictions."""
+    """Returns the lines of ground truth or predictions by frame."""
     header = PRED_HEADER if scored else GT_HEADER
     box = np.asarray(table["box"], np.float64).reshape(-1, 7)
     numbers = (box if scored else np.round(box, 2))[:, BOX_ORDER]
@@ -147,17 +147,17 @@ def read_kitti(folder: str | pathlib.Path) -> tuple[Columns, Columns, Columns]:
     """Reads ground truth, predictions and frame table from a folder of K-Radar's tools.
 
     Args:
-        folder: A folder with `preds` and perhaps `gts` and `desc`; or the folder of a
-            score threshold around its condition "all", or the one around that if it holds
+        folder: Folder with `preds` and optionally `gts` and `desc`; or the folder of a
+            score threshold, of which the condition "all" is read; or the parent folder of
             a single score threshold.
 
     Returns:
-        Ground truth, predictions and frame table. The frame id is the number of the file;
-        the frame table has weather, environment and time where `desc` has them.
+        Ground truth, predictions and frame table. The frame id is the number of the file.
+        The frame table has weather, environment and time if there is a folder `desc`.
 
     Raises:
-        UserError: Nothing to read in it, or several score thresholds.
-        DataError: A malformed line; names the file and the line.
+        UserError: The folder `preds` is missing, or there are several score thresholds.
+        DataError: A line is malformed; the message names the file and the line.
     """
     root = _find_root(pathlib.Path(folder))
     numbers, found = _read_folder(root / "preds", scored=True)
@@ -182,7 +182,11 @@ def _find_root(folder: pathlib.Path) -> pathlib.Path:
 
 
 def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Columns]:
-    """Numbers of the files in a folder, if there is one, and columns of all lines."""
+    """Reads a folder, which may be missing.
+
+    Returns:
+        The numbers of the files, and the columns of all lines.
+    """
     numbers, rows = [], []
     for path in sorted(folder.glob("*.txt")):
         if not re.fullmatch("[0-9]{1,9}", path.stem):

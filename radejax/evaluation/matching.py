@@ -1,8 +1,8 @@
-"""Pairing predictions with ground truth: every frame and class at the same time.
+"""Matching of predictions and ground truth for all frames and classes at once.
 
-Boxes of different groups (a group is one class in one frame) never meet in a pair, so one
-round serves the r-th box of every group at once, and the number of rounds is the largest
-number of boxes in a group, not the number of boxes.
+A group is one class in one frame, and only boxes of the same group can form a pair.
+Therefore each round of the matching processes one box of every group, and the number of
+rounds is the largest number of boxes in a group instead of the total number of boxes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ def candidate_pairs(
     box_a: Float[np.ndarray, "N 7"],
     box_b: Float[np.ndarray, "M 7"],
 ) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """Pairs (a, b) of one group whose rectangles can possibly touch.
+    """Finds the pairs (a, b) of the same group whose rectangles can overlap.
 
     Args:
-        group_a: `[N]` group of every box a, for instance frame and class in one number.
-        group_b: `[M]` groups of the boxes b, sorted.
-        box_a: `[N, 7]` boxes.
-        box_b: `[M, 7]` boxes.
+        group_a: `[N]` group of every box a, such as one number for frame and class.
+        group_b: `[M]` sorted groups of the boxes b.
+        box_a: `[N, 7]` boxes a.
+        box_b: `[M, 7]` boxes b.
 
     Returns:
         Two `[P]` index arrays, ordered by a, then b.
@@ -42,7 +42,8 @@ def candidate_pairs(
     """
     first = np.searchsorted(group_b, group_a)
     count = np.searchsorted(group_b, group_a, side="right") - first
-    # Half diagonals; 3 cm of slack for boxes that a protocol rounds to centimeters.
+    # Two boxes can only overlap if their distance is at most the sum of their half
+    # diagonals. 3 cm are added because some protocols round boxes to centimeters.
     reach_a = 0.5 * np.hypot(box_a[:, 3], box_a[:, 4]) + 0.03
     reach_b = 0.5 * np.hypot(box_b[:, 3], box_b[:, 4])
     parts = []
@@ -56,7 +57,7 @@ def candidate_pairs(
 
 
 def chunks(count: Int[np.ndarray, " R"]) -> list[Int[np.ndarray, " _"]]:
-    """Rows, in parts with about as many pairs as are compared at once.
+    """Splits rows into parts with about `PAIRS_PER_CHUNK` pairs each.
 
     Examples:
         >>> [rows.tolist() for rows in chunks(np.array([10**6, 2 * 10**6]))]
@@ -69,7 +70,7 @@ def chunks(count: Int[np.ndarray, " R"]) -> list[Int[np.ndarray, " _"]]:
 def ranges(
     first: Int[np.ndarray, " R"], count: Int[np.ndarray, " R"]
 ) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Which range, and index, of everything in the ranges [first, first + count).
+    """Returns the range and the index of every element of the ranges [first, first + count).
 
     Examples:
         >>> owner, index = ranges(np.array([5, 0]), np.array([2, 3]))
@@ -82,12 +83,12 @@ def ranges(
 
 
 class Pairs(NamedTuple):
-    """Boxes of one group that may overlap.
+    """Pairs of a prediction and a ground truth of the same group that may overlap.
 
     Attributes:
         pred: `[P]` prediction of every pair.
         gt: `[P]` ground truth of every pair.
-        iou: `[P]` overlap of every pair.
+        iou: `[P]` IoU of every pair.
     """
 
     pred: Int[np.ndarray, " P"]
@@ -95,7 +96,7 @@ class Pairs(NamedTuple):
     iou: Float[np.ndarray, " P"]
 
     def take(self, index: Int[np.ndarray, " K"] | Bool[np.ndarray, " P"]) -> Pairs:
-        """The pairs that `index` (positions or mask) selects."""
+        """Returns the pairs that `index` (positions or a mask) selects."""
         return Pairs(*(column[index] for column in self))
 
 
@@ -106,17 +107,18 @@ def greedy(
     group: Real[np.ndarray, " P"],
     num_targets: int,
 ) -> Int[np.ndarray, " K"]:
-    """Claimants take, one after the other, the best target that is still free.
+    """Matches each claimant in turn to its best target that is not matched yet.
 
     Args:
-        claimant: `[P]` claimant of every pair; the smaller number chooses first.
+        claimant: `[P]` claimant of every pair. Claimants are processed in ascending order.
         target: `[P]` target of every pair.
-        preference: `[P]` the larger, the better; the smaller target wins a tie.
-        group: `[P]` group of the claimant; no target occurs in two groups.
+        preference: `[P]` preference of every pair; larger is better, and the smaller
+            target is preferred in a tie.
+        group: `[P]` group of every pair. A target must not occur in two groups.
         num_targets: Number of targets.
 
     Returns:
-        `[K]` positions of the chosen pairs.
+        `[K]` positions of the matched pairs.
 
     Examples:
         >>> claimant, target = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
@@ -147,7 +149,7 @@ def greedy(
 
 
 def _is_new(*columns: Shaped[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
-    """Entries that differ from the one before in any column."""
+    """Returns a mask of the entries that differ from the previous one in any column."""
     new = np.zeros(columns[0].size, bool)
     new[:1] = True
     for column in columns:
@@ -156,14 +158,14 @@ def _is_new(*columns: Shaped[np.ndarray, " K"]) -> Bool[np.ndarray, " K"]:
 
 
 class KradarMatches(NamedTuple):
-    """K-Radar's two passes over all frames, independent of score thresholds.
+    """Matches of K-Radar's two passes over all frames for any score threshold.
 
     Attributes:
         first_gt: `[S]` ground truths matched in the first pass.
-        first_pred: `[S]` the prediction each of them took.
+        first_pred: `[S]` prediction matched to each of them.
         event_pred: `[E]` predictions at whose score the number of true positives of the
-            second pass changes when the score threshold sinks to it.
-        event_delta: `[E]` by how much.
+            second pass changes as the score threshold decreases.
+        event_delta: `[E]` change of the number of true positives at each of them.
     """
 
     first_gt: Int[np.ndarray, " S"]
@@ -178,13 +180,13 @@ def match_kradar(
     gt_group: Real[np.ndarray, " N"],
     threshold: float,
 ) -> KradarMatches:
-    """Both passes of K-Radar's matching.
+    """Computes both passes of K-Radar's matching.
 
-    First pass: ground truths in order, each takes the free prediction with the highest
-    score among those above the IoU threshold. Second pass, for every score threshold t:
-    the same with the largest IoU among the predictions that score at least t. The number
-    of true positives as a function of t is returned as steps, so that any set of
-    thresholds, frames or frame weights costs only a sum.
+    In the first pass, each ground truth in order is matched to the unmatched prediction
+    with the highest score among those above the IoU threshold. The second pass is run for
+    every score threshold t and uses the largest IoU among the predictions with a score of
+    at least t instead. The number of true positives as a function of t is returned as
+    steps, so that any set of thresholds, frames or frame weights only needs a sum.
 
     Args:
         pairs: Predictions and ground truths that may overlap.
@@ -202,7 +204,8 @@ def match_kradar(
     preference = score[pairs.pred]
     chosen = greedy(pairs.gt, pairs.pred, preference, gt_group[pairs.gt], score.size)
     first = pairs.take(chosen)
-    # A ground truth that shares no prediction is found once its best score is reached.
+    # A ground truth that shares none of its predictions with another one is a true
+    # positive for all thresholds up to its best score.
     has_rival = np.zeros(gt_group.size, bool)
     has_rival[pairs.gt[np.bincount(pairs.pred)[pairs.pred] > 1]] = True
     alone = pairs.take(~has_rival[pairs.gt])
@@ -221,9 +224,9 @@ def match_kradar(
 def _steps(
     pairs: Pairs, score: Real[np.ndarray, " M"], group: Real[np.ndarray, " P"]
 ) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
-    """True positives of the second pass as steps over the score threshold.
+    """Computes the true positives of the second pass as steps over the score threshold.
 
-    The matching is computed once per level, which is a distinct score of a group.
+    The matching is computed once per level, which is a distinct score in a group.
     """
     order = np.argsort(group, kind="stable")
     (pred, gt, iou), group = pairs.take(order), group[order]
@@ -238,7 +241,7 @@ def _steps(
         level, pair = ranges(first[rows], count[rows])
         enters = score[pred[pair]] >= score[level_pred[rows]][level]
         level, pair = level[enters], pair[enters]
-        # Levels are independent: renumber the predictions of each.
+        # Levels are independent, so the predictions of each level are renumbered.
         target = np.unique(level * score.size + pred[pair], return_inverse=True)[1]
         won = greedy(gt[pair], target, iou[pair], level, target.size)
         true_positives[rows] = np.bincount(level[won], minlength=rows.size)
@@ -249,7 +252,7 @@ def _steps(
 def match_best(
     pairs: Pairs, score: Real[np.ndarray, " M"], threshold: float
 ) -> Int[np.ndarray, " M"]:
-    """RADE-Net's rule: a prediction may only take its own best ground truth.
+    """Matches predictions by RADE-Net's rule, only to their own best ground truth.
 
     Args:
         pairs: Predictions and ground truths that may overlap.
@@ -257,9 +260,10 @@ def match_best(
         threshold: A match needs an IoU above this.
 
     Returns:
-        `[M]` matched ground truth or -1. The best ground truth is the one of largest IoU
-        (the first on a tie), taken or not; of the predictions that want the same one,
-        the highest score gets it (the first on a tie).
+        `[M]` matched ground truth or -1. The best ground truth has the largest IoU (the
+        first in a tie), even if it is matched to another prediction. Among predictions
+        with the same best ground truth, the one with the highest score is matched (the
+        first in a tie).
 
     Examples:
         >>> pairs = Pairs(np.array([0, 1]), np.array([0, 0]), np.array([0.7, 0.8]))
@@ -279,7 +283,7 @@ def match_free(
     num_gt: int,
     threshold: float,
 ) -> Int[np.ndarray, " M"]:
-    """By descending score, each prediction takes the best free object.
+    """Matches predictions by descending score to the best unmatched ground truth.
 
     Args:
         pairs: Predictions and ground truths that may overlap.
@@ -305,7 +309,7 @@ def match_free(
 
 
 def _matched(pairs: Pairs, num_pred: int) -> Int[np.ndarray, " M"]:
-    """Ground truth of each prediction in the pairs, -1 of all others."""
+    """Returns the ground truth of each prediction in the pairs, and -1 for all others."""
     matched = np.full(num_pred, -1)
     matched[pairs.pred] = pairs.gt
     return matched

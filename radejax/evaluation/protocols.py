@@ -1,7 +1,7 @@
-"""The protocols: what each does to boxes, frames, matches and the curve.
+"""Evaluation protocols: their treatment of boxes, frames, matches and curves.
 
-Everything here is exact for weighted frames: a weight of 0 ignores the frame, 2 counts
-it twice. Conditions (weathers) and bootstrap resamples are then the same computation.
+All computations are exact for weighted frames: a weight of 0 ignores a frame, a weight of
+2 counts it twice. Conditions (weathers) and bootstrap resamples are frame weights.
 """
 
 from __future__ import annotations
@@ -25,20 +25,23 @@ CurveKind = Literal["r40", "r11", "voc11", "recall41", "coco101", "auc", "all_po
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """How an average precision is computed.
+    """Definition of an average precision.
 
     Attributes:
         name: Name in results and reports.
-        geometry: Boxes compared: "plain" as given; "rounded" with ground truth rounded to
-            2 decimals; "swapped_lw" rounded and with l and w swapped (K-Radar's export);
-            "swapped_lw_z_top" also with z taken as the top of the box.
-        matching: "kradar" two passes in ground-truth order; "best" each prediction may
-            only take its own best object; "free" by score, the best free object.
-        curve: How precisions become one number.
-        empty_frames: Frames to ignore by default: "class" those without an object of the
-            class, "frame" those without an object of any class, "none" no frames.
-        is_fixed: Reports apply neither their score threshold nor their empty-frame rule:
-            every prediction and every frame counts.
+        geometry: Boxes that are compared: "plain" for boxes as given; "rounded" for
+            ground truth rounded to 2 decimals; "swapped_lw" for rounded ground truth and
+            l and w swapped (K-Radar's export); "swapped_lw_z_top" for the same with z
+            taken as the top of the box.
+        matching: "kradar" for two passes in ground-truth order; "best" if each prediction
+            can only be matched to its own best object; "free" if predictions are matched
+            by descending score to their best unmatched object.
+        curve: Method to compute the AP from the precisions.
+        empty_frames: Frames to ignore by default: "class" for frames without an object of
+            the class, "frame" for frames without an object of any class, "none" for no
+            frames.
+        is_fixed: Whether reports evaluate every prediction and every frame in this
+            protocol, regardless of their score threshold and empty-frame rule.
     """
 
     name: str
@@ -49,7 +52,7 @@ class Protocol:
     is_fixed: bool = False
 
     def resolve_empty_frames(self, empty_frames: str) -> str:
-        """An empty-frame rule, or the protocol's own for "protocol"."""
+        """Returns the empty-frame rule, which is the protocol's own for "protocol"."""
         expected = f"one of {', '.join(EMPTY_FRAMES)}"
         is_known = empty_frames in EMPTY_FRAMES
         require(is_known, "empty_frames", empty_frames, expected)
@@ -67,7 +70,7 @@ RECOMMENDED = "all_point"
 _ALL = (
     # K-Radar's revised evaluation as published, with length and width swapped.
     Protocol("kradar_r40", "swapped_lw", "kradar", "r40", "frame"),
-    # The same without the swap, so that the yaw is correct.
+    # K-Radar's revised evaluation without the swap, so that the yaw is correct.
     Protocol("kradar_r40_corrected", "rounded", "kradar", "r40", "frame"),
     # K-Radar's older evaluation: 11 of 41 samples, z as the top of a box.
     Protocol("kradar_r11", "swapped_lw_z_top", "kradar", "r11", "frame"),
@@ -83,10 +86,10 @@ PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
 
 
 def get_protocol(name: str) -> Protocol:
-    """The protocol of that name.
+    """Returns the protocol of a name.
 
     Raises:
-        UserError: No such protocol; the message lists them.
+        UserError: There is no such protocol; the message lists all.
 
     Examples:
         >>> get_protocol("kradar_r40").name
@@ -99,14 +102,15 @@ def get_protocol(name: str) -> Protocol:
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """What one AP was computed from.
+    """An average precision and its precision-recall curve.
 
     Attributes:
-        ap: Average precision, 0 to 100; NaN where no object exists, except that
-            K-Radar's protocols give 0 then.
-        num_gt: Objects in the frames that take part.
-        num_det: Predictions in those frames above the score threshold.
-        precision: Precision at each sample (K-Radar: made monotone; others: raw).
+        ap: Average precision, 0 to 100. Without objects, it is 0 in K-Radar's protocols
+            and NaN in the others.
+        num_gt: Number of objects in the frames that are evaluated.
+        num_det: Number of predictions in these frames above the score threshold.
+        precision: Precision at each sample, monotone in K-Radar's protocols and raw in
+            the others.
         recall: Recall at each sample.
         score: Score threshold of each sample, descending.
     """
@@ -120,33 +124,34 @@ class Curve:
 
     @property
     def is_defined(self) -> bool:
-        """Whether the class occurs at all; reports show `-` where it does not."""
+        """Whether the class occurs; otherwise reports show `-`."""
         return self.num_gt > 0
 
     @property
     def ap_or_none(self) -> float | None:
-        """AP, or None where the class does not occur, whatever the protocol defines."""
+        """AP, or None in every protocol if the class does not occur."""
         return self.ap if self.is_defined else None
 
 
 def score_thresholds(
     sampled: Float[np.ndarray, " S"], weight: Real[np.ndarray, " S"], num_gt: int
 ) -> Float[np.ndarray, " K"]:
-    """K-Radar's at most 41 score thresholds at recall steps of 1/40.
+    """Computes K-Radar's score thresholds, at most 41 at recall steps of 1/40.
 
-    Walking down the matched scores with c = 0, the i-th score is skipped while
-    (i+2)/n - c < c - (i+1)/n and it is not the last; else it is kept and c grows by 1/40.
-    The differences are monotone in i also after rounding, so the first score not skipped
-    for a given c is found by counting, and the k-th kept one is the larger of that and
-    the one after the (k-1)-th.
+    K-Radar's code goes through the matched scores in descending order, starting with c =
+    0. The i-th score is skipped if (i+2)/n - c < c - (i+1)/n and it is not the last one;
+    otherwise it is kept and c is increased by 1/40. Both sides are monotone in i even
+    after rounding, so the first score that is not skipped for a given c is found by
+    counting. The k-th kept score is this one or the score after the (k-1)-th kept one,
+    whichever comes later.
 
     Args:
         sampled: Scores of the matched predictions, descending.
-        weight: How often each counts.
+        weight: Number of times that each score counts.
         num_gt: Number of ground truths n.
 
     Returns:
-        Thresholds, descending, K <= 41. Empty without matches.
+        K <= 41 thresholds in descending order; none without matches.
 
     References:
         K-Radar, utils/kitti_eval/eval_revised.py: get_thresholds.
@@ -159,8 +164,9 @@ def score_thresholds(
     total = int(ends[-1]) if ends.size else 0
     if total == 0 or num_gt == 0:
         return np.zeros(0)
-    current = np.cumsum([0.0, *[1.0 / 40.0] * 40])  # step by step
-    # The crossing lies at i = c n - 3/2; a window decides it with the original rounding.
+    current = np.cumsum([0.0, *[1.0 / 40.0] * 40])  # sequential, as in the original
+    # The inequality changes at i = c n - 3/2. The exact index is found by evaluating it
+    # with the original rounding in a window around this value.
     low = np.maximum(np.ceil(current * num_gt - 1.5).astype(np.int64) - 4, 0)
     index = low[:, None] + np.arange(9)
     left, right = (index + 1) / num_gt, (index + 2) / num_gt
@@ -169,7 +175,7 @@ def score_thresholds(
     steps = np.arange(crossing.size)
     kept = steps + np.maximum.accumulate(crossing - steps)
     kept = kept[kept < total]
-    # The last score is always kept, and nothing after it.
+    # The last score is always kept, and there is none after it.
     return sampled[np.searchsorted(ends, kept, side="right")]
 
 
@@ -180,16 +186,16 @@ def kradar_curve(
     num_gt: int,
     samples: CurveKind,
 ) -> Curve:
-    """AP in K-Radar's protocol from the steps of `matching.match_kradar`.
+    """Computes the AP in K-Radar's protocols from the steps of `matching.match_kradar`.
 
     Args:
-        matched: Scores matched in the first pass, descending, and the weights of their
-            frames.
-        events: Scores at which true positives appear, descending, and how many, times the
-            weight of the frame.
+        matched: Scores of the predictions matched in the first pass, descending, and the
+            weights of their frames.
+        events: Scores at which the number of true positives changes, descending, and the
+            changes times the weights of their frames.
         detections: Scores of all predictions, descending, and the weights of their frames.
         num_gt: Number of ground truths.
-        samples: "r40" all 41 precision samples, "r11" every fourth.
+        samples: "r40" for all 41 precision samples, "r11" for every fourth.
 
     Examples:
         >>> both = np.array([0.9, 0.6]), np.ones(2)
@@ -219,7 +225,7 @@ def _sum_at_least(
     value: Real[np.ndarray, " E"],
     at: Float[np.ndarray, " K"],
 ) -> Real[np.ndarray, " K"]:
-    """Sum of `value` over entries with score >= at; scores are descending."""
+    """Sums `value` over the entries with score >= `at`; the scores are descending."""
     total = np.concatenate([[0], np.cumsum(value)])
     return total[np.searchsorted(-score, -at, side="right")]
 
@@ -231,12 +237,12 @@ def pooled_curve(
     num_gt: int,
     curve: str,
 ) -> Curve:
-    """AP from all predictions sorted by descending score.
+    """Computes the AP from all predictions in descending order of their scores.
 
     Args:
         score: Scores of the predictions, descending.
-        is_tp: True for true positives.
-        weight: Weights of their frames.
+        is_tp: Whether each prediction is a true positive.
+        weight: Weights of the frames of the predictions.
         num_gt: Number of ground truths.
         curve: "voc11", "recall41", "coco101", "auc" (RADE-Net) or "all_point".
 
@@ -251,7 +257,7 @@ def pooled_curve(
     found = np.cumsum(is_tp * weight)
     made = np.cumsum(weight)
     if curve == "all_point":
-        # Equal scores are one threshold, whatever order they are listed in.
+        # Equal scores are one threshold, so that their order does not matter.
         last = np.ones(score.size, bool)
         last[:-1] = score[1:] != score[:-1]
         found, made, score = found[last], made[last], score[last]
@@ -270,7 +276,7 @@ def pooled_curve(
 def _pooled_ap(
     precision: Float[np.ndarray, " K"], recall: Float[np.ndarray, " K"], curve: str
 ) -> float:
-    """One number in [0, 1] for a curve of rising recall."""
+    """Computes the AP in [0, 1] of a curve with increasing recall."""
     if curve == "all_point":
         height = np.maximum.accumulate(precision[::-1])[::-1]
         return float((np.diff(recall, prepend=0.0) * height).sum())

@@ -1,11 +1,11 @@
-"""The report of an evaluation: console text, JSON, CSV, Markdown, LaTeX, figures.
+"""The report of an evaluation: console text, JSON, CSV, Markdown, LaTeX and figures.
 
-The numbers of the result tables of the RADE-Net and DinoRADE papers are in
-`published.csv`, one line per class, space and IoU threshold of a printed row, in the
-order of the papers: average precisions in percent, "-" where a paper prints that, nothing
-where its table has no such column. Values of 0.99 (1/101, the lower bound of the protocol)
-are kept as printed. A difference to a published row is printed only where protocol,
-labels, region and split agree. Results of simulated frames are not printed next to them.
+`published.csv` contains the result tables of the RADE-Net and DinoRADE papers, with one
+line per class, space and IoU threshold of a printed row, in the order of the papers. The
+values are average precisions in percent, "-" if the paper prints "-", and empty if its
+table has no such column. Values of 0.99 (1/101, the lower bound of the protocol) are kept
+as printed. A difference to a published row is printed only if protocol, labels, region
+and split agree. Results of simulated frames are not printed next to published rows.
 
 References:
     RADE-Net: Leitgeb et al., "RADE-Net: Robust Attention Network for Radar-Only Object
@@ -44,13 +44,13 @@ from radejax.evaluation.results import (
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What `write_report` computed and wrote.
+    """Result of `write_report`.
 
     Attributes:
-        text: The console text.
-        metrics: The content of metrics.json.
+        text: Console text of the report.
+        metrics: Content of metrics.json.
         results: All average precisions.
-        folder: Folder of the files.
+        folder: Folder of the written files.
     """
 
     text: str
@@ -71,24 +71,24 @@ def write_report(
     warnings: Sequence[str] = (),
     draw_frame: Callable[[int, pathlib.Path], None] | None = None,
 ) -> Report:
-    """Evaluate predictions in the given protocols and `all_point`, and write the report.
+    """Evaluates predictions in the given protocols and `all_point`, and writes the report.
 
     Args:
-        ground_truth: Columns as in `evaluation.evaluate`.
-        predictions: The same with scores.
-        frames: Frame table: frame `[F]` ids, and as far as known name, sequence,
-            weather, environment, time, simulated and split.
-        out_dir: Folder of the report; files in it are replaced when all are written.
-        options: What to compute.
+        ground_truth: Columns as for `evaluation.evaluate`.
+        predictions: Such columns with scores.
+        frames: Frame table with the column frame `[F]` (ids) and, as far as known, name,
+            sequence, weather, environment, time, simulated and split.
+        out_dir: Folder of the report. Files in it are replaced when all are written.
+        options: Settings of the evaluation.
         run: Name of the run in tables.
-        left_out: Counts of what loading skipped, by reason.
-        warnings: Warnings of loading, to be printed.
-        draw_frame: Called with (frame id, path of a figure to write) for each of the
-            worst frames, or None.
+        left_out: Counts of what was read and skipped when loading, by reason.
+        warnings: Warnings of loading, which are printed in the report.
+        draw_frame: Function that is called with (frame id, path of a figure to write) for
+            each of the worst frames, or None.
 
     Raises:
-        UserError: Missing columns.
-        DataError: A bad row; names the table, frame and row.
+        UserError: An option is invalid, or a column is missing.
+        DataError: A row is invalid; the message names the table, frame and row.
     """
     if protocols.RECOMMENDED not in options.protocols:
         names = (*options.protocols, protocols.RECOMMENDED)
@@ -122,7 +122,7 @@ def write_report(
     text = _console_text(metrics, by_key, options)
     built = _tables(metrics, by_key, options)
     with files.swapped_in(out_dir) as folder:
-        # The inputs stay with the report, so that two reports can be compared later.
+        # The inputs are stored with the report, so that reports can be compared later.
         columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
         files.write_json(folder / "metrics.json", metrics)
         files.write_json(folder / "frames.json", columns)
@@ -134,7 +134,7 @@ def write_report(
             writer = csv.DictWriter(file, list(metrics["ap"][0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(metrics["ap"])
-        # With repaired sizes, so that the stored predictions can be evaluated again.
+        # The stored predictions have repaired sizes, so that they can be evaluated again.
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
         if options.plots:
@@ -143,14 +143,14 @@ def write_report(
             (folder / "worst_frames").mkdir()
             for entry in metrics["worst_frames"]:
                 name = f"frame_{entry['frame']}"
-                if {"name", "sequence"} <= set(entry):  # as other figures of frames
+                if {"name", "sequence"} <= set(entry):  # as in other figures
                     name = f"{entry['sequence']:02d}_{entry['name']}"
                 draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
 def _split(frames: Columns) -> str | None:
-    """The split that all frames are of; None if it is not known, or several."""
+    """Returns the split of all frames, or None if it is unknown or differs."""
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     return str(splits[0]) if splits.size == 1 else None
 
@@ -158,7 +158,7 @@ def _split(frames: Columns) -> str | None:
 def _tables(
     metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
 ) -> list[Table]:
-    """Tables in the papers' layouts, of every protocol and IoU threshold, and details."""
+    """Builds the tables in the papers' layouts, of all protocols and IoUs, and of details."""
     ious, subsets = options.iou_thresholds, metrics["subsets"]
     built = []
     if not metrics["is_simulated"]:
@@ -177,9 +177,9 @@ def _tables(
 def _console_text(
     metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
 ) -> str:
-    """The most important tables, on one screen."""
+    """Formats the most important tables for the console."""
     iou = options.iou_thresholds[0]
-    # Two thresholds of the first protocol, one of the others.
+    # The first protocol is shown at two IoU thresholds, the others at one.
     first, *others = options.main_protocols
     shown = [(first, level) for level in options.iou_thresholds[:2]]
     shown += [(protocol, iou) for protocol in others]
@@ -207,8 +207,8 @@ def _draw_curves(
     options: EvaluationOptions,
     folder: pathlib.Path,
 ) -> None:
-    """Draw precision over recall per class that has objects, a curve per weather."""
-    # Imported here, as matplotlib takes a second to load and may not be needed.
+    """Draws precision over recall for each class with objects, one curve per weather."""
+    # Imported here, as matplotlib takes a second to load and is not always needed.
     from radejax.visualize.curves import draw_precision_recall
     from radejax.visualize.style import save_figure
 
@@ -236,7 +236,7 @@ def _draw_curves(
 
 
 def plain(value: Any) -> Any:
-    """Values that strict JSON can hold: NaN becomes null."""
+    """Converts values to strict JSON: NaN and infinity become null."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -260,10 +260,10 @@ Results = Mapping[tuple[str, str, str, str, float], Result]
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A table ready to be rendered.
+    """A table of a report.
 
     Attributes:
-        title: One line that says what the numbers are.
+        title: Title that describes the numbers in one line.
         header: `[K]` column titles.
         rows: Rows of `K` strings or counts.
     """
@@ -273,7 +273,7 @@ class Table:
     rows: Sequence[Sequence[str | int]]
 
     def render(self, style: str = "text", *, is_simulated: bool = False) -> str:
-        """As "text", "markdown" or "latex" (a tabular; the title is a comment)."""
+        """Renders the table as "text", "markdown" or "latex" (with the title as comment)."""
         align = ["left", *["right"] * (len(self.header) - 1)]
         body = tabulate(
             self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
@@ -288,30 +288,30 @@ class Table:
 def rendered(
     tables: Sequence[Table], style: str = "text", *, is_simulated: bool
 ) -> str:
-    """Several tables, one below the other."""
+    """Renders several tables below each other."""
     return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
-    """A value as the papers print it; `-` for one that does not exist."""
+    """Formats a value with fixed decimals, and None or NaN as `-`."""
     if value is None or value != value:
         return "-"
     return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
 
 
 def numbers(values: Iterable[float | None], **options: Any) -> list[str]:
-    """Values as entries of a table, see `number`."""
+    """Formats values as table entries (see `number`)."""
     return [number(value, **options) for value in values]
 
 
 def ap_of(results: Results, *key: Any) -> float | None:
-    """AP of a key; None where the class does not occur or nothing was computed."""
+    """Returns the AP of a key, or None if the class does not occur or there is no result."""
     result = results.get(key)
     return None if result is None else result.ap_or_none
 
 
 def terms_of(results: Results, protocol: str) -> str:
-    """Protocol with its score threshold, empty-frame rule, label version and region."""
+    """Returns a protocol with its score threshold, empty-frame rule, labels and region."""
     found = next(r for r in results.values() if r.protocol == protocol)
     return ", ".join(found.metric.split("/")[1:])
 
@@ -319,7 +319,7 @@ def terms_of(results: Results, protocol: str) -> str:
 def class_by_weather(
     results: Results, options: EvaluationOptions, protocol: str, iou: float
 ) -> Table:
-    """Classes by total and weathers in one protocol, "3D / BEV" in each entry."""
+    """Builds the table of classes by weather in one protocol, with "3D / BEV" entries."""
     conditions = dict.fromkeys(key[1] for key in results)
     body = []
     for cls in (*options.classes, "mean"):
@@ -338,7 +338,10 @@ def class_by_weather(
 def by_protocol(
     results: Results, options: EvaluationOptions, space: str, iou: float
 ) -> Table:
-    """Protocols by classes, all weathers, with intervals over sequences if there are."""
+    """Builds the table of protocols by classes over all weathers.
+
+    The entries include the intervals over sequences if they were computed.
+    """
     classes = (*options.classes, "mean")
     body = []
     for name in options.protocols:
@@ -351,7 +354,7 @@ def by_protocol(
 
 
 def _with_interval(result: Result) -> str:
-    """AP, and its interval if there is one, such as "61.05 [50.1, 70.2]"."""
+    """Formats an AP with its interval, if there is one, such as "61.05 [50.1, 70.2]"."""
     if not result.is_defined or result.low is None:
         return number(result.ap_or_none)
     low, high = numbers((result.low, result.high), digits=1)
@@ -362,7 +365,7 @@ def _with_interval(result: Result) -> str:
 
 
 def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
-    """AP, precision and recall per subset and class that has boxes."""
+    """Builds the table of AP, precision and recall per subset and class with boxes."""
     title = f"By {kind}, {subsets['protocol']}"
     entries = [entry for entry in subsets[kind] if entry["num_gt"] or entry["num_det"]]
     names = [kind, "cls", "ap", "precision", "recall", "num_gt"]
@@ -370,7 +373,7 @@ def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
 
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
-    """Median errors of matched boxes, and how many headings are reversed."""
+    """Builds the table of median errors of matched boxes and of reversed headings."""
     entries = [{"cls": cls, **found} for cls, found in errors.items()]
     medians = [name for name in entries[0] if name.endswith("_median")]
     return _table_of(
@@ -384,7 +387,7 @@ def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
 def _table_of(
     title: str, entries: Sequence[Mapping[str, Any]], names: Sequence[str]
 ) -> Table:
-    """Some values of entries of metrics.json, one row each."""
+    """Builds a table with some values of entries of metrics.json, one entry per row."""
     values = [[entry.get(name, "") for name in names] for entry in entries]
     rows = [
         [value if isinstance(value, str | int) else number(value) for value in row]
@@ -418,12 +421,12 @@ class PublishedRow:
 
     Attributes:
         source: Paper and table, such as "DinoRADE, Table 2".
-        method: Name of the row; in ablations what the row ticks.
-        modality: L lidar, C camera, R radar.
+        method: Name of the row; in ablations, the components that the row includes.
+        modality: Sensors: L for LiDAR, C for camera, R for radar.
         label_version: K-Radar label revision.
         protocol: Evaluation protocol as far as known.
-        note: Remark for readers.
-        values: APs as printed; the class "mean" is the paper's mAP.
+        note: Remark on the row.
+        values: APs as printed. The class "mean" is the mAP of the paper.
     """
 
     source: str
@@ -441,9 +444,9 @@ class PublishedRow:
         options: EvaluationOptions,
         split: str | None,
     ) -> list[str]:
-        """Our APs minus the printed ones; "-" where there is none to compare with.
+        """Formats our APs minus the printed ones, with "-" if they are not comparable.
 
-        A mean is compared only with one over the same classes.
+        A mean is compared only with a mean over the same classes.
         """
         is_comparable = (
             options.paper_protocol == self.protocol
@@ -463,7 +466,7 @@ class PublishedRow:
 
 
 def _read() -> tuple[PublishedRow, ...]:
-    """The rows of `published.csv`."""
+    """Reads the rows of `published.csv`."""
     names = [field.name for field in dataclasses.fields(PublishedRow)][:-1]
     text = importlib.resources.files(__package__) / "published.csv"
     rows: dict[tuple[str, ...], PublishedRow] = {}
@@ -487,13 +490,16 @@ PUBLISHED = _read()
 def paper_tables(
     run: str, results: Results, options: EvaluationOptions, split: str | None
 ) -> list[Table]:
-    """All tables that the results allow, in the order of the papers.
+    """Builds the tables in the papers' layouts that the classes and IoUs allow.
 
     Args:
         run: Name of the run.
         results: Results of frames that are not simulated.
         options: Options of the evaluation.
-        split: Split of the frames, None if it is not known.
+        split: Split of the frames, or None if it is not known.
+
+    Returns:
+        Tables in the order of the papers.
     """
     if 0.3 not in options.iou_thresholds:
         return []
@@ -545,17 +551,17 @@ def _layout(
     groups: Sequence[Place],
     columns: Sequence[Place],
 ) -> Table:
-    """Published rows, each with the difference to it where there is one, then ours.
+    """Builds a table of published rows, each with our difference to it, and our rows.
 
     Args:
         run: Name of the run.
         results: Results of the run.
         options: Options of the evaluation.
-        split: Split of the frames, None if it is not known.
+        split: Split of the frames, or None if it is not known.
         title: Title of the table.
         sources: Papers and tables whose rows are printed.
-        groups: Condition, class, space or IoU threshold that each group of rows shares.
-        columns: The same of each column.
+        groups: Condition, class, space or IoU threshold of each group of rows.
+        columns: Condition, class, space or IoU threshold of each column.
     """
     body: list[list[str]] = []
     for group in groups:
@@ -565,7 +571,7 @@ def _layout(
         compared = [ap_of(results, options.paper_protocol, *cell) for cell in cells]
         for row in PUBLISHED:
             values = [row.values.get(cell, "-") for cell in cells]
-            # Both papers copy the same rows.
+            # Both papers contain the same rows of other methods.
             is_repeated = [row.method, *values] in printed
             if row.source not in sources or set(values) == {"-"} or is_repeated:
                 continue
@@ -584,6 +590,6 @@ def _layout(
 
 
 def _name(place: Place) -> str:
-    """Title of what a group or a column is of, such as "Light Snow BEV"."""
+    """Returns the title of a group or a column, such as "Light Snow BEV"."""
     names = {"3d": "3D", "bev": "BEV", 0.3: "IoU 0.3", 0.5: "IoU 0.5"} | TITLES
     return " ".join(str(names.get(value, value)) for value in place.values())

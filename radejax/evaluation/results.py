@@ -1,9 +1,9 @@
-"""All numbers of an evaluation: protocols, conditions, classes, spaces, IoU thresholds.
+"""Results of an evaluation for all protocols, conditions, classes, spaces and IoUs.
 
-Confidence intervals resample whole sequences: frames of one sequence show the same few
-cars, so they are not independent; sequences are. A resample draws as many sequences as
-there are, with replacement, and every frame counts as often as its sequence was drawn,
-which all protocols handle exactly.
+Confidence intervals are computed by resampling whole sequences (cluster bootstrap),
+because the frames of a sequence show the same few cars and are not independent. A
+resample draws as many sequences as there are, with replacement. Every frame counts as
+often as its sequence was drawn, which all protocols handle exactly.
 """
 
 from __future__ import annotations
@@ -53,22 +53,22 @@ _RANGES = {
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationOptions:
-    """Settings of an evaluation: the fields of `config.evaluation` and what reports add.
+    """Settings of an evaluation: the fields of `config.evaluation` and of reports.
 
     Attributes:
-        classes: Classes evaluated.
+        classes: Classes to evaluate.
         iou_thresholds: IoU thresholds.
         protocols: Names of protocols.
         score_threshold: Score threshold of all protocols except fixed ones (all_point).
         empty_frames: Frames to ignore, except in fixed protocols; see `evaluate`.
-        min_score: Predictions below are not stored and count nowhere.
+        min_score: Minimum score; predictions below it are neither stored nor evaluated.
         roi: Region of interest of ground truth and predictions.
         label_version: Label revision of the ground truth.
         bootstrap: Number of resamples of sequences for intervals; 0 for none.
-        invalid_sizes: "error", or "false_positive": predicted boxes with a size that is
-            not positive match nothing but count as predictions.
+        invalid_sizes: Treatment of predicted boxes with a size that is not positive:
+            "error", or "false_positive" to count them as predictions without a match.
         plots: Whether to draw curves.
-        batch_size: Frames per batch of predictions.
+        batch_size: Number of frames per batch of predictions.
         num_visualizations: Number of frames to draw.
     """
 
@@ -95,14 +95,14 @@ class EvaluationOptions:
 
     @classmethod
     def from_config(cls, config: ConfigDict, **changes: Any) -> EvaluationOptions:
-        """Options from the config of a run.
+        """Creates options from the config of a run.
 
         Args:
-            config: Config of the run; `evaluation`, `classes` and `data.label_version` are read.
+            config: Config of the run with `evaluation`, `classes` and `data.label_version`.
             **changes: Fields to replace.
 
         Raises:
-            UserError: A value out of its range, or classes that the run does not have.
+            UserError: A value is invalid, or the run does not have one of the classes.
         """
         classes = tuple(config.classes)
         if unknown := sorted(set(changes.get("classes", ())) - set(classes)):
@@ -123,7 +123,7 @@ class EvaluationOptions:
 
     @property
     def paper_protocol(self) -> str:
-        """Protocol of rows next to published ones: the authors', or the first."""
+        """Protocol for comparison with published rows: the authors', or else the first."""
         authors = protocols.AUTHORS_PROTOCOL
         return authors if authors in self.protocols else self.protocols[0]
 
@@ -136,7 +136,7 @@ class EvaluationOptions:
         return tuple(name for name in usual if name in self.protocols)
 
     def settings_of(self, protocol: str) -> dict[str, Any]:
-        """Score threshold and empty-frame rule of a protocol, for `results`."""
+        """Returns the score threshold and empty-frame rule of a protocol for `results`."""
         if protocols.get_protocol(protocol).is_fixed:
             return {"score_threshold": self.min_score, "empty_frames": "protocol"}
         threshold = max(self.score_threshold, self.min_score)
@@ -151,22 +151,23 @@ def evaluate_tables(
     *,
     per_weather: bool = True,
 ) -> tuple[EvaluationSet, list[Result]]:
-    """Evaluate predictions over all frames and over those of every weather.
+    """Evaluates predictions over all frames and over the frames of every weather.
 
     Args:
-        ground_truth: Columns as in `evaluation.evaluate`.
-        predictions: The same with scores.
+        ground_truth: Columns as for `evaluation.evaluate`.
+        predictions: Such columns with scores.
         frames: Frame table.
-        options: What to compute.
-        per_weather: Whether to evaluate every weather of the frame table too.
+        options: Settings of the evaluation.
+        per_weather: Whether to also evaluate every weather of the frame table.
 
     Returns:
-        The evaluation set and the results of all protocols, with 95 % intervals where
-        `options.bootstrap` asks for them. The last class of every group is "mean".
+        The evaluation set and the results of all protocols. With `options.bootstrap` and
+        known sequences, they have 95 % intervals (see `compute_results`). The last class
+        of every group is "mean".
 
     Raises:
-        UserError: Wrong options or missing columns.
-        DataError: A bad row; names the table, frame and row.
+        UserError: An option is invalid, or a column is missing.
+        DataError: A row is invalid; the message names the table, frame and row.
     """
     data = make_set(ground_truth, predictions, frames, options)
     weathers = condition_masks(frames, "weather") if per_weather else {}
@@ -181,7 +182,7 @@ def make_set(
     frames: Columns,
     options: EvaluationOptions,
 ) -> EvaluationSet:
-    """The evaluation set of these options; predicted sizes are repaired and counted."""
+    """Builds the evaluation set; repaired and clipped predictions are counted in it."""
     predictions, num_invalid = repair_sizes(predictions, options.invalid_sizes)
     sizes = np.asarray(predictions["box"], np.float64).reshape(-1, 7)[:, 3:6]
     is_clipped = ((sizes > 1e-6) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1)
@@ -206,11 +207,11 @@ def compute_results(
     weathers: Mapping[str, Bool[np.ndarray, " F"]],
     sequence: Shaped[np.ndarray, " F"] | None = None,
 ) -> list[Result]:
-    """Results of every protocol over all frames and over masks of frames.
+    """Computes the results of every protocol over all frames and the frames of weathers.
 
-    Where the sequences are given, all protocols have intervals over all frames, and the
-    main ones also per weather. Conditions are resampled within their sequences; those of
-    one sequence get none.
+    If the sequences are given, all protocols have intervals over all frames, and the main
+    protocols also per weather. The interval of a weather is computed by resampling its
+    sequences; there is none if it has only one sequence.
     """
     rows = []
     everything = {"all": np.ones(data.frame.size, bool)}
@@ -246,12 +247,12 @@ def compute_results(
                         for row, (low, high) in pairs
                     ]
                 rows += group
-    # By protocol, then by condition.
+    # The results are sorted by protocol, then by condition.
     return sorted(rows, key=lambda row: options.protocols.index(row.protocol))
 
 
 def _mean(group: Sequence[Result]) -> Result:
-    """The row "mean" of the classes of one space and IoU threshold, without a curve."""
+    """Returns the result "mean" over the classes of one space and IoU threshold."""
     return dataclasses.replace(
         group[0],
         cls="mean",
@@ -265,7 +266,7 @@ def _mean(group: Sequence[Result]) -> Result:
 def sequence_weights(
     sequence: Shaped[np.ndarray, " F"], *, resamples: int, seed: int
 ) -> Int[np.ndarray, "B F"]:
-    """How often each frame counts in each resample; int16.
+    """Draws how often each frame counts in each resample, as int16.
 
     Args:
         sequence: Sequence of every frame.
@@ -273,7 +274,7 @@ def sequence_weights(
         seed: Random seed; the same seed draws the same sequences.
 
     Raises:
-        UserError: Fewer than two sequences: there is nothing to resample.
+        UserError: There are fewer than two sequences.
     """
     names, inverse = np.unique(sequence, return_inverse=True)
     if names.size < 2:
@@ -295,9 +296,10 @@ def resample(
     empty_frames: str = "protocol",
     score_threshold: float = 0.0,
 ) -> Float[np.ndarray, "B _"]:
-    """`[B, C + 1]` AP of every class, then their mean, in every resample.
+    """Computes `[B, C + 1]` APs of every class and their mean in every resample.
 
-    NaN where a resample has no object of the class; the mean is over classes that occur.
+    The AP is NaN if a resample has no object of the class. The mean is over the classes
+    that occur.
     """
     chosen = protocols.get_protocol(protocol)
     empty_frames = chosen.resolve_empty_frames(empty_frames)
@@ -313,7 +315,10 @@ def resample(
 
 
 def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:
-    """95 % percentile interval of the samples that are defined; NaN if none is."""
+    """Computes the 95 % percentile interval of the samples that are not NaN.
+
+    Both ends are NaN if there are none.
+    """
     samples = samples[~np.isnan(samples)]
     if not samples.size:
         return float("nan"), float("nan")
@@ -322,7 +327,10 @@ def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:
 
 
 def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray, " F"]]:
-    """Masks of frames by value of a column of the frame table, K-Radar's weathers first."""
+    """Returns the mask of frames for each value in a column of the frame table.
+
+    K-Radar's weathers come first, in their order.
+    """
     if kind not in frames:
         return {}
     column = np.asarray(frames[kind]).astype(str)
@@ -332,7 +340,7 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
 
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:
-    """Counts of boxes and frames that are excluded from the numbers, by reason."""
+    """Counts the boxes and frames that are excluded from the results, by reason."""
     fixed = [p for p in options.protocols if protocols.PROTOCOLS[p].is_fixed]
     threshold = max(options.score_threshold, options.min_score)
     is_kept = data.score > threshold
@@ -351,15 +359,15 @@ def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[st
 
 
 def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
-    """Make invalid sizes, which an untrained network may predict, harmless.
+    """Repairs boxes with sizes that are not positive, as of an untrained network.
 
     Args:
-        predictions: Columns as in `evaluation.evaluate`.
-        rule: "error" leaves them as they are; "false_positive" shrinks boxes with a size
-            that is not positive to a micrometer: they match nothing but still count.
+        predictions: Columns as for `evaluation.evaluate`.
+        rule: "error" does not change them; "false_positive" sets all sizes of such boxes
+            to a micrometer, so that they match nothing but count as predictions.
 
     Returns:
-        The predictions and how many boxes were changed.
+        The predictions and the number of changed boxes.
     """
     box = np.array(predictions["box"], np.float64).reshape(-1, 7)
     is_invalid = (box[:, 3:6] <= 0).any(axis=1)
@@ -370,7 +378,7 @@ def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
 
 
 def to_row(result: Result) -> dict[str, Any]:
-    """A row of metrics.json and metrics.csv."""
+    """Converts a result to a row of metrics.json and metrics.csv."""
     others = ["ap", "precision", "recall", "score", "low", "high", "is_simulated"]
     terms = {name: value for name, value in vars(result).items() if name not in others}
     return {

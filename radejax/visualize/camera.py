@@ -1,8 +1,8 @@
-"""Boxes on the camera image.
+"""Drawing of boxes on the camera image.
 
-Boxes are in the radar frame, in which models are trained and evaluated; the calibration
-takes them to pixels. Boxes of label files (LiDAR frame) need the sensor offset first:
-the usual reason for boxes drawn next to their cars.
+Boxes are in the radar frame, in which models are trained and evaluated, and are projected
+to pixels with the calibration. The sensor offset must be added to boxes of label files
+(LiDAR frame) first; otherwise they are drawn next to their objects.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from radejax.visualize.style import (
     styled_sets,
 )
 
-_FRONT = [0, 3, 7, 4]  # of geometry.boxes.corners
-_MIN_LABEL_HEIGHT_PT = 12.0  # of a box on paper
+_FRONT = [0, 3, 7, 4]  # front face in geometry.boxes.corners
+_MIN_LABEL_HEIGHT_PT = 12.0  # height of a box in the figure
 _NEAR_M = 0.5
 
 
@@ -43,22 +43,22 @@ def draw_camera(
     show_labels: bool = True,
     title: str = "",
 ) -> Axes:
-    """Draw 3D boxes on an image: edges, and the front face tinted.
+    """Draw the edges and the tinted front faces of 3D boxes on an image.
 
     Args:
-        image: `[H, W, 3]` uint8, or float in [0, 1], of the calibration's size.
-        calibration: The camera, with its offset from the LiDAR.
+        image: `[H, W, 3]` uint8, or float in [0, 1], with the size of the calibration.
+        calibration: Calibration of the camera, with the offset from LiDAR to radar.
         ground_truth: Boxes in the radar frame, or None.
         predictions: Boxes with scores in the radar frame, or None.
         ax: Axes to draw on; a new figure by default.
-        show_labels: Write class and score at the boxes.
+        show_labels: Whether to write class and score at the boxes.
         title: Title of the axes.
 
     Returns:
         The axes, in pixels of the image.
 
     Raises:
-        UserError: Image and calibration differ in size.
+        UserError: The image does not have the size of the calibration.
     """
     image = np.asarray(image)
     expected = (calibration.height, calibration.width, 3)
@@ -69,7 +69,7 @@ def draw_camera(
             "read_left_image) and CameraCalibration.resized for a resized image"
         )
     focal_x, focal_y = np.asarray(calibration.intrinsics)[:2]
-    aspect = float(focal_x / focal_y)  # squeezed images are shown undistorted
+    aspect = float(focal_x / focal_y)  # undoes a non-uniform resize
     if ax is None:
         width = 9.0
         height = width * aspect * calibration.height / calibration.width
@@ -77,7 +77,7 @@ def draw_camera(
         ax = new_figure(width, total).add_axes((0, 0, 1, height / total))
     ax.imshow(image, interpolation="bilinear", aspect=aspect)
     ax.set_axis_off()
-    # Pixel centers are integers in imshow, half integers in the calibration.
+    # Pixel centers are integers in imshow and half-integers in the calibration.
     ax.set(xlim=(-0.5, calibration.width - 0.5), ylim=(calibration.height - 0.5, -0.5))
     ax.apply_aspect()
     labels = []
@@ -93,10 +93,10 @@ def draw_camera(
 def _draw_boxes(
     ax: Axes, calibration: CameraCalibration, boxes: Boxes, style: Style
 ) -> list[Label]:
-    """Draw what is in front of the camera; return labels of boxes that are not far."""
+    """Draw the boxes in front of the camera; return labels of boxes that are large enough."""
     segments, is_visible = calibration.project_boxes(boxes.box, near_m=_NEAR_M)
     segments = segments - 0.5
-    # Wild pixels far outside the image confuse the renderer's clipping.
+    # The renderer does not clip lines correctly that end far outside the image.
     limit = 20 * calibration.width
     is_visible = is_visible & (np.abs(segments) < limit).all((-1, -2))
     points, depth = calibration.project_ego(corners(boxes.box))

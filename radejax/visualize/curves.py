@@ -1,4 +1,4 @@
-"""Curves over data: precision and recall, training."""
+"""Figures of precision-recall curves and of training metrics."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ Curve = tuple[Any, Any] | None
 def draw_precision_recall(panels: Mapping[str, Mapping[str, Curve]]) -> Figure:
     """Draw precision over recall, one line per class, condition or model.
 
-    Lines differ in color and in dash pattern; a name that has no curve in one panel
-    keeps its color and pattern in the others.
+    Lines differ in color and in dash pattern, which depend on the position of the curve
+    in its panel. Use None for missing curves, so that a name has the same color and
+    pattern in all panels.
 
     Args:
-        panels: Title of each panel to its curves by name; at least one.
+        panels: Curves by name for the title of each panel; at least one panel.
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
@@ -58,7 +59,7 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
         ax.text(0.5, 0.5, "none found", transform=ax.transAxes, ha="center")
     if not ax.lines:
         return
-    ax.legend(  # below the axes, where it covers no curve
+    ax.legend(  # below the axes, not to cover a curve
         fontsize=7,
         loc="upper center",
         bbox_to_anchor=(0.5, -0.16),
@@ -68,13 +69,14 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
 
 
 def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Series of a run's `metrics.jsonl`: name to `(step [N], value [N])`.
+    """Read the series of a run's `metrics.jsonl` as `(step [N], value [N])` by name.
 
-    An unfinished last line, as an interrupted run leaves it, is ignored.
+    An incomplete last line of an interrupted run is ignored.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        DataError: A line is not a JSON object with a step; names file and line.
+        DataError: A line is not a JSON object with a step; the message names file and
+            line.
     """
     series: dict[str, list[tuple[float, float]]] = {}
     *lines, _ = files.read_text(path).split("\n")
@@ -93,10 +95,10 @@ def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray
 def draw_training(
     series: Mapping[str, tuple[Any, Any]], keys: Sequence[str], title: str = ""
 ) -> Figure:
-    """Figure of a run's losses over steps, one panel per key.
+    """Draw the losses of a run over steps, one panel per key.
 
     Args:
-        series: Name to `(step [N], value [N])`, such as those of `read_metrics`.
+        series: `(step [N], value [N])` by name, as returned by `read_metrics`.
         keys: Names of the series to show.
         title: Title of the figure.
     """
@@ -118,7 +120,10 @@ def draw_training(
 
 
 def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray, " N"]:
-    """Mean over the last `width` finite values, fewer at the start."""
+    """Compute the mean of the finite values among the last `width` values.
+
+    There are fewer values at the start. The mean is NaN if none is finite.
+    """
     is_finite = np.isfinite(values)
     total = np.cumsum(np.where(is_finite, values, 0.0))
     count = np.cumsum(is_finite)
@@ -130,7 +135,7 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
 
 
 def _line(i: int) -> dict[str, Any]:
-    """Color and dash pattern of the i-th line; no two alike among the first 24."""
+    """Return color and dash pattern of the i-th line; the first 24 lines all differ."""
     return {
         "color": SERIES_COLORS[i % len(SERIES_COLORS)],
         "linestyle": _LINE_STYLES[(i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)],

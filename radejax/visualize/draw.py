@@ -1,14 +1,14 @@
-"""Figures of radar frames: bird's-eye view, polar view, one frame, scenes, slices.
+"""Figures of radar frames: bird's-eye view, polar view, one frame, scenes and slices.
 
-The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map with
-the region of interest dashed, ground truth white with its class, predictions red with
-class and score, and the camera image. In the bird's-eye view x points up and y to the
-left, in meters, and every range-azimuth bin covers the ground that it measures.
+The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map with a
+dashed region of interest, white ground truth with its class, red predictions with class
+and score, and the camera image. In the bird's-eye view, x points up and y to the left, in
+meters, and every range-azimuth bin covers the ground that it measures.
 
-A projection `[R, A, D+E]` is two 3D maps side by side: range-azimuth-Doppler (maximum
-over elevation) and range-azimuth-elevation (maximum over Doppler). The Doppler axis
-wraps around at a few meters per second, so a position on it is an aliased radial
-velocity, never the velocity: figures of slices say so.
+A projection `[R, A, D+E]` consists of two 3D maps: range-azimuth-Doppler (maximum over
+elevation) and range-azimuth-elevation (maximum over Doppler). The Doppler axis wraps
+around at a few meters per second, so it shows the aliased radial velocity and is labelled
+as such.
 """
 
 from __future__ import annotations
@@ -68,15 +68,15 @@ def draw_map(
     color_limits: tuple[float, float] | None = None,
     label: str = "",
 ) -> Axes:
-    """Draw any range-azimuth map on the ground plane: heatmaps, gates, attention.
+    """Draw a range-azimuth map, such as a heatmap or attention, on the ground plane.
 
     Args:
-        values: `[R, A]`.
+        values: Map `[R, A]`.
         grid: Grid of the map; padded maps need the padded grid.
         ax: Axes to draw on; a new figure by default.
-        extent: Ground that is shown; by default the field of view.
-        color_limits: Limits of the color bar; by default from the values shown.
-        label: Text of the color bar; without one there is no color bar.
+        extent: Extent of the ground to show; the field of view by default.
+        color_limits: Limits of the color scale; computed from the shown values by default.
+        label: Label of the color bar, which is only drawn if this is not empty.
 
     Raises:
         UserError: Map and grid differ in shape.
@@ -89,12 +89,12 @@ def draw_map(
         )
     x0, x1, y0, y1 = extent = extent or _extent_m(grid, None)
     ax = _axes_for_extent(extent) if ax is None else ax
-    # Range bins outside the figure take time to draw and would set its colors.
+    # Range bins outside the figure are slow to draw and would affect its color limits.
     x, y = np.moveaxis(grid.bin_centers_ego(), -1, 0)
     is_shown = ((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)).any(1)
     rows = np.flatnonzero(is_shown) if is_shown.any() else np.arange(grid.num_range)
     first, last = max(rows[0] - 2, 0), min(rows[-1] + 3, grid.num_range)
-    # Edges half a bin outside the centers; the range edge before zero is zero.
+    # Edges are half a bin outside the centers; negative ranges are clipped to zero.
     range_bin = np.arange(first, last + 1) - 0.5
     range_bin = np.maximum(range_bin, -grid.range_m[0] / grid.range_step_m)
     azimuth_bin = np.arange(grid.num_azimuth + 1) - 0.5
@@ -102,24 +102,25 @@ def draw_map(
     ax.set_facecolor(_OUTSIDE_COLOR)
     shown = values[first:last]
     mesh = draw_tiles(ax, edges[..., 1], edges[..., 0], shown, color_limits)
-    # Seen from above with x ahead, left is left: y grows to the left.
+    # The y axis increases to the left, as in a view from above with x pointing up.
     ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, left [m]", ylabel="x, ahead [m]")
     ax.set_aspect("equal")
     if label:
-        # As high as the axes, also where equal aspect shrinks them.
+        # An inset has the height of the axes even if the equal aspect shrinks them.
         cax = ax.inset_axes((1.02, 0.0, 0.035, 1.0))
         ax.figure.colorbar(mesh, cax=cax, label=label)
     return ax
 
 
 def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -> Axes:
-    """Figure of one frame on the ground plane.
+    """Draw a figure of one frame on the ground plane.
 
-    The region of interest and its surroundings are shown, the field of view without one.
+    It shows the region of interest and its surroundings, or the field of view if the
+    scene has no region of interest.
 
     Args:
         scene: The frame.
-        color_limits: Limits of the color bar; by default from the values shown.
+        color_limits: Limits of the color scale; computed from the shown values by default.
 
     Returns:
         The axes; `.figure` is the figure.
@@ -140,31 +141,31 @@ def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -
 
 
 def _draw_ground(scene: Scene, **options: Any) -> Axes:
-    """Draw map, region, boxes and sensor, with options of `draw_map`."""
+    """Draw map, region, boxes and sensor; `options` are passed to `draw_map`."""
     extent = _extent_m(scene.grid, scene.roi)
     ax = draw_map(scene.power, scene.grid, extent=extent, **options)
     _draw_over(ax, scene, lambda points: points[..., ::-1])
-    # The sensor, pointing ahead.
+    # The sensor is drawn as a triangle that points ahead.
     ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
     return ax
 
 
 def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
-    """Edges of a uniform axis of `n` bin centers, half a step outside."""
+    """Return the bin edges of a uniform axis with `n` bin centers."""
     step = (centers[-1] - centers[0]) / (centers.size - 1)
     return centers[0] + step * (np.arange(centers.size + 1) - 0.5)
 
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
-    """Azimuth in degrees, right positive, and range of ground positions."""
+    """Convert ground positions to azimuth in degrees, positive to the right, and range."""
     x, y = points[..., 0], points[..., 1]
     return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
 
 
 def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
-    """Draw one frame as the network sees it: range over azimuth, one tile per bin.
+    """Draw one frame in the network's coordinates, range over azimuth, one tile per bin.
 
-    Straight box edges bend here; they are drawn bent.
+    The straight edges of boxes are curves in these coordinates.
     """
     horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
     vertical = bin_edges(scene.grid.range_m)
@@ -176,7 +177,7 @@ def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
 
 
 def draw_frame(scene: Scene) -> Figure:
-    """Figure of one frame: bird's-eye view, polar view and, if given, camera image.
+    """Draw one frame: bird's-eye view, polar view and, if given, camera image.
 
     Returns:
         A figure of 12 by 6.4 inches; write it with `save_figure`.
@@ -195,7 +196,7 @@ def draw_frame(scene: Scene) -> Figure:
         loc="lower center",
         bbox_to_anchor=(0.765, 0.095 + height),
         ncols=3,
-        fontsize=8,  # counts, threshold and the region's name fit
+        fontsize=8,  # so that counts, threshold and region fit
         frameon=False,
     )
     figure.suptitle(scene.title)
@@ -203,10 +204,10 @@ def draw_frame(scene: Scene) -> Figure:
 
 
 def draw_scenes(scenes: Sequence[Scene]) -> Figure:
-    """Figure of scenes, four per row, each with its camera image above its map.
+    """Draw scenes, four per row, each with its camera image above its map.
 
     Args:
-        scenes: At least one; the legend is that of the first.
+        scenes: One or more scenes. The legend is taken from the first one.
 
     Raises:
         UserError: There are no scenes.
@@ -217,7 +218,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     width = _COLUMN_IN * columns
     height = _ROW_IN * -(-len(scenes) // columns) + _FOOT_IN
     figure = new_figure(width, height)
-    # One color scale for all, which the few strongest echoes exceed.
+    # All scenes share one color scale. The few strongest echoes are beyond its limits.
     values = [scene.power.ravel() for scene in scenes]
     low, high = np.nanpercentile(np.concatenate(values), _SCENE_PERCENTILES)
     limits = (float(low), float(max(high, low + 1e-3)))
@@ -229,7 +230,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
         if scene.image is not None:
             place = (left, (base + 5.55) / height, across, 2.15 / height)
             above = figure.add_axes(place)
-            # Labels are readable on the map; here they would hide the image.
+            # Labels are only drawn on the map, as they would hide the small image.
             _draw_view(above, scene, show_labels=False)
         below = figure.add_axes((left, (base + 0.55) / height, across, 4.9 / height))
         _draw_ground(scene, ax=below, color_limits=limits)
@@ -256,7 +257,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
 
 
 def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
-    """Camera image, with the boxes where a calibration is given."""
+    """Draw the camera image, and the boxes on it if a calibration is given."""
     if scene.camera is None:
         ax.imshow(np.asarray(scene.image))
         ax.set_axis_off()
@@ -272,20 +273,20 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
 
 
 def _extent_m(grid: RadarGrid, roi: Sequence[float] | None) -> Extent:
-    """The region with its surroundings, or the field of view."""
+    """Return the extent of the region and its surroundings, or of the field of view."""
     far = grid.range_m[-1] + grid.range_step_m / 2
     side = far * np.sin(min(grid.fov_azimuth_rad, np.pi / 2))
     if roi is None:
         return -_BEHIND_M, far, -side, side
     _, x1, y0, y1 = roi[:4]
     far = min(far, 1.08 * x1)
-    # Narrow regions would be unreadable slivers: show at least 3:4.
+    # Narrow regions are widened to an aspect ratio of about 3:4 to be readable.
     half = max(min(max(-y0, y1, 0.0) * 1.25, side), 0.37 * far)
     return -_BEHIND_M, far, -half, half
 
 
 def _axes_for_extent(extent: Extent) -> Axes:
-    """Axes of a new figure that fit an extent, with space for color bar and legend."""
+    """Create axes in a new figure for an extent, with space for color bar and legend."""
     x0, x1, y0, y1 = extent
     scale = min(5.5 / (x1 - x0), 6.0 / (y1 - y0))
     width, height = scale * (y1 - y0), scale * (x1 - x0)
@@ -300,19 +301,19 @@ def _draw_over(
     to_axes: Callable[[np.ndarray], np.ndarray],
     show_labels: bool = True,
 ) -> None:
-    """Region of interest, boxes with headings and labels.
+    """Draw the region of interest, the boxes with their headings, and labels.
 
     Args:
-        ax: Axes of a map; limits and aspect are final.
+        ax: Axes of a map, whose limits and aspect must be final.
         scene: The frame.
-        to_axes: Ground positions `[..., 2]` to data coordinates.
-        show_labels: Write class and score next to the boxes.
+        to_axes: Function that converts ground positions `[..., 2]` to data coordinates.
+        show_labels: Whether to write class and score next to the boxes.
     """
     ax.apply_aspect()
     if scene.roi is not None:
         x0, x1, y0, y1 = scene.roi[:4]
         region = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 0, x1 - x0, y1 - y0, 0, 0]])
-        # White below the dashes: visible on dark and on bright ground.
+        # The dashes have a white outline to be visible on dark and on bright maps.
         ax.plot(
             *to_axes(footprints(region, 200)[0]).T,
             color=ROI_COLOR,
@@ -337,13 +338,17 @@ def _draw_over(
 
 
 def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:
-    """Segments from the middle of each front edge outwards: the echo stays visible."""
+    """Return line segments that show the heading of each box.
+
+    They start at the middle of the front edge and point outwards, so that the echo inside
+    the box remains visible.
+    """
     front = bev_corners(boxes)[:, [0, 3]].mean(1)
     return np.stack([front, front + 0.7 * (front - boxes[:, :2])], 1)
 
 
 def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
-    """One handle per kind of line."""
+    """Return one legend handle per kind of line."""
     handles = []
     for style, boxes in scene.sets:
         label = f"{style.name} ({len(boxes)})" if show_counts else style.name
@@ -363,14 +368,16 @@ def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
 
 
 def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
-    """Figure of three slices on one color scale: azimuth, Doppler, elevation.
+    """Draw range-azimuth, range-Doppler and azimuth-elevation maps on one color scale.
 
-    Ground truth is outlined where both axes are known. Labels have no Doppler: there a
-    bar at the left edge spans the ranges of each box.
+    Ground truth is outlined in the range-azimuth and azimuth-elevation maps. Labels
+    contain no Doppler, so the range-Doppler map shows the range interval of each box as a
+    bar at the left edge.
 
     Args:
         scene: The frame; predictions, region and image are not drawn.
-        range_idx: Range bin of the azimuth-elevation slice; None: maximum.
+        range_idx: Range bin of the azimuth-elevation slice, or None for the maximum over
+            range.
     """
     grid, values = scene.grid, np.asarray(scene.projection, np.float32)
     doppler, elevation = np.split(values, [grid.num_doppler], -1)
@@ -402,7 +409,7 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
         left, right = axes[1].get_xlim()
         outlines = _outlines(scene.ground_truth.box, left + 0.02 * (right - left))
         for ax, lines in zip(axes, outlines, strict=True):
-            # Most boxes are a few bins.
+            # Lines are thinner here, as most boxes only cover a few bins.
             draw_lines(ax, lines, GROUND_TRUTH.color, 0.7 * GROUND_TRUTH.width)
     return figure
 
@@ -410,7 +417,7 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
 def _outlines(
     boxes: Float[np.ndarray, "N 7"], left: float
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
-    """Lines of boxes in the three slices, bars at a Doppler of `left`."""
+    """Return the lines of boxes in the three slices, with bars at a Doppler of `left`."""
     azimuth_range = [to_polar(outline) for outline in footprints(boxes, 8)]
     bars, azimuth_elevation = [], []
     for outline, points in zip(azimuth_range, corners(boxes), strict=True):

@@ -1,7 +1,7 @@
-"""Sequences of frames: GIF, MP4 where ffmpeg is installed, and rerun recordings.
+"""Sequences of frames as GIF, MP4 (if ffmpeg is installed) and rerun recordings.
 
-Recordings show radar map, boxes and camera over time. They need the extra `viewer`
-(`pip install radejax[viewer]`); nothing else does.
+Recordings show radar map, boxes and camera over time. Only they need the extra `viewer`
+(`pip install radejax[viewer]`).
 """
 
 from __future__ import annotations
@@ -31,18 +31,20 @@ def animate(
     *,
     frames_per_second: float = 10.0,
 ) -> pathlib.Path:
-    """Write figures as the frames of a GIF or MP4, completely or not at all.
+    """Write figures as the frames of a GIF or MP4 file, which is replaced atomically.
 
     Args:
-        figures: Figures, at the size and resolution of the first; may be a generator.
-        path: Target; the suffix decides: .gif, or .mp4, which needs ffmpeg.
-        frames_per_second: K-Radar's sensors run at 10.
+        figures: Figures or a generator of figures, written at the size and resolution of
+            the first one.
+        path: File to write, with the suffix .gif, or .mp4, which needs ffmpeg.
+        frames_per_second: Frame rate; K-Radar's sensors have 10 frames per second.
 
     Returns:
-        The path written.
+        The path of the file.
 
     Raises:
-        UserError: Another suffix, no figures, or ffmpeg is missing or fails.
+        UserError: The suffix is not supported, there are no figures, or ffmpeg is missing
+            or fails.
     """
     path = pathlib.Path(path)
     writer: PillowWriter | FFMpegWriter
@@ -62,7 +64,7 @@ def animate(
     if first is None:
         raise UserError("no frames to animate")
     with atomic_path(path) as temporary:
-        # Both writers choose the format by the suffix.
+        # Both writers select the format by the suffix.
         target = temporary.with_name(f"{temporary.name}{path.suffix.lower()}")
         try:
             with writer.saving(first, str(target), first.dpi):
@@ -80,14 +82,14 @@ def animate(
 
 
 def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
-    """Write scenes into a recording (.rrd) that `rerun PATH` opens.
+    """Write scenes to a recording (.rrd) that `rerun PATH` opens.
 
     Args:
-        scenes: Frames in time order; an iterator keeps memory constant.
-        path: Target, written completely or not at all.
+        scenes: Frames in time order; use an iterator for constant memory.
+        path: File to write, which is replaced atomically.
 
     Raises:
-        UserError: rerun is not installed, the suffix is not .rrd, or no frames.
+        UserError: rerun is not installed, the suffix is not .rrd, or there are no frames.
     """
     path = pathlib.Path(path)
     if path.suffix != ".rrd":
@@ -109,13 +111,13 @@ def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
         if not count:
             raise UserError("no frames to record")
         stream.flush()
-        del stream  # closes the file before it takes its name
+        del stream  # closes the file before it is renamed
 
 
 def ground_mesh(
     grid: RadarGrid,
 ) -> tuple[Float[np.ndarray, "bins 3"], Int[np.ndarray, "T 3"]]:
-    """Vertices at bin centers on z = -2 m, and triangles."""
+    """Return the vertices (bin centers at z = -2 m) and triangles of the ground mesh."""
     centers = grid.bin_centers_ego().reshape(-1, 2)
     vertices = np.concatenate([centers, np.full((len(centers), 1), -2.0)], 1)
     index = np.arange(len(centers)).reshape(grid.num_range, grid.num_azimuth)
@@ -125,13 +127,13 @@ def ground_mesh(
 
 
 def yaw_quaternions(yaw_rad: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
-    """x, y, z, w of rotations about z."""
+    """Return the quaternions x, y, z, w of rotations about z."""
     zero = np.zeros_like(yaw_rad)
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], -1)
 
 
 def _blueprint() -> Any:
-    """3D view next to the camera image."""
+    """Return the layout of the viewer, with the 3D view next to the camera image."""
     import rerun.blueprint as rrb
 
     return rrb.Blueprint(

@@ -1,8 +1,8 @@
 """Shared parts of all figures: colors, the frame to draw, axes helpers and saving.
 
-Figures are plain `matplotlib.figure.Figure` objects: nothing here touches pyplot, its
-backend or its list of open figures, so drawing works without a display, in threads
-and in notebooks.
+Figures are plain `matplotlib.figure.Figure` objects. pyplot, its backend and its list of
+open figures are not used, so drawing works without a display, in threads and in
+notebooks.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
-# The brightest fifth is omitted: white boxes must stand out on the strongest echoes.
+# The brightest fifth is omitted so that white boxes are visible on the strongest echoes.
 COLOR_MAP = LinearSegmentedColormap.from_list(
     "radar", matplotlib.colormaps["viridis"](np.linspace(0.0, 0.82, 256))
 )
 ROI_COLOR = "black"
-# The color-blind safe palette of Okabe and Ito, with a yellow that shows on paper.
+# The color-blind safe palette of Okabe and Ito, with a yellow that is visible on paper.
 SERIES_COLORS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
     *("#000000", "#8A6D00"),
@@ -43,14 +43,14 @@ SERIES_COLORS = (
 
 
 class Style(NamedTuple):
-    """How one set of boxes is drawn.
+    """Style of one set of boxes.
 
     Attributes:
         name: Name in legends.
         color: Color of lines.
-        text_color: Color of labels; thin strokes need more light than lines.
+        text_color: Color of labels, which is lighter because text is thinner than lines.
         width: Width of lines in points.
-        side: Side of a box on a map where its label stands.
+        side: Side of a box on a map at which its label is written.
     """
 
     name: str
@@ -66,7 +66,7 @@ PREDICTION = Style("prediction", "#ff4d40", "#ff7d70", 1.3, "right")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """One frame to draw; every figure takes from it what it needs.
+    """The data of one frame to draw, of which each figure uses a part.
 
     Attributes:
         projection: `[R, A, D+E]` normalized log power of one frame.
@@ -76,13 +76,14 @@ class Scene:
         roi: x_min, x_max, y_min, y_max, z_min, z_max in meters, drawn as a dashed
             rectangle; or None.
         image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
-        camera: Calibration of the image, which draws the boxes on it; or None.
+        camera: Calibration of the image, with which boxes are drawn on it; or None.
         title: Title, such as sequence, frame and weather.
-        score_threshold: Threshold of the predictions shown, for the legend, or None.
-        time_s: Seconds since the Unix epoch, for recordings; or None.
+        score_threshold: Score threshold of the predictions for the legend, or None.
+        time_s: Seconds since the Unix epoch for recordings, or None.
 
     Raises:
-        UserError: The projection does not fit the grid, or boxes are of several frames.
+        UserError: The projection does not match the grid, or the boxes belong to several
+            frames.
     """
 
     projection: Any
@@ -113,25 +114,25 @@ class Scene:
 
     @property
     def sets(self) -> list[tuple[Style, Boxes]]:
-        """Ground truth and predictions, where given, with their styles."""
+        """Ground truth and predictions with their styles; None is left out."""
         return styled_sets(self.ground_truth, self.predictions)
 
     @property
     def power(self) -> Float[np.ndarray, "R A"]:
-        """Maximum over all channels, which is that over the whole radar tensor."""
+        """Maximum over all channels, which equals that over Doppler and elevation."""
         return np.asarray(self.projection, np.float32).max(-1)
 
 
 def styled_sets(
     ground_truth: Boxes | None, predictions: Boxes | None
 ) -> list[tuple[Style, Boxes]]:
-    """Ground truth and predictions, where given, with their styles."""
+    """Return ground truth and predictions with their styles; None is left out."""
     pairs = (GROUND_TRUTH, ground_truth), (PREDICTION, predictions)
     return [(style, boxes) for style, boxes in pairs if boxes is not None]
 
 
 def label_texts(boxes: Boxes) -> list[str]:
-    """Class names, with the score where there is one."""
+    """Return the class name of each box, followed by its score if there is one."""
     if boxes.score is None:
         return list(boxes.cls)
     pairs = zip(boxes.cls, boxes.score, strict=True)
@@ -141,15 +142,15 @@ def label_texts(boxes: Boxes) -> list[str]:
 def footprints(
     boxes: Float[np.ndarray, "N 7"], points_per_edge: int = 1
 ) -> Float[np.ndarray, "N {4*points_per_edge+1} 2"]:
-    """Closed outlines of boxes on the ground, counter-clockwise.
+    """Return closed counter-clockwise outlines of boxes on the ground.
 
     Args:
         boxes: Boxes in the radar frame.
-        points_per_edge: Points on each edge; more than 1 where edges bend, as in a
-            polar view.
+        points_per_edge: Number of points on each edge; more than 1 for views in which
+            edges are curves, such as the polar view.
 
     Returns:
-        x and y, starting at the front left corner.
+        x and y of the points, starting at the front left corner.
     """
     corners = bev_corners(boxes)
     following = np.roll(corners, -1, axis=1)
@@ -166,7 +167,7 @@ def draw_tiles(
     values: Float[np.ndarray, "rows columns"],
     color_limits: tuple[float, float] | None = None,
 ) -> Any:
-    """Draw one tile per value; the color limits follow from the values by default."""
+    """Draw one tile per value; the color limits are `color_limits_of(values)` by default."""
     low, high = color_limits or color_limits_of(values)
     return ax.pcolormesh(
         edges_x, edges_y, values, cmap=COLOR_MAP, vmin=low, vmax=high, rasterized=True
@@ -180,7 +181,7 @@ def draw_lines(
     widths: Any,
     zorder: float = 4.0,
 ) -> None:
-    """Draw lines over a black rim of half a point, without changing the limits."""
+    """Draw lines with a black outline of half a point, without changing the axes limits."""
     for stroke, extra in (("black", 1.1), (color, 0.0)):
         collection = LineCollection(
             list(lines),
@@ -195,9 +196,11 @@ def draw_lines(
 def line_scales(
     ax: Axes, outlines: Iterable[Float[np.ndarray, "_ 2"]], full_pt: float
 ) -> Float[np.ndarray, " N"]:
-    """Factors on line widths, 0.4 to 1: lines would fill boxes smaller than `full_pt`.
+    """Return factors from 0.4 to 1 for the line widths of boxes.
 
-    The size of a box is the shorter side of its outline's bounding rectangle on paper.
+    Lines of boxes smaller than `full_pt` points are thinner, as they would otherwise fill
+    the box. The size of a box is the shorter side of the bounding rectangle of its outline
+    in the figure.
     """
     pixels = [np.ptp(ax.transData.transform(o), axis=0).min() for o in outlines]
     size_pt = np.array(pixels) * 72 / ax.figure.dpi
@@ -205,7 +208,7 @@ def line_scales(
 
 
 def halo(width: float, color: str = "black") -> list:
-    """Path effects: an outline that keeps lines and text legible on any map."""
+    """Return path effects that outline lines and text to be legible on any map."""
     return [Stroke(linewidth=width, foreground=color), Normal()]
 
 
@@ -238,16 +241,17 @@ class Label(NamedTuple):
 
 
 def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> None:
-    """Write each text next to its outline, if no earlier text is covered by it.
+    """Write each text next to its outline, unless it would cover an earlier text.
 
-    The limits and the aspect of the axes must be final: space is computed in pixels.
+    Labels whose outline has its center outside the axes are left out too. The limits and
+    the aspect of the axes must be final, because overlaps are computed in pixels.
 
     Args:
         ax: Axes to draw on.
-        labels: The most important first.
+        labels: Labels in descending order of importance.
         font_size: Font size in points.
     """
-    point = ax.figure.dpi / 72  # pixels
+    point = ax.figure.dpi / 72  # in pixels
     gap = 3 * point
     low, high = ax.get_window_extent().get_points()
     taken = np.zeros((0, 4))
@@ -282,7 +286,7 @@ def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> No
 
 
 class _NotebookFigure(Figure):
-    """A figure that Jupyter shows without pyplot and its backends."""
+    """A figure that Jupyter displays without pyplot and its backends."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -296,21 +300,21 @@ def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
 
 
 def color_limits_of(values: np.ndarray) -> tuple[float, float]:
-    """Limits from the noise (20 %) to the strongest echoes (99.9 %).
+    """Return color limits from the noise (20th percentile) to strong echoes (99.9th).
 
-    Non-finite values are ignored; a constant map gets a range of one unit.
+    Non-finite values are ignored. The limits of a constant map differ by one.
     """
     finite = values[np.isfinite(values)]
     if finite.size == 0:
         return 0.0, 1.0
     low, high = np.percentile(finite, [20.0, 99.9])
-    if high <= low:  # a few peaks on nothing, such as a heatmap
+    if high <= low:  # nearly constant with a few peaks, such as a heatmap
         high = finite.max()
     return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)
 
 
 def figure_format(path: pathlib.Path) -> str:
-    """Return the format of a figure file; raise `UserError` for unknown suffixes."""
+    """Return the format of a figure file; raise a `UserError` for unknown suffixes."""
     suffix = path.suffix.lstrip(".").lower()
     supported = FigureCanvasBase.get_supported_filetypes()
     if suffix not in supported:
@@ -321,17 +325,17 @@ def figure_format(path: pathlib.Path) -> str:
 
 
 def save_figure(figure: Figure, path: PathLike) -> pathlib.Path:
-    """Write a figure completely or not at all.
+    """Write a figure to a file, which is replaced atomically.
 
     Args:
         figure: The figure.
-        path: Target; the suffix sets the format. Folders are created.
+        path: File to write. The suffix determines the format; missing folders are created.
 
     Returns:
-        The path written.
+        The path of the file.
 
     Raises:
-        UserError: matplotlib cannot write the suffix.
+        UserError: matplotlib does not support the suffix.
     """
     path = pathlib.Path(path)
     suffix = figure_format(path)

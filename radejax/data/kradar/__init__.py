@@ -1,4 +1,4 @@
-"""K-Radar on disk: sequence folders, labels, splits, as frames in order."""
+"""Reader of K-Radar's sequence folders, labels and splits."""
 
 from radejax.data.kradar.dataset import Frame, KRadar
 from radejax.data.kradar.labels import Label, read_labels

@@ -1,4 +1,4 @@
-"""Report on a K-Radar copy: what is there, what is missing, what is corrupted."""
+"""Health report on a K-Radar copy: existing, missing and corrupted files."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class HealthReport:
     Attributes:
         roots: The folders that were checked.
         version: Version of the labels.
-        sequences: One row per sequence: its conditions, numbers of files, and of labels
-            without them.
-        objects: One row per split and weather: objects of every class that are visible
-            to the radar and in its field of view.
-        summary: Counts, problems with file and line, notes.
+        sequences: One row per sequence with its conditions, its numbers of files, and
+            the numbers of labelled frames without these files.
+        objects: One row per split and weather with the number of objects of every class
+            that are visible to the radar and in its field of view.
+        summary: Counts, problems with file and line, and notes.
     """
 
     roots: list[str]
@@ -47,16 +47,16 @@ class HealthReport:
 
     @property
     def num_problems(self) -> int:
-        """Number of things missing or malformed."""
+        """Number of missing or malformed items."""
         return len(self.summary.problems)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
+        """Returns the report as JSON values."""
         summary = {"num_problems": self.num_problems, **self.summary.to_dict()}
         return {**vars(self), "summary": summary}
 
     def to_text(self) -> str:
-        """Tables for a terminal."""
+        """Returns the report as tables for a terminal."""
         names = {
             name: name.replace("_", "\n") for row in self.sequences for name in row
         }
@@ -76,7 +76,7 @@ class HealthReport:
 
 
 def _with_shares(row: Mapping[str, Any]) -> dict[str, str]:
-    """A row of `objects` as text, with the share of every class."""
+    """Formats a row of `objects` as text with the share of every class."""
     total = max(sum(row[cls] for cls in CLASSES), 1)
     cells = {}
     for cls in CLASSES:
@@ -96,25 +96,27 @@ def check_dataset(
     deep: bool = False,
     progress: bool = False,
 ) -> HealthReport:
-    """Check a K-Radar copy and report what is there and what is wrong.
+    """Checks a K-Radar copy and reports its content and its problems.
 
-    Labels are read whole; of radar tensors the head and the size, so that a copy of
-    16 TB takes minutes.
+    Label files are read completely. Only the head and the size of radar tensors are
+    checked, so that a copy of 16 TB takes minutes.
 
     Args:
-        roots: Folder or folders of the sequences.
-        labels: Folder or zip of a label revision; None: the sequences' own.
+        roots: Folder or folders that contain the sequences.
+        labels: Folder or zip file of a label revision, or None for the labels in the
+            sequences' own folders.
         version: Version of the labels.
-        sequence_numbers: Only these sequences; None for all.
-        weather: Only sequences of these weathers; None for all.
-        deep: Read and project every radar tensor, which finds all corruption and takes
-            hours.
-        progress: Show a progress bar.
+        sequence_numbers: Sequences to check, or None for all.
+        weather: Weathers of the sequences to check, or None for all.
+        deep: Whether to read and project every radar tensor, which finds all corruption
+            and takes hours.
+        progress: Whether to show a progress bar.
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
-        UserError: There are no sequence folders or no labels, none of the sequences and
-            weathers asked for, or the labels have another version.
+        UserError: There are no sequence folders or no labels, no frames of the given
+            sequences and weathers, or the labels have another version.
+        DataError: The folders or the labels are ambiguous or corrupted as a whole.
     """
     data = KRadar(
         roots,
@@ -167,7 +169,7 @@ def _row(
     frames: Sequence[Frame],
     splits: Mapping[str, str],
 ) -> dict[str, Any]:
-    """What the tables say of one sequence."""
+    """Returns the table row of one sequence."""
     conditions = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)._asdict()
     calibration = "unknown"
     if frames:
@@ -190,7 +192,7 @@ def _row(
 
 
 def _find_splits(data: KRadar) -> dict[str, str]:
-    """Split of every frame; what is wrong with the splits is added to the summary."""
+    """Returns the split of every frame and adds problems of the splits to the summary."""
     splits: dict[str, str] = {}
     summary = data.summary()
     for name in ("train", "test"):
@@ -221,7 +223,7 @@ def _count_objects(frames: Iterable[Frame], splits: Mapping[str, str]) -> Rows:
 
 
 def _check_conditions(number: int, frames: Sequence[Frame], summary: Summary) -> None:
-    """Note conditions that are not those that K-Radar published."""
+    """Notes conditions that differ from those that K-Radar published."""
     published = KRADAR_CONDITIONS.get(number)
     for frame in frames[:1]:
         found = frame.environment, frame.time, frame.weather
@@ -235,10 +237,10 @@ def _check_conditions(number: int, frames: Sequence[Frame], summary: Summary) ->
 def _check_calibration(
     folder: SequenceFolder, frames: Sequence[Frame], summary: Summary
 ) -> None:
-    """Report frame numbers that contradict the calibration file."""
+    """Reports frame numbers that contradict the calibration file."""
     path = folder.find("info_calib", "calib_radar_lidar.txt")
     differences = {frame.header.radar - frame.header.lidar for frame in frames}
-    with contextlib.suppress(DataError):  # KRadar has reported it
+    with contextlib.suppress(DataError):  # already reported by KRadar
         if path and differences - {expected := read_calibration(path)[0]}:
             message = (
                 f"{path}: frame difference {expected}, but radar minus LiDAR frame "

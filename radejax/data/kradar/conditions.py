@@ -10,7 +10,7 @@ from radejax.core.files import PathLike, read_text
 
 WEATHERS = ("normal", "overcast", "fog", "rain", "sleet", "lightsnow", "heavysnow")
 
-# Sequences 1 to 58, as published by K-Radar; environment, time, weather: sequences.
+# Environment, time and weather of sequences 1 to 58, as published by K-Radar.
 _CONDITIONS = {
     ("urban", "night", "normal"): (1, 6),
     ("highway", "night", "normal"): (2, 3, 4),
@@ -43,7 +43,7 @@ _CONDITIONS = {
 
 
 class Conditions(NamedTuple):
-    """Conditions of one sequence, as in its `description.txt`."""
+    """Conditions of one sequence, as written in its `description.txt`."""
 
     environment: str
     time: str
@@ -60,7 +60,7 @@ KRADAR_CONDITIONS: Mapping[int, Conditions] = {
 
 
 def read_description(path: PathLike) -> Conditions:
-    """Read `description.txt`: environment, time and weather on one line.
+    """Reads `description.txt` with environment, time and weather on one line.
 
     Raises:
         DataError: The file is malformed; the message names file and line.
@@ -76,7 +76,7 @@ def read_description(path: PathLike) -> Conditions:
 
 
 def check_weather(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names; `UserError` for one that no sequence has, or for none."""
+    """Returns the names; raises a `UserError` if there are none or one is unknown."""
     names, known = tuple(names), (*WEATHERS, "unknown")
     if not names or not set(names) <= set(known):
         raise UserError(f"unknown weather {names}; available: {', '.join(known)}")

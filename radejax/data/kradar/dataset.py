@@ -1,10 +1,10 @@
-"""K-Radar as it is on disk: labelled frames with boxes in the radar frame.
+"""Reader of K-Radar's folders: labelled frames with boxes in the radar frame.
 
 The folders are described in `docs/file_formats.md`. Reading starts from the label files:
-`KRadar` needs no radar tensor to open, so that labels can be counted and replaced without
-them. A sequence is a folder named by its number. One sequence may have folders under
-several roots (tensors on one disk, images on another); each file is taken from the first
-root that has it.
+`KRadar` can be opened without radar tensors, so that labels can be counted and replaced
+without them. A sequence is a folder named by its number. One sequence may have folders
+under several roots (tensors on one disk, images on another); each file is taken from the
+first root that has it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ SIMULATION_MARKER = "simulation.json"
 Key = tuple[int, str]
 """Sequence number and frame name, such as `(1, "00033_00001")`."""
 
-# Regular expressions, as str.isdecimal is also true of the digits of other scripts.
+# Regular expressions are used because str.isdecimal also accepts digits of other scripts.
 _SEQUENCE = re.compile(r"[0-9]{1,6}")
 _LABELLED_SEQUENCE = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
 _LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
@@ -75,16 +75,16 @@ _MAX_OFFSET_M = 100.0
 class Frame(LabelledFrame):
     """One labelled frame of K-Radar.
 
-    Its `name` has the radar and LiDAR frame numbers, such as `"00033_00001"`; its `boxes`
-    are those that the filters of the dataset keep.
+    The `name` consists of the radar and LiDAR frame numbers, such as `"00033_00001"`.
+    `boxes` contains only the objects that the filters of the dataset keep.
 
     Attributes:
         header: Frame numbers of all sensors and the time stamp.
-        labels: Every object of the file, in the LiDAR frame, unfiltered.
+        labels: All objects of the label file, unfiltered and in the LiDAR frame.
         visibility: Visibility flags of `boxes`.
-        tesseract_path: The 4D radar tensor, None where it is missing.
-        projection_path: A released `.npy` projection, None where there is none;
-            `radar_path` where the tensor is missing.
+        tesseract_path: File of the 4D radar tensor, or None if it is missing.
+        projection_path: File of the `.npy` projection of the reference implementation,
+            or None if it is missing. It is the `radar_path` if the tensor is missing.
     """
 
     header: LabelHeader
@@ -95,42 +95,45 @@ class Frame(LabelledFrame):
 
 
 class KRadar(LabelledFrames[Frame]):
-    """The labelled frames of a K-Radar copy, in the order of sequence and frame.
+    """The labelled frames of a K-Radar copy, sorted by sequence and frame.
 
-    What is missing or malformed is skipped, counted and listed in `summary()`.
+    Missing or malformed files and lines are skipped, counted and listed in `summary()`.
 
     Args:
-        root: Folder of the sequences, or several when they are spread over disks.
-            None when only labels are available.
-        labels: Folder or zip of a label revision; None: the sequences' own folders.
+        root: Folder that contains the sequences, or several such folders if they are
+            spread over disks. None if only labels are available.
+        labels: Folder or zip file of a label revision. None reads the labels in the
+            sequences' own folders.
         version: Version of these labels: v1.0, v1.1, v2.0 or v2.1.
         split: "train" or "test", the path of a split file, or None for every frame.
-            Official split files are looked for as `split/<name>.txt` in the roots and
-            next to `labels`; without them K-Radar's rule (alternating quarters of every
+            The official split files are searched as `<split>.txt` in `split/`,
+            `resources/split/` and the top level of the roots, of `labels` and of its
+            parent folder. Without them, K-Radar's rule (alternating quarters of every
             sequence) is applied, which `summary()` notes.
-        visibility: Visibility flags to keep, None for all.
-        include_unstarred_v11_labels: Lines of v1.x labels without a `*` count too, as in
-            the reference implementation.
+        visibility: Visibility flags of the objects to keep, or None for all.
+        include_unstarred_v11_labels: Whether lines of v1.x labels without a `*` are
+            objects too, as in the reference implementation.
         classes: Classes to keep.
-        field_of_view: Keep only boxes whose center is in the field of view.
-        sequence_numbers: Only these sequences; None for all. Sequences that have labels
-            and no folder in the roots are skipped and counted, if any has one.
-        weather: Only sequences of these weathers; None for all.
+        field_of_view: Whether to keep only boxes whose center is in the field of view.
+        sequence_numbers: Sequences to read, or None for all. None skips and counts
+            sequences that have labels but no folder in the roots, if roots are given.
+        weather: Weathers of the sequences to keep, or None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
-        common_camera: Use `common/cam_front0.yml` for all sequences, as the reference
-            implementation does.
+        common_camera: Whether to use `common/cam_front0.yml` for all sequences, as the
+            reference implementation does.
 
     Attributes:
-        grid: Sensor axes: K-Radar's, or those of `radar_grid.json` in a root.
-        roots: Folders of the sequences.
-        folders: Folders of every sequence in the roots, by number.
-        is_simulated: The simulator wrote one of these folders.
+        grid: Sensor axes of K-Radar, or of the `radar_grid.json` in a root.
+        roots: Folders that contain the sequences.
+        folders: Folders of every sequence in the roots, by sequence number.
+        is_simulated: Whether the simulator wrote the roots or the labels.
 
     Raises:
-        FileNotFoundError: A folder or file that was named does not exist.
-        UserError: There is nothing to read, no such version or split, or the labels
-            have another version.
-        DataError: The labels are corrupted or ambiguous as a whole.
+        FileNotFoundError: A root or `labels` does not exist.
+        UserError: There are no sequences, labels or labels of the given sequences; an
+            option has an invalid value; or the labels have another version.
+        DataError: The folders, the labels or the split file are ambiguous or corrupted
+            as a whole.
 
     Examples:
         >>> data = KRadar("/data/kradar", split="train")  # doctest: +SKIP
@@ -190,13 +193,13 @@ class KRadar(LabelledFrames[Frame]):
             SIMULATION_MARKER,
             lambda content: float(content["config"]["radar_from_lidar_m"][2]),
         )
-        # K-Radar's own files do not say by how much its radar is below its LiDAR.
+        # K-Radar's own files do not contain the height offset between radar and LiDAR.
         self._radar_from_lidar_z_m = KRADAR_RADAR_FROM_LIDAR_Z_M if z_m is None else z_m
         super().__init__([], grid or RadarGrid.kradar(), is_simulated=z_m is not None)
         self._camera_folders = _as_paths(camera_calibration)
         self._camera_folders += [r / name for r in roots for name in _CAMERA_FOLDERS]
         self._common_camera = common_camera
-        # Shared by the splits of a dataset: no label file is read twice.
+        # The splits of a dataset share this cache, so that no label file is read twice.
         self._read_label_file = functools.cache(
             functools.partial(
                 read_label_file,
@@ -207,12 +210,13 @@ class KRadar(LabelledFrames[Frame]):
         self._read(split)
 
     def of_split(self, split: PathLike | None) -> KRadar:
-        """Return the frames of a split, as opening the dataset with it gives them.
+        """Returns the dataset reopened with another split.
 
         Label files that were read before are not read again.
 
         Raises:
             UserError: There is no such split.
+            DataError: The split file is malformed.
         """
         other = copy.copy(self)
         other._read(split)
@@ -220,16 +224,16 @@ class KRadar(LabelledFrames[Frame]):
 
     @property
     def counts(self) -> collections.Counter[str]:
-        """What was read and skipped, by reason: `summary().counts`."""
+        """Numbers of items that were read and skipped, by reason (`summary().counts`)."""
         return self._summary.counts
 
     def class_counts(self) -> dict[str, int]:
-        """Objects of every class that the filters keep."""
+        """Returns the number of kept objects of every class."""
         counts = collections.Counter(cls for f in self._frames for cls in f.classes)
         return {cls: counts[cls] for cls in self.classes}
 
     def _read(self, split: PathLike | None) -> None:
-        """Read the label files of a split and make its frames."""
+        """Reads the label files of a split and builds its frames."""
         self._summary = Summary()
         keys = self._select(split)
         sequences = {
@@ -253,7 +257,7 @@ class KRadar(LabelledFrames[Frame]):
             )
 
     def _select(self, split: PathLike | None) -> list[Key]:
-        """Keys of the label files to read, sorted; the others are counted."""
+        """Returns the keys of the label files to read, sorted, and counts the others."""
         numbers = self._sequence_numbers
         labelled = {number for number, _ in self._label_paths}
         here = labelled & set(self.folders) if self.folders else labelled
@@ -283,7 +287,10 @@ class KRadar(LabelledFrames[Frame]):
         return [key for key in keys if key in entries]
 
     def _read_split_entries(self, split: str, keys: Sequence[Key]) -> set[Key]:
-        """Frames of a split, from its file or by rule; reports an overlap of splits."""
+        """Returns the frames of a split, from its file or by K-Radar's rule.
+
+        Frames that are in both official split files are reported.
+        """
         if split not in ("train", "test"):
             if not os.path.isfile(split):
                 raise UserError(
@@ -320,7 +327,10 @@ class KRadar(LabelledFrames[Frame]):
         self._summary.problems.append((kind, message))
 
     def _read_sequence(self, number: int) -> dict[str, Any]:
-        """Fields that the frames of a sequence share, from its files or by default."""
+        """Returns the fields that all frames of a sequence share.
+
+        They are read from the files of the sequence; missing ones have default values.
+        """
         folder = self.folders.get(number, _NO_FOLDER)
         camera, own = None, f"seq_{number:02d}/cam_1.yml"
         if not self._common_camera:
@@ -362,7 +372,10 @@ class KRadar(LabelledFrames[Frame]):
     def _read_or_report(
         self, read: Callable[[Any], T], path: LabelPath | None, kind: str
     ) -> T | None:
-        """Content of a file, None for none; a malformed one is reported."""
+        """Returns the content of a file, or None if it is missing or malformed.
+
+        A malformed file is reported.
+        """
         try:
             return None if path is None else read(path)
         except DataError as error:
@@ -370,7 +383,7 @@ class KRadar(LabelledFrames[Frame]):
             return None
 
     def _read_labels(self, keys: Iterable[Key]) -> dict[Key, LabelFile]:
-        """Content of label files; corrupted ones are left out and reported."""
+        """Reads label files; corrupted ones are left out and reported."""
         files, counts = {}, self.counts
         for key in keys:
             path = self._label_paths[key]
@@ -390,7 +403,10 @@ class KRadar(LabelledFrames[Frame]):
         files: Mapping[Key, LabelFile],
         sequences: Mapping[int, Mapping[str, Any]],
     ) -> list[Frame]:
-        """Frames with filtered boxes; filtering all boxes at once is faster."""
+        """Builds frames with filtered boxes.
+
+        The boxes of all frames are filtered at once, which is faster.
+        """
         labels = [label for file in files.values() for label in file.labels]
         sizes = np.array([len(file.labels) for file in files.values()], int)
         shifts = [sequences[number]["radar_from_lidar_m"] for number, _ in files]
@@ -425,7 +441,7 @@ class KRadar(LabelledFrames[Frame]):
         classes: Shaped[np.ndarray, " N"],
         flags: Shaped[np.ndarray, " N"],
     ) -> Bool[np.ndarray, " N"]:
-        """True for the objects to keep; the others are counted by reason."""
+        """Returns a mask of the objects to keep and counts the others by reason."""
         is_odd = np.isin(flags, VISIBILITY_FLAGS, invert=True)
         self.counts["objects with an odd availability flag"] = int(is_odd.sum())
         is_kept = np.ones(len(classes), bool)
@@ -446,7 +462,10 @@ class KRadar(LabelledFrames[Frame]):
         return is_kept
 
     def _find_files(self, key: Key, header: LabelHeader) -> dict[str, Any]:
-        """Paths of a frame's files, None where they are missing, which is reported."""
+        """Returns the paths of a frame's files, or None for missing ones.
+
+        A missing radar tensor is reported; missing images are counted.
+        """
         folder = self.folders.get(key[0], _NO_FOLDER)
         stem = f"tesseract_{header.radar:05d}"
         tesseract = folder.find("radar_tesseract", f"{stem}.mat")
@@ -472,14 +491,17 @@ class KRadar(LabelledFrames[Frame]):
 
 
 class SequenceFolder:
-    """All folders of one sequence, seen as one; a subfolder is listed once."""
+    """Merges the folders that one sequence has under several roots.
+
+    Every subfolder is listed only once, and the listing is cached.
+    """
 
     def __init__(self, folders: Sequence[pathlib.Path]) -> None:
         self.folders = tuple(folders)
         self.listing = functools.cache(self._list)
 
     def _list(self, subfolder: str) -> dict[str, pathlib.Path]:
-        """Files of a subfolder by name; the first root takes precedence."""
+        """Returns the files of a subfolder by name; the first root takes precedence."""
         files: dict[str, pathlib.Path] = {}
         for folder in self.folders:
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -488,7 +510,7 @@ class SequenceFolder:
         return files
 
     def find(self, subfolder: str, name: str) -> pathlib.Path | None:
-        """Path of a file, None where no root has it."""
+        """Returns the path of a file, or None if no root has it."""
         return self.listing(subfolder).get(name)
 
 
@@ -496,7 +518,7 @@ _NO_FOLDER = SequenceFolder([])
 
 
 def _as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
-    """A list of paths from one, several or none."""
+    """Converts one path, several paths or None to a list of paths."""
     if paths is None:
         return []
     if isinstance(paths, str | os.PathLike):
@@ -505,11 +527,11 @@ def _as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]
 
 
 def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
-    """Every sequence under the roots, by number.
+    """Finds the folders of all sequences under the roots, by sequence number.
 
     Raises:
         FileNotFoundError: A root does not exist.
-        DataError: A root has a sequence twice, as `1` and `01`.
+        DataError: A root contains a sequence twice, for example as `1` and `01`.
     """
     found: dict[int, list[pathlib.Path]] = {}
     for root in roots:
@@ -528,17 +550,17 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
 def _first_file(
     folders: Sequence[pathlib.Path], names: Sequence[str]
 ) -> pathlib.Path | None:
-    """The first file of these names in the first folder with any; None without one."""
+    """Returns the first existing file, or None; all names are tried per folder."""
     paths = (folder / name for folder, name in itertools.product(folders, names))
     return next(filter(pathlib.Path.is_file, paths), None)
 
 
 def read_calibration(path: PathLike) -> tuple[int, float, float]:
-    """Read `info_calib/calib_radar_lidar.txt`: a header line and three numbers.
+    """Reads `info_calib/calib_radar_lidar.txt`: a header line and three numbers.
 
     Returns:
-        Radar frame number minus LiDAR frame number, and meters to add to a LiDAR x
-        and y.
+        The radar frame number minus the LiDAR frame number, and the offsets in meters
+        that are added to LiDAR x and y to obtain radar x and y.
 
     Raises:
         DataError: The file is malformed; the message names file and line.
@@ -558,10 +580,10 @@ def read_calibration(path: PathLike) -> tuple[int, float, float]:
 def _read_common(
     folders: Sequence[pathlib.Path], name: str, read: Callable[[Any], T]
 ) -> T | None:
-    """What the JSON files of a name in these folders say; None where there are none.
+    """Reads the JSON files of one name in all folders; returns None if there are none.
 
     Raises:
-        DataError: A file is malformed, or two of them differ.
+        DataError: A file is malformed, or the contents of two files differ.
     """
     found: dict[pathlib.Path, T] = {}
     for path in (folder / name for folder in folders):
@@ -582,7 +604,12 @@ def _read_common(
 def find_own_labels(
     sequences: dict[int, SequenceFolder], version: str
 ) -> dict[Key, LabelPath]:
-    """Label files in the sequences' own folders, as the dataset is delivered."""
+    """Finds the label files in the sequences' own folders.
+
+    For every sequence, the first subfolder that contains label files is used:
+    `info_label_<version>`, such as `info_label_v2_1`, then `info_label_v2` for version
+    v2.0, then `info_label`.
+    """
     subfolders = [f"info_label_{version.replace('.', '_')}", "info_label"]
     if version == "v2.0":
         subfolders.insert(1, "info_label_v2")
@@ -598,22 +625,23 @@ def find_own_labels(
 
 
 def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
-    """Label files of a revision, a folder or zip with `<sequence>/<radar>_<lidar>.txt`.
+    """Finds the label files of a revision, in a folder or zip file.
 
-    The sequence is the nearest folder above that is named like one: `1/...`,
-    `1/info_label/...` or `1_info_label_revised/...`.
+    The files are named `<sequence>/<radar>_<lidar>.txt`. The sequence number is taken
+    from the nearest parent folder with such a name: `1/...`, `1/info_label/...` or
+    `1_info_label_revised/...`.
 
     Raises:
         FileNotFoundError: There is no such folder or file.
-        UserError: It holds no label files.
-        DataError: A frame is in it twice, or the zip is corrupted.
+        UserError: There are no label files in it.
+        DataError: It contains a frame twice, or the zip file is corrupted.
     """
     files: list[tuple[pathlib.PurePath, LabelPath]]
     if path.is_dir():
         files = [(file.relative_to(path), file) for file in sorted(path.rglob("*.txt"))]
     else:
         with wrap_read_errors(path, "a folder or a zip file of labels"):
-            archive = zipfile.ZipFile(path)  # open for as long as its members are used
+            archive = zipfile.ZipFile(path)  # stays open while its members are used
         files = [
             (pathlib.PurePosixPath(name), zipfile.Path(archive, name))
             for name in archive.namelist()
@@ -643,7 +671,7 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
 
 
 def read_split(path: PathLike) -> list[Key]:
-    """Read a split file: lines `sequence,label file`.
+    """Reads a split file with lines `sequence,label file`.
 
     Raises:
         DataError: A line is malformed; the message names file and line.
@@ -661,15 +689,17 @@ def read_split(path: PathLike) -> list[Key]:
 
 
 def split_by_rule(names: Iterable[str], split: str) -> list[str]:
-    """K-Radar's split of one sequence: quarters 1 and 3 train, quarters 2 and 4 test.
+    """Splits the frames of one sequence by K-Radar's rule.
+
+    Quarters 1 and 3 are for training, quarters 2 and 4 for testing.
 
     Args:
-        names: Names of every labelled frame of the sequence.
+        names: Names of all labelled frames of the sequence.
         split: "train" or "test".
 
     Returns:
-        The names of the split, sorted. On complete sequences they equal the official
-        split files.
+        The sorted names of the frames in the split. For complete sequences they are the
+        same as in the official split files.
     """
     names = sorted(names)
     ends = [int(len(names) * quarter / 4) for quarter in range(5)]
@@ -681,16 +711,20 @@ def split_by_rule(names: Iterable[str], split: str) -> list[str]:
 def held_out(
     sequences: Collection[int], validation: Sequence[float], seed: int
 ) -> list[int]:
-    """Whole sequences of the train split that a run keeps for validation, sorted.
+    """Returns the sequences of the train split that are held out for validation.
 
     Args:
-        sequences: Numbers of those that have frames to train on.
-        validation: Numbers of sequences; or one fraction of them above 0 and below 1,
-            which is drawn, at least one sequence; () for none.
-        seed: Seed of the draw.
+        sequences: Numbers of the sequences that have training frames.
+        validation: Numbers of the sequences to hold out; or a single fraction between 0
+            and 1 of the sequences, of which at least one is drawn at random; or () for
+            none.
+        seed: Seed of the random draw.
+
+    Returns:
+        The sorted numbers of the held-out sequences.
 
     Raises:
-        UserError: A sequence does not exist, or none is left to train on.
+        UserError: A sequence has no training frames, or none is left to train on.
 
     Examples:
         >>> held_out({1, 2, 5}, (5,), 0)

@@ -44,11 +44,11 @@ VISIBILITY_FLAGS = ("R", "L", "L1")
 _MAX_BYTES = 1 << 18  # K-Radar's largest label files have 3 kB
 _MAX_NUMBER = 1e4  # meters or degrees
 
-# Every pattern takes linear time.
+# Every pattern matches in linear time.
 _NUMBER = r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)"
 _SEPARATOR = r"\s*,\s*"
 _FLAG, _ID = r"(?P<visibility>[A-Za-z]\w*)", r"(?P<track_id>-?\d{1,9})"
-_PREVIOUS_ID = r"-?\d{1,9}"  # identity in the frame before, which nothing needs
+_PREVIOUS_ID = r"-?\d{1,9}"  # identity in the previous frame, not used
 _CLASS = f"(?P<cls>{'|'.join(LABEL_CLASSES)})"
 _FIELDS = {
     "v1.0": (_ID + rf"(?:{_SEPARATOR}{_PREVIOUS_ID})?", _CLASS),  # with one or two ids
@@ -68,7 +68,7 @@ _HEADERS = (
         r"\s*timestamp=(\d{1,12}(?:\.\d*)?)\s*",
         re.ASCII,
     ),
-    re.compile(  # of the early annotation tool
+    re.compile(  # format of the early annotation tool
         r"\*\s*radar idx: (\d{1,9}), lidar idx: (\d{1,9}), camera idx: (\d{1,9}), "
         r"time: (\d{1,12}(?:\.\d*)?)(?:,.*)?",
         re.DOTALL | re.ASCII,
@@ -83,11 +83,12 @@ class Label:
 
     Attributes:
         cls: One of `LABEL_CLASSES`.
-        box: x, y, z, l, w, h, yaw: center and full extents in meters in the LiDAR
-            frame, heading in radians, not normalized.
-        visibility: `R` is visible to the radar, `L` to the LiDAR only, `L1` not judged.
-            Versions without the flag (v1.0, v2.0) read `R`: every object counts.
-        track_id: Identity within the sequence; -1 where the file has none.
+        box: x, y, z, l, w, h, yaw in the LiDAR frame: center and full extents in meters,
+            heading in radians, not normalized.
+        visibility: `R` if the object is visible to the radar, `L` if it is visible to
+            the LiDAR only, `L1` if this was not judged. All objects of versions without
+            the flag (v1.0, v2.0) have `R`.
+        track_id: Identity within the sequence.
     """
 
     cls: str
@@ -98,15 +99,15 @@ class Label:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LabelHeader:
-    """First line of a label file: which frames of the sensors belong together.
+    """First line of a label file, which lists the sensor frames that belong together.
 
     Attributes:
         timestamp_s: Unix time of the OS2-64 scan.
         radar: Frame number of the radar tensor.
         lidar: Frame number of the OS2-64 LiDAR.
         camera_front: Frame number of the front camera.
-        lidar_long: Frame number of the OS1-128 LiDAR, None where unknown.
-        camera_lrr: Frame number of the left, right and rear cameras, None: unknown.
+        lidar_long: Frame number of the OS1-128 LiDAR, or None if unknown.
+        camera_lrr: Frame number of the left, right and rear cameras, or None if unknown.
     """
 
     timestamp_s: float
@@ -122,10 +123,10 @@ class LabelFile:
     """Content of one label file.
 
     Attributes:
-        header: Its first line.
-        labels: Its objects.
-        problems: Malformed lines, with file and line.
-        num_unstarred: Lines of v1.x without a `*` that are not among the objects.
+        header: Content of the first line.
+        labels: Objects of the file.
+        problems: Messages on malformed lines, with file and line.
+        num_unstarred: Number of v1.x lines without a `*` that were left out.
     """
 
     header: LabelHeader
@@ -135,7 +136,7 @@ class LabelFile:
 
 
 def normalize_version(version: str) -> str:
-    """`"2.1"`, `"v2_1"` and `"v2.1"` all name version `"v2.1"`.
+    """Converts names of a version, such as `"2.1"` and `"v2_1"`, to the form `"v2.1"`.
 
     Raises:
         UserError: There is no such version.
@@ -149,14 +150,14 @@ def normalize_version(version: str) -> str:
 
 
 def read_labels(path: PathLike, version: str = "v2.1") -> list[Label]:
-    """Read the objects of one label file, in the order of its lines.
+    """Reads the objects of one label file in the order of its lines.
 
     Args:
         path: Label file, `<radar index>_<lidar index>.txt`.
         version: Label version of the file.
 
     Returns:
-        Labels in the LiDAR frame, with full extents and radians.
+        Labels in the LiDAR frame, with full extents in meters and yaw in radians.
 
     Raises:
         DataError: The file is malformed; the message names file and line.
@@ -172,13 +173,13 @@ def read_labels(path: PathLike, version: str = "v2.1") -> list[Label]:
 def read_label_file(
     path: LabelPath, version: str, *, include_unstarred: bool = False
 ) -> LabelFile:
-    """Read a label file; malformed lines are skipped and described.
+    """Reads a label file; malformed lines are skipped and described in `problems`.
 
     Args:
         path: Label file.
         version: Label version, such as "v2.1".
-        include_unstarred: Lines of v1.x without a `*` are objects too where they have
-            the fields of one, as the reference implementation reads them.
+        include_unstarred: Whether lines of v1.x without a `*` are objects too if they
+            have the fields of an object, as in the reference implementation.
 
     Raises:
         DataError: The header is malformed, or the file is not text.
@@ -189,7 +190,7 @@ def read_label_file(
     if len(content) > _MAX_BYTES:
         raise DataError(f"{path}: more than {_MAX_BYTES} bytes, not a label file")
     first, *lines = _LINE_END.split(files.decoded(content, str(path)))
-    # Some files of v2.0 have their first object on the line of the header.
+    # Some v2.0 files have their first object on the same line as the header.
     second = first.find("*", first.find("*") + 1)
     header = _parse_header(first if second < 0 else first[:second], f"{path}:1")
     lines.insert(0, "" if second < 0 else first[second:])

@@ -1,7 +1,7 @@
-"""Writers of K-Radar's files: what `kradar` and `projection` read, byte for byte.
+"""Writers of files in K-Radar's formats, which `kradar` and `tesseract` read.
 
-The simulator writes its datasets with these. Every file appears under its name only
-when it is complete: writers write beside it and rename.
+The simulator writes its datasets with them. Every file is written under a temporary name
+and renamed, so that it is complete if it exists.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ def write_labels(
 
     Args:
         path: Label file, `<radar index>_<lidar index>.txt`.
-        indices: Frame numbers of radar, LiDAR OS2-64, front camera, LiDAR OS1-128 and
-            the other cameras.
+        indices: Frame numbers of the radar, the OS2-64 LiDAR, the front camera, the
+            OS1-128 LiDAR and the other cameras.
         timestamp_s: Unix time of the LiDAR scan.
-        labels: Objects in the LiDAR frame, full extents, radians.
-        version: Label version; v1.0 and v2.0 cannot keep the visibility.
+        labels: Objects in the LiDAR frame, with full extents in meters and yaw in
+            radians.
+        version: Label version; v1.0 and v2.0 do not store the visibility.
 
     Raises:
         UserError: There is no such version.
@@ -53,7 +54,14 @@ def write_labels(
 def write_calibration(
     path: str | os.PathLike, frame_difference: int, dx_m: float, dy_m: float
 ) -> None:
-    """Writes `info_calib/calib_radar_lidar.txt`: meters to add to LiDAR positions."""
+    """Writes `info_calib/calib_radar_lidar.txt`.
+
+    Args:
+        path: File to write.
+        frame_difference: Radar frame number minus LiDAR frame number.
+        dx_m: Offset that is added to LiDAR x to obtain radar x.
+        dy_m: Offset that is added to LiDAR y to obtain radar y.
+    """
     text = f"frame difference,x,y\n{int(frame_difference)},{float(dx_m)!r},{float(dy_m)!r}\n"
     write_text(path, text)
 
@@ -61,7 +69,7 @@ def write_calibration(
 def write_description(
     path: str | os.PathLike, environment: str, time: str, weather: str
 ) -> None:
-    """Writes `description.txt`: the conditions of one sequence on one line."""
+    """Writes `description.txt` with the conditions of one sequence on one line."""
     write_text(path, f"{environment},{time},{weather}\n")
 
 
@@ -73,9 +81,9 @@ def write_splits(
     """Writes `train.txt` and `test.txt` into a folder.
 
     Args:
-        folder: Where to write, normally `<root>/split`.
-        train: Pairs of sequence and frame name, such as `(1, "00033_00001")`.
-        test: The same for the test split.
+        folder: Folder to write to, normally `<root>/split`.
+        train: Pairs of sequence number and frame name, such as `(1, "00033_00001")`.
+        test: Such pairs for the test split.
     """
     for name, frames in (("train", train), ("test", test)):
         lines = [f"{sequence},{frame}.txt" for sequence, frame in frames]
@@ -88,16 +96,17 @@ def write_tesseract(
     *,
     compress: bool = False,
 ) -> None:
-    """Writes a tesseract as K-Radar does: MATLAB v5, `arrDREA`, column-major.
+    """Writes a tesseract in K-Radar's format: MATLAB v5, variable `arrDREA`, column-major.
 
-    Equal tensors give equal bytes: MATLAB's creation date is left out.
+    MATLAB's creation date is left out, so that equal tensors give identical files.
 
     Args:
-        path: `radar_tesseract/tesseract_<radar index>.mat`.
-        tesseract: Linear power; float32 stays float32.
-        compress: zlib-compress, 10 times slower to read.
+        path: File to write, `radar_tesseract/tesseract_<radar index>.mat`.
+        tesseract: Linear power; float32 values are stored as float32.
+        compress: Whether to compress the file with zlib, which makes reading 10 times
+            slower.
     """
-    import scipy.io  # loads slowly, and label writers do not need it
+    import scipy.io  # imported here, as it is slow to import and only needed here
 
     with atomic_write(path) as file:
         scipy.io.savemat(file, {"arrDREA": tesseract}, do_compression=compress)
@@ -106,7 +115,7 @@ def write_tesseract(
 
 
 def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
-    """Writes `radar_grid.json` at the root of a dataset of another sensor grid."""
+    """Writes `radar_grid.json` into the root of a dataset with a sensor grid of its own."""
     write_text(pathlib.Path(root) / "radar_grid.json", json.dumps(grid.to_dict()))
 
 
