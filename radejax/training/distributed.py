@@ -60,7 +60,7 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 
 
 def check_batch_size(batch_size: int) -> None:
-    """Raises `UserError` if the global batch size is not a multiple of all devices."""
+    """Raises `UserError` if the batch size is not a multiple of the number of devices."""
     count, name = make_mesh().size, "config.train.batch_size"
     require(batch_size % count == 0, name, batch_size, f"a multiple of {count} devices")
 
