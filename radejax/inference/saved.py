@@ -6,8 +6,8 @@ exported folder has the files that the Hugging Face Hub expects:
     config.json          the config of the run, the grid, checksums of the other files
     model.safetensors    variables by name, "params/backbone/..."
 
-It contains the weights of DINOv3 only on request or if they were fine-tuned, because their
-license restricts redistribution.
+It contains the weights of DINOv3 only on request, because their license restricts
+redistribution.
 """
 
 from __future__ import annotations
