@@ -136,7 +136,7 @@ class _Run:
     checkpoints: Checkpoints
     logger: MetricLogger
     stop: Callable[[], bool]
-    num_skipped: int = 0  # skipped steps that were reported, not finite in loss or gradient
+    num_skipped: int = 0  # steps that were skipped and reported so far
 
     def take_steps(
         self, train_step: TrainStep, state: TrainState, profile: str
