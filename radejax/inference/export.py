@@ -78,11 +78,10 @@ def export(
         detector: Detector to export. Its thresholds and region of interest become the
             defaults.
         folder: Folder, which is created if missing.
-        kind: Format of the folder. "stablehlo" writes the program, the weights and
-            `load.py`, which needs only jax, flatbuffers and numpy. "onnx" writes the
+        kind: Format of the folder. All formats contain the weights, the config and a
+            model card, and "huggingface" contains only these. "stablehlo" adds the program
+            and `load.py`, which needs only jax, flatbuffers and numpy. "onnx" adds the
             network, and the network with decoding and NMS, for one batch size.
-            "huggingface" writes the weights, the config and a model card. The weights,
-            the config and the model card are part of all formats.
         platforms: Platforms of the StableHLO program, from `KNOWN_PLATFORMS`.
         with_backbone: Keep the weights of the image transformer, see `save_model`.
         batch_size: Number of frames per call; None means any number with StableHLO, and 1
