@@ -2,7 +2,7 @@
 
 The workdir of a run contains
 
-config.json      the configuration without the paths of the data, which only checkpoints
+config.json      the configuration without the paths of the data, which the checkpoints
                  contain; it does not change after the first checkpoint
 run.json         versions, command, weights that the training started from
 checkpoints/     the newest checkpoints and the best one, by step
