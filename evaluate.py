@@ -1,10 +1,10 @@
-"""Evaluate a run: `radejax evaluate`.
+"""Evaluates a run: `radejax evaluate`.
 
     python evaluate.py --workdir runs/quickstart
     python evaluate.py --workdir runs/radenet --data /other/kradar
 
-Predictions in files and comparisons: `radejax score` and `radejax compare`.
-docs/evaluation.md explains every number.
+`radejax score` evaluates predictions in files, and `radejax compare` compares results.
+docs/evaluation.md explains every metric.
 """
 
 from radejax.cli.evaluate import evaluate

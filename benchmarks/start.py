@@ -16,7 +16,7 @@ import time
 from case import Case
 
 _ROOT = pathlib.Path(__file__).resolve().parents[1]
-_FIRST_STEP = " 1/12 ["  # The progress bar moves there when the first step has finished.
+_FIRST_STEP = " 1/12 ["  # of the progress bar, once the first step has finished
 _DETECT = f"""
 import sys
 sys.path.append({str(_ROOT / "benchmarks")!r})

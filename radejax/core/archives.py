@@ -1,4 +1,4 @@
-"""NumPy, zip and safetensors files, whose corruption is one error that names the file."""
+"""Readers of NumPy, zip and safetensors files that report corruption as a `DataError`."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from radejax.core.files import PathLike
 
 @contextlib.contextmanager
 def wrap_read_errors(where: PathLike, what: str) -> Iterator[None]:
-    """Turns what readers raise on corrupted files into a `DataError`.
+    """Turns the errors of readers on corrupted files into a `DataError`.
 
     Args:
-        where: File, or member of one.
-        what: What it should be, such as "a zip file".
+        where: Name of the file, or of a member of an archive, for the message.
+        what: Description of the expected file, such as "a zip file".
     """
     try:
         yield
     except (DataError, FileNotFoundError):
         raise
-    except Exception as error:  # readers raise whatever a corrupted byte leads to
+    except Exception as error:  # on corrupted files, readers raise errors of any type
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
-            raise  # of the file system: no such file, no permission, a failing disk
+            raise  # an error of the file system, such as a missing permission
         raise DataError(
             f"{where}: corrupted, not {what} ({type(error).__name__}: {one_line(error)})"
         ) from None
 
 
 def read_member(archive: zipfile.ZipFile, name: str, *, max_bytes: int) -> bytes:
-    """Content of a member of an archive; its checksum is verified.
+    """Reads a member of an archive and verifies its checksum.
 
     Args:
-        archive: Open for reading.
+        archive: Archive that is open for reading.
         name: Name of the member.
-        max_bytes: What a member of this kind can have at most.
+        max_bytes: Largest valid size of the member.
 
     Raises:
         DataError: The member is corrupted, encrypted or larger.
@@ -56,11 +56,11 @@ def read_member(archive: zipfile.ZipFile, name: str, *, max_bytes: int) -> bytes
 
 
 def read_npy(path: PathLike) -> np.ndarray:
-    """The array of a `.npy` file, without pickles.
+    """Reads the array of a `.npy` file, which must not contain pickled objects.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is corrupted, or its size is not what its header says.
+        DataError: The file is corrupted, or its size differs from that in its header.
     """
     with wrap_read_errors(path, "a NumPy array file"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -71,18 +71,28 @@ def read_npy(path: PathLike) -> np.ndarray:
 
 
 def read_npz(path: PathLike) -> dict[str, np.ndarray]:
-    """The arrays of a `.npz` file by name; errors as `read_npy`."""
+    """Reads the arrays of a `.npz` file by name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is corrupted.
+    """
     with (
         wrap_read_errors(path, "a NumPy archive"),
-        open(path, "rb") as file,  # NumPy leaves a file open that it fails to read
+        open(path, "rb") as file,  # NumPy would leave it open if reading fails
         np.load(file, allow_pickle=False) as arrays,
     ):
         return dict(arrays)
 
 
 def read_safetensors(path: PathLike) -> dict[str, np.ndarray]:
-    """The arrays of a safetensors file by name; errors as `read_npy`."""
-    import safetensors.numpy  # few of the callers of this module need it
+    """Reads the arrays of a safetensors file by name.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is corrupted.
+    """
+    import safetensors.numpy  # only few users of this module need it
 
     with wrap_read_errors(path, "a safetensors file"):
         return safetensors.numpy.load_file(path)

@@ -1,8 +1,8 @@
-"""The sections that every config has, and the options that choose a variant.
+"""Sections that every config has, and the options that select a variant of a config.
 
 A config file builds on `base_config` and `parse_options`, so that all configs have the
-same fields. Values are plain and resolved: nothing is computed later. The paths of the
-data (`DATA_PATHS`) are ignored when a run compares its config.
+same fields. Their values are plain: no field is computed from another one later. The paths
+of the data (`DATA_PATHS`) are ignored when a run compares its config with an earlier one.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def parse_options(arg: str | None, *choices: Collection[str]) -> list[str | None
         *choices: Groups of options; at most one of each group may be given.
 
     Returns:
-        One option per group, None where none was given.
+        One option per group; None for groups without a given option.
 
     Raises:
-        UserError: An option is in no group, or two are of the same group.
+        UserError: An option is in no group, or two options are in the same group.
     """
     chosen: list[str | None] = [None] * len(choices)
     for option in filter(None, (o.strip() for o in (arg or "").split(","))):
@@ -58,15 +58,18 @@ def parse_options(arg: str | None, *choices: Collection[str]) -> list[str | None
 
 
 def config_name(filename: str) -> str:
-    """Name of a run from its config: "configs/radenet.py:stem" gives "radenet-stem"."""
+    """Returns the name of a run from its config.
+
+    For example, "configs/radenet.py:stem" gives "radenet-stem".
+    """
     path, _, options = filename.partition(":")
     return "-".join([pathlib.Path(path).stem, *filter(None, options.split(","))])
 
 
 def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
-    """The module of a Python file that is in no package, such as a config file."""
+    """Loads a Python file that is not in a package, such as a config file, as a module."""
     spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
-    assert spec is not None  # a file has both
+    assert spec is not None  # for Python files, both are set
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -74,10 +77,13 @@ def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
 
 
 def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
-    """File of a config: a path, or the name of one that comes with radejax.
+    """Returns the file of a config.
+
+    Args:
+        name: Path of a `.py` file, or name of a config that is part of radejax.
 
     Raises:
-        UserError: There is none; says which names there are.
+        UserError: There is no such config; the message lists the names of radejax's.
 
     Examples:
         >>> config_file("quickstart").name
@@ -98,10 +104,11 @@ def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
 
 
 def load_config(path_and_options: str) -> ConfigDict:
-    """The config of a file or name such as "my/config.py" or "radenet:stem".
+    """Loads the locked config of a file or name such as "my/config.py" or "radenet:stem".
 
     Raises:
-        UserError: There is no such file, it makes no config, or an option is unknown.
+        UserError: There is no such file, it has no function `get_config`, or an option is
+            unknown.
     """
     name, _, options = path_and_options.partition(":")
     path = config_file(name)
@@ -120,14 +127,14 @@ DATA_PATHS = (
 
 
 def without_data_paths(config: ConfigDict) -> dict[str, Any]:
-    """Plain values of a config whose data paths are empty."""
+    """Returns the plain values of a config with its data paths (`DATA_PATHS`) emptied."""
     values = json.loads(config.to_json())
     empty: dict[str, Any] = {**dict.fromkeys(DATA_PATHS), "roots": []}
     return {**values, "data": {**values["data"], **empty}}
 
 
 _FIELDS: dict[str, Any] = {
-    # Seed of parameters, order of the data, dropout and augmentation.
+    # Seed of the initial parameters, the order of the data, dropout and augmentation.
     "seed": 0,
     # Classes to detect, in the order of the class indices.
     "classes": CLASSES,
@@ -160,14 +167,14 @@ _FIELDS: dict[str, Any] = {
         # Maps are padded to a multiple of this, itself a multiple of 2 to the power
         # of the number of encoder levels.
         "pad_multiple": 8,
-        # Crop the output to the bins of the projection.
+        # Crop the padded output to the bins of the projection.
         "crop_output": True,
         # Dtype of the computation: float32 or bfloat16. Parameters are float32.
         "dtype": "float32",
-        # Activations that the backward pass recomputes to save memory: none, those
-        # of blocks, or full.
+        # Activations that the backward pass recomputes to save memory: none, blocks
+        # (those of every block) or full.
         "remat": "none",
-        # Confidence of an untrained model, between 0 and 1.
+        # Score that an untrained model predicts, between 0 and 1.
         "heatmap_prior": 0.5,
         # Subtracted from the projection.
         "input_center": 0.0,
@@ -175,10 +182,10 @@ _FIELDS: dict[str, Any] = {
         "input_scale": 1.0,
     },
     "loss": {
-        # Standard deviation of the heatmap's targets: fixed, adaptive (with the size
-        # of the box), anisotropic (with its length and width).
+        # Standard deviation of the Gaussian heatmap targets: fixed, adaptive (depends on
+        # the size of the box), anisotropic (depends on its length and width).
         "heatmap_sigma_mode": "fixed",
-        # Standard deviation of fixed targets in bins; above 0.
+        # Standard deviation in the mode fixed, in bins; above 0.
         "heatmap_sigma_bins": 3.0,
         # Transform of the Wasserstein distance: sqrt, none, log1p.
         "gwd_transform": "sqrt",
@@ -192,8 +199,8 @@ _FIELDS: dict[str, Any] = {
         # Weight of every loss term, at least 0, by its name in
         # `radejax.losses.detection.LOSSES`.
         "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
-        # Divide each term by its own value, which is constant in the gradient: the loss
-        # is then the sum of the weights.
+        # Divide each term by its own value, without a gradient through the divisor. The
+        # value of the loss is then the sum of the weights.
         "normalize": True,
     },
     "decode": {
@@ -203,14 +210,15 @@ _FIELDS: dict[str, Any] = {
         "score_threshold": 0.3,
         # Keep scores equal to the threshold.
         "threshold_inclusive": True,
-        # NMS removes a box with at least this IoU with a better one, from 0 to 1.
+        # NMS removes a box whose IoU with a better box is at least this, from 0 to 1.
         "nms_iou": 0.3,
         # Apply NMS to each class separately.
         "per_class_nms": False,
-        # Boxes with a center outside are removed before NMS: x0, x1, y0, y1, z0, z1.
+        # Region of interest: x0, x1, y0, y1, z0, z1 in meters. Boxes whose center is
+        # outside are removed before NMS. None: everywhere.
         "roi": placeholder(tuple),
-        # Where the length of the regressed yaw vector scales a box: nms, always
-        # (in the results too, as in the released evaluator), never.
+        # Where the length of the regressed yaw vector scales a box: nms (in NMS only),
+        # always (in the results too, as in the released evaluator), never.
         "raw_yaw": "nms",
         # Clip sizes to at least 0.01 m.
         "clip_sizes": True,
@@ -224,16 +232,17 @@ _FIELDS: dict[str, Any] = {
         "learning_rate": 1e-3,
         # Final learning rate, from 0 to the peak.
         "final_learning_rate": 1e-4,
-        # cosine (once over the training) or cyclic_cosine (down in one epoch, up in
-        # the next, as released), per step.
+        # Learning rate per step: cosine (decreases once, over the training) or
+        # cyclic_cosine (decreases in one epoch and increases in the next, as released).
         "schedule": "cosine",
         # Weight decay on every parameter; at least 0.
         "weight_decay": 0.01,
-        # Steps of a linear warm-up from 0; fewer than the training has.
+        # Steps of a linear warm-up from 0; fewer than the steps of the training.
         "warmup_steps": 0,
-        # Largest norm of the gradient, above 0; None: not clipped.
+        # Global norm to which the gradient is clipped, above 0; None: not clipped.
         "gradient_clip_norm": placeholder(float),
-        # Decay per step of a moving average of the parameters, below 1; None: none.
+        # Decay per step of the exponential moving average of the parameters, below 1;
+        # None: no average.
         "ema_decay": placeholder(float),
         # Batches per update of the parameters; at least 1.
         "gradient_accumulation_steps": 1,
@@ -243,20 +252,21 @@ _FIELDS: dict[str, Any] = {
         "log_every_steps": 20,
         # Steps between checkpoints; at least 1.
         "checkpoint_every_steps": 500,
-        # Newest checkpoints that are kept, at least 1; None: all.
+        # Number of newest checkpoints that are kept, at least 1; None: all.
         "checkpoints_to_keep": 2,
         # Epochs between evaluations; 0: only after the training.
         "evaluate_every_epochs": 0,
-        # Metric of the best checkpoint: mean over classes, in the first protocol.
+        # Metric that selects the best checkpoint: a mean over classes in the first
+        # protocol.
         "best_metric": "map_3d_iou30",
-        # Consecutive steps with a loss or gradient that is not finite, after which
-        # the run stops.
+        # The run stops after more than this number of consecutive steps whose loss or
+        # gradient is not finite.
         "max_skipped_steps": 20,
     },
     "data": {
         # kradar, another name of `radejax.data.dataset.DATA_SETS`, or module:Class.
         "format": "kradar",
-        # Folders of the dataset; empty for what `simulation` describes.
+        # Folders of the dataset; empty: the dataset that `simulation` describes.
         "roots": (),
         # Folder or zip of a label revision; None: the labels in the roots.
         "labels": placeholder(str),
@@ -272,7 +282,7 @@ _FIELDS: dict[str, Any] = {
         "label_version": "v2.1",
         # Visibility flags of the objects that count: R, L, L1; None: all.
         "visibility": ("R",),
-        # Count lines of v1.1 without an asterisk as objects, as released.
+        # Count label lines of v1.1 without an asterisk as objects, as released.
         "include_unstarred_v11_labels": False,
         # Only these sequences, such as (1, 58); empty: all.
         "sequences": (),
@@ -283,11 +293,11 @@ _FIELDS: dict[str, Any] = {
         "validation": (),
         # Seed with which a fraction is drawn; independent of `seed`.
         "validation_seed": 0,
-        # Padded objects per frame; K-Radar v2.1 has at most 14.
+        # Number of objects to which each frame is padded; K-Radar v2.1 has at most 14.
         "max_objects": 32,
-        # true, or stretched for official checkpoints.
+        # Mapping of azimuth bins to angles: true, or stretched for official checkpoints.
         "azimuth_mapping": "true",
-        # Threads that prepare batches; 0: the main thread.
+        # Number of threads that prepare batches; 0: the main thread prepares them.
         "num_threads": 2,
         # Probability of mirroring a frame left to right, from 0 to 1.
         "mirror_probability": 0.0,
@@ -299,8 +309,8 @@ _FIELDS: dict[str, Any] = {
         "roi": NARROW_ROI,
         # Evaluation protocols; the first chooses the best checkpoint.
         "protocols": ("coco101", "all_point", "kradar_r40"),
-        # Excluded frames: protocol (its own rule), class (without the class), frame
-        # (without any object), none.
+        # Frames that are excluded: protocol (by the protocol's own rule), class (frames
+        # without an object of the class), frame (frames without any object), none.
         "empty_frames": "protocol",
         # IoU thresholds, from 0 to below 1.
         "iou_thresholds": (0.3, 0.5),
@@ -308,31 +318,34 @@ _FIELDS: dict[str, Any] = {
         "score_threshold": 0.3,
         # Predictions below this score are not stored, from 0 to 1.
         "min_score": 0.05,
-        # Resamples of sequences for 95 % intervals; 0: no intervals.
+        # Number of bootstrap resamples of sequences for 95 % confidence intervals; 0: no
+        # intervals.
         "bootstrap": 0,
         # Frames per call of the detector; at least 1.
         "batch_size": 8,
-        # Figures of frames in a report; at least 0.
+        # Number of figures of frames in a report; at least 0.
         "num_visualizations": 8,
     },
     "logging": {
-        # Figures of fixed frames at every evaluation during training; at least 0.
+        # Number of figures of fixed frames at every evaluation during training; at
+        # least 0.
         "num_visualizations": 4,
         # Log to Weights & Biases in addition to TensorBoard.
         "wandb": False,
-        # Its project.
+        # Project at Weights & Biases.
         "wandb_project": "radejax",
-        # First and last step of a trace (`--profile`), counted from the start.
+        # First and last step of a profiler trace (`--profile`), counted from the step at
+        # which the command starts or continues.
         "profile_steps": (2, 5),
     },
 }
 
 
 def base_config() -> ConfigDict:
-    """A config of RADE-Net with all sections: the paper's training on K-Radar.
+    """Returns a config of RADE-Net with all sections: the paper's training on K-Radar.
 
-    Two fields are not the paper's, because the released weights and the reported
-    parameter count are not either: `model.cbam` ("official", the released block) and
+    Two fields differ from the paper, because the released weights and the reported
+    parameter count differ from it too: `model.cbam` ("official", the released block) and
     `loss.assignment` ("center"). `configs/radenet.py` has presets for the paper and the
     released code.
     """
@@ -343,9 +356,10 @@ def override(config: ConfigDict, texts: Mapping[str, str]) -> None:
     """Sets fields of a config from texts such as those of a command line.
 
     Args:
-        config: Changed in place.
-        texts: By dotted name, such as {"train.batch_size": "4"}: Python literals, words
-            such as "off", "true" and "none", or several for a tuple, "fog,rain".
+        config: Config that is changed in place.
+        texts: Texts by the dotted names of the fields, such as
+            {"train.batch_size": "4"}. A text is a Python literal, a word such as "off",
+            "true" or "none", or for a tuple several of these, such as "fog,rain".
 
     Raises:
         UserError: There is no such field, or the value is of another type.
@@ -372,7 +386,7 @@ def override(config: ConfigDict, texts: Mapping[str, str]) -> None:
 
 
 def fields_of(config: ConfigDict, path: str = "") -> Iterator[tuple[str, type]]:
-    """Dotted name and type of every field."""
+    """Yields the dotted name and the type of every field."""
     for key in config:
         if isinstance(config[key], ConfigDict):
             yield from fields_of(config[key], f"{path}{key}.")
@@ -381,7 +395,7 @@ def fields_of(config: ConfigDict, path: str = "") -> Iterator[tuple[str, type]]:
 
 
 def _literal(text: str) -> Any:
-    """The Python value that a text is, or the text."""
+    """Returns the Python value that a text represents, or the text itself."""
     words = {"true": True, "false": False, "none": None}
     try:
         return ast.literal_eval(text.strip())

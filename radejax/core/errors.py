@@ -1,7 +1,7 @@
-"""Errors of the user and of files, and the ranges of options.
+"""Errors caused by users and by files, and checks of the ranges of options.
 
 Command line programs print every `ValueError` with an `exit_code` as one line without a
-traceback: 2 for wrong use, 1 for a corrupted file and a full disk.
+traceback. They exit with 2 for wrong use, and with 1 for a corrupted file or a full disk.
 """
 
 import math
@@ -12,12 +12,12 @@ _LONGEST = 2000
 
 
 def one_line(error: BaseException | str) -> str:
-    """What an error of another library says, as a message of ours quotes it."""
+    """Returns the message of another library's error on one line of at most 200 characters."""
     return " ".join(str(error).split())[:200]
 
 
 class _OneLine(ValueError):
-    """Whatever a message quotes, it is one line and not endless."""
+    """A `ValueError` whose message is one line and is cut after `_LONGEST` characters."""
 
     def __init__(self, message: object = "") -> None:
         text = str(message).replace("\n", " ")
@@ -25,19 +25,22 @@ class _OneLine(ValueError):
 
 
 class UserError(_OneLine):
-    """A wrong argument, config field, folder or combination of them."""
+    """Raised for a wrong argument, config field or folder, or a wrong combination of them."""
 
     exit_code = 2
 
 
 class DiskFullError(UserError):
-    """No space is left: exit code 1, as the command itself was right."""
+    """Raised if no space is left on the disk.
+
+    The exit code is 1, because the command itself was correct.
+    """
 
     exit_code = 1
 
 
 class DataError(_OneLine):
-    """A file that is missing parts, malformed or corrupted; the message names it."""
+    """Raised for an incomplete, malformed or corrupted file, which the message names."""
 
     exit_code = 1
 
@@ -45,13 +48,11 @@ class DataError(_OneLine):
 def require(holds: bool, name: str, value: object, expected: str) -> None:
     """Raises `UserError` unless a setting is in its range.
 
-    The constructors of what config sections configure check their fields with it.
-
     Args:
         holds: Whether the value is in its range.
-        name: Field as a user knows it, such as "config.train.batch_size".
-        value: What it is.
-        expected: The range, such as "an integer of at least 1".
+        name: Name of the setting for users, such as "config.train.batch_size".
+        value: Value of the setting.
+        expected: Description of the range, such as "an integer of at least 1".
 
     Example:
         >>> require(2 >= 1, "config.train.batch_size", 2, "an integer of at least 1")
@@ -65,7 +66,7 @@ Range = tuple[Callable[[Any], bool], str]
 
 
 def integer(least: int, most: float = math.inf) -> Range:
-    """Integers of a range; True is not 1."""
+    """Returns the range of integers from `least` to `most`; booleans are not in it."""
     upper = "" if most == math.inf else f" and at most {most:.0f}"
     return (
         lambda value: isinstance(value, int) and _is_number(value, least, most),
@@ -74,20 +75,28 @@ def integer(least: int, most: float = math.inf) -> Range:
 
 
 def number(least: float, most: float = math.inf) -> Range:
-    """Finite numbers of a closed range."""
+    """Returns the range of finite numbers from `least` to `most`; booleans are not in it."""
     upper = "" if most == math.inf else f" and at most {most}"
     return lambda x: _is_number(x, least, most), f"a number of at least {least}{upper}"
 
 
 def one_of(*choices: Any) -> Range:
-    """One of several values."""
+    """Returns the range that consists of the given values."""
     return lambda value: value in choices, f"one of {', '.join(map(repr, choices))}"
 
 
 def several(
     entries: Range, expected: str, count: int | None = None, least: int = 0
 ) -> Range:
-    """At least so many different entries, each of a range; or `count`, equal or not."""
+    """Returns a range of sequences.
+
+    Args:
+        entries: Range of each entry.
+        expected: Description of the range.
+        count: Required number of entries, which may then be equal. If None, the entries
+            must be different.
+        least: Smallest number of entries if `count` is None.
+    """
 
     def holds(values: Any) -> bool:
         is_size = len(set(values)) == len(values) >= least
@@ -98,7 +107,7 @@ def several(
 
 
 def or_none(values: Range) -> Range:
-    """A range, or None."""
+    """Returns a range extended by None."""
     holds, expected = values
     return lambda value: value is None or holds(value), f"{expected}, or None"
 
@@ -114,7 +123,13 @@ BELOW_ONE: Range = (
 
 
 def check_options(values: Any, section: str, ranges: Mapping[str, Range]) -> None:
-    """Raises `UserError` for the first field of a section that is out of its range."""
+    """Raises `UserError` for the first field of a section that is out of its range.
+
+    Args:
+        values: Fields of the section, as a mapping.
+        section: Name of the section, such as "config.train".
+        ranges: Range of each field to check.
+    """
     for name, (holds, expected) in ranges.items():
         value = values[name]
         try:

@@ -1,4 +1,4 @@
-"""Files that are either complete or absent, and folders that belong to one job."""
+"""Atomic writing and reading of files, and locks and descriptions of job folders."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ _MAX_VALUE_CHARS = 80
 def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
     """Yields a temporary path to write to, which becomes `path` at the end of the block.
 
-    Missing parent folders are created. After an error or a kill `path` is unchanged.
+    Missing parent folders are created. If an error occurs or the process is killed, `path`
+    remains unchanged.
 
     Raises:
         DiskFullError: No space is left on the disk.
@@ -51,7 +52,7 @@ def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
 
 @contextlib.contextmanager
 def atomic_write(path: PathLike) -> Iterator[IO[bytes]]:
-    """As `atomic_path`: an open binary file that becomes `path`."""
+    """Yields a binary file open for writing, which becomes `path` like in `atomic_path`."""
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         yield file
 
@@ -60,8 +61,8 @@ def atomic_write(path: PathLike) -> Iterator[IO[bytes]]:
 def swapped_in(folder: PathLike) -> Iterator[pathlib.Path]:
     """Yields a temporary folder whose content moves into `folder` after the block.
 
-    Entries of the same name are replaced, others stay. After an error `folder` is
-    unchanged.
+    Entries of the same name are replaced, and others stay. If the block raises an error,
+    `folder` remains unchanged.
 
     Raises:
         DiskFullError: No space is left on the disk.
@@ -99,7 +100,7 @@ def _temporary_path(path: pathlib.Path) -> pathlib.Path:
 
 
 def remove_stale(folder: pathlib.Path, prefix: str = "**/.") -> None:
-    """Removes temporary files that killed processes of this machine left in a folder."""
+    """Removes temporary files that killed processes on this machine left in a folder."""
     for path in list(folder.glob(f"{prefix}*{socket.gethostname()}.*.tmp")):
         process = path.name.split(".")[-2]
         if process.isdecimal() and not _is_running(int(process)):
@@ -110,19 +111,21 @@ def _is_running(process: int) -> bool:
     try:
         os.kill(process, 0)
     except OSError as error:
-        return error.errno == errno.EPERM  # of another user
+        return error.errno == errno.EPERM  # the process belongs to another user
     return True
 
 
 @contextlib.contextmanager
 def disk_full(path: PathLike) -> Iterator[None]:
-    """Turns errors on a full disk into one line; a `with` block or a decorator.
+    """Turns errors caused by a full disk into a `DiskFullError` with a one-line message.
+
+    It can be used in a `with` statement or as a decorator.
 
     Args:
         path: File that is written in the block.
 
     Raises:
-        DiskFullError: No space is left, or a quota is used up.
+        DiskFullError: No space is left on the disk, or a quota is exhausted.
     """
     try:
         yield
@@ -136,9 +139,10 @@ def disk_full(path: PathLike) -> Iterator[None]:
 
 
 def is_no_space(error: BaseException) -> bool:
-    """True if an error says that the disk is full or a quota is used up.
+    """Returns whether an error reports a full disk or an exhausted quota.
 
-    Libraries in C++ keep the message of the system but not its number.
+    C++ libraries pass on the system's error message but not its error number, so the
+    message is searched as well.
     """
     numbers = (errno.ENOSPC, errno.EDQUOT)
     if isinstance(error, OSError) and error.errno in numbers:
@@ -154,7 +158,8 @@ def read_text(path: PathLike) -> str:
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: It is a folder, or not UTF-8; names the line.
+        DataError: The path is a folder, or the file is not valid UTF-8. In the latter case
+            the message contains the line number.
     """
     try:
         content = pathlib.Path(path).read_bytes()
@@ -164,7 +169,15 @@ def read_text(path: PathLike) -> str:
 
 
 def decoded(content: bytes, where: str) -> str:
-    """Text of the bytes of a file named `where`; `DataError` if they are not UTF-8."""
+    """Decodes the UTF-8 content of a file.
+
+    Args:
+        content: Bytes of the file; a byte order mark is removed.
+        where: Name of the file in the error message.
+
+    Raises:
+        DataError: The content is not valid UTF-8; the message contains the line number.
+    """
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -179,7 +192,7 @@ def read_json(path: PathLike) -> Any:
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is not valid JSON.
+        DataError: The file is not valid UTF-8 or not valid JSON.
     """
     text = read_text(path)
     try:
@@ -189,11 +202,11 @@ def read_json(path: PathLike) -> Any:
 
 
 def read_object(path: PathLike, *keys: str) -> dict[str, Any]:
-    """Reads a JSON file that holds an object with some keys.
+    """Reads a JSON file that contains an object with the given keys.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file holds something else.
+        DataError: The file is not valid JSON, or does not contain such an object.
     """
     value = read_json(path)
     if not isinstance(value, dict) or not set(keys) <= set(value):
@@ -213,18 +226,21 @@ def claim(
     name: str = "",
     ignore: Collection[str] = (),
 ) -> None:
-    """Writes the description of a job into its folder, or compares it with that there.
+    """Writes the description of a job into its folder, or compares it with the existing one.
 
     Args:
-        path: JSON file in the folder; written with the folder if missing.
-        wanted: Description of the job, plain values.
-        what: The folder contains if it is another job's: "another simulation".
-        fix: What to do in that case.
-        name: Prefix of the fields' names in the message.
-        ignore: Fields that may differ.
+        path: JSON file in the folder. If it does not exist, it is written and missing
+            folders are created.
+        wanted: Description of the job as plain values.
+        what: Content of a folder that belongs to another job, for the error message, such
+            as "another simulation".
+        fix: Advice at the end of the error message.
+        name: Prefix of the field names in the error message.
+        ignore: Top-level fields that may differ.
 
     Raises:
-        UserError: The folder is another job's; names the fields that differ.
+        UserError: The folder belongs to another job; the message names the fields that
+            differ.
         DataError: The JSON file is corrupted.
     """
     path = pathlib.Path(path)
@@ -241,7 +257,7 @@ def claim(
 
 
 def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
-    """One line per difference of two trees of values as read from JSON."""
+    """Returns one line per difference between two trees of values read from JSON."""
     if found == wanted:
         return []
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
@@ -259,16 +275,19 @@ def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
 
 @contextlib.contextmanager
 def lock(path: PathLike, message: str | None = None) -> Iterator[None]:
-    """Keeps other processes out of a block.
+    """Holds an exclusive lock on a file while a block runs.
 
-    The system releases the lock however the process ends.
+    The operating system releases the lock when the process ends, even if it is killed. If
+    the file system does not support locks, a warning is logged and the block runs without
+    one.
 
     Args:
-        path: File that is locked; created with its folder if missing, and kept.
-        message: Of the error; without one the process waits for the lock.
+        path: File to lock. It and its folder are created if missing, and are not removed.
+        message: Error message if another process holds the lock; if None, the process
+            waits for the lock instead.
 
     Raises:
-        UserError: Another process holds it.
+        UserError: Another process holds the lock, and `message` is given.
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -283,6 +302,6 @@ def lock(path: PathLike, message: str | None = None) -> Iterator[None]:
 
 
 def relative(path: pathlib.Path) -> str:
-    """A path below the current folder as relative to it, others unchanged."""
+    """Returns a path relative to the current folder if it is below it, else unchanged."""
     here = pathlib.Path.cwd()
     return str(path.relative_to(here) if path.is_relative_to(here) else path)

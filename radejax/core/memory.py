@@ -15,13 +15,13 @@ _TUNABLES = (
 
 
 def restart_with_huge_pages() -> None:
-    """Restart this program with `GLIBC_TUNABLES` for pages of 2 MB, where they help.
+    """Restart this program with `GLIBC_TUNABLES` that enable pages of 2 MB.
 
-    Arrays are then mapped in few large pieces, and freed memory stays for the next
-    step. glibc reads the variable when a process begins, so a program calls this first.
-    Nothing happens where the environment sets how to allocate (`MALLOC_...`,
-    `GLIBC_TUNABLES`), or where the kernel does not leave the choice to programs. Other
-    C libraries ignore the variable.
+    Arrays are then mapped to few large pages, and freed memory is kept for the next step.
+    glibc reads the variable when a process starts, so programs call this function first.
+    It does nothing if the environment already configures the allocator (`MALLOC_...`,
+    `GLIBC_TUNABLES`), or if the kernel does not let programs choose (`madvise`). C
+    libraries other than glibc ignore the variable.
     """
     is_set = any(name.startswith(("MALLOC_", "GLIBC_TUNABLES")) for name in os.environ)
     if is_set or not sys.executable or not _PAGES.exists():

@@ -1,9 +1,10 @@
-"""The containers that the packages pass to each other: all are JAX pytrees of fixed shape.
+"""Containers that the packages pass to each other.
 
-B frames, R range bins, A azimuth bins, D Doppler and E elevation bins, N padded
-ground-truth boxes, K padded detections, C classes. Boxes are in the radar (ego) frame: x
-forward, y left, z up, meters, with the z of the LiDAR (docs/conventions.md); yaw counter-clockwise
-from x, radians.
+`Batch`, `DetectionMaps` and `Detections` are JAX pytrees of fixed shape; `Boxes` is used
+outside `jit`. Shapes are written with B frames, R range bins, A azimuth bins, D Doppler bins,
+E elevation bins, N padded ground-truth boxes, K padded detections and C classes. Boxes are in
+the radar (ego) frame in meters: x forward, y left, z up, with the origin of z at the LiDAR
+(docs/conventions.md). The yaw is counter-clockwise from x in radians.
 """
 
 from __future__ import annotations
@@ -48,18 +49,19 @@ class Batch(struct.PyTreeNode):
     """One batch of frames as the pipeline delivers it and the losses consume it.
 
     Attributes:
-        projection: Normalized projections as they are stored, D Doppler channels first,
-            then E of elevation.
-        boxes: x, y, z, l, w, h, sin yaw, cos yaw; full extents; float32.
+        projection: Normalized projections as they are stored: D Doppler channels, then E
+            elevation channels.
+        boxes: x, y, z, l, w, h, sin yaw, cos yaw; l, w and h are full extents; float32.
         classes: int32 class indices; any value where not `is_valid`.
         is_valid: True where a box is an object and not padding.
-        frame: int32 index of the frame in its dataset; -1 where the batch is filled up.
-        image: `[B, H, W, 3]` uint8 left front camera images, or what the image backbone
-            made of them; or None.
-        camera: `Camera` or `ReferencePoints` of higher layers, `[B, ...]`; or None.
+        frame: int32 index of the frame in its dataset; -1 for frames that pad the batch.
+        image: `[B, H, W, 3]` uint8 left front camera images, the features that the image
+            backbone computed from them, or None.
+        camera: `Camera` or `ReferencePoints` with a leading axis B, or None. Both are
+            defined in higher layers.
     """
 
-    # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
+    # Leaves are not validated: JAX also rebuilds the tree with shapes, specs or None.
     projection: Real[Array, "B R A DE"]
     boxes: Float[Array, "B N 8"]
     classes: Int[Array, "B N"]
@@ -69,7 +71,10 @@ class Batch(struct.PyTreeNode):
     camera: Any = None
 
     def model_inputs(self) -> tuple[Any, ...]:
-        """Positional inputs of a model: the projection; with images, the camera's too."""
+        """Returns the positional inputs of a model.
+
+        These are the projection and, if the batch has images, the images and cameras.
+        """
         projection = to_float(self.projection)
         if self.image is None:
             return (projection,)
@@ -77,25 +82,25 @@ class Batch(struct.PyTreeNode):
 
 
 def to_float(projection: Real[Array, "*axes"]) -> Float[jax.Array, "*axes"]:
-    """Stored values of projections to float32 network input, on the device.
+    """Converts stored values of projections to float32 network input on the device.
 
-    Batches travel in the type of the records (a quarter to a half of the bytes); the
-    jitted train step starts with this cast.
+    Batches are transferred in the dtype of the records, which takes a quarter to a half
+    of the bytes of float32. The jitted train step therefore starts with this cast.
 
     Args:
-        projection: uint8 (p = q / 255), float16, bfloat16 or float32.
+        projection: Projections in uint8 (p = q / 255), float16, bfloat16 or float32.
     """
     values = jnp.asarray(projection).astype(jnp.float32)
     return values / 255.0 if projection.dtype == jnp.uint8 else values
 
 
 class DetectionMaps(struct.PyTreeNode):
-    """What a detector predicts for every range-azimuth bin.
+    """Predictions of a detector for every range-azimuth bin.
 
     Attributes:
-        heatmap_logits: Center-point logits, before the sigmoid.
-        box_params: Raw dx, dy, z, l, w, h, sin yaw, cos yaw; dx and dy from the center of
-            the bin, in meters.
+        heatmap_logits: Logits of the center heatmap, before the sigmoid.
+        box_params: Raw dx, dy, z, l, w, h, sin yaw, cos yaw; dx and dy are offsets from
+            the center of the bin in meters.
     """
 
     heatmap_logits: Float[jax.Array, "B R A C"]
@@ -103,15 +108,16 @@ class DetectionMaps(struct.PyTreeNode):
 
 
 class Detections(struct.PyTreeNode):
-    """Boxes of a batch, by descending score, padded to a fixed number K.
+    """Detected boxes of a batch, by descending score, padded to a fixed number K.
 
     Attributes:
         boxes: x, y, z, l, w, h, yaw.
-        scores: In [0, 1]; 0 where not `is_valid`.
+        scores: Scores in [0, 1]; 0 where not `is_valid`.
         classes: int32 class indices; -1 where not `is_valid`.
-        is_valid: True where a row is a detection.
-        num_truncated: int32 peaks above the score threshold that did not fit in K.
-        class_names: Names of the class indices, the detector's; static under `jit`.
+        is_valid: True where a row is a detection and not padding.
+        num_truncated: int32 number of peaks before NMS and boxes after it that were
+            dropped because of the fixed number of rows, see `detection.decode.decode`.
+        class_names: Names of the detector's classes by class index; static under `jit`.
     """
 
     boxes: Float[jax.Array, "B K 7"]
@@ -122,22 +128,25 @@ class Detections(struct.PyTreeNode):
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
     def __repr__(self) -> str:
-        """Show only the shape: padded arrays are long, traced ones have no values."""
+        """Shows only the shape: padded arrays are long, and traced arrays have no values."""
         return f"Detections(boxes {getattr(self.boxes, 'shape', self.boxes)})"
 
     @property
     def num_clipped(self) -> Int[np.ndarray, " B"]:
-        """Detections of every frame of a size that was regressed below `MIN_SIZE_M`."""
+        """Number of detections per frame with an l, w or h of at most `MIN_SIZE_M`.
+
+        `decode` clips smaller sizes to this value by default.
+        """
         sizes = np.asarray(self.boxes)[..., 3:6]
         is_clipped = (sizes <= np.float32(MIN_SIZE_M)).any(-1)
         return (is_clipped & np.asarray(self.is_valid)).sum(-1)
 
     def to_columns(self) -> dict[str, Shaped[np.ndarray, "N ..."]]:
-        """The valid rows of all frames as plain columns, as evaluation takes them.
+        """Returns the valid rows of all frames as NumPy columns for the evaluation.
 
         Returns:
-            "frame" `[N]` position in the batch, "box" `[N, 7]`, "cls" `[N]` names,
-            "score" `[N]`; by frame, then by descending score.
+            Columns "frame" `[N]` (position in the batch), "box" `[N, 7]`, "cls" `[N]`
+            (class names) and "score" `[N]`, sorted by frame, then by descending score.
         """
         frame, row = np.nonzero(np.asarray(self.is_valid))
         indices = np.asarray(self.classes)[frame, row]
@@ -149,7 +158,10 @@ class Detections(struct.PyTreeNode):
         }
 
     def to_list(self) -> list[list[dict[str, Any]]]:
-        """One list per frame of dictionaries: cls, score and the seven box numbers."""
+        """Returns a list of dictionaries per frame.
+
+        Each dictionary is one detection with the keys cls, score, x, y, z, l, w, h, yaw.
+        """
         frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
         columns = (column.tolist() for column in self.to_columns().values())
         for frame, box, cls, score in zip(*columns, strict=True):
@@ -158,7 +170,10 @@ class Detections(struct.PyTreeNode):
         return frames
 
     def to_pandas(self) -> Any:
-        """One row a detection, as a `pandas.DataFrame` (extra "notebook")."""
+        """Returns a `pandas.DataFrame` with one row per detection.
+
+        pandas is installed by the extra "notebook".
+        """
         import pandas
 
         columns = self.to_columns()
@@ -172,17 +187,17 @@ MAX_BOX_VALUE = 1e6
 
 @dataclasses.dataclass(frozen=True)
 class Boxes:
-    """Boxes of many frames outside `jit`: predictions, ground truth, what is drawn.
+    """Predicted or ground-truth boxes of any number of frames, outside `jit`.
 
     Attributes:
         frame: int64 index of each box's frame.
-        box: float64 x, y, z, l, w, h, yaw in meters and radians, radar frame.
-        cls: Class names, or indices of classes.
-        score: float64 in [0, 1]; None for ground truth.
+        box: float64 x, y, z, l, w, h, yaw in meters and radians in the radar frame.
+        cls: Class names or class indices.
+        score: float64 scores in [0, 1]; None for ground truth.
 
     Raises:
-        DataError: Columns differ in length, or a value is not finite or out of range;
-            names the frame and the row.
+        DataError: Columns differ in length, or a value is not finite or out of range. In
+            the latter case the message names the frame and the row.
     """
 
     frame: Int[np.ndarray, " N"]
@@ -217,7 +232,13 @@ class Boxes:
 
     @classmethod
     def one_frame(cls, box: Any, names: Any, score: Any = None) -> Boxes:
-        """Boxes of one frame, numbered 0, from boxes, class names and scores."""
+        """Creates the boxes of a single frame, whose index is 0.
+
+        Args:
+            box: Boxes x, y, z, l, w, h, yaw.
+            names: Class names.
+            score: Scores; None for ground truth.
+        """
         box = np.asarray(box, np.float64).reshape(-1, 7)
         score = None if score is None else np.asarray(score, np.float64)
         names = np.asarray(names, str)
@@ -227,6 +248,6 @@ class Boxes:
         return len(self.frame)
 
     def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
-        """The boxes at positions or under a mask."""
+        """Returns the boxes selected by an array of positions or a boolean mask."""
         score = None if self.score is None else self.score[rows]
         return Boxes(self.frame[rows], self.box[rows], self.cls[rows], score)

@@ -22,16 +22,16 @@ Submit = Callable[..., concurrent.futures.Future[Any]]
 def process_pool(
     num_workers: int, start: Callable[..., Any] | None = None, *arguments: Any
 ) -> Iterator[Submit]:
-    """Processes for the time of a block, which gets a function to submit work with.
+    """Runs worker processes during a block and yields a function to submit work.
 
-    Results must be short, at most a few hundred bytes: the pool reads all of them from
-    one pipe, and waits forever for the rest of a result whose worker was killed while
-    writing it. Writes of less than 4 KiB are atomic. Workers write large results to
-    files and return their names.
+    Results must be at most a few hundred bytes long. The pool reads all results from one
+    pipe, and if a worker is killed while it writes one, the pool waits forever for the
+    rest. Writes of less than 4 KiB are atomic and cannot be cut off. Workers should
+    therefore write large results to files and return the names of the files.
 
     Args:
         num_workers: Number of processes.
-        start: Called first in each of them, or None.
+        start: Function that each process calls first, or None.
         *arguments: Arguments of `start`.
 
     Yields:
@@ -51,7 +51,7 @@ def process_pool(
             try:
                 yield pool.submit
             except BaseException:
-                # An interrupt must not wait for what the workers are doing.
+                # An interrupt must not wait until the workers finish their tasks.
                 for process in multiprocessing.active_children():
                     if process not in others:
                         process.terminate()
@@ -68,12 +68,12 @@ def process_pool(
 def _start_processes(
     pool: concurrent.futures.ProcessPoolExecutor, num_workers: int
 ) -> None:
-    """Starts the processes while SIGINT is blocked, which they inherit for good."""
-    resource_tracker.ensure_running()  # its start would clear the mask
+    """Starts the processes while SIGINT is blocked; they inherit this signal mask."""
+    resource_tracker.ensure_running()  # starting it later would clear the mask
     old = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         for _ in range(num_workers):
-            pool.submit(os.getpid)  # one process starts per task that waits
+            pool.submit(os.getpid)  # the pool starts one process per waiting task
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, old)
 

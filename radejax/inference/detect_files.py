@@ -1,7 +1,7 @@
-"""Boxes for folders of frames: what `radejax detect` does.
+"""Detection in folders of frames, as in `radejax detect`.
 
-Labels are not needed, but for images: in K-Radar only the header of a label file says
-which image belongs to which frame.
+Labels are needed only to find images: in K-Radar, only the header of a label file states
+which image belongs to a frame.
 """
 
 from __future__ import annotations
@@ -36,18 +36,23 @@ def find_frames(
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
 ) -> list[pathlib.Path]:
-    """Tesseract and projection files among files and below folders, sorted.
+    """Find tesseract and projection files in files and folders.
 
-    If a frame exists as both, the projection is taken.
+    If a frame has both files, only the projection is returned.
 
     Args:
-        paths: Files and folders.
-        sequence_numbers: Only these sequences; all if None.
-        weather: Only sequences of these, by their `description.txt`; all if None.
+        paths: Files, which are taken whatever their name, and folders, which are searched
+            recursively.
+        sequence_numbers: Numbers of the sequences to take; all if None.
+        weather: Kinds of weather to take, according to the `description.txt` of each
+            sequence; all if None.
+
+    Returns:
+        Sorted paths of the files.
 
     Raises:
         FileNotFoundError: A path, or a `description.txt`, does not exist.
-        UserError: There is no frame; names what was looked for.
+        UserError: There is no frame; the message names what was searched.
     """
     found: set[pathlib.Path] = set()
     for path in map(pathlib.Path, paths):
@@ -88,17 +93,20 @@ def front_images(
     labels: str | os.PathLike | None = None,
     version: str = "v2.1",
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
-    """Image and camera of the files of frames that have both.
+    """Find the images and cameras of frames.
 
     Args:
-        paths: Of `find_frames`.
-        detector: Of a radar-camera model.
-        labels: Label revision, see `KRadar`; the sequences' own label files if None,
-            where there are any.
-        version: Of these labels.
+        paths: Radar files that `find_frames` returned.
+        detector: Detector of a radar-camera model.
+        labels: Label revision, see `KRadar`. If None, the label files of the sequences
+            are used, and sequences without them have no images.
+        version: Version of the labels.
+
+    Returns:
+        Image file and camera by the path of the radar file, for the frames that have both.
 
     Raises:
-        UserError: The labels are of another version, or a calibration is of images of
+        UserError: The labels are of another version, or a calibration is for images of
             another size than the model's.
     """
     sequences = [
@@ -141,34 +149,34 @@ def detect_files(
     image_backbone: str | os.PathLike | None = None,
     **settings: Any,
 ) -> dict[str, int]:
-    """Detect in every frame and write one file per frame, atomically.
+    """Detect the objects in every frame, and write one file per frame atomically.
 
     Args:
-        source: Model, as `load_model` takes it: a run, an exported folder, ...
+        source: Path of the model, such as a run or an exported folder, see `load_model`.
         paths: Files and folders of frames.
-        out: Folder for `<sequence>_<radar>.json`: a list of {frame, cls, score, x, y, z,
-            l, w, h, yaw}, meters and radians in the radar frame, frame
-            "sequence/radar".
+        out: Folder of the files `<sequence>_<radar>.json`. Each contains a list of {frame,
+            cls, score, x, y, z, l, w, h, yaw}, in meters and radians in the radar frame;
+            the value of "frame" is "<sequence>/<radar>".
         step: Step of the checkpoint, or "best"; the latest if None.
-        batch_size: Frames at once.
-        file_format: "json", or "kitti" for `preds/000000.txt` as K-Radar's tools write
-            them, and `frames.json` with the frames of these numbers.
-        sequence_numbers: See `find_frames`, as `weather`.
-        weather: See `find_frames`.
-        labels: Label revision used to find the image of each frame, for radar-camera
-            models; the one that a run was trained with if None.
-        image_backbone: See `Detector.from_workdir`.
-        **settings: `score_threshold`, `nms_iou`, `roi` of the detector.
+        batch_size: Number of frames per call of the detector.
+        file_format: "json", or "kitti" for files `preds/000000.txt` in the format of
+            K-Radar's tools, and `frames.json` with the frames that these numbers stand for.
+        sequence_numbers: Numbers of the sequences to take, see `find_frames`.
+        weather: Kinds of weather to take, see `find_frames`.
+        labels: Label revision in which a radar-camera model's images are looked up; the
+            revision that the run was trained with if None.
+        image_backbone: Weights of the image backbone, see `Detector.from_workdir`.
+        **settings: `score_threshold`, `nms_iou` and `roi` of the detector.
 
     Returns:
-        Counts "frames", "boxes" and "clipped", boxes of them with a size that was
-        clipped, and for a radar-camera model "radar_only": frames without a label file,
-        image or calibration.
+        The numbers of "frames", of "boxes" and of "clipped" boxes, whose size was clipped.
+        For a radar-camera model, "radar_only" is the number of frames without a label
+        file, image or calibration.
 
     Raises:
         FileNotFoundError: A path does not exist.
-        UserError: There is no frame, two would be written to one file, or an image or
-            a weight is not as expected.
+        UserError: There is no frame, two frames would be written to the same file, or an
+            image or weight is not as expected.
     """
     frames = find_frames(paths, sequence_numbers, weather)
     seen: dict[str, pathlib.Path] = {}
@@ -212,7 +220,7 @@ def detect_files(
 
 
 def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> list[str]:
-    """Contents of the files of some frames."""
+    """Return the contents of the files of a batch of frames."""
     if file_format == "kitti":
         return [f"{text}\n" for text in kitti.prediction_texts(detections)]
     frames = zip(keys, detections.to_list(), strict=True)
@@ -221,12 +229,15 @@ def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> lis
 
 
 def frame_key(path: pathlib.Path) -> str:
-    """Key without the part that only labels tell: "5/00033"."""
+    """Return the key of a frame without the LiDAR index, such as "5/00033".
+
+    Only label files contain the LiDAR index.
+    """
     radar = path.stem.removeprefix("DERA_").removeprefix("tesseract_")
     sequence = _sequence(path).name
     return f"{sequence}/{radar}" if sequence else radar
 
 
 def output_name(path: pathlib.Path) -> str:
-    """Name that is unique among sequences: "5_00033"."""
+    """Return a name such as "5_00033", which is unique among the sequences of a dataset."""
     return frame_key(path).replace("/", "_")

@@ -1,4 +1,4 @@
-"""`Detector`: radar tensors in, boxes out, in one jitted call."""
+"""`Detector` computes boxes from radar tensors in one jitted call."""
 
 from __future__ import annotations
 
@@ -63,17 +63,20 @@ def detect(
     camera: Any = None,
     settings: Mapping[str, Array] | None = None,
 ) -> Detections:
-    """From a batch of radar tensors to detections; pure, to be jitted.
+    """Compute detections from a batch of radar tensors.
+
+    This is a pure function that can be jitted.
 
     Args:
         model: Radar or radar-camera detector.
-        grid: Of its maps, see `models.map_grid`.
+        grid: Grid of the model's maps, see `models.map_grid`.
         options: Keyword arguments of `radejax.detection.decode.decode`.
-        variables: Of the model.
-        frames: Projections as they are stored, or tesseracts, linear power.
-        image: Of a radar-camera model, or None for the radar only.
-        camera: Likewise.
-        settings: Options that replace those in `options`, of `SETTINGS`, traced.
+        variables: Variables of the model.
+        frames: Projections as they are stored, or tesseracts in linear power.
+        image: Images for a radar-camera model, or None to use the radar only.
+        camera: Cameras of the images, or None without images.
+        settings: Values by the names in `SETTINGS`, which replace those in `options` and
+            may be traced.
     """
     if frames.ndim == 5:
         frames = project_jax(frames)
@@ -83,30 +86,33 @@ def detect(
 
 
 class Detector:
-    """A trained model with everything between a radar tensor and boxes.
+    """A trained model with the preprocessing and decoding from radar tensors to boxes.
 
     One object may be shared by threads. Batches are padded to a few fixed sizes, so
     that any number of frames compiles at most `len(batch_sizes)` programs per kind of
-    input; thresholds and region can change without compiling again.
+    input. The thresholds and the region of interest can change without recompilation.
 
     Args:
-        saved: From `load_model`.
-        sharding: Where batches are computed: `batch_sharding` of a mesh splits each over
-            its devices, on which the variables are replicated; JAX's default device if
-            None. In several processes each passes the same number of frames, a multiple
-            of its devices, and gets the detections of all.
-        score_threshold: Default of calls; of the config if None, as the next two.
-        nms_iou: Default of calls.
-        roi: Default of calls: x, y, z limits `(x0, x1, y0, y1, z0, z1)`, "narrow" or
-            "wide".
-        dtype: Of the computation, "float32" or "bfloat16"; of the config if None.
-        batch_sizes: Sizes that are compiled, each per process.
+        saved: The trained model, as `load_model` returns it.
+        sharding: Placement of the batches. `batch_sharding` of a mesh splits each batch
+            over the devices of the mesh, on which the variables are replicated. None
+            places batches on JAX's default device. With several processes, each passes
+            the same number of frames, a multiple of its devices, and gets the detections
+            of all processes.
+        score_threshold: Default score threshold of calls; the config's if None.
+        nms_iou: Default IoU threshold of NMS of calls; the config's if None.
+        roi: Default region of interest of calls, in meters: limits
+            `(x0, x1, y0, y1, z0, z1)`, "narrow" or "wide"; the config's if None.
+        dtype: Dtype of the computation, "float32" or "bfloat16"; the config's if None.
+        batch_sizes: Batch sizes per process for which the model is compiled. Each is
+            rounded up to a multiple of the process's devices.
 
     Attributes:
-        num_radar_only: Frames so far, except of a `Batch`, that a radar-camera model
-            predicted without an image.
-        num_invalid_frames: Frames so far, of NumPy arrays, with values that no radar
-            power gives (NaN, infinite, decibels): their detections are meaningless.
+        num_radar_only: Number of frames so far that a radar-camera model predicted
+            without an image and its calibration. Frames in a `Batch` are not counted.
+        num_invalid_frames: Number of frames so far, passed as NumPy arrays, with values
+            that cannot be radar power (NaN, infinity, decibels). Their detections are
+            meaningless.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
@@ -158,18 +164,19 @@ class Detector:
         image_backbone: PathLike | None = None,
         **options: Any,
     ) -> Detector:
-        """Detector of a training run, or of anything else that `load_model` takes.
+        """Create a detector from a training run or another model that `load_model` takes.
 
         Args:
             path: Workdir of `train.py`, its `checkpoints` or one of them, a folder of
-                `radejax export`, or an official file.
+                `radejax export`, or an official checkpoint file.
             step: Step of the checkpoint, or "best"; the latest if None.
-            image_backbone: Weights of a frozen image backbone, if they are not where
-                the run was trained from, or the exported folder has none.
-            **options: Arguments of `Detector`.
+            image_backbone: Weights of a frozen image backbone. They are needed if the
+                file that the run was trained with has moved, or if the exported folder
+                does not contain them.
+            **options: Keyword arguments of `Detector`.
 
         Raises:
-            FileNotFoundError: There is no run, or no such checkpoint.
+            FileNotFoundError: There is no model, or no such checkpoint.
         """
         saved = load_model(path, step=step, image_backbone=image_backbone)
         return cls(saved, **options)
@@ -182,12 +189,12 @@ class Detector:
         image_backbone: PathLike | None = None,
         **options: Any,
     ) -> Detector:
-        """Detector of an official RADE-Net or DinoRADE checkpoint.
+        """Create a detector from an official RADE-Net or DinoRADE checkpoint.
 
         Args:
             path_or_state_dict: File, or mapping of names to arrays, see `load_torch`.
             image_backbone: Folder of DINOv3, for DinoRADE files without its weights.
-            **options: Arguments of `Detector`.
+            **options: Keyword arguments of `Detector`.
         """
         saved = load_torch(path_or_state_dict, image_backbone=image_backbone)
         return cls(saved, **options)
@@ -198,7 +205,10 @@ class Detector:
         variables: Mapping[str, Any] | None = None,
         batch_sizes: Sequence[int] | None = None,
     ) -> Detector:
-        """The same detector with other variables or batch sizes, compiled together."""
+        """Return a copy with other variables or batch sizes that shares compiled programs.
+
+        The counters of the copy start at zero.
+        """
         other = copy.copy(self)
         other._lock = threading.Lock()
         other.num_radar_only = other.num_invalid_frames = 0
@@ -209,7 +219,7 @@ class Detector:
         return other
 
     def _set_batch_sizes(self, sizes: Sequence[int]) -> None:
-        """Each rounded up to a multiple of the devices of this process."""
+        """Set the batch sizes, rounded up to multiples of the devices of this process."""
         is_possible = len(sizes) > 0 and min(sizes, default=0) >= 1
         require(is_possible, "batch_sizes", sizes, "integers of at least 1")
         count = len(self.sharding.addressable_devices)
@@ -227,27 +237,29 @@ class Detector:
         nms_iou: float | None = None,
         roi: Sequence[float] | str | None = None,
     ) -> Detections:
-        """Detect the objects in one frame or many.
+        """Detect the objects in one or more frames.
 
         Args:
             frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in
-                linear power, or one without B; paths of either, or a list of those; or
-                a `Batch`, whose image and camera are used.
-            image: For a radar-camera model: `[B, H, W, 3]` uint8, embedded images, or a
-                list of arrays, paths and None.
-            camera: One calibration for all frames, or a list of one per frame.
-            score_threshold: Of this call.
-            nms_iou: Of this call.
-            roi: Of this call.
+                linear power, a single frame without the axis B, the path of a file, or a
+                list of arrays and paths. Alternatively a `Batch`, whose image and camera
+                are used.
+            image: Images for a radar-camera model: `[B, H, W, 3]` uint8, embedded images,
+                or a list of arrays, paths and None.
+            camera: One calibration for all frames, or a list with one per frame.
+            score_threshold: Score threshold of this call; the detector's default if None.
+            nms_iou: IoU threshold of NMS of this call; the detector's default if None.
+            roi: Region of interest of this call; the detector's default if None.
 
         Returns:
             Detections of B frames, on the device.
 
         Raises:
-            UserError: A shape or number is not as expected.
+            UserError: A shape, a number of images or cameras, or a setting is not as
+                expected.
         """
         inputs: Any
-        if isinstance(frames, Batch):  # checked when it was made
+        if isinstance(frames, Batch):  # its content was checked when it was created
             inputs = frames.projection, frames.image, frames.camera
         else:
             radar = radar_batch(frames, self.grid)
@@ -273,25 +285,26 @@ class Detector:
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
     def _detect(self, inputs: Any, settings: Any) -> Detections:
-        """Detections of at most the largest batch size."""
+        """Detect objects in at most as many frames as the largest batch size."""
         count = inputs[0].shape[0]
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
         found = self._run(self.variables, *inputs, settings)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
-            # Devices that share cores miss each other where batches pile up.
+            # With several batches in flight, CPU devices that share cores can fail to
+            # synchronize.
             jax.block_until_ready(found)
         found = found.replace(class_names=self.classes)
         return found if count == size else jax.tree.map(lambda x: x[:count], found)
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
-        """Detections of one item after the other, each started before the last ends.
+        """Yield the detections of items in order, with up to two items in flight.
 
-        Reading and projecting the next item overlap with the work of the device.
+        The next item is read and prepared while the device processes the current one.
 
         Args:
-            frames: Items as `__call__` takes them first; a tuple is frames, image and
-                camera.
+            frames: Items that `__call__` accepts as `frames`, or tuples of the frames,
+                image and camera of an item.
             **settings: Keyword arguments of `__call__`.
         """
         started: list[Detections] = []
@@ -303,9 +316,12 @@ class Detector:
         yield from started
 
     def warmup(self, batch_size: int = 1) -> Detector:
-        """Compile for a batch size of projections, so that the first call is fast.
+        """Compile the model for a batch size of projections, so that the first call is fast.
 
         A radar-camera model is compiled for frames with images.
+
+        Returns:
+            The detector itself.
         """
         shape = (batch_size, *self.grid.projection_shape)
         inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
@@ -316,7 +332,7 @@ class Detector:
         return self
 
     def detect_function(self) -> Callable[..., Detections]:
-        """The pure function that is jitted: `detect` of this model and its options."""
+        """Return the pure function that is jitted: `detect` with this model and options."""
         mapping = self.saved.config.data.azimuth_mapping
         grid = models.map_grid(self.grid, self.model, mapping)
         return functools.partial(detect, self.model, grid, self.decode_options)
@@ -324,8 +340,9 @@ class Detector:
     def put(self, x: Shaped[Any, "b ..."]) -> Shaped[jax.Array, "B ..."]:
         """Copy the rows of this process to the devices; the caller may then reuse `x`.
 
-        On CPU `device_put` shares aligned memory whatever `may_alias` says; elsewhere
-        the transfer reads it after the call returns.
+        NumPy arrays need care: on CPU, `device_put` shares aligned memory regardless of
+        `may_alias`, so the array is copied first; on other platforms the transfer is
+        asynchronous, so the call waits for it.
         """
         if not isinstance(x, np.ndarray):
             return jax.device_put(x, self.sharding)
@@ -336,7 +353,7 @@ class Detector:
 
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
-    """Repeat the last frame up to a batch size."""
+    """Pad a batch to a batch size by repeating its last frame."""
     count = x.shape[0]
     return x if count == size else x[np.minimum(np.arange(size), count - 1)]
 
@@ -345,7 +362,10 @@ def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]
 
 
 def _read_paths(given: Any, read: Callable[[pathlib.Path], np.ndarray]) -> Any:
-    """An array as it is; a path, or a list with paths, as a list of arrays and None."""
+    """Replace paths by the arrays that they contain.
+
+    An array is returned unchanged. A path or a list becomes a list of arrays and None.
+    """
     if not isinstance(given, str | os.PathLike | Sequence):
         return given
     entries = [given] if isinstance(given, _PATH) else given
@@ -353,18 +373,19 @@ def _read_paths(given: Any, read: Callable[[pathlib.Path], np.ndarray]) -> Any:
 
 
 def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
-    """Radar frames as one array with a leading axis of B.
+    """Combine radar frames into one array with a leading axis B.
 
     Args:
-        frames: Projections or tesseracts, one array or a list of them, or the path of
-            a file or several; see `Detector`.
+        frames: Projections or tesseracts: an array, a path, or a list of arrays and
+            paths, see `Detector.__call__`.
         grid: Axes of the sensor.
 
     Returns:
-        `[B, R, A, D+E]` or `[B, D, R, E, A]`.
+        Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]`.
 
     Raises:
-        UserError: The shape is of neither, or there is no frame.
+        UserError: The shape is neither that of projections nor that of tesseracts, or
+            there is no frame.
     """
     radar = _read_paths(frames, lambda path: read_frame(path, grid))
     if isinstance(radar, list):
@@ -388,15 +409,20 @@ _MAX_DECIBELS = 300.0
 
 
 def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:
-    """Number of frames whose values are not a linear power, or a level of a projection.
+    """Count the frames whose values cannot be linear power or levels of a projection.
 
-    Decibels are neither: noise alone spans more than they do, with bins below 1. Arrays
-    on a device are not checked, nor is uint8, of which every value is a level.
+    A frame is taken to be in decibels if all its values are above 1 and at most 300: in
+    linear power, noise has a wider range, with bins below 1. Arrays on a device are not
+    checked. Neither are uint8 arrays, in which every value is a valid level.
+
+    Args:
+        frames: Projections or tesseracts.
+        warn: Log a warning if there are such frames.
     """
     if not isinstance(frames, np.ndarray) or frames.dtype == np.uint8:
         return 0
     axes = tuple(range(1, frames.ndim))
-    low, high = frames.min(axes), frames.max(axes)  # NaN if one is in it
+    low, high = frames.min(axes), frames.max(axes)  # NaN if the frame contains NaN
     lowest, limit = -MAX_LEVEL, MAX_LEVEL
     if frames.ndim == 5:
         lowest, limit = 0.0, float(np.finfo(np.float32).max)
@@ -420,25 +446,26 @@ def camera_batch(
     model: Any,
     options: CameraOptions,
 ) -> tuple[Real[Array, "B _ _ _"] | None, Camera | None, int]:
-    """Images and cameras as arrays, as `data.pipeline` puts them into a `Batch`.
+    """Convert images and cameras to arrays, as `data.pipeline` puts them into a `Batch`.
 
     Args:
-        image: `[B, H, W, 3]` uint8 (or `[H, W, 3]` of the only frame), what
-            `model.embed` made of it, or a list with one image, path or None per frame.
-        camera: One calibration for all frames or a list with one (or None) per frame:
-            `CameraCalibration`, path of a file of K-Radar, or `Camera`. Also a batch of
-            `Camera`.
-        num_frames: B.
-        model: A radar-only model takes neither.
-        options: How calibrations are used.
+        image: Images `[B, H, W, 3]` uint8 (or `[H, W, 3]` for a single frame), the output
+            of `model.embed` for them, or a list with one image, path or None per frame.
+        camera: One calibration for all frames, or a list with one (or None) per frame. A
+            calibration is a `CameraCalibration`, the path of a K-Radar calibration file,
+            or a `Camera`. A batched `Camera` is also accepted.
+        num_frames: Number of frames B.
+        model: The detector; a radar-only model takes neither images nor cameras.
+        options: Options that define how calibrations are used.
 
     Returns:
-        Images `[B, ...]`, a `Camera` with leading axes of B (both None without any
-        image), and the number of frames that a radar-camera model predicts without one.
+        Images `[B, ...]` and a `Camera` with leading axes B, both None if no images are
+        given, and the number of frames that a radar-camera model predicts without an
+        image.
 
     Raises:
-        UserError: A size or number is not as expected, image or camera is given without
-            the other, or an image is missing where that is not allowed.
+        UserError: A size or number is not as expected, only one of image and camera is
+            given, or an image is missing where that is not allowed.
     """
     if not models.has_camera(model):
         if image is None and camera is None:
@@ -470,7 +497,7 @@ def camera_batch(
 def _images(
     image: Any, model: Any, resize: bool
 ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
-    """Images as one array, and which of them are not None."""
+    """Return the images as one array, and a mask that is True where an image is given."""
     sizes = ((*model.image_size, 3), model.feature_shape)
     image = _read_paths(
         image, lambda path: read_left_image(path, model.image_size, resize=resize)
@@ -495,7 +522,7 @@ def _images(
 def _cameras(
     camera: Any, num_frames: int, model: Any, options: CameraOptions
 ) -> Camera:
-    """A batch of cameras."""
+    """Combine the cameras of all frames into one batched `Camera`."""
     if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 1:
         return camera
     if not isinstance(camera, list | tuple):
@@ -524,7 +551,7 @@ def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
 def placeholder(
     num_frames: int, model: Any
 ) -> tuple[UInt8[np.ndarray, "{num_frames} H W 3"], Camera]:
-    """Black images and a camera that sees nothing, of the shapes of real ones."""
+    """Return black images and a batch of invalid cameras in the shapes of real ones."""
     image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
     return image, stack_cameras([no_camera(model.image_size)] * num_frames)
 
@@ -532,11 +559,14 @@ def placeholder(
 def check_backbone(
     image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
 ) -> None:
-    """`UserError` for images if the variables lack the weights of the backbone.
+    """Check that the variables contain the image backbone if images require it.
 
     Args:
-        image: `[B, H, W, 3]`, what the backbone made of it, or None.
-        variables: Variables of a model.
+        image: Images `[B, H, W, 3]`, embedded images, or None.
+        variables: Variables of the model.
+
+    Raises:
+        UserError: Images are given, and the weights of the image backbone are missing.
     """
     is_raw = image is not None and image.shape[-1] == 3
     if is_raw and IMAGE_BACKBONE not in variables["params"]:
@@ -551,7 +581,7 @@ def _settings(
     nms_iou: float | None,
     roi: Sequence[float] | str | None,
 ) -> dict[str, Any]:
-    """Those of `SETTINGS` that are given."""
+    """Return the given values by the names in `SETTINGS`, without those that are None."""
     given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
     settings: dict[str, Any] = {k: float(v) for k, v in given.items() if v is not None}
     if roi is not None:

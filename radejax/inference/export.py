@@ -1,7 +1,7 @@
-"""Models as folders that work without radejax: StableHLO, ONNX, Hugging Face.
+"""Export of models to folders: StableHLO and ONNX programs, and Hugging Face models.
 
-All formats hold `config.json` and `model.safetensors`, which `load_model` reads.
-docs/deploy.md says how to use each of them.
+The programs run without radejax. Folders of all formats contain `config.json` and
+`model.safetensors`, which `load_model` reads. docs/deploy.md explains how to use each format.
 """
 
 from __future__ import annotations
@@ -75,22 +75,27 @@ def export(
     """Write a folder with the model; existing files of the same names are replaced.
 
     Args:
-        detector: What to export, with its thresholds as defaults.
-        folder: Created if missing.
-        kind: "stablehlo": program, weights and `load.py`, which needs jax, flatbuffers
-            and numpy only; "onnx": network, and network with decoding and NMS, for one
-            batch size; "huggingface": weights, config and model card.
-        platforms: Platforms of StableHLO, of `KNOWN_PLATFORMS`.
+        detector: Detector to export. Its thresholds and region of interest become the
+            defaults.
+        folder: Folder, which is created if missing.
+        kind: Format of the folder. All formats contain the weights, the config and a
+            model card, and "huggingface" contains only these. "stablehlo" adds the program
+            and `load.py`, which needs only jax, flatbuffers and numpy. "onnx" adds the
+            network, and the network with decoding and NMS, for one batch size.
+        platforms: Platforms of the StableHLO program, from `KNOWN_PLATFORMS`.
         with_backbone: Keep the weights of the image transformer, see `save_model`.
-        batch_size: Frames of a call; None for any number with StableHLO and 1 with ONNX.
-        half: Store float16; only of "huggingface".
+        batch_size: Number of frames per call; None means any number with StableHLO, and 1
+            with ONNX.
+        half: Store the weights as float16; only with "huggingface".
 
     Returns:
-        "bytes" of all files, and "left_out", names of variables.
+        "bytes", the size of all files in the folder, and "left_out", the names of the
+        variables that were not written.
 
     Raises:
-        UserError: An unknown kind or platform; ONNX without jax2onnx; half with
-            a program, which takes float32 weights.
+        UserError: The kind or a platform is unknown, jax2onnx is not installed for ONNX,
+            the image transformer is to be kept for ONNX, or `half` is given for a program,
+            which takes float32 weights.
     """
     require(kind in FORMATS, "format", kind, f"one of {FORMATS}")
     is_known = set(platforms) <= set(KNOWN_PLATFORMS)
@@ -123,7 +128,7 @@ def export(
 
 
 def _readme(detector: Detector, left_out: Sequence[str]) -> str:
-    """The model card, which is short: docs/deploy.md has the rest."""
+    """Return the text of the model card, which refers to docs/deploy.md for details."""
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _README.format(
@@ -145,10 +150,10 @@ def _array(*shape: Any, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
 def _exported(
     detector: Detector, batch: Any, with_backbone: bool
 ) -> tuple[dict[str, Any], tuple[Any, ...]]:
-    """Variables of a program, and shapes of its inputs.
+    """Return the variables of a program and the shapes of its inputs.
 
-    Inputs are projections, and of a radar-camera model images (embedded ones without
-    the backbone) and a dictionary of the fields of the camera.
+    The inputs are projections and, for a radar-camera model, images and a dictionary of
+    the camera's fields. Without the image transformer, the images are embedded ones.
     """
     variables = {name: dict(tree) for name, tree in detector.variables.items()}
     projection = _array(batch, *detector.grid.projection_shape)
@@ -167,7 +172,7 @@ def _exported(
 def _detect(
     detector: Detector, variables: Any, inputs: Sequence[Any], settings: Sequence[Any]
 ) -> dict[str, jax.Array]:
-    """The detector on inputs as `_exported` shapes them; the program of both formats."""
+    """Run the detector on inputs in the shapes of `_exported`, for both program formats."""
     projection, *rest = inputs
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
     given = dict(zip(SETTINGS, settings, strict=True))
@@ -182,10 +187,10 @@ def _stablehlo(
     batch_size: int | None,
     with_backbone: bool,
 ) -> bytes:
-    """The serialized program: weights, inputs, settings -> dictionary of arrays.
+    """Return the serialized program from weights, inputs and settings to detections.
 
-    The batch size is symbolic if it is None. Without the backbone the images are
-    embedded ones.
+    The result of the program is a dictionary of arrays. The batch size is symbolic if
+    `batch_size` is None. Without the backbone, the images are embedded ones.
     """
     batch = batch_size or jax.export.symbolic_shape("b")[0]
     variables, inputs = _exported(detector, batch, with_backbone)
@@ -206,7 +211,9 @@ def _stablehlo(
 def _onnx_files(
     detector: Detector, batch_size: int, with_backbone: bool
 ) -> dict[str, bytes]:
-    """`network.onnx` and, with decoding and rotated NMS, `detector.onnx`.
+    """Return the contents of the ONNX files by name.
+
+    `network.onnx` contains the network, and `detector.onnx` also decoding and rotated NMS.
 
     Raises:
         UserError: jax2onnx is not installed, or the image transformer is to be kept.
@@ -223,7 +230,9 @@ def _onnx_files(
             'format "onnx" needs jax2onnx: pip install "radejax[onnx]"'
         ) from error
 
-    if detector.takes_camera:  # no choice by platform, which does not convert
+    # With a fixed chunk size, the program does not choose by platform, which jax2onnx
+    # cannot convert.
+    if detector.takes_camera:
         config = detector.saved.config.copy_and_resolve_references()
         config.model.fusion.chunk_size = config.model.fusion.chunk_size or CHUNK_SIZE
         detector = Detector(dataclasses.replace(detector.saved, config=config))
@@ -252,7 +261,7 @@ def _onnx_files(
         )
         return model.SerializeToString()
 
-    # It warns of every shape that is not static.
+    # onnx_ir warns of every shape that is not static.
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Explicitly requested dtype float64")

@@ -1,4 +1,4 @@
-"""Boxes from radar without radejax: python load.py projection.npy [...].
+"""Detects objects in radar projections without radejax: python load.py projection.npy [...].
 
 It needs `pip install jax flatbuffers`.
 """
@@ -16,7 +16,7 @@ FOLDER = pathlib.Path(__file__).resolve().parent
 
 
 def read_file(path: pathlib.Path, sha256: str) -> bytes:
-    """Content of a file; `ValueError` if it is not what was exported."""
+    """Reads a file; raises `ValueError` if its SHA-256 differs from the exported file's."""
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != sha256:
         raise ValueError(
@@ -26,7 +26,7 @@ def read_file(path: pathlib.Path, sha256: str) -> bytes:
 
 
 def read_weights(data: bytes) -> dict[str, np.ndarray]:
-    """Arrays of a safetensors file: a JSON header, then float32 numbers."""
+    """Reads the arrays of a safetensors file: a JSON header, then float32 numbers."""
     start = 8 + int.from_bytes(data[:8], "little")
     header = {k: v for k, v in json.loads(data[8:start]).items() if k[0] != "_"}
     flat = np.frombuffer(data, "<f4", offset=start)
@@ -35,7 +35,12 @@ def read_weights(data: bytes) -> dict[str, np.ndarray]:
 
 
 def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
-    """`detect(projection, ...)` -> dictionary of arrays; see README.md."""
+    """Loads the detector of an exported folder.
+
+    Returns:
+        A function `detect(projection, ...)` that returns a dictionary of arrays. Its
+        keyword arguments `score_threshold`, `nms_iou` and `roi` replace the defaults.
+    """
     folder = pathlib.Path(folder)
     config = json.loads((folder / "config.json").read_text())
     data = {name: read_file(folder / name, x) for name, x in config["sha256"].items()}
@@ -47,7 +52,8 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
 
     def detect(*inputs, **settings):
         values = [np.asarray(x, np.float32) for x in {**defaults, **settings}.values()]
-        # Copies: on CPU device_put shares memory, which the caller may refill.
+        # On CPU, device_put shares memory with arrays that the caller may overwrite, so
+        # they are copied.
         own = jax.tree.map(np.array, inputs)
         return run(weights, jax.device_put(own, device), *values)
 

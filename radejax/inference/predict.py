@@ -1,4 +1,4 @@
-"""Detections and embedded images of whole datasets."""
+"""Detection and image embedding for whole datasets."""
 
 from __future__ import annotations
 
@@ -40,20 +40,25 @@ def predict_dataset(
     progress: bool = True,
     should_stop: Callable[[], bool] | None = None,
 ) -> dict[str, Shaped[np.ndarray, "N ..."]]:
-    """Detections on every frame, on all devices; the same on every process.
+    """Detect the objects in every frame on the devices of the detector.
+
+    Every process returns the detections of all frames.
 
     Args:
-        detector: Over the devices of several processes each reads its part of a batch.
+        detector: Detector. If its devices belong to several processes, each process reads
+            its part of every batch.
         records: Projections of the frames.
-        frames: Which frames, in which order.
-        batch_size: Frames at once; rounded up to a multiple of the devices.
-        images: Images of these frames, for a radar-camera model, see `camera_inputs`.
+        frames: Frames, in the order of the results.
+        batch_size: Number of frames per batch over all processes; rounded up to a multiple
+            of the number of devices.
+        images: Images of the frames for a radar-camera model, see `camera_inputs`.
         progress: Show a progress bar.
-        should_stop: Asked before every batch.
+        should_stop: Function that is called before every batch; returning True ends the
+            detection.
 
     Returns:
-        Columns "frame" (position in `frames`), "box", "cls", "score", by frame and
-        descending score.
+        Columns "frame" (position in `frames`), "box", "cls" and "score", sorted by frame,
+        then by descending score.
 
     Raises:
         UserError: There are no frames.
@@ -74,7 +79,7 @@ def predict_dataset(
         shuffle=False,
         num_epochs=1,
         drop_remainder=False,
-        pad_remainder=num_devices > 1,  # one device pads by itself
+        pad_remainder=num_devices > 1,  # for one device, the detector pads the batch
         process_index=jax.process_index() % count,
         process_count=count,
     )
@@ -93,7 +98,7 @@ def predict_dataset(
     show = progress and distributed.is_main()
     with tqdm.tqdm(total=len(frames), desc="detect", disable=not show) as bar:
         for found in detector.stream(batches()):
-            frame = np.asarray(started.pop(0))  # -1 where a batch was padded
+            frame = np.asarray(started.pop(0))  # -1 for frames that pad the batch
             columns = found.to_columns()
             columns["frame"] = frame[columns["frame"]]
             is_real = columns["frame"] >= 0
@@ -116,25 +121,28 @@ def embed_dataset(
     resize: bool = False,
     batch_size: int = 8,
 ) -> dict[str, int]:
-    """Write the backbone's features of every front image that has none yet.
+    """Write the backbone's features of every front image that has none in the folder yet.
 
     Args:
-        model: A `DinoRade`.
-        variables: With the backbone's parameters, `params/image_backbone`.
-        image_config: `config.model.image`, kept with the embeddings.
-        frames: Of a dataset, normally without a split.
-        folder: Folder of the embeddings; made if needed.
-        dtype: "float32", with which training is the same as from images, or "float16",
-            half the size.
-        resize: Resize images of another size than the model's.
-        batch_size: Images at once.
+        model: A `DinoRade` model.
+        variables: Variables with the backbone's parameters in `params/image_backbone`.
+        image_config: The section `config.model.image`, which is stored with the
+            embeddings.
+        frames: Frames of a dataset, normally of all splits.
+        folder: Folder of the embeddings, created if missing.
+        dtype: Dtype of the stored features: "float32", with which training gives the same
+            results as with images, or "float16", which needs half the space.
+        resize: Resize images of another size to the model's size.
+        batch_size: Number of images per batch.
 
     Returns:
-        Counts: "frames", "embedded", "found", "missing" (frames without an image).
+        The number of all "frames", of newly "embedded" images, of "found" embeddings that
+        existed before, and of "missing" images.
 
     Raises:
-        UserError: The folder has other records; no frames; an unknown dtype.
-        DataError: An image is corrupted or of another size.
+        UserError: The folder contains other records, there are no frames, or the dtype is
+            unknown.
+        DataError: An image is corrupted or, without `resize`, of another size.
     """
     if not len(frames):
         raise UserError("no frames to embed")

@@ -1,12 +1,12 @@
-"""Saved models: of a run, of an exported folder, of an official PyTorch file.
+"""Loading and saving of trained models.
 
-All of them become one `SavedModel`. An exported folder has the files that the Hugging
-Face Hub expects:
+Runs, exported folders and official PyTorch files are all loaded as a `SavedModel`. An
+exported folder has the files that the Hugging Face Hub expects:
 
     config.json          the config of the run, the grid, checksums of the other files
     model.safetensors    variables by name, "params/backbone/..."
 
-The weights of DINOv3 are never in it unless asked for: their license restricts
+It contains the weights of DINOv3 only on request, because their license restricts
 redistribution.
 """
 
@@ -55,16 +55,16 @@ Step = int | Literal["best"] | None
 
 @dataclasses.dataclass(frozen=True)
 class SavedModel:
-    """A trained model and everything it needs to be used.
+    """A trained model with its config and radar grid.
 
     Attributes:
-        config: The config it was trained with; of official weights the one that
-            corresponds to them.
+        config: Config that the model was trained with; for official weights, the
+            corresponding config.
         grid: Axes of the sensor.
-        variables: Parameters and other collections of the model, NumPy arrays.
-        step: Step of the checkpoint, or None.
+        variables: Parameters and other collections of the model as NumPy arrays.
+        step: Step of the checkpoint; None if the model is not from a checkpoint.
         run: Data, frozen weights and versions of the run, see
-            `radejax.runs.experiment.checkpoint_info`; empty for what is not a
+            `radejax.runs.experiment.checkpoint_info`; empty if the model is not from a
             checkpoint.
     """
 
@@ -85,21 +85,22 @@ def load_model(
 ) -> SavedModel:
     """Load the model of a run, a checkpoint, an exported folder or an official file.
 
-    A frozen image backbone is in no checkpoint: it is read from the files that the run
-    was trained with. If they do not exist, the model accepts embedded images only.
+    Checkpoints do not contain a frozen image backbone, so it is read from the files that
+    the run was trained with. If they do not exist, the model accepts embedded images only.
 
     Args:
         path: Workdir of a run, its `checkpoints`, one of them, a folder of
             `radejax export`, or an official file, see `load_torch`.
-        step: Step of the checkpoint, with a workdir or its `checkpoints`.
+        step: Step of the checkpoint, or "best"; the latest if None. Only for a workdir
+            or its `checkpoints`.
         image_backbone: Weights of the image backbone, instead of those of the run: the
             DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
 
     Raises:
         FileNotFoundError: There is no model, or no such checkpoint.
-        UserError: A step of what holds one model only; the backbone is not the one that
-            the run was trained with.
-        DataError: A file is corrupted, or config and weights do not fit.
+        UserError: A step is given, but the path contains one model only; or the backbone
+            is not the one that the run was trained with.
+        DataError: A file is corrupted, or config and weights do not fit each other.
     """
     path = pathlib.Path(path).absolute()
     if not path.exists():
@@ -119,16 +120,17 @@ def load_torch(
     image_backbone: PathLike | None = None,
     **model_overrides: Any,
 ) -> SavedModel:
-    """Load official RADE-Net or DinoRADE weights, on the grid of K-Radar.
+    """Load official RADE-Net or DinoRADE weights on the grid of K-Radar.
 
     Args:
         path_or_state_dict: `.pth`, `.pt` or `.safetensors` file, or a mapping of names
-            to arrays. Names that begin with `rad_backbone.` are DinoRADE's.
+            to arrays. If any name begins with `rad_backbone.`, the weights are DinoRADE's.
         image_backbone: Folder of DINOv3, for a DinoRADE file without its weights.
-        **model_overrides: Fields of the model that names and shapes do not determine.
+        **model_overrides: Fields of the model that cannot be derived from the names and
+            shapes of the arrays.
 
     Raises:
-        UserError: An image backbone is given, and the model is RADE-Net.
+        UserError: An image backbone is given, but the model is RADE-Net.
         DataError: Tensors are missing, unexpected or of another shape.
     """
     parts = radenet_torch.PART, dinorade_torch.PART
@@ -162,21 +164,22 @@ def save_model(
     half: bool = False,
     programs: Mapping[str, bytes] | None = None,
 ) -> dict[str, Any]:
-    """Write `config.json` and `model.safetensors`.
+    """Write a model to a folder as `config.json` and `model.safetensors`.
 
     Args:
-        saved: What to write.
-        folder: Created if missing; existing files of the same names are replaced.
+        saved: Model to write.
+        folder: Folder, which is created if missing. Existing files of the same names are
+            replaced.
         with_backbone: Keep the weights of the image transformer.
-        half: Store float16; `load_model` returns float32.
-        programs: Further files by name.
+        half: Store weights as float16; `load_model` converts them to float32.
+        programs: Contents of further files by name.
 
     Returns:
         The content of `config.json`.
 
     Raises:
-        UserError: The image transformer was trained, so that the model is incomplete
-            without its weights.
+        UserError: The image transformer was fine-tuned, so that the model is incomplete
+            without its weights, and `with_backbone` is False.
     """
     folder = pathlib.Path(folder)
     variables = {name: dict(tree) for name, tree in saved.variables.items()}
@@ -216,7 +219,7 @@ def save_model(
 
 
 def _read_exported(folder: pathlib.Path) -> SavedModel:
-    """Inverse of `save_model`."""
+    """Read a folder that `save_model` wrote."""
     path, weights = folder / CONFIG_FILE, folder / WEIGHTS_FILE
     content = files.read_object(path)
     data, kind = weights.read_bytes(), content.get("format")
@@ -236,7 +239,7 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
         names, count = config.classes, config.model.num_classes
         require(len(names) == count, "config.classes", names, f"{count} classes")
         return saved
-    # What a config that was edited by hand makes ConfigDict and the constructors raise.
+    # ConfigDict and the constructors raise these for a config that was edited by hand.
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: {error}") from None
 
@@ -249,7 +252,7 @@ def _is_checkpoint(path: pathlib.Path) -> bool:
 
 
 def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
-    """Model of a workdir, its `checkpoints`, or one of them."""
+    """Read the model of a workdir, its `checkpoints`, or one of them."""
     if _is_checkpoint(path):
         folder, step = path.parent, int(path.name)
     elif (path / "checkpoints").is_dir():
@@ -275,9 +278,10 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
 
 
 def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
-    """The same with the weights of its image backbone, where they are available.
+    """Add the weights of the image backbone to a model, if they are available.
 
-    In this order: what is given, what the run was trained with, what it started from.
+    They are read from the given file or folder, else from the one that the run was
+    trained with, else from the weights that the run started from.
     """
     params, data = saved.variables["params"], saved.config.data
     is_complete = IMAGE_BACKBONE in params
@@ -309,11 +313,11 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
 
 @dataclasses.dataclass(frozen=True)
 class StartingWeights:
-    """What a training starts from instead of random weights.
+    """Weights that a training starts from instead of random ones.
 
     Attributes:
-        variables: Variables of the whole model, or None.
-        pretrained: A part that replaces random weights, or None.
+        variables: Variables of the whole model; None to initialize them randomly.
+        pretrained: Part of the variables that replaces initialized ones, or None.
         frozen_sha256: Checksum of the frozen image backbone; None if there is none.
     """
 
@@ -328,18 +332,19 @@ def starting_weights(
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
 ) -> StartingWeights:
-    """Read the weights that are to be trained further or to stay frozen.
+    """Read the weights that a training starts from, including frozen ones.
 
     Args:
-        config: `config.model`.
-        init_from: What `load_model` takes; None initializes all weights randomly.
+        config: The section `config.model`.
+        init_from: Path of a model that `load_model` accepts; None initializes all weights
+            randomly, except those of the image backbone.
         image_backbone_path: Weights of the image backbone, see
             `image_backbone.load_image_backbone`.
-        embeddings_sha256: Checksum of the weights that the embeddings of `radejax
-            embed` are from, which replace the frozen part.
+        embeddings_sha256: Checksum of the weights with which `radejax embed` computed the
+            embeddings that replace the frozen backbone; None without embeddings.
 
     Raises:
-        UserError: They do not fit the model; names what differs.
+        UserError: The weights do not fit the model; the message names the differences.
     """
     model: Any = models.build(config)
     variables = pretrained = digest = None
@@ -358,7 +363,7 @@ def starting_weights(
 
 
 def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
-    """Weights of another run or an official file, which must fit `config.model`."""
+    """Read the weights of another run or an official file, which must fit `config.model`."""
     wanted = json.loads(config.to_json())
     if pathlib.Path(path).is_dir():
         other = load_model(path)

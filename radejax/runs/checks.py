@@ -33,11 +33,11 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
 from radejax.simulation.config import SimulationConfig, default_config
 
-_SEED = integer(0, 2**32 - 2)  # of 32 bits; a training uses the next one too
+_SEED = integer(0, 2**32 - 2)  # 32 bits; the training also uses the next integer
 _VERSIONS = one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
 _SEQUENCES = several(integer(1), "different sequence numbers; () for all")
 
-# What no constructor checks, or only one that reads data.
+# Fields that no constructor checks, or only one that reads data.
 _RUN = {
     "seed": _SEED,
     "classes": several(one_of(*LABEL_CLASSES), f"different classes of {LABEL_CLASSES}"),
@@ -91,15 +91,15 @@ _GRID = dict.fromkeys(("num_doppler", "num_range", "num_elevation"), _SIZE)
 _GRID |= {"num_azimuth": _SIZE, "max_range_m": POSITIVE}
 _KINDS: dict[type, Any] = {float: int | float, tuple: tuple | list}
 _OPTIONAL = ("data.visibility", "evaluation.roi", "train.checkpoints_to_keep")
-# Sections of some configs, whose names are checked by what they construct.
+# Sections that not every config has. Their constructors check the names of the fields.
 _OWN_NAMES = ("model.", "loss.weights.", "data.camera", "simulation")
 
 
 def check(config: ConfigDict) -> None:
-    """Constructs what each section configures; nothing is read or written.
+    """Checks a config by constructing the objects that its sections configure.
 
-    What needs data is checked later: whether a warm-up is shorter than the training,
-    for example.
+    No data are read or written. Conditions that depend on the data, such as a warm-up that
+    is shorter than the training, are checked later.
 
     Raises:
         UserError: A field is missing, unknown, of another type or out of its range.
@@ -126,7 +126,7 @@ def check(config: ConfigDict) -> None:
 
 
 def _check_pairs(config: ConfigDict) -> None:
-    """What one field requires of another."""
+    """Checks conditions between two fields."""
     name, count = "config.model.num_classes", config.model.num_classes
     classes = f"{len(config.classes)}, the number of config.classes"
     require(count == len(config.classes), name, count, classes)
@@ -144,7 +144,13 @@ def _check_pairs(config: ConfigDict) -> None:
 
 
 def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
-    """Raises `UserError` unless `config.model` is made for a radar, that of `source`."""
+    """Raises `UserError` if the Doppler or elevation bins of a model and a grid differ.
+
+    Args:
+        model: The section `config.model`.
+        grid: Grid of the radar.
+        source: Description of the radar for the error message.
+    """
     for name in ("doppler", "elevation"):
         bins, expected = model[f"{name}_bins"], getattr(grid, f"num_{name}")
         text = f"{expected}, as {source} has"
@@ -161,7 +167,7 @@ def _check_simulation(config: ConfigDict) -> None:
 
 
 def _check_fields(config: ConfigDict) -> None:
-    """Names of the fields that every config has, and types of all."""
+    """Checks the names of the fields that every config has, and the types of all fields."""
     reference = load_config("dinorade").unlock()
     reference.simulation = ConfigDict(default_config())
     found, known = dict(fields_of(config)), dict(fields_of(reference))
@@ -176,7 +182,7 @@ def _check_fields(config: ConfigDict) -> None:
             value = config_path.get_value(name, config)
         except (KeyError, TypeError):  # a section that this config does not have
             continue
-        if kind is type(None):  # any value; checked by what is constructed
+        if kind is type(None):  # any type is allowed here; the constructors check it
             continue
         is_fine = isinstance(value, _KINDS.get(kind, kind))
         is_fine = is_fine and isinstance(value, bool) == (kind is bool)

@@ -1,4 +1,4 @@
-"""The data of a run: where they are, and one object that gives frames and batches."""
+"""Paths of a run's data, and the class `Data` that provides its frames and batches."""
 
 from __future__ import annotations
 
@@ -36,22 +36,25 @@ _log = logging.getLogger(__name__)
 
 
 class Data:
-    """Frames, records and cameras of a run, opened once; nothing is written.
+    """Frames, records and cameras of a run.
+
+    Creating the object writes nothing; only `preprocess` does.
 
     Args:
-        config: Config of the run, see `located`.
-        model: What `config.model` describes.
+        config: Config of the run with absolute paths, see `located`.
+        model: The model that `config.model` describes.
 
     Attributes:
-        options: `config.data`.
-        frames: All frames, with the labels that the config asks for.
-        classes: Names in the order of the class indices.
-        camera: How images and calibrations are used; None for radar-only models.
+        options: The section `config.data`.
+        frames: All frames, with the labels that the config selects.
+        classes: Class names in the order of the class indices.
+        camera: Options that define how images and calibrations are used; None for
+            radar-only models.
         features: Embedded images, or None.
 
     Raises:
-        UserError: Embeddings are given and another backbone made them, or the model
-            has none.
+        UserError: Embeddings are given, but another backbone computed them, the model
+            has no frozen image backbone, or frames are mirrored.
         FileNotFoundError: A folder is missing.
     """
 
@@ -90,12 +93,13 @@ class Data:
         )
 
     def preprocess(self) -> None:
-        """Write the records that are missing, on one process while others wait.
+        """Write the missing records on the main process while the others wait.
 
         `split` then leaves out frames whose radar tensor is missing or corrupted.
 
         Raises:
-            UserError: No frames, records of something else, or no space left.
+            UserError: There are no frames, the folder contains records of another kind,
+                or no space is left on the disk.
         """
         report = distributed.main_only(
             lambda: records.preprocess(self.frames, self.options.records)
@@ -112,14 +116,18 @@ class Data:
         return records.open_projections(self.options.records, self.frames.grid)
 
     def split(self, name: str, *, may_be_empty: bool = False) -> LabelledFrames:
-        """Frames of "train", "validation", "test", "all" or a split file.
+        """Return the frames of a split.
 
-        Without those that `preprocess` skipped, which are counted.
-        Sequences that `options.validation` holds out of "train" are "validation".
+        Frames that `preprocess` skipped are left out and counted. The sequences that
+        `options.validation` holds out of "train" form the split "validation".
+
+        Args:
+            name: "train", "validation", "test", "all" or the path of a split file.
+            may_be_empty: Return a split without frames instead of raising an error.
 
         Raises:
-            UserError: No such split, no frames in it unless it `may_be_empty`, or
-                sequences to hold out that are not there.
+            UserError: There is no such split, it has no frames, or the sequences to hold
+                out do not exist or leave none to train on.
         """
         if name not in self._splits:
             if name in ("train", "validation"):
@@ -135,7 +143,11 @@ class Data:
         return self._splits[name]
 
     def _part_of_train(self, name: str) -> LabelledFrames:
-        """What the train split leaves to train on, or what is held out of it."""
+        """Return the part of the train split that is trained on, or is held out.
+
+        Args:
+            name: "train" or "validation".
+        """
         frames = self.frames.of_split("train")
         chosen = self.options.validation
         if name == "validation" and not chosen:
@@ -153,11 +165,14 @@ class Data:
 
     @property
     def choosing_split(self) -> str:
-        """By which the best checkpoint is chosen: "validation", "test" without one."""
+        """Split on which the best checkpoint is chosen.
+
+        It is "validation" if sequences are held out of the train split, else "test".
+        """
         return "validation" if self.options.validation else "test"
 
     def images(self, frames: FrameSequence) -> pipeline.CameraInputs | None:
-        """Images and cameras of frames; None for a model without a camera.
+        """Return the images and cameras of frames, or None for a radar-only model.
 
         Raises:
             UserError: Images or calibrations are missing or of another size.
@@ -170,16 +185,16 @@ class Data:
     def training_batches(
         self, frames: FrameSequence, train: ConfigDict, seed: int
     ) -> grain.DatasetIterator[Batch]:
-        """An endless, shuffled, checkpointable iterator over batches of this process.
+        """Return an endless, shuffled, checkpointable iterator over this process's batches.
 
         Args:
-            frames: To train on.
-            train: `config.train`.
-            seed: Of order and augmentation.
+            frames: Frames to train on.
+            train: The section `config.train`.
+            seed: Seed of the order and the augmentation.
 
         Raises:
-            UserError: As `images`, or no frame has a usable one; fewer frames than one
-                batch.
+            UserError: Images or calibrations are missing or of another size, no frame has
+                a usable image, or there are fewer frames than one batch needs.
         """
         images, options = self.images(frames), self.options
         pipeline.require_images(frames, images)
@@ -204,12 +219,16 @@ class Data:
 
 
 def located(config: ConfigDict) -> ConfigDict:
-    """A copy of a config whose `config.data` has absolute paths, roots and records.
+    """Return a copy of a config with absolute paths in `config.data`.
+
+    By default, the roots are the folder of the simulated dataset, and the records are
+    below the first root.
 
     Raises:
-        UserError: Neither data nor a simulation is given.
-        FileNotFoundError: A path of `config.data` does not exist, except the data that
-            are simulated and the records, which are made.
+        UserError: Neither data nor a simulation is given, or a simulation has several
+            roots.
+        FileNotFoundError: A path of `config.data` does not exist. The records and
+            simulated data may be missing, because a run creates them.
     """
     config = config.copy_and_resolve_references()
     options, is_simulated = config.data, "simulation" in config
@@ -236,7 +255,7 @@ def _check_exist(paths: Iterable[str | None]) -> None:
 
 
 def _simulated_root(simulation: ConfigDict) -> str:
-    """Folder of a simulated dataset, named by its config."""
+    """Return the folder of a simulated dataset, whose name contains a hash of its config."""
     text = json.dumps(json.loads(simulation.to_json()), sort_keys=True)
     return f"data/simulated-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
@@ -247,36 +266,40 @@ def _set_paths(options: ConfigDict, roots: Iterable[str]) -> None:
     paths = {name: options[name] for name in DATA_PATHS if name != "roots"}
     paths["records"] = paths["records"] or pathlib.Path(roots[0], "records")
     absolute = {n: x and str(pathlib.Path(x).absolute()) for n, x in paths.items()}
-    with options.ignore_type():  # tuples are lists in the config of a checkpoint
+    with options.ignore_type():  # a checkpoint's config has lists instead of tuples
         options.update(absolute, roots=roots)
     _check_exist([options.camera_calibration])
 
 
 def simulate_missing(config: ConfigDict) -> None:
-    """Simulate the dataset of a located config that has a `simulation` section."""
+    """Simulate the dataset of a config if it has a `simulation` section.
+
+    Args:
+        config: Config of the run with absolute paths, see `located`.
+    """
     if "simulation" in config:
         values, root = dict(config.simulation), config.data.roots[0]
         distributed.main_only(lambda: simulate_dataset(values, root))
 
 
 def open_data(config: ConfigDict, model: nn.Module) -> Data:
-    """Simulate if the config says so, preprocess what has no record yet, open all.
+    """Simulate the data if the config requires it, write missing records, and open all.
 
-    One process of several writes before the others read.
+    With several processes, the main process writes the files before the others read them.
 
     Args:
-        config: Config of the run, see `located`.
-        model: What `config.model` describes.
+        config: Config of the run with absolute paths, see `located`.
+        model: The model that `config.model` describes.
 
     Raises:
-        UserError: Another backbone made the embeddings, no frames to train on, or no
-            space is left.
+        UserError: Another backbone computed the embeddings, the radar does not fit the
+            model, there are too few frames to train on, or no space is left on the disk.
         FileNotFoundError: A folder is missing.
     """
     simulate_missing(config)
     data = Data(config, model)
     _log.info("%s", data.frames.summary().to_text())
-    # Preprocessing takes long.
+    # Preprocessing can take hours, so the data are checked before it.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
     pipeline.check_enough(len(data.split("train")), config.train.batch_size)
     data.preprocess()
@@ -295,14 +318,19 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
 def data_of_run(
     saved: SavedModel, changes: Mapping[str, Any] | None = None
 ) -> tuple[ConfigDict, Data]:
-    """The config of a run with changes of `config.data`, and these data.
+    """Return the config of a run with changes of `config.data`, and the data it describes.
 
-    Other roots have labels, records, embeddings and calibrations of their own, and are
-    taken whole, unless `changes` say otherwise. Nothing is preprocessed.
+    If `changes` replace the roots, the labels, records, embeddings, calibrations and the
+    image backbone of the run are not used, and all sequences and weather conditions are
+    selected, unless `changes` contain these fields too. Nothing is preprocessed.
+
+    Args:
+        saved: Model of the run.
+        changes: Fields of `config.data` to replace.
 
     Raises:
-        UserError: The run has no data and none are given, or they are of another radar
-            grid.
+        UserError: The run has no data and none are given, or the data are of another
+            radar grid.
         FileNotFoundError: A folder is missing.
     """
     config = saved.config.copy_and_resolve_references()
@@ -328,7 +356,11 @@ def data_of_run(
 
 
 def data_name(changes: Mapping[str, Any]) -> str:
-    """Name of results on other data: folder, labels, sequences and weather."""
+    """Return a name for results on other data from the changed fields of `config.data`.
+
+    It consists of the names of the first root and the labels, the sequences and the
+    weather, or is "other" if none of them is changed.
+    """
     parts = [pathlib.Path(path).resolve().name for path in changes.get("roots", ())[:1]]
     if changes.get("labels") is not None:
         parts.append(pathlib.Path(changes["labels"]).resolve().stem)

@@ -1,4 +1,4 @@
-"""Evaluation of a model on data: detect on a split, evaluate, tabulate, draw."""
+"""Evaluation of a model on a split: detections, metrics, tables and figures."""
 
 from __future__ import annotations
 
@@ -40,17 +40,16 @@ _log = logging.getLogger(__name__)
 
 
 class Evaluation:
-    """Detections of a model on a split, and what they score.
+    """Evaluation of a model's detections on a split.
 
     Every process takes part in the predictions.
 
     Args:
-        config: Of the run; `evaluation`, `decode`, `logging` and `train.best_metric` are
-            read.
-        data: To evaluate on.
-        split: "test", "validation", "train", "all" or a split file.
-        shuffle_images: Seed; see `evaluate_run`.
-        mesh: All devices if None.
+        config: Config of the run.
+        data: Data to evaluate on.
+        split: "test", "validation", "train", "all" or the path of a split file.
+        shuffle_images: Seed for shuffling the images, or None; see `evaluate_run`.
+        mesh: Devices for the predictions; all devices if None.
         **changes: Fields of `EvaluationOptions` to replace.
 
     Raises:
@@ -85,7 +84,15 @@ class Evaluation:
     def predict(
         self, variables: Mapping[str, Any], **options: Any
     ) -> dict[str, np.ndarray]:
-        """Columns of all boxes that are stored; `options` are of `predict_dataset`."""
+        """Detect objects in all frames of the split.
+
+        Args:
+            variables: Variables of the model.
+            **options: Keyword arguments of `predict_dataset`.
+
+        Returns:
+            Columns of the boxes whose score reaches `min_score`, see `predict_dataset`.
+        """
         return predict_dataset(
             self._detector.replace(variables=variables),
             self._data.records,
@@ -100,12 +107,17 @@ class Evaluation:
         variables: Mapping[str, Any],
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
-        """Scores of the variables of a model, during training.
+        """Evaluate the variables of a model during training.
 
         Every process computes the same numbers.
 
+        Args:
+            variables: Variables of the model.
+            should_stop: Function that is called before every batch; returning True ends
+                the evaluation.
+
         Raises:
-            distributed.Stopped: `should_stop`, asked at every batch, said so.
+            distributed.Stopped: `should_stop` returned True.
         """
         predictions = self.predict(variables, progress=False, should_stop=should_stop)
         options = dataclasses.replace(self._options, bootstrap=0)
@@ -134,14 +146,14 @@ class Evaluation:
         step: int | None = None,
         run: str | None = None,
     ) -> Report | None:
-        """Detect, and write the tables and figures of an evaluation.
+        """Detect objects, and write the tables and figures of an evaluation.
 
         Args:
-            variables: Of the model.
-            workdir: Of the run.
+            variables: Variables of the model.
+            workdir: Workdir of the run.
             out: Folder of the results; `evaluation` in the workdir if None.
-            step: Of the variables, for `source.json`.
-            run: Name of the run in the report; that of the workdir if None.
+            step: Step of the variables, which is written to `source.json`.
+            run: Name of the run in the report; the workdir's name if None.
 
         Returns:
             The report that was written; None on all processes except the first.
@@ -171,7 +183,7 @@ class Evaluation:
     def _write_camera_share(
         self, variables: Mapping[str, Any], path: pathlib.Path
     ) -> None:
-        """Writes the weight of the camera by weather, of some frames."""
+        """Write the mean weight of the camera by weather, computed on up to 256 frames."""
         model, some = self._detector.model, figures.spread(self._frames, 256)
         maps = figures.frame_shares(model, variables, self._data, some)
         shares = ((frame.weather, share) for frame, share in maps)
@@ -181,7 +193,7 @@ class Evaluation:
     def _write_figures(
         self, predictions: Columns, workdir: pathlib.Path, folder: pathlib.Path
     ) -> None:
-        """Writes figures of frames, one of all weathers, and the curves of the run."""
+        """Write figures of frames, a figure of all weathers, and the loss curves."""
         frames = self._frames
         suffix = ", simulated" if frames.is_simulated else ""
         for name, figure in self._figures(
@@ -201,9 +213,10 @@ class Evaluation:
                 save_figure(figure, folder / "training.png")
 
     def _scene(self, predictions: Columns, index: int, **fields: Any) -> Scene:
-        """The frame at a position of the split with its boxes and image.
+        """Return the scene of a frame with its boxes and image.
 
-        Predictions from `decode.score_threshold` on, as in use of the detector.
+        Predictions are drawn if their score reaches `config.decode.score_threshold`, the
+        default of the detector.
         """
         frame, records, found = self._frames[index], self._data.records, predictions
         threshold = self._config.decode.score_threshold
@@ -223,7 +236,7 @@ class Evaluation:
     def _figures(
         self, predictions: Columns, count: int
     ) -> Iterator[tuple[str, Figure]]:
-        """Figures of frames with objects, always of the same, spread over the split."""
+        """Yield names and figures of a fixed selection of the split's frames with objects."""
         candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
         for index in figures.spread(candidates, count):
             frame = self._frames[index]
@@ -243,20 +256,21 @@ def evaluate_run(
     run: str | None = None,
     **changes: Any,
 ) -> Report | None:
-    """Evaluate a run's checkpoint as its config says, on all devices.
+    """Evaluate a checkpoint of a run with the settings of its config, on all devices.
 
     Args:
-        workdir: Of `train.py`.
-        step: Checkpoint step or "best"; the latest if None.
-        split: "test", "validation", "train", "all" or a split file.
-        out: Folder of the results; `evaluation` in the workdir if None,
-            `evaluation_<name>` for other data, and with `_validation` for that split.
+        workdir: Workdir of `train.py`.
+        step: Step of the checkpoint, or "best"; the latest if None.
+        split: "test", "validation", "train", "all" or the path of a split file.
+        out: Folder of the results. If None, it is `evaluation` in the workdir, or
+            `evaluation_<name>` for other data, with `_validation` appended for that split.
         image_backbone: Weights of a frozen backbone, see `load_model`.
-        shuffle_images: Seed; every frame gets the image and camera of another one, a
-            sanity check of what a radar-camera model takes from the images. The default
-            `out` then ends in `_shuffled`.
+        shuffle_images: Seed with which every frame with an image gets the image and
+            camera of another frame, or None. This is a sanity check of how much a
+            radar-camera model uses the images. `_shuffled` is appended to the default
+            `out`.
         other: Fields of `config.data` to replace, such as `{"roots": ("/data",)}`.
-        run: Name of the run in the report; that of the workdir if None.
+        run: Name of the run in the report; the workdir's name if None.
         **changes: Fields of `EvaluationOptions` to replace.
 
     Returns:
@@ -264,8 +278,9 @@ def evaluate_run(
 
     Raises:
         UserError: The split has no frames, or too few images to shuffle; the run has no
-            data and none are given; other data do not fit the run, or `out` has results
-            on others. Or a change out of its range.
+            data and none are given; other data do not fit the run; the default folder of
+            their results contains results on different data; or a change is out of its
+            range.
     """
     saved = load_model(workdir, step=step, image_backbone=image_backbone)
     workdir = pathlib.Path(workdir).absolute()
@@ -305,7 +320,7 @@ def evaluate_run(
 def source_of(
     data: Data, split: str, shuffle_images: int | None = None
 ) -> dict[str, Any]:
-    """Description of what results are of, plain values."""
+    """Return a description of the data and split of results as plain values."""
     return {
         "split": split,
         "shuffle_images": shuffle_images,
@@ -315,7 +330,7 @@ def source_of(
 
 
 def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
-    """Raise `UserError` if a folder has results on other data than these."""
+    """Raise `UserError` if a folder contains results on other data than `source`."""
     if not (out / "source.json").exists():
         return
     found = files.read_object(out / "source.json")
@@ -326,7 +341,14 @@ def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
 
 
 def with_shuffled_images(data: Data, split: str, seed: int) -> list[LabelledFrame]:
-    """The frames of a split, each with the image and calibration of another one.
+    """Return the frames of a split with images and calibrations shuffled among them.
+
+    Every frame that has an image gets the image and calibration of another one.
+
+    Args:
+        data: Data of the run.
+        split: Name of the split, see `Data.split`.
+        seed: Seed of the permutation.
 
     Raises:
         UserError: The model has no camera, or fewer than two frames have an image.

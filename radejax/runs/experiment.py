@@ -1,15 +1,15 @@
-"""A whole run: data, training, evaluation, for one seed or several.
+"""Complete runs of data preparation, training and evaluation, for one seed or several.
 
 The workdir of a run contains
 
-config.json      the configuration without the paths of the data, which checkpoints
-                 contain; it never changes after the first checkpoint
-run.json         versions, command, weights that training started from
-checkpoints/     newest, best and last, by step
-metrics.jsonl    losses by step; tensorboard/ has the same
-evaluation/      metrics.json, metrics.csv, tables, figures of the last evaluation;
-                 evaluation_<name>/ of one on other data, described by its source.json
-lock             held by the training that is running
+config.json      the configuration without the paths of the data, which the checkpoints
+                 contain; it does not change after the first checkpoint
+run.json         versions, command, weights that the training started from
+checkpoints/     the newest checkpoints and the best one, by step
+metrics.jsonl    losses by step; tensorboard/ has the same values
+evaluation/      metrics.json, metrics.csv, tables and figures of the last evaluation;
+                 evaluation_<name>/ has those on other data, described by its source.json
+lock             lock file, which the running training holds
 """
 
 from __future__ import annotations
@@ -59,20 +59,23 @@ def run(
     init_from: PathLike | None = None,
     profile: PathLike = "",
 ) -> pathlib.Path:
-    """Trains and evaluates; called again, it continues where it stopped.
+    """Trains and evaluates a model, or continues an interrupted run.
 
     Args:
-        config: Complete configuration of one seed; `run_seeds` takes several.
+        config: Complete configuration of one seed; `run_seeds` runs several.
         workdir: Folder of the run, created if missing.
-        init_from: Weights to start from: official .pth file or another workdir.
-        profile: Folder for a trace of the steps `config.logging.profile_steps`.
+        init_from: Weights to start from: an official checkpoint file, another workdir, or
+            another model that `load_model` accepts.
+        profile: Folder for a profiler trace of the steps `config.logging.profile_steps`;
+            empty for no trace.
 
     Returns:
-        The workdir.
+        The absolute path of the workdir.
 
     Raises:
-        UserError: A field of the config is out of its range, the workdir belongs to
-            another configuration or is in use, no data, or no space.
+        UserError: A field of the config is out of its range, the workdir belongs to a run
+            with another configuration or is in use, there are no data, or no space is
+            left on the disk.
         FileNotFoundError: A path does not exist.
     """
     checks.check(config)
@@ -139,13 +142,14 @@ def run(
 
 @contextlib.contextmanager
 def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
-    """Locks a workdir, which is created if missing, for a training with a config.
+    """Locks a workdir for a training with a config while a block runs.
 
-    A folder without a checkpoint takes the config that is given.
+    The workdir is created if missing. If it has no checkpoint yet, the given config
+    replaces the one in it.
 
     Raises:
-        UserError: Another process holds it, or it belongs to a run with another
-            configuration; names the fields that differ.
+        UserError: Another process holds the lock; or the workdir belongs to a run with
+            another configuration, in which case the message names the fields that differ.
     """
     path = workdir / "config.json"
     message = (
@@ -174,9 +178,12 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
 def run_info(
     workdir: pathlib.Path, init_from: PathLike | None = None
 ) -> dict[str, Any]:
-    """Versions, command and starting weights of a run; plain values.
+    """Returns the versions, device, command and starting weights of a run as plain values.
 
-    A run that continues keeps the weights that it started from.
+    Args:
+        workdir: Workdir of the run.
+        init_from: Weights that the run starts from. If None, the entry of an existing
+            `run.json` is kept.
     """
     if init_from is not None:
         init_from = str(pathlib.Path(init_from).absolute())
@@ -197,22 +204,22 @@ def checkpoint_info(
     run: Mapping[str, Any],
     same: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Plain values of every checkpoint of a run; `inference.saved` reads them.
+    """Returns the plain values in every checkpoint of a run, which `inference.saved` reads.
 
     Args:
-        config: Of the run.
-        grid: Of the sensor.
-        run: See `run_info`.
-        same: Values by name that a run that continues must not change.
+        config: Config of the run.
+        grid: Grid of the sensor.
+        run: Result of `run_info`.
+        same: Values by name that must not change when the run continues.
     """
     values = {"config": json.loads(config.to_json()), "grid": grid.to_dict()}
     return {**values, "run": dict(run), "same": dict(same)}
 
 
 def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, Any]:
-    """Properties of the data and frozen weights that a run must not change.
+    """Returns properties of the data and frozen weights that a run must not change.
 
-    Folders may move, therefore frames are compared by their keys and the frozen
+    Folders may move. Therefore frames are identified by their keys, and the frozen
     backbone by its weights.
     """
     keys = "\n".join(frame.key for frame in frames)
@@ -233,24 +240,25 @@ _KEYS = ("protocol", "condition", "cls", "space", "iou")
 def run_seeds(
     config: ConfigDict, workdir: PathLike, seeds: Sequence[int], **options: Any
 ) -> pathlib.Path:
-    """Runs a config with every seed, one after the other.
+    """Runs a config with several seeds, one after the other.
 
-    Only `config.seed` changes: weights, order of the frames and augmentation. A
-    simulated dataset has a seed of its own. Called again, finished seeds are evaluated
-    again and the others continue.
+    Only `config.seed` differs between the runs, which determines the initial weights, the
+    order of the frames, dropout and augmentation. A simulated dataset has its own seed.
+    When the function is called again, finished seeds are evaluated again and the others
+    continue.
 
     Args:
-        config: Of the runs.
-        workdir: Contains `seed0`, `seed1`, ... and the summary.
-        seeds: Two or more, all different.
+        config: Config of the runs.
+        workdir: Folder of the runs `seed0`, `seed1`, ... and the summary.
+        seeds: Seeds, all different.
         **options: Further arguments of `run`.
 
     Returns:
-        The workdir. `seeds.json` and `seeds.txt` in it have mean and standard deviation
-        of the seeds that are finished.
+        The absolute path of the workdir. Its files `seeds.json` and `seeds.txt` contain
+        the mean and standard deviation over the finished seeds.
 
     Raises:
-        UserError: Two seeds are equal; and as `run`.
+        UserError: Two seeds are equal, or `run` raises it.
     """
     require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
     workdir, tables = pathlib.Path(workdir).absolute(), {}
@@ -276,7 +284,15 @@ def run_seeds(
 def _write_summary(
     workdir: pathlib.Path, tables: dict[str, dict[tuple[str, ...], float]]
 ) -> None:
-    """Mean, standard deviation (n - 1; None for one seed) and values of common APs."""
+    """Writes mean, standard deviation and values of the APs that all seeds have.
+
+    The standard deviation is the sample standard deviation with n - 1, and None for one
+    seed.
+
+    Args:
+        workdir: Folder of `seeds.json` and `seeds.txt`.
+        tables: APs by seed and by the values of `_KEYS`.
+    """
     rows, lines = [], []
     first, *others = tables.values()
     for key in (key for key in first if all(key in table for table in others)):

@@ -1,4 +1,4 @@
-"""Figures of a run: frames with boxes, losses, and how much fusion uses the camera."""
+"""Figures of a run: frames with boxes, loss curves, and the camera's weight in the fusion."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from radejax.visualize.style import Scene
 def frame_scene(
     frame: LabelledFrame, projection: Any, grid: RadarGrid, **fields: Any
 ) -> Scene:
-    """Scene of a labelled frame: its boxes, image, calibration and title.
+    """Create the scene of a labelled frame with its boxes, image, calibration and title.
 
     Args:
-        frame: The frame.
-        projection: Its `[R, A, D+E]` projection.
+        frame: Frame to draw.
+        projection: Projection `[R, A, D+E]` of the frame.
         grid: Grid of the projection.
         **fields: Other fields of `Scene`, such as `predictions` and `roi`.
     """
@@ -39,9 +39,9 @@ def frame_scene(
 
 
 def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
-    """Position of the frame with the most objects of each weather, as tables order them.
+    """Return the position of the frame with the most objects for each weather.
 
-    Unknown weathers come last.
+    The weathers are in the order of the tables, and unknown ones come last.
     """
     fullest: dict[str, int] = {}
     for i, frame in enumerate(frames):
@@ -53,7 +53,7 @@ def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
 
 
 def spread(values: Any, count: int) -> list[Any]:
-    """At most `count` items, evenly spaced."""
+    """Return at most `count` evenly spaced items of a sequence."""
     places = np.linspace(0, len(values) - 1, min(count, len(values)))
     return [values[int(i)] for i in np.round(places)]
 
@@ -64,16 +64,16 @@ def frame_shares(
     data: Data,
     frames: FrameSequence,
 ) -> Iterator[tuple[LabelledFrame, Float[np.ndarray, "R A"]]]:
-    """Every frame with the weight of the camera in the fused map, in [0, 1].
+    """Yield every frame with a map of the camera's weight in the fusion, in [0, 1].
 
-    0 in bins that no query sees in the image, and everywhere without an image. The maps
-    are padded as the model's are.
+    The weight is 0 in bins without a query that projects into the image, and everywhere
+    if the frame has no image. The maps include the padding of the model's maps.
 
     Args:
         model: Radar-camera detector.
         variables: Variables of the model.
-        data: Data of the run, or other data.
-        frames: Frames of the data.
+        data: Data that the frames belong to.
+        frames: Frames to compute the maps for.
     """
     images = data.images(frames)
     assert images is not None  # the model has a camera
@@ -94,18 +94,20 @@ def frame_shares(
 def average_shares(
     shares: Iterable[tuple[str, Float[np.ndarray, "R A"]]], grid: RadarGrid
 ) -> dict[str, dict[str, Any]]:
-    """Mean weight of the camera by group, "all" first, over what the camera sees.
+    """Compute the mean weight of the camera by group over the bins in its view.
 
-    A bin that no query sees in the image has weight 0, which says nothing about the
-    gate: every bin is averaged over the frames that have it in view.
+    Bins without a query that projects into the image have weight 0, which is not an output
+    of the gate. Therefore every bin is first averaged over the frames that have it in view,
+    then the mean over these bins is taken.
 
     Args:
         shares: Group and map of every frame.
-        grid: Of the maps without their padding.
+        grid: Grid of the maps without their padding.
 
     Returns:
-        By group the "mean" over bins in view, None without any, and the number of
-        "frames" with anything in view, that is, with an image.
+        A dictionary per group, with the group "all" first. "mean" is the mean over the
+        bins in view, or None if there are none; "frames" is the number of frames with any
+        bin in view, that is, with an image.
     """
     groups, maps = zip(*shares, strict=True)
     names, stacked = np.array(groups), np.stack(maps)
@@ -122,9 +124,9 @@ def average_shares(
 
 
 def mean_share(share: Float[np.ndarray, "R A"], grid: RadarGrid) -> float:
-    """Mean of a map over the bins in view, those above 0; NaN without any.
+    """Compute the mean of a map over the bins in view, whose weight is above 0.
 
-    Bins beyond the grid are padding and do not count.
+    Bins beyond the grid are padding and are ignored. The result is NaN if no bin is in view.
     """
     share = np.asarray(share)[: grid.num_range, : grid.num_azimuth]
     return float(share[share > 0].mean()) if (share > 0).any() else float("nan")

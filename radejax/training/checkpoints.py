@@ -1,8 +1,8 @@
 """Checkpoints of a run: state, position in the data, configuration and metrics.
 
-Orbax writes them in the background, to a temporary folder that gets its final name when
-it is complete. Checksums of the arrays are saved with them and verified when they are
-restored.
+Orbax writes each checkpoint in the background to a temporary folder, which gets its final
+name when it is complete. Checksums of the arrays are saved with the checkpoint and verified
+when it is restored.
 """
 
 from __future__ import annotations
@@ -34,12 +34,13 @@ _VARIABLES = ("params", "ema_params", "model_state")
 
 
 class Checkpoints:
-    """The checkpoints of one workdir, to be used in a `with` block.
+    """The checkpoints of one workdir, to be used in a `with` statement.
 
     Args:
-        folder: Created if missing.
-        max_to_keep: The newest few are kept, and the best; None keeps all.
-        read_only: For evaluation: nothing is written or cleaned up.
+        folder: Folder of the checkpoints. It is created if missing, unless `read_only`.
+        max_to_keep: Number of the newest checkpoints that are kept in addition to the
+            best one; None keeps all.
+        read_only: Do not write or clean up anything, for evaluation.
 
     Raises:
         DataError: The files that describe the steps are corrupted.
@@ -67,7 +68,7 @@ class Checkpoints:
         )
         try:
             self._manager = ocp.CheckpointManager(self.folder, options=options)
-        # Orbax reads the description and the metrics of every step first.
+        # Orbax reads the description and the metrics of every step when it starts.
         except (ValueError, TypeError, LookupError) as error:
             raise DataError(
                 f"{self.folder}: a description or the metrics of a checkpoint are "
@@ -75,15 +76,15 @@ class Checkpoints:
             ) from None
 
     def steps(self) -> list[int]:
-        """Steps of the finished checkpoints, oldest first."""
+        """Returns the steps of the finished checkpoints, oldest first."""
         self._manager.reload()
         return sorted(self._manager.all_steps())
 
     def best_step(self) -> int:
-        """Step of the checkpoint with the highest metric.
+        """Returns the step of the checkpoint with the highest metric.
 
         Raises:
-            FileNotFoundError: None was evaluated.
+            FileNotFoundError: No checkpoint was evaluated.
         """
         best = self._manager.best_step()
         if best is None:
@@ -102,18 +103,19 @@ class Checkpoints:
         info: Mapping[str, Any],
         best: float | None = None,
     ) -> None:
-        """Starts to save; returns as soon as the arrays are copied.
+        """Starts to save a checkpoint, and returns as soon as the arrays are copied.
 
         Args:
-            step: Name of the checkpoint, above those that exist.
+            step: Step of the state, which names the checkpoint. It must be higher than
+                the steps of the existing checkpoints.
             state: Pytree of arrays.
-            data_iterator: The grain iterator whose next batch belongs to `step`. All
+            data_iterator: Grain iterator whose next batch belongs to `step`. All
                 processes share each batch and are at the same position.
-            info: Plain values: configuration, versions.
-            best: Metric of this step by which the best is chosen; higher is better.
+            info: Plain values such as the configuration and versions.
+            best: Metric of this step that selects the best checkpoint; higher is better.
 
         Raises:
-            DiskFullError: Earlier checkpoints stay intact.
+            DiskFullError: No space is left on the disk; earlier checkpoints stay intact.
         """
         description = {
             "info": dict(info),
@@ -133,10 +135,10 @@ class Checkpoints:
             )
 
     def wait(self) -> None:
-        """Returns when everything that was started is on disk.
+        """Waits until all started checkpoints are on disk.
 
         Raises:
-            DiskFullError: Earlier checkpoints stay intact.
+            DiskFullError: No space is left on the disk; earlier checkpoints stay intact.
         """
         with files.disk_full(self.folder):
             self._manager.wait_until_finished()
@@ -144,20 +146,21 @@ class Checkpoints:
     def restore(
         self, state: Any, data_iterator: Any
     ) -> tuple[Any, dict[str, Any], int] | None:
-        """Restores the newest checkpoint that is whole, with a warning for newer ones.
+        """Restores the newest checkpoint that is intact.
 
-        Corrupted checkpoints are moved to a folder next to this one.
+        Newer, corrupted checkpoints are moved to a folder next to this one with a warning.
 
         Args:
-            state: Pytree of `jax.ShapeDtypeStruct` with the shardings wanted, which
-                need not be those that were saved.
-            data_iterator: Set to the position that was saved.
+            state: Pytree of `jax.ShapeDtypeStruct` with the wanted shardings, which may
+                differ from those at the time of saving.
+            data_iterator: Iterator that is set to the saved position.
 
         Returns:
-            State, the `info` saved with it, and step; None without any checkpoint.
+            The state, the `info` saved with it, and the step; None if there are no
+            checkpoints.
 
         Raises:
-            DataError: There are checkpoints, and none is whole; they stay as they are.
+            DataError: There are checkpoints, but none is intact. They are not moved.
         """
         steps = self.steps()
         for step in reversed(steps):
@@ -181,18 +184,19 @@ class Checkpoints:
         return None
 
     def restore_variables(self, step: int | None = None) -> tuple[Any, dict, int]:
-        """Variables of a model, without the state of the optimizer.
+        """Reads the variables of a model without the optimizer state.
 
         Args:
-            step: The newest if None.
+            step: Step of the checkpoint; the newest if None.
 
         Returns:
-            `params`, `ema_params` and `model_state` as nested dictionaries of NumPy
-            arrays, the `info` saved with them, the step.
+            A dictionary with `params`, `ema_params` and `model_state` as nested
+            dictionaries of NumPy arrays, or None where the checkpoint has none; the
+            `info` saved with them; and the step.
 
         Raises:
-            FileNotFoundError: No checkpoint, or not that step.
-            DataError: It is corrupted.
+            FileNotFoundError: There is no checkpoint, or none of that step.
+            DataError: The checkpoint is corrupted.
         """
         steps = self.steps()
         if not steps:
@@ -206,10 +210,15 @@ class Checkpoints:
         return {n: found.get(n) for n in _VARIABLES}, description["info"], step
 
     def _read(self, step: int, state: Any = None) -> tuple[Any, dict[str, Any]]:
-        """A state, or the variables as NumPy arrays, and the description of a checkpoint.
+        """Reads the state and the description of a checkpoint.
+
+        Args:
+            step: Step of the checkpoint.
+            state: Pytree of `jax.ShapeDtypeStruct` to restore; None restores the
+                variables of the model as NumPy arrays.
 
         Raises:
-            DataError: It is corrupted.
+            DataError: The checkpoint is corrupted.
         """
         try:
             if state is None:
@@ -233,7 +242,7 @@ class Checkpoints:
             for name, value in array_checksums(found["state"]).items():
                 if description["checksums"].get(name) != value:
                     raise DataError(f"the checksum of array {name} differs")
-        # A corrupted file makes orbax, tensorstore or json raise anything.
+        # On corrupted files, orbax, tensorstore and json raise errors of any type.
         except Exception as error:
             raise DataError(
                 f"checkpoint {step} in {self.folder} is corrupted ({one_line(error)}); "
@@ -242,7 +251,7 @@ class Checkpoints:
         return found["state"], description
 
     def _saved_variables(self, step: int) -> dict[str, Any]:
-        """Descriptions of the arrays in a checkpoint that are variables of a model."""
+        """Returns the metadata of the arrays in a checkpoint that are model variables."""
         with ocp.PyTreeCheckpointer() as reader:
             folder = self.folder / str(step) / "state"
             saved = reader.metadata(folder).item_metadata.tree
@@ -273,10 +282,13 @@ def _best_of(metrics: Mapping[str, float]) -> float:
 
 
 def array_checksums(tree: Any) -> dict[str, int]:
-    """CRC-32 of the bytes of every array of a tree, by its path "params/conv/bias".
+    """Computes the CRC-32 of the bytes of every array of a tree.
 
-    It is the same for every placement of the arrays over devices and processes, which all
-    have to call this.
+    The checksums do not depend on the placement of the arrays over devices and processes.
+    All processes have to call this function.
+
+    Returns:
+        Checksums by the paths of the arrays, such as "params/conv/bias".
     """
     checksums = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
@@ -289,5 +301,5 @@ def array_checksums(tree: Any) -> dict[str, int]:
 
 
 def _text_checksum(values: Any) -> str:
-    """SHA-256 of plain values as JSON."""
+    """Computes the SHA-256 of plain values serialized as JSON."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -1,8 +1,8 @@
-"""Devices and processes that train together: mesh, placement, who writes, when to stop.
+"""Training on several devices and processes: mesh, placement, main process and signals.
 
 Training is data parallel: every device holds all parameters and a slice of the batch.
-With `fsdp` the large parameters and their optimizer state are split over the same devices
-too; XLA gathers them where a layer needs them.
+With `fsdp`, the large parameters and their optimizer state are also split over the same
+devices, and XLA gathers them where a layer needs them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ _numbers = itertools.count()
 
 
 def make_mesh(num_devices: int | None = None) -> Mesh:
-    """One-dimensional mesh over all devices of all processes, or the first few."""
+    """Creates a one-dimensional mesh over the devices of all processes.
+
+    Args:
+        num_devices: Use only this many devices, the first ones; all if None.
+    """
     devices = jax.devices()[:num_devices]
     return jax.make_mesh(
         (len(devices),), (DATA_AXIS,), axis_types=(AxisType.Auto,), devices=devices
@@ -46,17 +50,17 @@ def make_mesh(num_devices: int | None = None) -> Mesh:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Sharding of what every device holds whole."""
+    """Returns the sharding of arrays that every device holds completely."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Sharding of arrays whose leading axis is the batch."""
+    """Returns the sharding of arrays whose leading axis is the batch."""
     return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
 
 
 def check_batch_size(batch_size: int) -> None:
-    """Raises `UserError` for a global batch that does not divide over all devices."""
+    """Raises `UserError` if the batch size is not a multiple of the number of devices."""
     count, name = make_mesh().size, "config.train.batch_size"
     require(batch_size % count == 0, name, batch_size, f"a multiple of {count} devices")
 
@@ -64,21 +68,27 @@ def check_batch_size(batch_size: int) -> None:
 def put_batch(
     batch: PyTree[Shaped[np.ndarray, "b ..."]], mesh: Mesh
 ) -> PyTree[Shaped[jax.Array, "B ..."]]:
-    """Puts this process's frames, `b = B / processes`, onto the mesh as a global batch."""
+    """Puts this process's `b = B / processes` frames onto the mesh as part of a global batch.
+
+    Args:
+        batch: Pytree of the arrays of this process.
+        mesh: Devices of all processes.
+    """
     return jax.make_array_from_process_local_data(batch_sharding(mesh), batch)
 
 
 def state_sharding(
     state: Any, mesh: Mesh, parameters: ParameterSharding, min_size: int = 2**16
 ) -> Any:
-    """Pytree of `NamedSharding`: where each array of a train state is placed.
+    """Returns a pytree of `NamedSharding` with the placement of each array of a train state.
 
     Args:
         state: Pytree of arrays or `jax.ShapeDtypeStruct`.
-        mesh: From `make_mesh`.
-        parameters: "replicated", or "fsdp": every array of at least `min_size`
-            elements is split along its largest axis that divides over the mesh.
-        min_size: Smaller arrays stay whole; splitting them costs more than it saves.
+        mesh: Mesh that `make_mesh` returned.
+        parameters: "replicated", or "fsdp" to split every array of at least `min_size`
+            elements along its largest axis that is a multiple of the mesh size.
+        min_size: Number of elements below which arrays are replicated, because splitting
+            them costs more than it saves.
     """
     size = mesh.devices.size
 
@@ -98,18 +108,25 @@ def state_sharding(
 
 
 def is_main() -> bool:
-    """True on the one process that writes logs, figures and configurations."""
+    """Returns True on the process that writes logs, figures and configurations."""
     return jax.process_index() == 0
 
 
 def main_only(work: Callable[[], T]) -> T | None:
-    """Calls a function on the main process while the others wait; returns None on those.
+    """Calls a function on the main process while the other processes wait.
 
-    For data, reports and figures, which may take long: processes that continued would
-    wait in a collective, or at the end of JAX, and give up after minutes.
+    It is used for data, reports and figures, which may take long. Processes that continued
+    would time out after minutes in a collective or in JAX's shutdown.
+
+    Args:
+        work: Function to call.
+
+    Returns:
+        The result of the function on the main process, and None on the others.
 
     Raises:
-        UserError: On the others, if the main process failed; it raises its own error.
+        UserError: The function failed on the main process, which raises the original
+            error; the other processes raise this one.
     """
     if jax.process_count() == 1:
         return work()
@@ -118,8 +135,8 @@ def main_only(work: Callable[[], T]) -> T | None:
         result = work() if is_main() else None
     except Exception as failed:
         error = failed
-    # All processes are named, so that they wait at the coordinator and not in a collective,
-    # which would give up after minutes.
+    # With an explicit list of processes, they wait at the coordinator and not in a
+    # collective, which would time out after minutes.
     ocp.multihost.sync_global_processes(
         f"radejax {next(_numbers)}",
         timeout=_WAIT_S,
@@ -134,22 +151,25 @@ def main_only(work: Callable[[], T]) -> T | None:
 
 
 def all_agree(is_fine: bool) -> bool:
-    """True if it is true on every process."""
+    """Returns whether `is_fine` is true on every process, all of which must call this."""
     return bool(multihost_utils.process_allgather(np.int32(is_fine)).all())
 
 
 class Stopped(Exception):
-    """A long computation, such as an evaluation, ended early because of a signal."""
+    """Raised when a signal ends a long computation, such as an evaluation, early."""
 
 
 @contextlib.contextmanager
 def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells all processes in the same step that all should stop.
+    """Yields a function that returns whether all processes should stop.
 
-    It returns True once SIGTERM or SIGINT came to one process, and every process must
-    call it equally often. A second signal interrupts at once. A signal reaches processes
-    in different steps, and those that continue would wait for the others forever.
-    Therefore each call sends a flag around and reads the flag of the previous call.
+    The function returns True on all processes in the same call, once any of them received
+    SIGTERM or SIGINT. Every process must call it equally often. A second signal raises
+    `KeyboardInterrupt` at once.
+
+    Processes can receive a signal in different steps, and those that continue would wait
+    for the others forever. With several processes, each call therefore combines the flags
+    of all processes and returns the result of the previous call.
 
     Args:
         mesh: Devices of all processes.
@@ -172,7 +192,7 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
         found, before = before, any_of(put_batch(rows, mesh))
         return found is not None and bool(found)
 
-    # Only a main thread may set handlers.
+    # Python allows only the main thread to set signal handlers.
     is_main_thread = threading.current_thread() is threading.main_thread()
     numbers = (signal.SIGTERM, signal.SIGINT) if is_main_thread else ()
     previous = {number: signal.signal(number, handle) for number in numbers}
@@ -180,5 +200,6 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
         yield stop
     finally:
         for number, handler in previous.items():
-            # None: set outside Python, by jax.distributed; it cannot be restored.
+            # A handler that was not set from Python, such as that of jax.distributed, is
+            # returned as None and cannot be restored.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

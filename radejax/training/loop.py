@@ -1,4 +1,4 @@
-"""The training loop: from a data iterator to checkpoints, for any number of devices."""
+"""Training loop with logging, evaluation and checkpoints for any number of devices."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from radejax.training.step import (
 
 _log = logging.getLogger(__name__)
 
-_STEPS_IN_FLIGHT = 2  # more would only pile up batches in memory
+_STEPS_IN_FLIGHT = 2  # more steps would only keep more batches in memory
 
 Evaluate = Callable[[Mapping[str, Any], Callable[[], bool]], Scores]
 """Called with the variables of the model, averaged if they are, and a function that
@@ -61,31 +61,35 @@ def train(
     evaluate: Evaluate | None = None,
     profile: str = "",
 ) -> tuple[TrainState, bool]:
-    """Trains until the configured epochs are done, from where an earlier start ended.
+    """Trains a model for the configured epochs, or continues from the newest checkpoint.
 
     Args:
-        config: `seed`, `train`, `loss`, `decode` and `logging` are read, and were checked
-            by `radejax.runs.checks.check`.
-        model: Called as `model.apply(variables, *inputs, train=True)`.
-        loader: Checkpointable grain iterator of `Batch`; endless.
+        config: Config of the run, which `radejax.runs.checks.check` has checked. The
+            fields `seed`, `train`, `loss`, `decode` and `logging` are used.
+        model: Model, which is called as `model.apply(variables, *inputs, train=True)`.
+        loader: Endless, checkpointable grain iterator of `Batch`.
         grid: Grid of the model's maps.
         workdir: Folder of checkpoints and logs.
-        info: Plain values that each checkpoint carries. Those under "same" must be the
-            same on every start of a run.
-        steps_per_epoch: Batches of one pass over the data.
-        variables: To start from; initialized from the seed if None.
+        info: Plain values that are saved in each checkpoint. The value of "same" must be
+            the same whenever the run continues.
+        steps_per_epoch: Number of batches of one pass over the data.
+        variables: Variables to start from; initialized from the seed if None.
         pretrained: Part of the variables that replaces initialized ones.
-        evaluate: Called every `evaluate_every_epochs` epochs and at the end.
-        profile: Folder for a trace of the steps `config.logging.profile_steps`, counted
-            from this start.
+        evaluate: Function that is called every `evaluate_every_epochs` epochs and, unless
+            this field is 0, after the last step.
+        profile: Folder for a profiler trace of the steps `config.logging.profile_steps`,
+            counted from the first step of this call.
 
     Returns:
-        State, placed on all devices, and whether the training is finished: False where a
-        signal ended it, or its last evaluation, early; the state is saved.
+        The state, placed on all devices, and whether the training is finished. It is not
+        finished if a signal ended the training or its last evaluation early; the state is
+        saved in that case.
 
     Raises:
-        DataError: No checkpoint restores, or too many steps in a row are not finite.
-        UserError: Other data than before, a warm-up that is too long, a full disk.
+        DataError: No checkpoint can be restored, or the loss or gradient was not finite in
+            too many consecutive steps.
+        UserError: The run would continue with other data, the warm-up is too long, or no
+            space is left on the disk.
     """
     options, folder = config.train, pathlib.Path(workdir)
     optimizer = make_optimizer(
@@ -127,7 +131,7 @@ def train(
 
 @dataclasses.dataclass
 class _Run:
-    """The steps of a run; attributes are what `train` has, or makes."""
+    """Takes the steps of a run; the attributes are arguments and objects of `train`."""
 
     config: ConfigDict
     steps_per_epoch: int
@@ -138,12 +142,12 @@ class _Run:
     checkpoints: Checkpoints
     logger: MetricLogger
     stop: Callable[[], bool]
-    num_skipped: int = 0  # steps without a finite loss and gradient, as reported
+    num_skipped: int = 0  # steps that were skipped and reported so far
 
     def take_steps(
         self, train_step: TrainStep, state: TrainState, profile: str
     ) -> tuple[TrainState, bool]:
-        """Takes the remaining steps, until a signal comes; returns what `train` does."""
+        """Takes the remaining steps until a signal arrives; returns the result of `train`."""
         step, num_steps = int(state.step), self.num_steps
         first, last = (step + n for n in self.config.logging.profile_steps)
         if profile and num_steps <= first:
@@ -164,7 +168,7 @@ class _Run:
         return state, step >= num_steps and not is_stopped
 
     def _finish_step(self, step: int, state: TrainState, metrics: Metrics) -> bool:
-        """Logs, evaluates and saves where it is due; returns whether a signal came."""
+        """Logs, evaluates and saves if it is due; returns whether a signal arrived."""
         train = self.config.train
         self.logger.advance(step, metrics)
         is_logged = self._is_due(step, train.log_every_steps)
@@ -190,14 +194,17 @@ class _Run:
         return is_stopped
 
     def _is_due(self, step: int, every: int) -> bool:
-        """True every so many steps (never for 0) and, where done at all, at the end."""
+        """Returns whether an action is due that is done every `every` steps and at the end.
+
+        An action with `every` 0 is never due.
+        """
         return every > 0 and (step % every == 0 or step == self.num_steps)
 
     def _check_skipped(self, state: TrainState) -> None:
-        """Warns of steps without a finite loss and gradient beyond those reported.
+        """Warns of new steps that were skipped because loss or gradient was not finite.
 
         Raises:
-            DataError: Too many were consecutive.
+            DataError: More than `max_skipped_steps` consecutive steps were skipped.
         """
         limit = self.config.train.max_skipped_steps
         if (in_row := int(state.opt_state.notfinite_count)) > limit:
@@ -216,7 +223,7 @@ class _Run:
 def _initial_variables(
     model: nn.Module, seed: int, batch: Batch, variables: Any, pretrained: Any
 ) -> Any:
-    """Variables of step 0; the batch has the shapes of the model's inputs."""
+    """Creates the variables of step 0; the batch has the shapes of the model's inputs."""
     if variables is None:
         keys = jax.random.split(jax.random.key(seed))
         rngs = {"params": keys[0], "dropout": keys[1]}
@@ -234,18 +241,19 @@ def _restore_or_initialize(
     mesh: jax.sharding.Mesh,
     parameters: distributed.ParameterSharding,
 ) -> TrainState:
-    """State of the newest checkpoint, or that before the first step.
+    """Restores the state of the newest checkpoint, or creates the initial state.
 
     Args:
-        checkpoints: Of the run.
-        loader: Set to the position that was saved.
-        info: Its "same" must be what was saved.
-        initial: Returns the variables before the first step.
-        create: Makes the state before the first step from them.
-        mesh: Devices that the state is placed on.
-        parameters: How they are placed.
+        checkpoints: Checkpoints of the run.
+        loader: Iterator that is set to the saved position.
+        info: Plain values of the run, whose "same" must equal the saved one.
+        initial: Function that returns the variables before the first step.
+        create: Function that creates the state before the first step from them.
+        mesh: Devices on which the state is placed.
+        parameters: Placement of the parameters, see `distributed.state_sharding`.
 
     Raises:
+        DataError: There are checkpoints, but none can be restored.
         UserError: The run would continue with other data or frozen weights.
     """
     abstract = jax.eval_shape(create, jax.eval_shape(initial))
@@ -265,22 +273,22 @@ def _restore_or_initialize(
             f"{'; '.join(lines)}; give the same, or another --workdir"
         )
     _log.info("continuing from step %d", step)
-    if abstract.frozen:  # not saved: these parameters come from where they came from
+    if abstract.frozen:  # checkpoints do not contain frozen parameters
         frozen = jax.jit(lambda x: create(x).frozen, out_shardings=placement.frozen)
         state = state.replace(frozen=frozen(jax.tree.map(np.asarray, initial())))
     return state
 
 
 def loss_options(config: ConfigDict) -> dict[str, Any]:
-    """Keyword arguments of `detection_loss`.
+    """Returns the keyword arguments of `detection_loss` for a config.
 
-    The assignment "nms" uses the thresholds of `config.decode`.
+    They include `config.decode`, whose thresholds the assignment "nms" uses.
     """
     return {**config.loss.to_dict(), "decoding": DecodeOptions(**config.decode)}
 
 
 def _empty_batch(loader: Any) -> Batch:
-    """One empty frame of the right shapes; the iterator stays where it is."""
+    """Returns a batch of one empty frame in the loader's shapes, and keeps its position."""
     position = loader.get_state()
     batch = next(loader)
     loader.set_state(position)
@@ -290,10 +298,11 @@ def _empty_batch(loader: Any) -> Batch:
 def _compile(
     step: Step, state: TrainState, mesh: jax.sharding.Mesh, seed: int
 ) -> TrainStep:
-    """The step of a run, for states placed as this one; it consumes its state.
+    """Compiles the step of a run for states with the shardings of `state`.
 
-    It takes the batch of this process, and returns before it is computed, unless too many
-    steps are under way.
+    The compiled step donates the buffers of its input state and takes the batch of this
+    process. It returns before the computation ends, and waits only if more than
+    `_STEPS_IN_FLIGHT` steps are in flight.
     """
     whole = distributed.replicated(mesh)
     placement = jax.tree.map(lambda x: x.sharding, state)

@@ -29,8 +29,8 @@ class Scores:
 
     Attributes:
         values: Metrics by name.
-        best: The metric that decides which checkpoint is best; None where undefined.
-        figures: By name, on the main process.
+        best: Metric that selects the best checkpoint; None if it is undefined.
+        figures: Figures by name; empty except on the main process.
     """
 
     values: Mapping[str, float]
@@ -39,20 +39,23 @@ class Scores:
 
 
 class MetricLogger:
-    """Writes the metrics of a run, on the main process.
+    """Writes the metrics of a run on the main process.
 
-    Records of steps after `start_step`, left by a run that was interrupted after its
-    last checkpoint, are removed; they will be written again.
+    If a run is interrupted after its last checkpoint, it leaves records of steps after
+    `start_step`. They are removed, because these steps are repeated.
 
     Args:
-        folder: Workdir; contains `metrics.jsonl` and `tensorboard/`.
-        config: Of the run; Weights & Biases shows it, if `config.logging.wandb` is set.
+        folder: Workdir of the run; the logger writes `metrics.jsonl` and `tensorboard/`.
+        config: Config of the run, which is also logged to Weights & Biases if
+            `config.logging.wandb` is set.
         start_step: Step of the restored state.
-        num_steps: Of the whole training.
+        num_steps: Number of steps of the whole training.
 
     Raises:
-        UserError: Weights & Biases is asked for and not installed.
-        DiskFullError: No space is left, also in the methods.
+        UserError: `config.logging.wandb` is set, but wandb is not installed.
+        DataError: `metrics.jsonl` is corrupted.
+        DiskFullError: No space is left on the disk. The methods that write can raise it
+            too.
     """
 
     def __init__(
@@ -71,7 +74,7 @@ class MetricLogger:
                 _remove_after(start_step, self._path)
             if config.logging.wandb:
                 self._wandb = _start_wandb(folder, config)
-            # An unlimited queue: a limited one blocks forever on a full disk.
+            # The queue is unlimited, because a limited one blocks forever on a full disk.
             self._board = tensorboardX.SummaryWriter(
                 str(folder / "tensorboard"), purge_step=start_step + 1, max_queue=0
             )
@@ -87,11 +90,12 @@ class MetricLogger:
         self._waited, self._since = 0.0, time.perf_counter()
 
     def next_batch(self, loader: Any, metrics: Any) -> Any:
-        """The next batch; counts the time in which devices were idle because of it.
+        """Returns the next batch, and counts the time that the devices were idle meanwhile.
 
         Args:
             loader: Iterator of batches.
-            metrics: Results of the previous step: until they are ready, devices work.
+            metrics: Results of the previous step. If they are not ready when the batch is,
+                the devices were busy and no time is counted.
         """
         started = time.perf_counter()
         batch = next(loader)
@@ -100,18 +104,31 @@ class MetricLogger:
         return batch
 
     def advance(self, step: int, metrics: Any) -> None:
-        """Moves the progress bar; the first step, which compiles, is not timed."""
+        """Moves the progress bar to a step.
+
+        The first step, which includes the compilation, is left out of the rate.
+
+        Args:
+            step: Number of the step.
+            metrics: Results of the step.
+        """
         if step == self._start + 1:
             jax.block_until_ready(metrics)
             self._restart_timer(step)
         self._bar.update(step - self._bar.n)
 
     def _restart_timer(self, step: int) -> None:
-        """Leaves the time since the last record out of the rate."""
+        """Restarts the measurement of the rate at a step."""
         self._waited, self._since, self._last_step = 0.0, time.perf_counter(), step
 
     def log(self, step: int, metrics: Mapping[str, Any], *, epoch: float) -> None:
-        """Writes the metrics of a step, and the rate since the last record."""
+        """Writes the metrics of a step and the rate of frames since the last record.
+
+        Args:
+            step: Number of the step.
+            metrics: Metrics of the step by name.
+            epoch: Number of epochs at the step, with a fraction.
+        """
         values = {k: float(np.asarray(v)) for k, v in metrics.items()}
         text = [f"{k} {v:.4g}" for k, v in values.items() if k in LOSSES]
         elapsed, steps = time.perf_counter() - self._since, step - self._last_step
@@ -124,7 +141,7 @@ class MetricLogger:
         self._write(step, {**values, "epoch": epoch}, {})
 
     def log_scores(self, step: int, scores: Scores) -> None:
-        """Writes the result of an evaluation, whose time is left out of the rate."""
+        """Writes the result of an evaluation, and leaves its duration out of the rate."""
         self._write(step, scores.values, scores.figures)
         self._restart_timer(step)
 
@@ -136,7 +153,7 @@ class MetricLogger:
         with files.disk_full(self._path):
             with self._path.open("a") as file:
                 file.write(json.dumps({"step": step, **values}) + "\n")
-            self._board.flush()  # raises if its thread could not write
+            self._board.flush()  # raises an error if the writer thread failed
             for name, value in values.items():
                 self._board.add_scalar(name, value, step)
             for name, figure in figures.items():
@@ -150,7 +167,9 @@ class MetricLogger:
         if self._board is not None:
             try:
                 self._board.close()
-            except OSError:  # a full disk, which `_write` reported; not again at exit
+            # The disk is full, which `_write` reported. Without this, it would be
+            # reported again at exit.
+            except OSError:
                 writer = self._board._get_file_writer().event_writer
                 writer._worker.stop()
                 writer._closed = True
@@ -159,7 +178,7 @@ class MetricLogger:
 
 
 def _remove_after(step: int, path: pathlib.Path) -> None:
-    """Keeps the records up to a step; a killed run may have left half a line."""
+    """Removes records after a step, and a last line that a killed run left incomplete."""
     lines = files.read_text(path).splitlines(keepends=True)
     try:
         kept = [x for x in lines if x.endswith("\n") and json.loads(x)["step"] <= step]
@@ -169,7 +188,7 @@ def _remove_after(step: int, path: pathlib.Path) -> None:
 
 
 def _start_wandb(folder: pathlib.Path, config: ConfigDict) -> Any:
-    """The run of a workdir at Weights & Biases, which copies what TensorBoard gets."""
+    """Starts or resumes a workdir's run at Weights & Biases, which mirrors TensorBoard."""
     try:
         import wandb
     except ImportError as error:

@@ -33,17 +33,17 @@ Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
     """Linear warm-up from zero, then a cosine between the peak and the minimum.
 
-    RADE-Net section IV-B: cosine per step from 1e-3 to 1e-4, no warm-up.
+    RADE-Net section IV-B uses a cosine per step from 1e-3 to 1e-4 without warm-up.
 
     Args:
-        train: `config.train`. Its `schedule` is "cosine": falls once, over the training;
-            or "cyclic_cosine", as released: falls in one epoch and climbs back in the
-            next, and so on, which is torch's `CosineAnnealingLR` with
-            `T_max = steps_per_epoch`, stepped per batch.
-        steps_per_epoch: Batches of one pass over the data.
+        train: The section `config.train`. With the `schedule` "cosine", the learning rate
+            decreases once, over the training. With "cyclic_cosine", as in the released
+            code, it decreases in one epoch, increases in the next, and so on: this is
+            torch's `CosineAnnealingLR` with `T_max = steps_per_epoch`, stepped per batch.
+        steps_per_epoch: Number of batches of one pass over the data.
 
     Returns:
-        Learning rate by step, float32.
+        Function from the step to the float32 learning rate.
 
     Raises:
         UserError: The warm-up is not shorter than the training.
@@ -66,10 +66,11 @@ def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
 
 
 def _cyclic_cosine(peak: float, minimum: float, half_period: int) -> optax.Schedule:
-    """Closed form of torch's recursion: minimum + (peak - minimum) cos^2(pi t / 2T).
+    """Returns the closed form of torch's recursion.
 
-    In whole steps from the nearest minimum, so that float32 keeps all digits of the rate
-    where it is small and after any number of epochs.
+    The rate is minimum + (peak - minimum) cos^2(pi t / 2T). It is computed from the whole
+    number of steps to the nearest minimum, which keeps the float32 precision where the
+    rate is small and after any number of epochs.
     """
 
     def rate(step: ArrayLike) -> Float[jax.Array, "..."]:
@@ -87,20 +88,22 @@ def make_optimizer(
     gradient_clip_norm: float | None = None,
     gradient_accumulation_steps: int = 1,
 ) -> optax.GradientTransformation:
-    """AdamW with torch's defaults, decaying every parameter as the papers' runs do.
+    """Creates AdamW with torch's defaults and weight decay on every parameter.
 
-    A step whose gradient is not finite changes nothing and is counted in the state, see
-    `optax.apply_if_finite`; any number of them may follow each other.
+    A step whose gradient is not finite changes no parameters and is counted in the
+    optimizer state, see `optax.apply_if_finite`. The number of consecutive such steps is
+    not limited here.
 
     Args:
-        schedule: Learning rate by step.
+        schedule: Function from the step to the learning rate.
         weight_decay: Decoupled weight decay.
-        gradient_clip_norm: Global norm to clip to, or None.
-        gradient_accumulation_steps: The mean gradient of this many steps updates the
+        gradient_clip_norm: Global norm to which the gradient is clipped; None does not
+            clip.
+        gradient_accumulation_steps: Number of steps whose mean gradient updates the
             parameters, see `optax.MultiSteps`.
     """
     count = gradient_accumulation_steps
-    # The optimizer counts updates, and the schedule steps.
+    # The optimizer counts updates, while the schedule takes steps.
     adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)
     parts: list[optax.GradientTransformation] = [adamw]
     if gradient_clip_norm is not None:
@@ -115,11 +118,11 @@ def make_optimizer(
 
 
 class TrainState(struct.PyTreeNode):
-    """Everything a training step reads and writes.
+    """State that a training step reads and updates.
 
     Attributes:
         step: Number of steps taken, including skipped ones; int32.
-        params: Parameters that are trained, float32.
+        params: Trained parameters, float32.
         model_state: Other variable collections, such as running batch statistics.
         opt_state: State of the optimizer. It counts skipped steps, see
             `optax.ApplyIfFiniteState`.
@@ -137,7 +140,7 @@ class TrainState(struct.PyTreeNode):
 
     @property
     def eval_variables(self) -> dict[str, Any]:
-        """Variables to run the model with: averaged parameters where there are any."""
+        """Variables for evaluation, with the averaged parameters if there are any."""
         params = self.params if self.ema_params is None else self.ema_params
         return {"params": merge_parameters(params, self.frozen), **self.model_state}
 
@@ -149,13 +152,14 @@ def create_state(
     use_ema: bool,
     is_frozen: Callable[[str], bool] | None = None,
 ) -> TrainState:
-    """State before the first step.
+    """Creates the state before the first step.
 
     Args:
-        variables: Of the model: "params" and any other collections.
-        optimizer: From `make_optimizer`.
+        variables: Variables of the model: "params" and any other collections.
+        optimizer: Optimizer that `make_optimizer` returned.
         use_ema: Keep a moving average of the parameters.
-        is_frozen: Called with the path of a parameter; True if it is not trained.
+        is_frozen: Function from the path of a parameter to whether it is not trained;
+            None trains all parameters.
     """
     params, frozen = split_parameters(variables["params"], is_frozen)
     return TrainState(
@@ -171,7 +175,12 @@ def create_state(
 def split_parameters(
     params: Mapping[str, Any], is_frozen: Callable[[str], bool] | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Parameters that are trained, and those that are not, as two trees."""
+    """Splits parameters into a tree of trained and a tree of frozen ones.
+
+    Args:
+        params: Parameters of the model.
+        is_frozen: See `create_state`.
+    """
     flat = flax.traverse_util.flatten_dict(params, sep="/")
     parts: tuple[dict, dict] = ({}, {})
     for name, leaf in flat.items():
@@ -182,7 +191,7 @@ def split_parameters(
 def merge_parameters(
     params: Mapping[str, Any], frozen: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Inverse of `split_parameters`."""
+    """Merges trained and frozen parameters; the inverse of `split_parameters`."""
     trees = [flax.traverse_util.flatten_dict(t, sep="/") for t in (params, frozen)]
     return flax.traverse_util.unflatten_dict({**trees[0], **trees[1]}, sep="/")
 
@@ -190,15 +199,16 @@ def merge_parameters(
 def with_pretrained(
     variables: Mapping[str, Any], part: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Variables with some of them replaced, such as a pretrained image backbone.
+    """Returns variables with a part replaced, such as a pretrained image backbone.
 
     Args:
-        variables: Of a model: "params" and other collections.
-        part: The same tree or a part of it, e.g.
-            `{"params": {"image_backbone": params}}`. What `variables` lack is added.
+        variables: Variables of a model: "params" and other collections.
+        part: Tree of the variables to replace, such as
+            `{"params": {"image_backbone": params}}`. Entries that `variables` lack are
+            added.
 
     Raises:
-        UserError: Shapes differ.
+        UserError: The shapes of a variable differ.
     """
     merged = flax.traverse_util.flatten_dict(variables, sep="/")
     for path, new in flax.traverse_util.flatten_dict(part, sep="/").items():
@@ -221,21 +231,21 @@ def make_train_step(
     loss: Mapping[str, Any],
     ema_decay: float | None = None,
 ) -> Step:
-    """Builds the function of one training step.
+    """Builds the function that computes one training step.
 
-    A step whose loss or gradient is not finite leaves parameters, batch statistics and
-    optimizer as they were; the state of the optimizer counts it.
+    A step whose loss or gradient is not finite leaves the parameters, batch statistics and
+    optimizer moments unchanged; the optimizer state counts it.
 
     Args:
         model: Radar or radar-camera detector.
-        optimizer: From `make_optimizer`.
+        optimizer: Optimizer that `make_optimizer` returned.
         grid: Grid of the model's maps.
         loss: Keyword arguments of `detection_loss`.
         ema_decay: Decay of the parameters' moving average, or None.
 
     Returns:
-        `step(state, batch, rng) -> (state, metrics)`; `rng` is the key of the run, from
-        which each step derives its own by the state's counter.
+        Function `step(state, batch, rng) -> (state, metrics)`. `rng` is the key of the
+        run; each step derives its own key from it and from `state.step`.
     """
 
     def loss_fn(
@@ -262,7 +272,7 @@ def make_train_step(
         grad_norm = optax.global_norm(grads)
         is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(total)
 
-        # The optimizer skips by the gradient, which can be finite without the loss.
+        # The optimizer checks only the gradient, which can be finite if the loss is not.
         grads = jax.tree.map(lambda g: jnp.where(is_finite, g, jnp.nan), grads)
         opt_state: Any
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
@@ -282,7 +292,7 @@ def make_train_step(
             opt_state=opt_state,
             ema_params=ema_params,
         )
-        # Otherwise the next step would be compiled again.
+        # If shapes or dtypes differed, the next step would be compiled again.
         chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
         counts = {"skipped": opt_state.total_notfinite}
         return after, {"loss": total, **parts, "grad_norm": grad_norm, **counts}
