@@ -62,7 +62,7 @@ def require(holds: bool, name: str, value: object, expected: str) -> None:
 
 
 Range = tuple[Callable[[Any], bool], str]
-"""Whether a value is in a range, and the range in words."""
+"""A function that returns whether a value is in a range, and a description of the range."""
 
 
 def integer(least: int, most: float = math.inf) -> Range:
@@ -113,7 +113,7 @@ def or_none(values: Range) -> Range:
 
 
 SIZE = integer(1, 1 << 16)
-"""Numbers of channels, classes, heads, ..."""
+"""Range of numbers of channels, classes, heads and similar sizes."""
 
 POSITIVE: Range = lambda x: _is_number(x, 0) and x > 0, "a number above 0"
 BELOW_ONE: Range = (

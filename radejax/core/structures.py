@@ -30,19 +30,19 @@ RARE_SHARE = 0.02
 of DinoRADE."""
 
 BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
-"""Names of the numbers of a box, meters and radians."""
+"""Names of the parameters of a box, in meters and radians."""
 
 NARROW_ROI = (0.0, 72.0, -6.4, 6.4, -2.0, 6.0)
-"""K-Radar's benchmark region: x, y, z from and to, meters, ego frame."""
+"""K-Radar's benchmark region: x0, x1, y0, y1, z0, z1 in meters in the ego frame."""
 
 MIN_SIZE_M = 0.01
-"""What sizes of decoded boxes are clipped to: none is negative."""
+"""Smallest length, width and height of decoded boxes in meters; smaller ones are clipped."""
 
 WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
-"""K-Radar's wide region: x, y, z from and to, meters, ego frame."""
+"""K-Radar's wide region: x0, x1, y0, y1, z0, z1 in meters in the ego frame."""
 
 ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
-"""Regions by name; bounds are inclusive, and of box centers."""
+"""Regions by name. Their bounds apply to box centers and are inclusive."""
 
 
 class Batch(struct.PyTreeNode):
@@ -182,7 +182,7 @@ class Detections(struct.PyTreeNode):
 
 
 MAX_BOX_VALUE = 1e6
-"""Meters and radians: squares of larger numbers lose all precision."""
+"""Largest valid box parameter in meters or radians; squares of larger ones lose precision."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 ArrayT = TypeVar("ArrayT", bound=np.ndarray | jax.Array)
-"""NumPy's arrays or JAX's, in and out alike."""
+"""An array type, NumPy's or JAX's, that is the same for input and output."""
 
 # Signs of the half extents at the corners, counter-clockwise from front left.
 _SIGN_LENGTH = (1.0, -1.0, -1.0, 1.0)

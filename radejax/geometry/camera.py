@@ -28,15 +28,20 @@ from radejax.geometry.boxes import array_module, corners
 from radejax.geometry.radar_grid import ArrayValues
 
 ImageKind = Literal["raw", "pinhole"]
-"""The recorded image with lens distortion, or the same matrix without distortion."""
+"""The recorded image with lens distortion, or a pinhole image with the same intrinsics."""
 
 RADAR_FROM_LIDAR_M = (-2.54, 0.3, 0.0)
-"""Ego = LiDAR + this, as in every sequence's `calib_radar_lidar.txt`; dz as RADE-Net.
-K-Radar's loaders use `KRADAR_RADAR_FROM_LIDAR_Z_M` for boxes too."""
+"""Translation from the LiDAR frame to the ego frame, `p_ego = p_lidar + translation`.
+
+x and y are those of every sequence's `calib_radar_lidar.txt`, z is RADE-Net's. K-Radar's
+loaders use `KRADAR_RADAR_FROM_LIDAR_Z_M` for the z of boxes too.
+"""
 
 KRADAR_RADAR_FROM_LIDAR_Z_M = 0.7
-"""Meters by which K-Radar's radar is below its LiDAR, as in K-Radar's own loaders: what
-radar directions are projected with, whatever z boxes are counted from."""
+"""Height in meters of K-Radar's LiDAR above its radar, as in K-Radar's own loaders.
+
+Radar directions are projected with this height, independently of the origin of the boxes' z.
+"""
 
 _ANGLES = ("yaw_ldr2cam", "pitch_ldr2cam", "roll_ldr2cam")
 _SHIFTS = ("x_ldr2cam", "y_ldr2cam", "z_ldr2cam")

@@ -24,7 +24,7 @@ _MAX_VALUE = 10_000.0  # larger than any value on a radar's axes
 
 AzimuthMapping = Literal["true", "stretched"]
 Positions = float | Real[Any, "*#bins"]
-"""One number or an array of them, which broadcast against each other: `[...]`."""
+"""A number or an array; several positions broadcast against each other."""
 
 
 class ArrayValues:

@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
-"""Shapes of the arguments of `decode` that change without compiling again."""
+"""Shapes of the arguments of `decode` that can change without recompilation."""
 
 Frames = Array | PathLike | Sequence[Array | PathLike]
 Images = Array | Sequence[Array | PathLike | None]

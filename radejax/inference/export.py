@@ -33,7 +33,7 @@ FORMATS = ("stablehlo", "onnx", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
 
 CHUNK_SIZE = 1024
-"""Queries at once of the deformable attention in ONNX files, unless the config says."""
+"""Default chunk size of the deformable attention in ONNX files, in bins."""
 
 RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
 

@@ -47,7 +47,7 @@ CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 FORMAT = "radejax-2"
 
 FROZEN_BACKBONE = "sha256 of the frozen image backbone"
-"""Name of the first 16 digits among what a checkpoint says of its run."""
+"""Key of the first 16 digits of the checksum in a checkpoint's description of its run."""
 
 Step = int | Literal["best"] | None
 """Step of a checkpoint, "best" by the metric of the run, or None for the latest."""

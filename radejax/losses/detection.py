@@ -27,7 +27,7 @@ Boxes8 = Float[jax.Array, "B N 8"]
 Mask = Bool[jax.Array, "B N"]
 
 _MAX_PEAKS = 128
-"""Peaks that enter NMS where NMS chooses the boxes."""
+"""Maximum number of peaks that enter NMS for the assignment "nms"."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,7 +219,7 @@ LOSSES: dict[str, Callable[[Pairs, LossOptions], Float[jax.Array, ""]]] = {
     "gwd": _gwd,
     "smooth_l1": _smooth_l1,
 }
-"""Terms of the loss by name: what `weights` may name."""
+"""Terms of the loss by their name in `LossOptions.weights`."""
 
 
 def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batch"]:
@@ -263,7 +263,10 @@ def _weighted_sum(
 Assigned = tuple[
     Float[jax.Array, "B K 8"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]
 ]
-"""Predicted boxes, their objects, and which have one; K objects, or peaks."""
+"""Predicted boxes, their objects, and a mask of the boxes that have one.
+
+K is the number of objects, or of peaks for the assignment "nms".
+"""
 
 
 def _at_centers(

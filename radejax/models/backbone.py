@@ -194,4 +194,4 @@ class Backbone(nn.Module):
 
 
 BACKBONES: dict[str, type[Backbone]] = {"unet": Backbone}
-"""What `config.model.backbone` may name."""
+"""Backbones by their name in `config.model.backbone`."""

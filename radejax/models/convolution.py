@@ -20,11 +20,11 @@ from jaxtyping import Float
 _DIMENSION_NUMBERS = ("NHWC", "HWIO", "NHWC")
 
 _BLOCK_BINS = 900
-"""Bins whose shifted copies fit in a CPU's cache; best of 200 to 28,000, measured."""
+"""Bins per block, so that shifted copies fit in a CPU's cache; the fastest of 200 to 28,000."""
 
 _MIN_BINS = 4096
 _MIN_WEIGHTS = 128 * 128
-"""Maps of up to so many bins gain from blocks only with more weights a tap than these."""
+"""Blocks are used only for more than `_MIN_BINS` bins or `_MIN_WEIGHTS` weights per tap."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))

@@ -31,7 +31,11 @@ from jaxtyping import Float, Int
 Arrays = tuple[jax.Array, ...]
 
 _CHUNK_SIZES = {"cpu": 448, "default": 8192}
-"""Bins at a time: a CPU wants the sampled rows in cache, an accelerator few large steps."""
+"""Bins per chunk.
+
+On a CPU, the sampled rows should fit into the cache; an accelerator is faster with few
+large chunks.
+"""
 
 
 class Linear(nn.Module):

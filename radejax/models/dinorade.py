@@ -26,8 +26,7 @@ from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
 
 IMAGE_BACKBONE = "image_backbone"
-"""Key of the image backbone in the parameters: what is frozen, and what published
-checkpoints must leave out."""
+"""Key of the image backbone in the parameters, which published checkpoints must not contain."""
 
 _SCOPE = f"{IMAGE_BACKBONE}/"
 

@@ -88,7 +88,7 @@ class PlainNeck(Neck):
 
 
 NECKS: dict[str, type[Neck]] = {"dilated": DilatedNeck, "plain": PlainNeck}
-"""What `config.model.neck` may name."""
+"""Necks by their name in `config.model.neck`."""
 
 
 NUM_BOX_PARAMS = 8
@@ -137,7 +137,7 @@ class DefaultHead(Head):
 
 
 HEADS: dict[str, type[Head]] = {"expanded": ExpandedHead, "default": DefaultHead}
-"""What `config.model.heads` may name."""
+"""Heads by their name in `config.model.heads`."""
 
 
 class Heads(nn.Module):

@@ -29,7 +29,7 @@ HasImage = Bool[jax.Array, " B"]
 Mask = Bool[jax.Array, "B 1 1 1"] | None
 
 _IMAGENET = np.array([(0.485, 0.456, 0.406), (0.229, 0.224, 0.225)], np.float32)
-"""Mean and standard deviation of the colors."""
+"""Mean and standard deviation of ImageNet's RGB values, scaled to [0, 1]."""
 
 
 def normalize(
@@ -166,7 +166,7 @@ def batch_norm(name: str, dtype: Any, train: bool) -> nn.BatchNorm:
 
 
 STRIDE = 16
-"""Pixels per bin of the trunk's map."""
+"""Image pixels per pixel of the trunk's output, along each axis."""
 
 
 class FrozenBatchNorm(nn.Module):

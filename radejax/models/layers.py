@@ -22,7 +22,7 @@ from radejax.models.convolution import conv2d, plain_conv2d, product
 Initializer = Callable[..., jax.Array]
 Map = Float[jax.Array, "B R A C"]
 Features = Float[jax.Array, "B R A _"]
-"""As `Map`, where a layer changes the number of channels."""
+"""Like `Map`, for layers that change the number of channels."""
 
 
 def uniform_fan_in(fan_in: int) -> Initializer:

@@ -29,12 +29,13 @@ OutOfViewRule = Literal["drop", "official"]
 WeightingKind = Literal["mlp", "cnn", "off"]
 
 OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
-"""Released offsets between radar and camera rig: the `radar_from_lidar_m` to project
-with, together with the "pinhole" image."""
+"""The `radar_from_lidar_m` of the released code, to be used with the "pinhole" image."""
 
 MARGIN_PX = 280
-"""Left and right, of an image 1280 wide, that `out_of_view="official"` leaves out: a leftover
-of square image crops."""
+"""Columns at the left and right border that `out_of_view="official"` treats as out of view.
+
+They are a remnant of square crops of images 1280 pixels wide.
+"""
 
 _OFFICIAL_DEPTH_OFFSET_M = 1e-6
 

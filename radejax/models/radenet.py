@@ -30,8 +30,11 @@ from radejax.models.layers import Map
 Projection = Float[jax.Array, "B R A DE"]
 
 REMAT = ("none", "blocks", "full")
-"""What the backward pass computes again instead of keeping: nothing, the inside of each
-block, or also all but the ends of backbone, neck and heads."""
+"""Activations that the backward pass recomputes instead of storing them.
+
+"none" stores all, "blocks" only those between blocks, and "full" only those between
+backbone, neck and heads.
+"""
 
 
 class RadeNet(nn.Module):

@@ -27,7 +27,7 @@ AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
 Tokens = Float[jax.Array, "B T C"]
 PerHead = Float[jax.Array, "B T heads D"]
 Rope = tuple[Float[jax.Array, "patches D"], Float[jax.Array, "patches D"]]
-"""Cosines and sines of the rotary embedding, D channels of a head."""
+"""Cosines and sines of the rotary embedding, with D channels per head."""
 
 _BLOCK = 256  # queries per block, so that the scores of a head stay in the cache
 _INIT = nn.initializers.truncated_normal(0.02)

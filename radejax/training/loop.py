@@ -40,9 +40,9 @@ _log = logging.getLogger(__name__)
 _STEPS_IN_FLIGHT = 2  # more steps would only keep more batches in memory
 
 Evaluate = Callable[[Mapping[str, Any], Callable[[], bool]], Scores]
-"""Called with the variables of the model, averaged if they are, and a function that
-returns whether to stop; it then raises `distributed.Stopped`. Every process must call that
-function equally often."""
+"""Function that evaluates variables during training. Its arguments are the variables, with
+averaged parameters if there are any, and a function that returns whether to stop, which every
+process must call equally often. If that returns True, it raises `distributed.Stopped`."""
 
 TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
