@@ -132,7 +132,7 @@ class LabelledFrame:
 
 
 FrameSequence = Sequence[LabelledFrame]
-"""A dataset or a part of one: where only its frames matter."""
+"""A dataset, or a part of one, of which only the frames are read."""
 
 _F = TypeVar("_F", bound=LabelledFrame)
 
@@ -196,8 +196,8 @@ DATA_SETS: dict[str, str | Callable[..., LabelledFrames]] = {
 }
 """Readers that `config.data.format` may name, as classes or as "module:Class".
 
-They are called with roots, labels and the options of `KRadar`, of which another reader may
-ignore those that it has no use for."""
+They are called with the roots, the labels and the options of `KRadar`; another reader may
+ignore options that do not apply to it."""
 
 
 def data_set(name: str) -> Callable[..., LabelledFrames]:

@@ -25,7 +25,7 @@ LOG_SCALE_DB = 184.3
 """p = (10 log10(power + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB."""
 
 MAX_LEVEL = 100.0
-"""Beyond any projection: float64's largest power is at 17, the smallest at -0.54."""
+"""Bound on the absolute value of a level; any power in float64 gives -0.54 to 17."""
 
 
 def project_tensor(

@@ -216,7 +216,7 @@ def worst_frames(
 # Sanity checks ------------------------------------------------------------------------
 
 MAX_BEHIND = 0.01
-"""A larger fraction of predictions behind the sensor is reported."""
+"""Largest fraction of predictions behind the sensor that causes no warning."""
 
 MAX_OFFSET_M = 0.25
 """A larger median offset is reported where it is nearly the same for all objects."""

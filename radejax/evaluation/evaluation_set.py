@@ -23,8 +23,9 @@ T = TypeVar("T")
 SPACES = ("bev", "3d")
 
 MAX_PAIRS = 1_000_000
-"""Most pairs of predictions and objects per class and frame; 100 predictions and 20
-objects are many."""
+"""Largest number of pairs of predictions and objects per class and frame.
+
+A frame rarely has more than 100 predictions and 20 objects of a class."""
 
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 

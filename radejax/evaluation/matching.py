@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Real, Shaped
 
 PAIRS_PER_CHUNK = 2_000_000
-"""Pairs compared at once, about, which bounds the memory."""
+"""Approximate number of pairs compared at once, which bounds the memory."""
 
 
 def candidate_pairs(

@@ -251,7 +251,7 @@ TITLES = {"all": "Total"} | {
     name: name.replace("snow", " snow").title() for name in WEATHERS
 }
 SPACES = ("3d", "bev")
-"""In the order of the papers."""
+"""Box spaces in the order of the papers' tables."""
 
 STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
 Results = Mapping[tuple[str, str, str, str, float], Result]

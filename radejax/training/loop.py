@@ -14,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
+from jax.interpreters import partial_eval
 from ml_collections import ConfigDict
 
 from radejax.core import files
@@ -227,8 +228,7 @@ def _initial_variables(
     if variables is None:
         keys = jax.random.split(jax.random.key(seed))
         rngs = {"params": keys[0], "dropout": keys[1]}
-        inputs = jax.eval_shape(batch.model_inputs)
-        variables = model.lazy_init(rngs, *inputs, train=False)
+        variables = model.init(rngs, *batch.model_inputs(), train=False)
     return variables if pretrained is None else with_pretrained(variables, pretrained)
 
 
@@ -256,15 +256,13 @@ def _restore_or_initialize(
         DataError: There are checkpoints, but none can be restored.
         UserError: The run would continue with other data or frozen weights.
     """
-    abstract = jax.eval_shape(create, jax.eval_shape(initial))
+    traced, shapes = jax.make_jaxpr(initial, return_shape=True)()
+    abstract = jax.eval_shape(create, shapes)
     placement = distributed.state_sharding(abstract, mesh, parameters)
     saved = jax.tree.map(lambda x, s: x.update(sharding=s), abstract, placement)
     restored = checkpoints.restore(saved.replace(frozen={}), loader)
     if restored is None:
-        # One operation at a time: in one program, each of a hundred random generators
-        # would be compiled on its own, which takes half as long as the training step.
-        drawn = jax.tree.map(np.asarray, initial())
-        return jax.jit(create, out_shardings=placement)(drawn)
+        return jax.jit(create, out_shardings=placement)(_evaluate(traced, shapes))
     state, saved_info, step = restored
     found, same = saved_info.get("same", {}), info.get("same", {})
     if lines := files.differences(found, {k: same.get(k) for k in found}, ""):
@@ -275,8 +273,21 @@ def _restore_or_initialize(
     _log.info("continuing from step %d", step)
     if abstract.frozen:  # checkpoints do not contain frozen parameters
         frozen = jax.jit(lambda x: create(x).frozen, out_shardings=placement.frozen)
-        state = state.replace(frozen=frozen(jax.tree.map(np.asarray, initial())))
+        state = state.replace(frozen=frozen(_evaluate(traced, shapes)))
     return state
+
+
+def _evaluate(traced: jax.core.ClosedJaxpr, shapes: Any) -> Any:
+    """Returns the results of a traced function as a tree of NumPy arrays.
+
+    Only the operations that the results need are executed, one at a time. In one program,
+    each of a hundred random generators would be compiled on its own, which takes half as
+    long as the compilation of a training step.
+    """
+    is_result = [True] * len(traced.jaxpr.outvars)
+    needed, _ = partial_eval.dce_jaxpr(traced.jaxpr, is_result, instantiate=True)
+    leaves = jax.core.eval_jaxpr(needed, traced.consts)
+    return jax.tree.unflatten(jax.tree.structure(shapes), map(np.asarray, leaves))
 
 
 def loss_options(config: ConfigDict) -> dict[str, Any]:
