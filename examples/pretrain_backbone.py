@@ -19,10 +19,12 @@ import dataclasses
 import functools
 import pathlib
 import time
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import click
 import flax.linen as nn
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +37,7 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.models.image import STRIDE, ResNetTrunk, frozen_params, normalize
+from radejax.models.image import STRIDE, ResNetTrunk, normalize
 from radejax.models.vit import ViT
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.camera.shapes import camera_position
@@ -243,7 +245,14 @@ def save(backbone: ViT | ResNetTrunk, variables: Any, out: pathlib.Path) -> None
         dinov3_hf.save(backbone, own["params"], out)
     else:
         out.mkdir(parents=True, exist_ok=True)
-        image_backbone.save_resnet(frozen_params(own), out / RESNET_FILE)
+        image_backbone.save_resnet(_frozen_params(own), out / RESNET_FILE)
+
+
+def _frozen_params(variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Converts the variables of a trunk with `frozen=False` to parameters of a frozen one."""
+    flat = flax.traverse_util.flatten_dict(dict(variables["params"]))
+    stats = flax.traverse_util.flatten_dict(dict(variables["batch_stats"]))
+    return flax.traverse_util.unflatten_dict(flat | stats)
 
 
 def pretrain(

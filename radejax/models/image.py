@@ -11,11 +11,9 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -245,8 +243,7 @@ class ResNetTrunk(nn.Module):
         width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
         depths: Number of blocks in each of the three stages.
         frozen: Whether to normalize with fixed statistics, as in a detector. Otherwise the
-            trunk has batch normalization, for training the weights that `frozen_params`
-            converts.
+            trunk has batch normalization, for pretraining the weights.
         dtype: Dtype of the computation; the output is float32.
     """
 
@@ -273,13 +270,6 @@ class ResNetTrunk(nn.Module):
                     name=f"stage_{stage}_block_{i + 1}",
                 )(x, train)
         return x.astype(jnp.float32)
-
-
-def frozen_params(variables: Mapping[str, Any]) -> dict[str, Any]:
-    """Converts the variables of a trunk with `frozen=False` to parameters of a frozen one."""
-    flat = flax.traverse_util.flatten_dict(dict(variables["params"]))
-    stats = flax.traverse_util.flatten_dict(dict(variables["batch_stats"]))
-    return flax.traverse_util.unflatten_dict(flat | stats)
 
 
 class ResNetNeck(nn.Module):

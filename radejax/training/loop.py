@@ -14,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 from ml_collections import ConfigDict
 
@@ -208,12 +209,12 @@ class _Run:
             DataError: More than `max_skipped_steps` consecutive steps were skipped.
         """
         limit = self.config.train.max_skipped_steps
-        if (in_row := int(state.opt_state.notfinite_count)) > limit:
+        if (in_row := int(state.num_skipped_in_row)) > limit:
             raise DataError(
                 f"loss or gradient was not finite in {in_row} steps in a row (limit "
                 f"config.train.max_skipped_steps={limit})"
             )
-        if (skipped := int(state.opt_state.total_notfinite)) > self.num_skipped:
+        if (skipped := int(state.num_skipped)) > self.num_skipped:
             _log.warning(
                 "%d steps so far were skipped because loss or gradient was not finite",
                 skipped,
@@ -277,7 +278,7 @@ def _restore_or_initialize(
     return state
 
 
-def _evaluate(traced: jax.core.ClosedJaxpr, shapes: Any) -> Any:
+def _evaluate(traced: ClosedJaxpr, shapes: Any) -> Any:
     """Returns the results of a traced function as a tree of NumPy arrays.
 
     Only the operations that the results need are executed, one at a time. In one program,

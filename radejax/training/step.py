@@ -11,7 +11,6 @@ import flax.linen as nn
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
 from jax.typing import ArrayLike
@@ -90,10 +89,6 @@ def make_optimizer(
 ) -> optax.GradientTransformation:
     """Creates AdamW with torch's defaults and weight decay on every parameter.
 
-    A step whose gradient is not finite changes no parameters and is counted in the
-    optimizer state, see `optax.apply_if_finite`. The number of consecutive such steps is
-    not limited here.
-
     Args:
         schedule: Function from the step to the learning rate.
         weight_decay: Decoupled weight decay.
@@ -110,8 +105,8 @@ def make_optimizer(
         parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
     optimizer: optax.GradientTransformation = optax.chain(*parts)
     if count > 1:
-        optimizer = optax.MultiSteps(optimizer, count).gradient_transformation()
-    return optax.apply_if_finite(optimizer, np.iinfo(np.int32).max)
+        return optax.MultiSteps(optimizer, count).gradient_transformation()
+    return optimizer
 
 
 # State -------------------------------------------------------------------------------
@@ -122,16 +117,19 @@ class TrainState(struct.PyTreeNode):
 
     Attributes:
         step: Number of steps taken, including skipped ones; int32.
+        num_skipped: Number of steps skipped because loss or gradient was not finite.
+        num_skipped_in_row: Number of steps skipped since the last step that was not.
         params: Trained parameters, float32.
         model_state: Other variable collections, such as running batch statistics.
-        opt_state: State of the optimizer. It counts skipped steps, see
-            `optax.ApplyIfFiniteState`.
+        opt_state: State of the optimizer.
         ema_params: Moving average of `params`, or None.
         frozen: Parameters that are not trained. They have no gradient, optimizer state
             or average, and are not saved in checkpoints.
     """
 
     step: Int[jax.Array, ""]
+    num_skipped: Int[jax.Array, ""]
+    num_skipped_in_row: Int[jax.Array, ""]
     params: Any
     model_state: Any
     opt_state: Any
@@ -164,6 +162,8 @@ def create_state(
     params, frozen = split_parameters(variables["params"], is_frozen)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
+        num_skipped=jnp.zeros((), jnp.int32),
+        num_skipped_in_row=jnp.zeros((), jnp.int32),
         params=params,
         model_state={k: v for k, v in variables.items() if k != "params"},
         opt_state=optimizer.init(params),
@@ -234,7 +234,7 @@ def make_train_step(
     """Builds the function that computes one training step.
 
     A step whose loss or gradient is not finite leaves the parameters, batch statistics and
-    optimizer moments unchanged; the optimizer state counts it.
+    the optimizer's state unchanged; the train state counts it.
 
     Args:
         model: Radar or radar-camera detector.
@@ -272,29 +272,30 @@ def make_train_step(
         grad_norm = optax.global_norm(grads)
         is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(total)
 
-        # The optimizer checks only the gradient, which can be finite if the loss is not.
-        grads = jax.tree.map(lambda g: jnp.where(is_finite, g, jnp.nan), grads)
-        opt_state: Any
-        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
-        ema_params = state.ema_params
-        if ema_decay is not None:
-            ema_params = optax.incremental_update(params, ema_params, 1.0 - ema_decay)
-        ema_params, model_state = jax.tree.map(
-            lambda new, old: jnp.where(is_finite, new, old),
-            (ema_params, model_state),
-            (state.ema_params, state.model_state),
-        )
-        after = state.replace(
+        def update() -> TrainState:
+            updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+            params = optax.apply_updates(state.params, updates)
+            ema_params = state.ema_params
+            if ema_decay is not None:
+                ema_params = optax.incremental_update(params, ema_params, 1 - ema_decay)
+            return state.replace(
+                params=params,
+                model_state=model_state,
+                opt_state=opt_state,
+                ema_params=ema_params,
+                frozen={},
+            )
+
+        after = jax.lax.cond(is_finite, update, lambda: state.replace(frozen={}))
+        after = after.replace(
             step=state.step + 1,
-            params=params,
-            model_state=model_state,
-            opt_state=opt_state,
-            ema_params=ema_params,
+            num_skipped=state.num_skipped + ~is_finite,
+            num_skipped_in_row=jnp.where(is_finite, 0, state.num_skipped_in_row + 1),
+            frozen=state.frozen,
         )
         # If shapes or dtypes differed, the next step would be compiled again.
         chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
-        counts = {"skipped": opt_state.total_notfinite}
+        counts = {"skipped": after.num_skipped}
         return after, {"loss": total, **parts, "grad_norm": grad_norm, **counts}
 
     return step

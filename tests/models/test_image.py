@@ -1,6 +1,7 @@
 """Tests of radejax.models.image."""
 
 import chex
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,7 +117,9 @@ def test_a_trained_trunk_is_the_frozen_one_of_its_statistics():
         variables = trained.init(jax.random.key(0), image)
         _, stats = trained.apply(variables, image, True, mutable=["batch_stats"])
         variables = {**variables, **stats}
-        params = image_lib.frozen_params(variables)
+        flatten = flax.traverse_util.flatten_dict
+        merged = flatten(variables["params"]) | flatten(variables["batch_stats"])
+        params = flax.traverse_util.unflatten_dict(merged)
         expected = trained.apply(variables, image)
         return expected, frozen.apply({"params": params}, image), params
 
