@@ -25,7 +25,7 @@ from radejax.simulation.radar.tensor import RadarParameters
 SIMULATOR_VERSION = 4
 """Raised whenever the same config gives other files than before."""
 
-# Environment, time and weather of the procedural sequences, in turn.
+# Environment, time and weather of the procedural sequences, used cyclically.
 CONDITIONS = (
     ("urban", "day", "normal"),
     ("highway", "day", "overcast"),
@@ -54,7 +54,7 @@ _RANGES = {
     "frame_stride": integer(1),
     "image_width": integer(0),
     "image_height": integer(0),
-    "vru_density_scale": number(0, 5),  # more would leave no space for other road users
+    "vru_density_scale": number(0, 5),  # more leaves no space for other road users
     "output": one_of("tesseract", "projection"),
     "camera_mode": one_of("scene", "oracle"),
     "label_distance_m": POSITIVE,
@@ -72,40 +72,44 @@ FULL_SIZE = {
 
 @dataclasses.dataclass(frozen=True)
 class SimulationConfig:
-    """Settings of a simulated dataset; the defaults are a small one for tests.
+    """Settings of a simulated dataset. The defaults give a small dataset for tests.
 
     Attributes:
-        seed: Everything random follows from it.
+        seed: Seed of all random numbers.
         scenes: "procedural", or the path of a K-Radar label folder or zip.
-        train_sequences: How many procedural sequences, numbered from 1. Conditions go
-            round `CONDITIONS`.
-        test_sequences: As many after them.
-        sequences: Numbers of the sequences of real labels; None for all.
-        label_version: Version of real labels.
-        frames_per_sequence: At 10 frames a second; 0 for all of real labels.
-        frame_stride: Use every n-th frame of real labels.
-        vru_density_scale: Number of pedestrians, motorcycles and bicycles in procedural
-            training scenes, as a multiple of what a road of the type has; at most 5.
-            Test scenes are not changed.
+        train_sequences: Number of procedural training sequences, numbered from 1. The
+            conditions of procedural sequences repeat `CONDITIONS` cyclically.
+        test_sequences: Number of procedural test sequences, numbered after the training
+            sequences.
+        sequences: Numbers of the sequences to use from real labels, or None for all.
+        label_version: Version of the real labels.
+        frames_per_sequence: Number of frames per sequence, at 10 frames per second in
+            procedural scenes; 0 uses all frames of real labels.
+        frame_stride: Stride at which the frames of real labels are used.
+        vru_density_scale: Factor on the number of pedestrians, motorcycles and bicycles
+            in procedural training scenes, at most 5. Test scenes are not affected.
         grid: Arguments of `RadarGrid.reduced`, or "kradar".
         radar: Fields of `RadarParameters` that differ from its defaults.
-        output: "tesseract" for K-Radar's files, "projection" for projections only.
-        image_width: Of one of the two stereo images; 0 for none.
-        image_height: The same.
-        cover_lens: Let bad weather cover the lens, as often as in K-Radar.
-        camera_mode: "scene" renders all that a camera sees; "oracle" only silhouettes
-            of the objects in the color of their class, an upper bound for the camera.
-        radar_from_lidar_m: `p_radar = p_lidar + t`; z as in K-Radar's own loaders.
-        label_distance_m: Objects farther away get no label.
+        output: "tesseract" to write 4D tensors in K-Radar's file format, "projection" to
+            write only projections.
+        image_width: Width in pixels of each of the two stereo images; 0 for no images.
+        image_height: Height in pixels of the images.
+        cover_lens: Whether bad weather covers the lens, as often as in K-Radar.
+        camera_mode: "scene" renders everything that the camera sees. "oracle" renders only
+            silhouettes of the objects in the color of their class, as an upper bound for
+            the camera.
+        radar_from_lidar_m: Translation t of `p_radar = p_lidar + t` in meters; its z is
+            the value in K-Radar's own data loaders.
+        label_distance_m: Maximum distance of labeled objects.
 
     Raises:
-        UserError: A field is out of its range; names it.
+        UserError: A field is out of its range. The message names the field.
     """
 
     seed: int = 0
     scenes: str = "procedural"
-    # Many short sequences: frames of one sequence resemble each other, and a network
-    # learns more from 20 roads for 2 seconds than from 10 roads for 4.
+    # Many short sequences, as the frames of one sequence resemble each other: a network
+    # learns more from 20 roads for 2 seconds than from 10 roads for 4 seconds.
     train_sequences: int = 20
     test_sequences: int = 8
     sequences: tuple[int, ...] | None = None
@@ -135,7 +139,7 @@ class SimulationConfig:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> SimulationConfig:
-        """Settings from plain values or a ConfigDict; missing fields have defaults.
+        """Creates settings from plain values or a ConfigDict, with defaults where missing.
 
         Raises:
             UserError: A field is unknown or out of its range.
@@ -170,7 +174,7 @@ class SimulationConfig:
         require(holds, f"config.simulation.{name}", getattr(self, name), expected)
 
     def make_grid(self) -> RadarGrid:
-        """The radar's axes."""
+        """Returns the axes of the radar tensor."""
         if self.grid == "kradar":
             return RadarGrid.kradar()
         fields: Any = self.grid
@@ -182,33 +186,33 @@ class SimulationConfig:
             raise UserError(f"config.simulation.grid: {error}") from None
 
     def make_parameters(self) -> RadarParameters:
-        """The rest of the radar."""
+        """Returns the parameters of the radar other than its axes."""
         try:
             return RadarParameters(**self.radar)
         except TypeError as error:
             raise UserError(f"config.simulation.radar: {error}") from None
 
     def to_json(self) -> str:
-        """Canonical text: equal settings give equal text."""
+        """Returns canonical JSON text, which is equal for equal settings."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
     def fingerprint(self) -> str:
-        """Short hash of everything the files depend on."""
+        """Returns a short hash of the settings and the simulator version."""
         text = f"{SIMULATOR_VERSION} {self.to_json()}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def conditions(self, number: int) -> tuple[str, str, str]:
-        """Environment, time and weather of sequence `number` (from 1)."""
+        """Returns environment, time and weather of sequence `number`, counted from 1."""
         return CONDITIONS[(number - 1) % len(CONDITIONS)]
 
 
 def default_config() -> dict[str, Any]:
-    """Fields and defaults of `SimulationConfig` as fresh plain values."""
+    """Returns the fields of `SimulationConfig` with their defaults as a new dictionary."""
     return dataclasses.asdict(SimulationConfig())
 
 
 def plain(config: Any) -> Any:
-    """ConfigDicts and other mappings as dictionaries, recursively."""
+    """Converts ConfigDicts and other mappings to dictionaries, recursively."""
     if hasattr(config, "to_dict"):
         config = config.to_dict()
     if isinstance(config, Mapping):

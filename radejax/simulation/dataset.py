@@ -1,8 +1,9 @@
 """Writes simulated sequences in K-Radar's folders and file formats.
 
-Frames are written one by one, the label file last: a frame exists when its label file
-does. A killed run resumes and ends with the same bytes. Worker processes make scenes and
-images; this process computes the radar's part on its device.
+Frames are written one by one. The label file of a frame is written last, so a frame is
+complete if its label file exists. A killed run can be resumed and gives the same bytes.
+Worker processes create scenes and images, and the main process computes the radar data on
+its device.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ __all__ = ["default_config", "simulate_dataset"]
 
 _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
-_FEW_FRAMES = 100  # done before worker processes have started
+_FEW_FRAMES = 100  # simulated before worker processes would have started
 
 _T = TypeVar("_T")
 
@@ -61,22 +62,23 @@ def simulate_dataset(
     num_workers: int | None = None,
     progress: bool = True,
 ) -> pathlib.Path:
-    """Simulates a dataset into `root`, or finishes or reuses the one that is there.
+    """Simulates a dataset into `root`, or finishes or reuses an existing dataset.
 
     Args:
-        config: Plain values as `default_config` returns (a mapping or ConfigDict).
-        root: Folder of the dataset; made if missing.
-        num_workers: Processes that make scenes and render images; 0: this one; None: one
-            per core, or this one for few frames.
-        progress: Show a progress bar.
+        config: Mapping or ConfigDict of plain values, as returned by `default_config`.
+        root: Folder of the dataset, which is created if it does not exist.
+        num_workers: Number of processes that create scenes and render images. 0 uses only
+            this process. None uses one per core, or only this process for few frames.
+        progress: Whether to show a progress bar.
 
     Returns:
-        `root` as a path, with a complete K-Radar tree in it: per sequence tesseracts,
-        front images, labels (v2.1), calibration and description; splits, camera
-        calibrations and, for a grid other than K-Radar's, `radar_grid.json`.
+        `root` as a path. The folder contains a complete K-Radar tree: tesseracts or
+        projections, front images, labels (v2.1), calibration and description of each
+        sequence, the splits, the camera calibrations and, for a grid other than
+        K-Radar's, `radar_grid.json`.
 
     Raises:
-        UserError: A config value is wrong, `root` holds something else or a dataset
+        UserError: A config value is invalid, `root` contains other files or a dataset
             of another config, the disk is full, or a worker was killed.
     """
     checked = SimulationConfig.from_mapping(config)
@@ -98,7 +100,7 @@ def simulate_dataset(
 
 
 def expected_size(config: SimulationConfig, source: SceneSource) -> tuple[int, float]:
-    """Frames of a dataset and about how many bytes its files take."""
+    """Returns the number of frames of a dataset and its approximate size in bytes."""
     grid = config.make_grid()
     is_whole = config.output == "tesseract"
     numbers = np.prod(grid.shape_drea if is_whole else grid.projection_shape)
@@ -108,7 +110,12 @@ def expected_size(config: SimulationConfig, source: SceneSource) -> tuple[int, f
 
 
 def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
-    """True for a complete dataset of this config; raises for any other content."""
+    """Returns True if `root` contains the complete dataset of this config.
+
+    Raises:
+        UserError: `root` is a file, or contains other files or a dataset of another
+            config.
+    """
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file, expected a folder for the dataset")
     marker = root / SIMULATION_MARKER
@@ -129,7 +136,7 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
 
 
 def _marker(config: SimulationConfig) -> dict[str, Any]:
-    """Marker file of an unfinished dataset; the fingerprint includes the version."""
+    """Returns the content of the marker file of an unfinished dataset."""
     return {
         "config": json.loads(config.to_json()),
         "finished": False,
@@ -138,7 +145,7 @@ def _marker(config: SimulationConfig) -> dict[str, Any]:
 
 
 def _cameras(config: SimulationConfig) -> tuple[CameraCalibration, ...]:
-    """Left and right camera, or none."""
+    """Returns the left and right camera, or an empty tuple without images."""
     if not config.image_width:
         return ()
     size = config.image_width, config.image_height
@@ -148,7 +155,7 @@ def _cameras(config: SimulationConfig) -> tuple[CameraCalibration, ...]:
 def _write_common(
     root: pathlib.Path, config: SimulationConfig, source: SceneSource
 ) -> None:
-    """Splits, sensor axes, camera calibrations."""
+    """Writes the splits, the sensor axes and the camera calibrations."""
     names: dict[str, list[tuple[int, str]]] = {"train": [], "test": []}
     for number in source.numbers:
         for spec in source.frames(number):
@@ -201,7 +208,10 @@ def _write_frames(
 def _missing(
     root: pathlib.Path, config: SimulationConfig, source: SceneSource
 ) -> Iterator[tuple[int, FrameSpec]]:
-    """Yields frames without a label file; writes the other files of a sequence."""
+    """Yields the frames without a label file, and writes the files of each sequence.
+
+    These files are the description and the calibration.
+    """
     for number in source.numbers:
         folder, specs = root / str(number), source.frames(number)
         kradar_write.write_description(
@@ -240,7 +250,7 @@ def _write_frame(
 
 
 class _Scenes:
-    """Prepares the input of the radar and the labels of frames, and writes images."""
+    """Prepares the radar input and the labels of frames, and writes their images."""
 
     def __init__(
         self, root: pathlib.Path, config: SimulationConfig, source: SceneSource
@@ -258,7 +268,7 @@ class _Scenes:
             path = self._root / str(number) / "cam-front" / name
             with files.atomic_write(path) as file:
                 image = Image.fromarray(renderer.render(frame))
-                image.save(file, format="PNG", compress_level=1)  # fast, not small
+                image.save(file, format="PNG", compress_level=1)  # for speed
         given = simulator.radar_input(frame)
         labels = simulator.labels(
             frame, given, config.radar_from_lidar_m, config.label_distance_m
@@ -282,9 +292,10 @@ class _Scenes:
 def _prepared(
     num_workers: int, missing: Sequence[tuple[int, FrameSpec]], *of_scenes: Any
 ) -> Generator[tuple[int, FrameSpec, RadarInput, list[Label]], None, None]:
-    """Yields sequence, frame, radar input and labels, in order.
+    """Yields the sequence number, frame, radar input and labels of each frame, in order.
 
-    Close it to end the processes: it starts `num_workers`, or works in this one if 0.
+    The generator starts `num_workers` processes, or uses this process if it is 0. Closing
+    the generator ends the processes.
     """
     if not num_workers:
         scenes = _Scenes(*of_scenes)
@@ -301,7 +312,10 @@ def _prepared(
 
 
 def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:
-    """The items, each after `count` further ones have been taken and so started."""
+    """Yields each item after the next `count` items have been taken from the iterator.
+
+    Taking an item starts its computation.
+    """
     waiting = collections.deque(itertools.islice(items, count))
     while waiting:
         waiting.extend(itertools.islice(items, 1))
@@ -312,14 +326,17 @@ _scenes: Any = None
 
 
 def _start_worker(root: pathlib.Path, *of_scenes: Any) -> None:
-    """Only the parent uses the accelerator; this process uses the CPU."""
+    """Sets up a worker process, which uses the CPU as the parent uses the accelerator."""
     global _scenes
     jax.config.update("jax_platforms", "cpu")
     _scenes = root, _Scenes(root, *of_scenes)
 
 
 def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
-    """Writes a file, as results of workers must be short, and returns its path."""
+    """Prepares a frame, writes the result to a file and returns the path of the file.
+
+    The result itself is too large to be returned by a worker.
+    """
     root, scenes = _scenes
     path = root / f".{number}_{spec.name}.tmp"
     path.write_bytes(pickle.dumps(scenes.prepare(number, spec)))

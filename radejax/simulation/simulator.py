@@ -1,7 +1,7 @@
-"""The sequences of a dataset and their frames: radar input and labels.
+"""Sequences of a simulated dataset, and the radar input and labels of their frames.
 
 A source lists sequences and their frames (numbers, time stamps, split) without simulating
-anything, and makes the scene of one sequence on request, procedural or from label files.
+them. It creates the scene of a sequence on request, procedurally or from label files.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ MIN_LIT = 0.15
 
 @dataclasses.dataclass(frozen=True)
 class RadarInput:
-    """Everything that decides one radar frame.
+    """Input from which one radar frame is computed.
 
     Attributes:
         scatterers: Point targets.
-        noise_power: Mean noise power.
-        key: Seed of the noise.
-        snr_db: Power of each box's scatterers over the receiver noise.
+        noise_power: Mean noise power of each range and Doppler bin.
+        key: Random key of the noise.
+        snr_db: Ratio of the total power of each box's scatterers to the receiver noise.
         lit: Fraction of each box's power that no other box blocks.
     """
 
@@ -62,9 +62,10 @@ def simulate_radar(
     parameters: tensor.RadarParameters,
     output: Literal["tesseract", "projection"],
 ) -> Float[jax.Array, "..."]:
-    """Rows `[R, E, D, A]` of the 4D radar tensor, or the projection `[R, A, D+E]`.
+    """Computes the rows `[R, E, D, A]` of the 4D radar tensor or its projection.
 
-    The result is still on the device, where it may not be complete yet.
+    The projection has the shape `[R, A, D+E]`. The result is a device array, whose
+    computation may not be finished when the function returns.
     """
     return tensor.simulate(
         given.scatterers,
@@ -77,16 +78,17 @@ def simulate_radar(
 
 
 class SequenceSimulator:
-    """Radar frames and labels of one sequence, the same for the same seed.
+    """Simulates radar frames and labels of one sequence, reproducibly for a given seed.
 
-    Frames are independent of each other: any frame, in any order, on any thread.
+    Frames are independent of each other and can be simulated in any order and on any
+    thread.
 
     Args:
-        sequence: The scene.
+        sequence: Scene of the sequence.
         grid: Axes of the radar.
-        parameters: The rest of the radar.
-        seed: Scattering centers, phases and noise follow from it, the sequence's
-            number and the frame's index.
+        parameters: Parameters of the radar other than its axes.
+        seed: Seed of scattering centers, phases and noise, in addition to the number of
+            the sequence and the index of the frame.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class SequenceSimulator:
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
 
     def radar_input(self, frame: SceneFrame) -> RadarInput:
-        """Scatterers and noise of a frame: NumPy, ready for `tensor.simulate`."""
+        """Computes scatterers and noise of a frame as NumPy input of `tensor.simulate`."""
         sequence, parameters = self.sequence, self.parameters
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
         static = scattering.scatter_surroundings(frame, self._static_phase, parameters)
@@ -120,7 +122,7 @@ class SequenceSimulator:
             propagation.WEATHERS[sequence.weather].surface,
             parameters.wavelength_m,
         )
-        # The cross-section of the ground already includes reflection by the ground.
+        # The cross-section of the ground already includes its reflections.
         is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
         count = len(objects.power)
         bounce[count : count + len(is_ground)][is_ground] = 1.0
@@ -148,7 +150,7 @@ class SequenceSimulator:
         given: RadarInput,
         output: Literal["tesseract", "projection"] = "projection",
     ) -> Float[np.ndarray, "..."]:
-        """The 4D radar tensor `[D, R, E, A]` or the projection `[R, A, D+E]`."""
+        """Computes the 4D radar tensor `[D, R, E, A]` or the projection `[R, A, D+E]`."""
         rows = np.asarray(simulate_radar(given, self.grid, self.parameters, output))
         is_whole = output == "tesseract"
         return rows.transpose(tensor.TESSERACT_OF_ROWS) if is_whole else rows
@@ -156,7 +158,11 @@ class SequenceSimulator:
     def is_radar_visible(
         self, frame: SceneFrame, given: RadarInput
     ) -> Bool[np.ndarray, " N"]:
-        """True for boxes in the field of view, strong enough, and not hidden."""
+        """Returns True for boxes that the radar can detect.
+
+        These are in the field of view, have an SNR above `MIN_SNR_DB`, and more than
+        `MIN_LIT` of their power is not blocked by other boxes.
+        """
         inside = self.grid.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
         return inside & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
 
@@ -167,13 +173,13 @@ class SequenceSimulator:
         radar_from_lidar_m: tuple[float, float, float],
         max_distance_m: float,
     ) -> list[Label]:
-        """Labels of one frame, in the LiDAR frame as K-Radar's files have them.
+        """Returns the labels of one frame in the LiDAR frame, as in K-Radar's files.
 
         Args:
             frame: Scene of the frame.
             given: Radar input of the same frame.
-            radar_from_lidar_m: `p_radar = p_lidar + t`.
-            max_distance_m: Farther objects get no label.
+            radar_from_lidar_m: Translation t of `p_radar = p_lidar + t`.
+            max_distance_m: Distance from which on objects get no label.
         """
         visible = self.is_radar_visible(frame, given)
         distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
@@ -200,10 +206,10 @@ class FrameSpec:
     """One frame of a dataset before it is simulated.
 
     Attributes:
-        scene_idx: Its index in the scene of the sequence.
+        scene_idx: Index of the frame in the scene of the sequence.
         indices: Frame numbers of radar, LiDAR OS2-64, front camera, LiDAR OS1-128 and
-            the other cameras: the header of its label file.
-        timestamp_s: Unix time.
+            the other cameras, as in the header of the label file.
+        timestamp_s: Unix time in seconds.
         split: "train" or "test".
     """
 
@@ -218,7 +224,7 @@ class FrameSpec:
 
 
 class ProceduralSource:
-    """Procedural sequences numbered from 1, the training ones first."""
+    """Source of procedural sequences, numbered from 1 with training sequences first."""
 
     def __init__(self, config: SimulationConfig) -> None:
         self._config = config
@@ -262,11 +268,12 @@ class ProceduralSource:
 
 
 class LabelSource:
-    """Sequences of a K-Radar label folder or zip, with K-Radar's own split."""
+    """Source of the sequences in a K-Radar label folder or zip, with K-Radar's split."""
 
     def __init__(self, config: SimulationConfig) -> None:
         self._config = config
-        # Objects outside the field of view block and appear in images: keep all.
+        # Objects outside the field of view are kept, as they can block other objects and
+        # appear in images.
         data = KRadar(
             labels=config.scenes,
             version=config.label_version,
@@ -282,7 +289,7 @@ class LabelSource:
         self.numbers = sorted(self._frames)
 
     def conditions(self, number: int) -> tuple[str, str, str]:
-        """Environment, time and weather of the sequence `number`."""
+        """Returns environment, time and weather of the sequence `number`."""
         frame = self._frames[number][0]
         return frame.environment, frame.time, frame.weather
 
@@ -314,7 +321,10 @@ class LabelSource:
 
 
 def _header_indices(header: LabelHeader) -> tuple[int, int, int, int, int]:
-    """Frame numbers of `FrameSpec`; old labels name some sensors only."""
+    """Returns the frame numbers of a `FrameSpec`.
+
+    Sensors that are missing in old labels get the frame number of the LiDAR.
+    """
     maybe = header.camera_front, header.lidar_long, header.camera_lrr
     camera, long_lidar, others = (header.lidar if n is None else n for n in maybe)
     return header.radar, header.lidar, camera, long_lidar, others
@@ -324,5 +334,5 @@ SceneSource = ProceduralSource | LabelSource
 
 
 def make_source(config: SimulationConfig) -> SceneSource:
-    """The source that a config names."""
+    """Creates the source of scenes selected by a config."""
     return (ProceduralSource if config.scenes == "procedural" else LabelSource)(config)

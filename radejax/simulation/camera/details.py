@@ -1,9 +1,9 @@
-"""Details of vehicles, and the flat shapes beside the road.
+"""Details of vehicles and people, and the flat shapes beside the road.
 
-A detail (windows, wheels, lights, plates, hair) is a rectangle on a face of a block of
-`shapes.BLOCKS`, in fractions of that face; it lies within the object's box and is painted
-right after its block. Trees, poles, guard rails and facades are the same reflectors
-that scatter radar waves, so that an image shows what the radar map shows.
+A detail (window, wheel, light, plate, hair) is a rectangle on a face of a block of
+`shapes.BLOCKS`, in fractions of that face. It lies within the object's box and is painted
+directly after its block. Trees, poles, guard rails and facades are drawn at the reflectors
+that also scatter radar waves, so that image and radar map agree.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ class Detail(NamedTuple):
     Attributes:
         block: Index of the block.
         face: `FRONT`, `REAR`, `LEFT`, `RIGHT` or `TOP`.
-        u: From and to, from the face's first corner to its second.
-        v: From and to, upward; may leave [0, 1] where the block's neighbor is there.
+        u: Start and end, from 0 at the face's first corner to 1 at its second.
+        v: Start and end, from 0 at the bottom of the face to 1 at its top. They may be
+            outside of [0, 1] where an adjacent block continues the face.
         color: Red, green, blue.
     """
 
@@ -48,7 +49,7 @@ _HAIR = (48.0, 38.0, 32.0)
 
 
 def _pair(block, face, u, v, color, other=None) -> list[Detail]:
-    """At u, and mirrored across the middle of the same or of another face."""
+    """Returns a detail and its mirror image on the same face or on face `other`."""
     mirrored = Detail(
         block, face if other is None else other, (1.0 - u[1], 1.0 - u[0]), v, color
     )
@@ -56,12 +57,12 @@ def _pair(block, face, u, v, color, other=None) -> list[Detail]:
 
 
 def _sides(block, u, v, color) -> list[Detail]:
-    """On both sides; u runs from the rear to the front."""
+    """Returns a detail on both sides of a block, with u from the rear to the front."""
     return _pair(block, LEFT, u, v, color, RIGHT)
 
 
 def _wheel(block, center, half_u, low, high) -> list[Detail]:
-    """A wheel on both sides: two rectangles make an octagon, a third its rim."""
+    """Returns wheels on both sides: two overlapping rectangles each, and one for the rim."""
     middle, half_v = (low + high) / 2.0, (high - low) / 2.0
     result = []
     for share_u, share_v, color in (
@@ -131,15 +132,15 @@ def on_faces(
     u: Float[np.ndarray, "F 2"],
     v: Float[np.ndarray, "F 2"],
 ) -> Float[np.ndarray, "F 4 3"]:
-    """Rectangles on quadrilaterals.
+    """Computes the corners of rectangles on quadrilateral faces.
 
     Args:
-        faces: Corners: below first, below second, above second, above first.
-        u: From and to along the lower edge.
-        v: From and to upward.
+        faces: Corners of the faces: lower first, lower second, upper second, upper first.
+        u: Start and end along the lower edge.
+        v: Start and end in the upward direction.
 
     Returns:
-        Corners in the same order, bilinear between those of the face.
+        Corners in the same order, interpolated bilinearly between the corners of the face.
     """
     u, v = u[:, [0, 1, 1, 0], None], v[:, [0, 0, 1, 1], None]  # [F, 4, 1]
     a, b, c, d = (faces[:, None, i] for i in range(4))
@@ -160,8 +161,8 @@ class Faces(NamedTuple):
     Attributes:
         corners: x, y, z.
         color: Red, green, blue in white light.
-        depth_m: Distance of the object.
-        block_depth_m: Distance of the block.
+        depth_m: Distance of the object from the camera.
+        block_depth_m: Distance of the block from the camera.
         box: Index of the box, -1 for none.
     """
 
@@ -175,13 +176,13 @@ class Faces(NamedTuple):
 def make_panels(
     frame: SceneFrame, origin: Float[np.ndarray, "3"], ground_m: float, white: float
 ) -> Faces:
-    """Upright rectangles of the surroundings in one frame, which belong to no box.
+    """Creates upright rectangles for the surroundings in one frame.
 
     Args:
-        frame: Its reflectors are drawn.
-        origin: Camera position; trees and poles turn their face to it.
+        frame: Scene of the frame, which contains the reflectors to draw.
+        origin: Camera position, which trees and poles face.
         ground_m: Height of the ground.
-        white: Snow on everything, 0 to 1.
+        white: Amount of snow on trees and poles, from 0 to 1.
     """
     fixed = frame.reflectors
     near = np.hypot(fixed.position_m[:, 0], fixed.position_m[:, 1]) < _FAR_M

@@ -1,8 +1,8 @@
-"""Weather before and on the camera: haze, falling rain and snow, a covered lens.
+"""Effects of weather on camera images: haze, rain, snow and a covered lens.
 
-The second paper counts, of K-Radar's 35,000 front images, 7,500 partly, 4,800 heavily
-and 4,900 fully covered ones, all in bad weather. `AIR` reproduces these numbers when
-every sequence of K-Radar is simulated.
+Among K-Radar's 35,000 front images, the DinoRADE paper counts 7,500 partially, 4,800 heavily
+and 4,900 fully covered ones, all in bad weather. `AIR` reproduces these numbers if all
+sequences of K-Radar are simulated.
 
 References:
     DinoRADE (`docs`), section 5: covered front images in K-Radar.
@@ -18,14 +18,15 @@ from PIL import Image, ImageDraw
 
 @dataclasses.dataclass(frozen=True)
 class Air:
-    """Effect of the air on an image.
+    """Effects of one kind of weather on an image.
 
     Attributes:
-        extinction_per_m: Haze: contrast falls with `exp(-extinction x distance)`.
-        drops: Streaks or flakes per megapixel.
-        is_snow: Flakes instead of streaks.
-        wetness: Shine of the road, 0 to 1.
-        white: Snow on the ground, 0 to 1.
+        extinction_per_m: Extinction coefficient of haze. The contrast decreases with
+            `exp(-extinction x distance)`.
+        drops: Mean number of streaks or flakes per megapixel.
+        is_snow: Whether to draw flakes instead of streaks.
+        wetness: Wetness of the road, which darkens it, from 0 to 1.
+        white: Amount of snow on the ground, from 0 to 1.
         cover: Probabilities of `LEVELS`.
     """
 
@@ -54,7 +55,7 @@ BLOCK_FRAMES = 50
 
 
 def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
-    """State of the lens in one frame, one of `LEVELS`; constant over blocks of frames."""
+    """Returns the level of lens cover, which is constant in blocks of `BLOCK_FRAMES`."""
     rng = np.random.default_rng([seed, sequence, frame // BLOCK_FRAMES, 13])
     return LEVELS[rng.choice(4, p=AIR[weather].cover)]
 
@@ -62,7 +63,7 @@ def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
 def add_precipitation(
     image: Image.Image, air: Air, light: float, rng: np.random.Generator
 ) -> Image.Image:
-    """Streaks of rain or flakes of snow, different on every frame."""
+    """Draws streaks of rain or flakes of snow on an image."""
     width, height = image.size
     count = rng.poisson(air.drops * width * height / 1e6)
     if not count:
@@ -88,14 +89,15 @@ def cover_lens(
     light: float,
     rng: np.random.Generator,
 ) -> Image.Image:
-    """Drops, slush or snow on the lens.
+    """Adds drops, slush or snow on the lens to an image.
 
     Args:
-        image: What the camera would see.
+        image: Image of the camera with a clear lens.
         level: One of `LEVELS`.
-        is_snow: White patches instead of clear drops.
+        is_snow: Whether the patches are white instead of clear drops.
         light: Brightness, 1 by day.
-        rng: Where the drops sit; give the same for frames of one block.
+        rng: Random generator of the drop positions. Pass one with the same state for all
+            frames of a block.
     """
     if level == "clear":
         return image
@@ -110,7 +112,7 @@ def cover_lens(
 
 
 def _blurred(image: Image.Image, factor: float) -> Image.Image:
-    """Blur by shrinking and enlarging, relative to an image of 1280 pixels width."""
+    """Blurs an image by downsampling; `factor` applies to a width of 1280 pixels."""
     width, height = image.size
     factor = max(factor * width / 1280.0, 1.01)
     small = (max(int(width / factor), 2), max(int(height / factor), 2))
@@ -119,7 +121,7 @@ def _blurred(image: Image.Image, factor: float) -> Image.Image:
 
 
 def _drop_mask(size, share: float, rng: np.random.Generator) -> Image.Image:
-    """Soft round patches that cover about the fraction `share` of the image."""
+    """Draws a mask of soft round patches that cover about a fraction of the image."""
     width, height = 160, 90
     mask = Image.new("L", (width, height), 0)
     draw = ImageDraw.Draw(mask)

@@ -1,4 +1,4 @@
-"""Vehicles and people as a few flat faces each, in the frame of their box."""
+"""Shapes of vehicles and people, which consist of a few flat faces in their box."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details
 from radejax.simulation.camera.details import Faces
 
-# A block in units of the half extents: x, y, z ranges; color role; fraction of
-# the length and width that is kept at its top (a taper).
+# A block in units of the half extents: x, y and z range, color role, and the taper, which is
+# the fraction of length and width at its top.
 _Pair = tuple[float, float]
 _Block = tuple[_Pair, _Pair, _Pair, str, _Pair]
 
@@ -76,13 +76,13 @@ _SUN = np.array([0.35, 0.45, 0.82])
 
 @dataclasses.dataclass(frozen=True)
 class Polygon:
-    """A face on the image.
+    """A face projected into the image.
 
     Attributes:
-        points: Pixels in order, u and v in turn.
+        points: Corners in order as a flat list u0, v0, u1, v1, ... in pixels.
         color: Red, green, blue.
-        depth_m: Distance of its object; `visible_polygons` sorts by it.
-        box: Index of its box in the frame.
+        depth_m: Distance of the object, by which `visible_polygons` sorts.
+        box: Index of the box in the frame, -1 for roadside shapes.
     """
 
     points: list[float]
@@ -94,7 +94,7 @@ class Polygon:
 def object_colors(
     cls: Int[np.ndarray, " N"], rng: np.random.Generator
 ) -> Float[np.ndarray, "N 2 3"]:
-    """Body color and second color (legs) of objects by class index."""
+    """Draws the body color and second color (legs) of objects given by class index."""
     paint = _PAINT[rng.integers(len(_PAINT), size=len(cls))]
     clothes = _CLOTHES[rng.integers(len(_CLOTHES), size=len(cls))]
     paint = paint * rng.uniform(0.82, 1.08, (len(cls), 1))
@@ -103,7 +103,7 @@ def object_colors(
 
 
 def blocks_of(cls: str) -> Float[np.ndarray, "K 8 3"]:
-    """Corners of a class's blocks in half extents: 4 below, 4 above."""
+    """Returns the corners of a class's blocks in half extents, 4 lower then 4 upper."""
     corners = []
     for (x0, x1), (y0, y1), (z0, z1), _, (keep_x, keep_y) in BLOCKS[cls]:
         cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
@@ -117,13 +117,13 @@ def blocks_of(cls: str) -> Float[np.ndarray, "K 8 3"]:
 
 @dataclasses.dataclass(frozen=True)
 class Light:
-    """How bright and how hazy the scene is.
+    """Brightness and haze of a scene.
 
     Attributes:
         ambient: Brightness, 1 by day.
         veil: Color of the haze.
-        extinction_per_m: Density of the haze.
-        headlights: True if the ego vehicle lights up what is ahead.
+        extinction_per_m: Extinction coefficient of the haze.
+        headlights: Whether the headlights of the ego vehicle are on.
     """
 
     ambient: float
@@ -138,7 +138,7 @@ class Light:
         y_m: Float[np.ndarray, " N"],
         depth_m: Float[np.ndarray, " N"],
     ) -> Float[np.ndarray, "N 3"]:
-        """Colors of surfaces at positions as they appear."""
+        """Computes the apparent colors of surfaces from their colors and positions."""
         brightness = np.full(np.shape(depth_m), self.ambient)
         if self.headlights:
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
@@ -155,15 +155,15 @@ def visible_polygons(
     light: Light,
     roadside: Faces,
 ) -> list[Polygon]:
-    """Faces that look at the camera, far objects first.
+    """Returns the faces that are turned toward the camera as polygons, far objects first.
 
     Args:
-        boxes: In the radar's frame.
+        boxes: Boxes in the radar frame.
         classes: Class name of each box.
-        colors: Colors as `object_colors` returns them.
-        calibration: The camera.
+        colors: Colors as returned by `object_colors`.
+        calibration: Calibration of the camera.
         light: Brightness and haze.
-        roadside: Surroundings, see `details.make_panels`.
+        roadside: Faces of the surroundings, from `details.make_panels`.
     """
     objects = _object_faces(boxes, classes, colors, camera_position(calibration))
     faces = Faces(*map(np.concatenate, zip(objects, roadside, strict=True)))
@@ -182,14 +182,17 @@ def visible_polygons(
 
 
 def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
-    """Position of the camera in the radar's frame."""
+    """Returns the position of the camera in the radar frame."""
     return calibration.radar_from_lidar_m - (
         calibration.rotation.T @ calibration.translation_m
     )
 
 
 def _object_faces(boxes, classes, colors, origin) -> Faces:
-    """Faces that look at the camera, of all objects in front of it."""
+    """Returns the faces of the objects that are turned toward the camera.
+
+    Objects with their center more than 3 m behind the radar are left out.
+    """
     flat, vector = np.zeros(0), np.zeros((0, 3))
     parts = [(np.zeros((0, 4, 3)), vector, flat, flat, flat.astype(int), vector)]
     for index in np.flatnonzero(boxes[:, 0] > -3.0):
@@ -203,7 +206,7 @@ def _object_faces(boxes, classes, colors, origin) -> Faces:
         quads = corners[:, _VERTICES].reshape(-1, 4, 3)
         roles = _ROLE_COLORS | {"body": colors[index, 0], "legs": colors[index, 1]}
         color = np.array([roles[role] for *_, role, _ in BLOCKS[cls]], float)[block]
-        if depth < _DETAIL_M:  # after their blocks, so that they are painted on them
+        if depth < _DETAIL_M:  # appended, so that details are painted over their blocks
             on_block, on_face, u, v, paint = _DETAIL_TABLES[cls]
             chosen = quads[on_block * len(_NORMALS) + on_face]
             quads = np.concatenate([quads, details.on_faces(chosen, u, v)])
@@ -224,9 +227,10 @@ def _object_faces(boxes, classes, colors, origin) -> Faces:
 def _project_faces(
     faces: Float[np.ndarray, "F 4 3"], calibration: CameraCalibration
 ) -> list[list[float]]:
-    """Pixels of faces cut at the near plane, u and v in turn; edges bend with the lens.
+    """Projects faces to flat lists of pixels, clipped at the near plane.
 
-    A face wholly nearer than the plane, or off the image, gives an empty list.
+    Edges are subdivided to follow the lens distortion. A face that is entirely in front of
+    the near plane or outside of the image gives an empty list.
     """
     camera = calibration.camera("raw")
     following = np.roll(faces, -1, axis=1)
@@ -238,7 +242,7 @@ def _project_faces(
     nearest, farthest = depth.min(1), depth.max(1)
     result: list[list[float]] = [[] for _ in faces]
     shown = ((places.max(1) >= 0) & (places.min(1) <= size)).all(1)
-    # Only visible faces, as flat lists: making tuples would take as long as drawing.
+    # Flat lists of only the visible faces: creating tuples would take as long as drawing.
     whole = np.flatnonzero(shown & ~(nearest < _NEAR_M))
     for index, points in zip(whole, _flat(places[whole], size), strict=True):
         result[index] = points
@@ -252,13 +256,13 @@ def _project_faces(
 def _flat(
     places: Float[np.ndarray, "F P 2"], size: Float[np.ndarray, "2"]
 ) -> list[list[float]]:
-    """Pixels of all faces in one array, near an image of a given size."""
+    """Returns the pixels of faces as flat lists, clipped to the vicinity of the image."""
     near = np.clip(places, -2.0 * size, 3.0 * size)
     return near.reshape(len(near), 2 * near.shape[1]).tolist()
 
 
 def _cut_near(outline, depth, near_m) -> np.ndarray:
-    """Polygon `[P, 3]` cut at a depth (Sutherland and Hodgman)."""
+    """Clips a polygon `[P, 3]` at a depth by the Sutherland-Hodgman algorithm."""
     kept = []
     for i in range(len(outline)):
         here, there = depth[i - 1], depth[i]

@@ -1,24 +1,27 @@
-"""Propagation at 77 GHz: weather on the path, and the road as a mirror (two-ray).
+"""Propagation at 77 GHz: effects of weather and two-ray reflection at the road.
 
-Rain is that of about 10 mm/h. Its backscatter is that of a reflectivity of 24 dBZ, which
-large drops do not exceed at this wavelength. Snow, fog and the losses on the radome are
-chosen: the order is known (fog has hardly any effect, dry snow less than rain, melting
-snow more), the values depend on the day.
+Rain is modeled at a rate of about 10 mm/h. Its backscatter corresponds to a reflectivity
+of 24 dBZ, which large drops do not exceed at this wavelength. The values of snow, fog and
+radome losses are our choice. Their order is known: fog has hardly any effect, dry snow
+attenuates less than rain and melting snow more. The actual values vary.
 
-Between radar and target there is a second path over the road, longer by a few
-wavelengths. There and back, the two paths combine to four; near grazing incidence an even
-road reflects almost everything, so they add up to 12 dB more or nearly cancel. The bounced
-path is given the direction of the direct one: 1.5 m of mirrored height are one beam of
-elevation at 10 m and less beyond. Hills, kerbs and vehicles in between do not disturb it.
+Between radar and target there is a second path, reflected by the road and longer by a few
+wavelengths. The two paths on the way there and the two on the way back give four
+combinations. Near grazing incidence an even road reflects almost completely, so the
+combinations add up to 12 dB more power or nearly cancel. The model gives the reflected path
+the direction of the direct path, because 1.5 m of mirrored height correspond to one
+elevation beam at 10 m and to less than one beyond. Hills, kerbs and vehicles in between are
+neglected.
 
 References:
-    Attenuation by rain: ITU-R P.838-3, 5.9 dB/km at 10 mm/h and 11.4 at 25 mm/h (77 GHz,
-    horizontal polarization).
-    Both effects of rain on automotive radar: Zang et al., "The impact of adverse weather
-    conditions on autonomous vehicles", IEEE Vehicular Technology Magazine 2019.
-    Melting snow attenuates more than rain of its water: Jain and Watson, "Attenuation in
-    melting snow on microwave- and millimeter-wave terrestrial radio links", Electronics
-    Letters 1985.
+    Attenuation by rain: ITU-R P.838-3, 5.9 dB/km at 10 mm/h and 11.4 dB/km at 25 mm/h
+    (77 GHz, horizontal polarization).
+    Attenuation and backscatter of rain in automotive radar: Zang et al., "The impact of
+    adverse weather conditions on autonomous vehicles", IEEE Vehicular Technology Magazine
+    2019.
+    Melting snow attenuates more than rain with the same amount of water: Jain and Watson,
+    "Attenuation in melting snow on microwave- and millimeter-wave terrestrial radio links",
+    Electronics Letters 1985.
     Reflection: Fresnel's equations; loss of coherence by roughness: Ament, "Toward a
     theory of reflection by a rough surface", Proc. IRE 1953. Asphalt: Locatelli,
     Alvarez-Perez and Yarovoy, "Multipath model improvement for automotive radar
@@ -41,11 +44,11 @@ from radejax.simulation.radar.tensor import RadarParameters
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
-    """What covers the road.
+    """Surface of the road.
 
     Attributes:
-        permittivity: Relative, complex.
-        roughness_m: Standard deviation of height.
+        permittivity: Complex relative permittivity.
+        roughness_m: Standard deviation of the height.
     """
 
     permittivity: complex
@@ -59,15 +62,16 @@ _SNOW = Surface(1.6 - 0.01j, 0.004)
 
 @dataclasses.dataclass(frozen=True)
 class Weather:
-    """How one kind of weather changes what the radar receives.
+    """Effects of one kind of weather on the received signal.
 
     Attributes:
-        attenuation_db_per_km: Loss on the way, one way.
-        radome_db: Loss by water or snow on the sensor, there and back.
+        attenuation_db_per_km: One-way attenuation in the air.
+        radome_db: Two-way loss by water or snow on the sensor.
         backscatter_db: Cross-section of the falling particles in dB of m2 per m3.
         spread_mps: Standard deviation of the particles' radial velocities.
-        surface: Of the road. Our choice: values of the usual order, a film of water that
-            fills the asphalt's pores in rain and sleet, loose snow.
+        surface: Surface of the road. Its values are our choice, of the usual order: dry
+            asphalt, a film of water that fills the asphalt's pores in rain and sleet, or
+            loose snow.
     """
 
     attenuation_db_per_km: float
@@ -92,7 +96,7 @@ WEATHERS = {
 def attenuation(
     weather: str, distance_m: Float[np.ndarray, "*cells"]
 ) -> Float[np.ndarray, "*cells"]:
-    """Factor on received power at distances: the way there and back, and the radome."""
+    """Computes the factor on the received power by two-way attenuation and radome loss."""
     law = WEATHERS[weather]
     loss_db = 2.0 * law.attenuation_db_per_km * distance_m / 1000.0 + law.radome_db
     return 10.0 ** (-loss_db / 10.0)
@@ -104,12 +108,13 @@ def noise_profile(
     parameters: RadarParameters,
     ego_velocity_mps: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "R D"]:
-    """Mean noise power of range and Doppler cells: receiver plus backscatter.
+    """Computes the mean power of receiver noise and backscatter per range-Doppler cell.
 
-    Many drops in one cell add up to a complex Gaussian, like noise, so they need no
-    scatterers. The cell of beam solid angle W at range R holds R^2 W dR cubic meters,
-    so its power falls with R^-2. Drops stand still in the air: their range rate is
-    minus the ego speed, plus a spread, on an axis that wraps around.
+    The echoes of many drops in one cell add up to a complex Gaussian, so they are modeled
+    as noise and not as scatterers. At range R, the cell of a beam of solid angle W has a
+    volume of R^2 W dR, so its power falls with R^-2. Drops have no mean velocity over
+    ground. Their range rate is minus the ego speed plus a spread, on a Doppler axis that
+    wraps around.
 
     Returns:
         float32 linear power.
@@ -137,11 +142,13 @@ def reflection(
     surface: Surface,
     wavelength_m: float,
 ) -> Inexact[Any, "*targets"]:
-    """Complex reflection coefficient of the mean field, horizontally polarized.
+    """Computes the complex reflection coefficient of the coherent field.
+
+    The polarization is horizontal.
 
     Args:
         sine: Sine of the grazing angle.
-        surface: What reflects.
+        surface: Reflecting surface.
         wavelength_m: Wavelength.
     """
     sine = np.asarray(sine, float)
@@ -157,16 +164,17 @@ def bounce(
     surface: Surface,
     wavelength_m: float,
 ) -> Complex[np.ndarray, " S"]:
-    """Factor on the amplitude of targets over a flat road, two-way.
+    """Computes the two-way factor on the amplitude of targets above a flat road.
 
-    `(1 + rho exp(i 2 pi d / wavelength))^2`: direct and bounced on the way there times
-    the same on the way back; d is how much longer the bounced way is.
+    The factor is `(1 + rho exp(i 2 pi d / wavelength))^2`, where rho is the reflection
+    coefficient and d the difference in length between the reflected and the direct path.
+    The square accounts for the way there and the way back.
 
     Args:
-        position_m: In the radar's frame.
-        ground_m: Height of the road in that frame (negative). Targets lower than it
-            count as lying on it.
-        surface: What covers the road.
+        position_m: Positions of the targets in the radar frame.
+        ground_m: Height of the road in the radar frame (negative). Targets below the road
+            are treated as lying on it.
+        surface: Surface of the road.
         wavelength_m: Wavelength.
     """
     flat = np.hypot(position_m[:, 0], position_m[:, 1])

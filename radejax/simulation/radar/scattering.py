@@ -1,11 +1,11 @@
-"""How road users and surroundings scatter: boxes to point scatterers.
+"""Point scatterers of road users and surroundings.
 
-Every object gets scattering centers on its faces once per sequence; each frame turns
-them to the object's pose, keeps those on faces the radar sees, weakens those behind
-other objects, and moves wheels, legs and pedals (micro-Doppler).
+Every object gets scattering centers on its faces once per sequence. In each frame, they are
+transformed to the pose of the object, attenuated if their face is turned away from the
+radar or if another object blocks them, and wheels, legs and pedals move (micro-Doppler).
 
-Cross-sections are chosen, one mean and one deviation per class, of the order that is
-measured at 77 GHz; there is no single source for all five.
+The cross-sections are our choice, with one mean and one standard deviation per class. They
+are of the order of measurements at 77 GHz. There is no single source for all five classes.
 
 References:
     Pedestrians: Fortuny-Guasch and Chareau, "Radar cross section measurements of
@@ -42,15 +42,16 @@ from radejax.simulation.world.scene import (
 
 @dataclasses.dataclass(frozen=True)
 class ClassScattering:
-    """Radar cross-section of one class.
+    """Scattering properties of one class.
 
     Attributes:
-        rcs_dbsm: Mean over aspects and objects, in dB of the mean of square meters.
-        spread_db: Standard deviation from object to object.
-        num_points: Scattering centers on the whole surface.
-        glint: Power of the flash of a flat face at normal incidence, relative to its
-            diffuse power.
-        micro: Fraction of scattering centers on moving parts.
+        rcs_dbsm: Radar cross-section, averaged in square meters over aspects and objects
+            and converted to dB.
+        spread_db: Standard deviation of the cross-section between objects.
+        num_points: Number of scattering centers on the whole surface.
+        glint: Power of the specular flash of a flat face at normal incidence, relative to
+            its diffuse power.
+        micro: Fraction of the scattering centers that are on moving parts.
     """
 
     rcs_dbsm: float
@@ -82,14 +83,15 @@ class ObjectScatterers(NamedTuple):
     """Scattering centers of all objects in one sequence, in the frames of their boxes.
 
     Attributes:
-        track: Index of the track that each belongs to, ascending.
-        position: In units of the box's half extents.
+        track: Index of the track of each scattering center, in ascending order.
+        position: Position in units of the half extents of the box.
         normal: Unit normal of the face.
-        power_m2: Radar cross-section seen along the normal, without glint.
-        glint: Relative power of the flash.
+        power_m2: Radar cross-section at normal incidence, without glint.
+        glint: Power of the specular flash, relative to the diffuse power.
         phase_rad: Phase of the reflection.
-        micro: Velocity swing relative to the object's speed, 0 for the body.
-        micro_phase_rad: Phase of that swing at time 0.
+        micro: Amplitude of the velocity swing relative to the object's speed, 0 for the
+            body.
+        micro_phase_rad: Phase of the velocity swing at time 0.
     """
 
     track: Int[np.ndarray, " S"]
@@ -107,16 +109,16 @@ def make_object_scatterers(
     size_m: Float[np.ndarray, "N 3"],
     rng: np.random.Generator,
 ) -> ObjectScatterers:
-    """Scattering centers of objects.
+    """Draws the scattering centers of objects.
 
     Args:
         cls: Class indices.
-        size_m: Length, width, height.
-        rng: Source of the random placement and of the objects' cross-sections.
+        size_m: Length, width and height of each object.
+        rng: Random generator for the scattering centers and the cross-sections.
 
     Returns:
-        Centers of all objects, object by object. The cross-section of an object,
-        averaged over aspects, is its class's times a log-normal factor.
+        Scattering centers of all objects, ordered by object. The cross-section of an
+        object, averaged over aspects, is the mean of its class times a log-normal factor.
     """
     flat, vector = np.zeros(0), np.zeros((0, 3))
     none = ObjectScatterers(flat.astype(int), vector, vector, *[flat] * 5)
@@ -130,20 +132,22 @@ def make_object_scatterers(
 def _one_object(
     index: int, cls: str, size_m: Float[np.ndarray, "3"], rng: np.random.Generator
 ) -> ObjectScatterers:
-    """Scattering centers of one object."""
+    """Draws the scattering centers of one object."""
     law = CLASS_SCATTERING[cls]
     length, width, height = size_m
     count = law.num_points
-    # Faces in proportion to what they show: front, rear, left, right (roofs hardly).
+    # Front, rear, left and right face in proportion to their area. Roofs are left out,
+    # as the radar hardly sees them.
     area = np.array([width, width, length, length]) * height
     face = rng.choice(4, count, p=area / area.sum())
     face[:4] = np.arange(4)  # every side has at least one
     sign = np.where(face % 2 == 0, 1.0, -1.0)
     is_end = face < 2
     along = rng.uniform(-1.0, 1.0, count)
-    # Edges and corners scatter more: pull half of the points outward.
+    # Half of the points are moved outward, as edges and corners scatter more.
     along = np.where(rng.random(count) < 0.5, np.sign(along) * abs(along) ** 0.3, along)
-    # Bodies scatter low: bumpers, wheels and the road's mirror image under them.
+    # Most of the power comes from low parts: bumpers, wheels and their reflection in the
+    # road.
     up = rng.beta(1.6, 2.4, count) * 2.0 - 1.0
     position = np.stack(
         [np.where(is_end, sign, along), np.where(is_end, along, sign), up], 1
@@ -159,7 +163,7 @@ def _one_object(
     cosine = normal[:, :2] @ np.stack([np.cos(angle), np.sin(angle)])  # [S, aspects]
     mean = (weight[:, None] * face_gain(cosine, law.glint)).sum(0).mean()
     rcs_db = law.rcs_dbsm + law.spread_db * rng.normal()
-    # The log-normal factor has mean exp(s^2 / 2): the class's mean stays exact.
+    # Divide by the mean exp(s^2 / 2) of the log-normal factor to keep the class's mean.
     rcs_db -= law.spread_db**2 * np.log(10.0) / 20.0
     return ObjectScatterers(
         track=np.full(count, index),
@@ -176,13 +180,13 @@ def _one_object(
 def face_gain(
     cosine: Float[np.ndarray, "*faces"], glint: Float[np.ndarray, "*#faces"] | float
 ) -> Float[np.ndarray, "*faces"]:
-    """Power of a scatterer on a face seen under an angle to its normal.
+    """Computes the relative power of a scatterer from the aspect angle of its face.
 
-    Diffuse part `cos^2`, a Gaussian flash near the normal, and a small rest from
-    faces turned away.
+    The power is the sum of a diffuse part `cos^2`, a Gaussian specular flash near the
+    normal, and a small constant, which is all that faces turned away return.
 
     Args:
-        cosine: Cosine between normal and the direction to the radar.
+        cosine: Cosine of the angle between the normal and the direction to the radar.
         glint: Power of the flash relative to the diffuse part at normal incidence.
     """
     facing = np.clip(cosine, 0.0, 1.0)
@@ -192,14 +196,14 @@ def face_gain(
 
 
 class FrameScattering(NamedTuple):
-    """Scatterers of a frame before phases: positions, velocities and powers.
+    """Scatterers of a frame in Cartesian coordinates.
 
     Attributes:
-        position_m: In the radar's frame.
-        velocity_mps: Over ground.
+        position_m: Position in the radar frame.
+        velocity_mps: Velocity over ground, along the axes of the radar frame.
         power: Linear received power.
-        phase_rad: Phase of the reflection, without the way there and back.
-        owner: Index into the frame's boxes, -1 for surroundings.
+        phase_rad: Phase of the reflection, without the phase of the two-way path.
+        owner: Index of the box in the frame, -1 for surroundings and ghosts.
     """
 
     position_m: Float[np.ndarray, "S 3"]
@@ -212,11 +216,10 @@ class FrameScattering(NamedTuple):
 def scatter_objects(
     frame: SceneFrame, centers: ObjectScatterers, parameters: RadarParameters
 ) -> tuple[FrameScattering, Float[np.ndarray, " N"]]:
-    """Scatterers of the objects in one frame.
+    """Computes the scatterers of the objects in one frame.
 
     Returns:
-        The scatterers, and the fraction of each box's power that is not
-        occluded by other boxes.
+        The scatterers, and the fraction of each box's power that no other box blocks.
     """
     boxes = frame.boxes
     owner_of_track = np.full(int(centers.track.max(initial=-1)) + 1, -1)
@@ -239,7 +242,7 @@ def scatter_objects(
     total = np.bincount(owner, power, len(boxes))
     power = np.where(blocked, power * 10.0 ** (OCCLUDED_DB / 10.0), power)
 
-    # Wheel rims, legs and pedals swing between 0 and twice the speed of the body.
+    # Wheel rims, legs and pedals move at 0 to 2 times the speed of the body.
     speed = np.hypot(*frame.velocity_mps.T)[owner]
     is_walking = frame.cls[owner] == CLASSES.index("Pedestrian")
     turning = np.where(is_walking, 1.8, speed / 0.33)
@@ -258,7 +261,7 @@ def received_power(
     rcs_m2: Float[np.ndarray, " S"],
     parameters: RadarParameters,
 ) -> Float[np.ndarray, " S"]:
-    """Radar equation: gain x cross-section x pattern / R^4, linear power."""
+    """Computes linear power by the radar equation, gain x cross-section x pattern / R^4."""
     distance = np.maximum(np.linalg.norm(position_m, axis=1), 1.0)
     forward = np.clip(position_m[:, 0] / distance, 0.0, 1.0)
     pattern = forward**parameters.pattern_exponent
@@ -274,17 +277,18 @@ def to_scatterers(
     ego_velocity_mps: Float[np.ndarray, "2"],
     wavelength_m: float,
 ) -> Scatterers:
-    """What the radar measures of scatterers: polar positions, range rate, amplitude.
+    """Converts scatterers to polar positions, range rates and complex amplitudes.
 
     Args:
-        found: Objects, surroundings, ghosts.
+        found: Scatterers of objects, surroundings and ghosts.
         ego_velocity_mps: Velocity of the radar over ground.
         wavelength_m: Wavelength of the sensor.
 
     Returns:
-        float32 NumPy arrays. The phase of an amplitude is that of the reflection plus
-        `4 pi R / wavelength`, so it turns as the object moves, and neighbors on one
-        object add up or cancel from frame to frame.
+        float32 NumPy arrays, padded to a multiple of `CAPACITY_STEP`. The phase of an
+        amplitude is the phase of the reflection plus `4 pi R / wavelength`. It changes as
+        the object moves, so adjacent scatterers of an object add up in some frames and
+        cancel in others.
     """
     position, amplitude = found.position_m, np.sqrt(found.power)
     velocity = found.velocity_mps - ego_velocity_mps
@@ -311,12 +315,12 @@ def scatter_surroundings(
     phase_rad: Float[np.ndarray, " M"],
     parameters: RadarParameters,
 ) -> FrameScattering:
-    """Scatterers of the static surroundings: ground, rails, walls, poles, trees.
+    """Computes the scatterers of ground, guard rails, walls, poles and trees.
 
     Args:
-        frame: Its reflectors are used.
-        phase_rad: Phases of all reflectors of its sequence.
-        parameters: The sensor.
+        frame: Scene of the frame, which contains the reflectors.
+        phase_rad: Phases of all reflectors of the sequence.
+        parameters: Parameters of the sensor.
     """
     fixed = frame.reflectors
     position = fixed.position_m
@@ -345,14 +349,15 @@ _MIRROR_REACH_M = 45.0
 def scatter_ghosts(
     objects: FrameScattering, mirrors_m: Sequence[float]
 ) -> FrameScattering:
-    """Mirror images of objects behind rails and walls beside the road.
+    """Computes the ghosts of objects, mirrored at guard rails and walls beside the road.
 
-    The way radar - wall - object - wall - radar looks like an object at the mirrored
-    position with the mirrored velocity (the third-order ghost of the literature).
+    The path radar - wall - object - wall - radar gives an echo at the mirrored position
+    with the mirrored velocity, known in the literature as a third-order ghost.
 
     Args:
         objects: Scatterers of the objects of the frame.
-        mirrors_m: Rails and walls, meters left of the ego; near it they run along x.
+        mirrors_m: Lateral positions of rails and walls in meters left of the ego vehicle.
+            They are assumed to be parallel to x.
 
     References:
         Ghosts: Kraus et al., "Using machine learning to detect ghost images in

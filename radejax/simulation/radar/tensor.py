@@ -1,11 +1,12 @@
-"""From point scatterers to the 4D radar tensor, or straight to its projections.
+"""Computation of the 4D radar tensor, or only its projections, from point scatterers.
 
-A frame is a set of point scatterers with complex amplitudes. Every axis of the sensor
-answers to a point with the Fourier transform of its window (equation (1) of RADE-Net),
-the responses add as complex numbers, receiver noise joins them, and the tensor is the
-squared magnitude. One range row is one matrix product, (Doppler x elevation) by
-scatterers by azimuth; rows are made one after another, so that the projections of a
-full-size frame never need its 260 MB tensor in memory.
+A frame is a set of point scatterers with complex amplitudes. The response of every sensor
+axis to a point is the Fourier transform of the axis's window (equation (1) of RADE-Net).
+The complex responses are summed, receiver noise is added, and the tensor is the squared
+magnitude. Each range row is a matrix product of (Doppler x elevation) by scatterers with
+scatterers by azimuth. Rows are computed one after another on CPUs and in batches on
+accelerators, so that computing the projections of a full-size frame does not need its
+260 MB tensor in memory.
 """
 
 from __future__ import annotations
@@ -45,22 +46,25 @@ _RANGES = {
 
 @dataclasses.dataclass(frozen=True)
 class RadarParameters:
-    """Parameters of the sensor except its axes; hashable, so static under `jax.jit`.
+    """Parameters of the sensor other than its axes.
 
-    K-Radar publishes no link budget. The level is set so that the noise lies
-    near the middle of the TPM's normalized scale and a car at 5 m near its upper end.
+    Instances are hashable and can be static arguments of `jax.jit`. K-Radar publishes no
+    link budget. Gain and noise are set so that the noise lies near the middle of the
+    normalized scale of the tensor projection and a car at 5 m near its upper end.
 
     Attributes:
-        gain_db: Received power in dB of 0 dBsm at 1 m on boresight.
+        gain_db: Received power in dB from a target of 0 dBsm at 1 m on boresight.
         noise_db: Mean noise power per cell in dB.
-        wavelength_m: Carrier wavelength; 77 GHz.
-        azimuth_elements: Length of the virtual array in half wavelengths, azimuth.
-        elevation_elements: The same for elevation.
-        array_pedestal: Taper of the array between Hann (0) and uniform (1).
-        range_resolution_m: Width of a range bin of the FFT; 0 means the grid's step.
-        pattern_exponent: Two-way antenna gain is `cos(angle) ** exponent`.
-        max_scatterers_per_row: Scatterers summed in one range row, the strongest
-            ones; what lies below them is dropped.
+        wavelength_m: Carrier wavelength, by default at 77 GHz.
+        azimuth_elements: Number of elements of the virtual array in azimuth, at a spacing
+            of half a wavelength.
+        elevation_elements: Number of elements of the virtual array in elevation, at the
+            same spacing.
+        array_pedestal: Taper of the array, from 0 (Hann window) to 1 (uniform window).
+        range_resolution_m: Width of a range bin of the FFT, or 0 for the grid's step.
+        pattern_exponent: Exponent of the two-way antenna gain `cos(angle) ** exponent`.
+        max_scatterers_per_row: Maximum number of scatterers summed in one range row.
+            Only the strongest ones are summed.
 
     Raises:
         UserError: A value is out of its range.
@@ -81,18 +85,18 @@ class RadarParameters:
 
 
 class Scatterers(struct.PyTreeNode):
-    """Point targets of one frame as the radar sees them; a JAX pytree.
+    """Point targets of one frame in the polar coordinates of the radar, as a JAX pytree.
 
     Attributes:
         range_m: Distance from the radar.
-        azimuth_rad: Positive to the right.
-        elevation_rad: Positive upward.
-        velocity_mps: Rate of change of range, not aliased.
-        amplitude: float32 real and imaginary part; power is the sum of squares. Zero for
-            padding.
+        azimuth_rad: Azimuth, positive to the right.
+        elevation_rad: Elevation, positive upward.
+        velocity_mps: Rate of change of the range, not aliased.
+        amplitude: float32 real and imaginary part, whose squares sum to the power. Padding
+            has zero amplitude.
     """
 
-    # Any leaf passes: trees of arrays are rebuilt from shapes, specs or None as well.
+    # Leaves are not checked, because JAX also rebuilds pytrees with shapes, specs or None.
     range_m: Float[Array, " S"]
     azimuth_rad: Float[Array, " S"]
     elevation_rad: Float[Array, " S"]
@@ -103,17 +107,18 @@ class Scatterers(struct.PyTreeNode):
 def window_response(
     x: Float[Array, "*bins"], pedestal: float, num_samples: float = 0.0
 ) -> Float[jax.Array, "*bins"]:
-    """Zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
+    """Computes the zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
 
-    With D the transform of the uniform window (the Dirichlet kernel of `num_samples`
-    samples, or sinc), the window `p + (1 - p) cos^2` transforms to a sum of three:
-    `D(x) + b / a (D(x - 1) + D(x + 1))`, a = p + (1 - p) / 2, b = (1 - p) / 4.
-    Pedestal 0 is the Hann window: first sidelobe -31.5 dB, zeros from 2 bins on.
+    Let D be the transform of the uniform window, which is the Dirichlet kernel of
+    `num_samples` samples or sinc. The transform of the window `p + (1 - p) cos^2` is
+    `D(x) + b / a (D(x - 1) + D(x + 1))` with a = p + (1 - p) / 2 and b = (1 - p) / 4.
+    Pedestal 0 is the Hann window, whose first sidelobe is at -31.5 dB and whose zeros are
+    at distances of 2 bins and more.
 
     Args:
         x: Distance from the peak in bins (cells of the unpadded FFT).
-        pedestal: p, in [0, 1]; 1 is the uniform window.
-        num_samples: Period in bins for axes that wrap around; 0 means no period.
+        pedestal: Pedestal p in [0, 1]; 1 is the uniform window.
+        num_samples: Period in bins of an axis that wraps around, or 0 for no period.
 
     Returns:
         Real amplitudes.
@@ -127,7 +132,7 @@ def window_response(
         ratio = jnp.sin(jnp.pi * t) / jnp.where(is_peak, 1.0, num_samples * small)
         return jnp.where(is_peak, 1.0, ratio)
 
-    if num_samples:  # one period around the peak, where an even kernel is continuous
+    if num_samples:  # even kernels are continuous only within one period
         x = x - num_samples * jnp.round(x / num_samples)
     center = pedestal + (1.0 - pedestal) / 2.0
     side = (1.0 - pedestal) / 4.0
@@ -137,7 +142,7 @@ def window_response(
 def doppler_response(
     velocity_mps: Float[Array, " S"], grid: RadarGrid
 ) -> Float[jax.Array, "D S"]:
-    """Amplitudes on the Doppler axis; velocities alias by its period."""
+    """Computes amplitudes on the Doppler axis, where velocities alias by its period."""
     step = float(grid.doppler_mps[1] - grid.doppler_mps[0])
     cell = (velocity_mps[None] - grid.doppler_mps[0]) / step
     offset = np.arange(grid.num_doppler, dtype=np.float32)[:, None] - cell
@@ -147,7 +152,7 @@ def doppler_response(
 def range_response(
     range_m: Float[Array, " S"], grid: RadarGrid, parameters: RadarParameters
 ) -> Float[jax.Array, "R S"]:
-    """Amplitudes on the range axis."""
+    """Computes amplitudes on the range axis."""
     resolution = parameters.range_resolution_m or grid.range_step_m
     axis = grid.range_m.astype(np.float32)[:, None]
     return window_response((axis - range_m[None]) / resolution, 0.0)
@@ -163,22 +168,22 @@ def simulate(
     parameters: RadarParameters = RadarParameters(),
     output: Literal["rows", "projection"] = "projection",
 ) -> Float[jax.Array, "..."]:
-    """One radar frame, jitted; map it over frames with `jax.vmap`.
+    """Simulates one radar frame. The function is jitted and supports `jax.vmap`.
 
     Args:
-        scatterers: Point targets; pad with zero amplitude.
-        noise_power: Mean power of noise (and of weather's backscatter, which
-            has the same statistics); zero for none.
-        key: Seed of the noise of this frame.
+        scatterers: Point targets, padded with targets of zero amplitude.
+        noise_power: Mean power of the noise and of backscatter by weather, which has the
+            same statistics.
+        key: Random key of the noise of this frame.
         grid: Axes of the tensor.
-        parameters: The sensor.
-        output: "rows" for linear power `[R, E, D, A]`, a tensor in the order in which it
-            is computed (see `TESSERACT_OF_ROWS`); "projection" for `[R, A, D+E]`
-            normalized projections, the values that `radejax.data.projection` makes of
-            the tensor.
+        parameters: Parameters of the sensor.
+        output: "rows" for the tensor in linear power as `[R, E, D, A]`, the order in
+            which it is computed (see `TESSERACT_OF_ROWS`), or "projection" for its
+            normalized projections `[R, A, D+E]`, with the same values as those of
+            `radejax.data.projection`.
 
     Returns:
-        float32 array as `output` says.
+        float32 array, the tensor or its projections as selected by `output`.
     """
     pedestal = parameters.array_pedestal
     arrays = (
@@ -215,7 +220,7 @@ def simulate(
 
 
 def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:
-    """Normalized maxima of one range row."""
+    """Computes the normalized projections of one range row."""
     maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
     return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
@@ -223,12 +228,13 @@ def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:
 def array_basis(
     axis_rad: Float[np.ndarray, " bins"], elements: float, pedestal: float
 ) -> Float[np.ndarray, "bins N"]:
-    """Real matrix B that makes array bins of what the array's elements receive.
+    """Returns the real beamforming matrix from the elements of an array to its bins.
 
-    A bin is the sum of the N elements with weights `w_n` and the phases of its angle; with
-    elements placed about zero, those of a pair are a column
-    `w_n cos(pi n sin a)` and one with the sine. Rows have length 1: of independent noise
-    every bin has the power of one column, and two bins correlate by
+    A bin of angle a is the sum over the N elements with weights `w_n` and the phases of
+    that angle. As the elements are placed symmetrically around zero, each pair of opposite
+    elements gives two real columns, `w_n cos(pi n sin a)` and `w_n sin(pi n sin a)`. Rows
+    are normalized to length 1. Therefore independent noise keeps its power in every bin,
+    and the noise of two bins a and b has a correlation proportional to
     `sum_n w_n^2 cos(pi n (sin a - sin b))`.
     """
     place, weight = _pairs(elements, pedestal)
@@ -242,10 +248,12 @@ def array_basis(
 def array_signal(
     angle_rad: Float[Array, " S"], elements: float, pedestal: float
 ) -> Float[jax.Array, "N S"]:
-    """What the columns of `array_basis` receive of points, 1 in the bin at their angle.
+    """Returns the signals of point targets at the inputs of `array_basis`.
 
-    The product of both is the pattern of the array with weights `w_n`, which depends on
-    the difference of sines: beams widen away from boresight.
+    They are scaled so that a target has amplitude 1 in a bin at its angle. The product of
+    `array_basis` and these signals is the pattern of the array with weights `w_n`. It
+    depends on the difference of the sines of the angles, so beams widen away from
+    boresight.
     """
     place, weight = _pairs(elements, pedestal)
     turn = jnp.pi * place.astype(np.float32)[:, None] * jnp.sin(angle_rad)[None]
@@ -260,7 +268,7 @@ def array_signal(
 def _pairs(
     elements: float, pedestal: float
 ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
-    """Places in half wavelengths and weights of one element of each pair."""
+    """Returns position in half wavelengths and weight of one element of each pair."""
     count = max(round(elements), 1)
     place = np.arange(count) - (count - 1) / 2
     place = place[place >= 0]
@@ -273,7 +281,7 @@ def _beams(
     elevation_basis: Float[np.ndarray, "E M"],
     azimuth_basis: Float[np.ndarray, "A N"],
 ) -> Float[jax.Array, "E D 2 A"]:
-    """Real and imaginary part of every bin, of what both arrays receive."""
+    """Computes real and imaginary part of every bin from the signals of the arrays."""
     (num_elevation, m), (_, n) = elevation_basis.shape, azimuth_basis.shape
     rows = _product(received.reshape(-1, n), azimuth_basis.T)  # [D M 2, A]
     rows = rows.reshape(received.shape[0] // m, m, -1).transpose(1, 0, 2)
@@ -291,10 +299,10 @@ def _noise(
     row_idx: UInt32[jax.Array, ""],
     count: int,
 ) -> Float[jax.Array, "D columns"]:
-    """Complex Gaussian noise of one range row of a mean power, as the arrays receive it.
+    """Generates the complex Gaussian noise of one range row at the inputs of the arrays.
 
-    White noise of every Doppler bin and pair of elements goes through the Hann window
-    of the Doppler axis (in bins: 1/2, 1, 1/2).
+    White noise of every Doppler bin and pair of elements is filtered by the Hann window of
+    the Doppler axis (1/2, 1, 1/2 in bins) and scaled to the mean power of each bin.
     """
     num_doppler = power.shape[0]
     one = np.eye(num_doppler, dtype=np.float32)
@@ -307,10 +315,11 @@ def _noise(
 def _white_noise(
     count: int, key: UInt32[Array, "2"], row_idx: UInt32[jax.Array, ""]
 ) -> Float[jax.Array, " {count}"]:
-    """Independent Gaussian numbers of mean square 1/2.
+    """Generates independent Gaussian numbers with a mean square of 1/2.
 
-    Neighbors are the real and imaginary part of one complex number, made of one
-    32-bit number: 20 bits for its power, which is exponential, 12 for its phase.
+    Adjacent numbers are the real and imaginary part of one complex number. It is computed
+    from a random 32-bit integer, of which 20 bits determine its power, which has an
+    exponential distribution, and 12 bits its phase.
     """
     counter = lax.iota(jnp.uint32, count)
     row_key = _hash(row_idx * jnp.uint32(0x9E3779B9) + key[0], key[1])
@@ -321,10 +330,10 @@ def _white_noise(
 
 
 def _sine_of_turn(bits: UInt32[jax.Array, "*all"]) -> Float[jax.Array, "*all"]:
-    """Sine of the angle whose 4096th parts of a turn are the 12 lowest bits.
+    """Approximates the sine of an angle given in 1/4096 turns by the 12 lowest bits.
 
-    Two parabolas, wrong by 0.1 % at most: ample for noise, and the library's sine would
-    take most of the simulator's time.
+    The approximation by two parabolas has an error of at most 0.1 %, which is sufficient
+    for noise. The sine of the library would take most of the simulator's time.
     """
     half_turns = (bits & 0xFFF).astype(jnp.float32) * np.float32(2.0**-11) - 1.0
     rough = 4.0 * half_turns * (jnp.abs(half_turns) - 1.0)
@@ -334,10 +343,11 @@ def _sine_of_turn(bits: UInt32[jax.Array, "*all"]) -> Float[jax.Array, "*all"]:
 def _hash(
     x: UInt32[jax.Array, "*all"], key: UInt32[Array, ""]
 ) -> UInt32[jax.Array, "*all"]:
-    """A 32-bit integer hash of a number under a key (multiply and xor-shift).
+    """Computes a keyed 32-bit integer hash by multiplications and xor-shifts.
 
-    Cheaper than threefry by far, and the same bits on every platform. The key enters
-    between the rounds, so that counters under two keys are not shifted copies.
+    The hash is much cheaper than threefry and gives the same bits on every platform. The
+    key is applied between the rounds, so that the hashes of a counter with two keys are
+    not shifted copies of each other.
     """
     x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
     x = x ^ key
@@ -346,5 +356,5 @@ def _hash(
 
 
 def frame_key(*numbers: int) -> UInt32[np.ndarray, "2"]:
-    """Noise key of a frame from any integers, well mixed."""
+    """Derives the noise key of a frame from any number of integers."""
     return np.random.SeedSequence([n & 0xFFFFFFFF for n in numbers]).generate_state(2)

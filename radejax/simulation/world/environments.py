@@ -1,4 +1,4 @@
-"""K-Radar's road types: what drives, stands and grows where, how fast, how it scatters."""
+"""K-Radar's road types: traffic, parked vehicles, people and static reflectors."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ class Environment:
     Attributes:
         speed_mps: Range of ego speeds.
         lane_width_m: Width of a lane.
-        lanes_left: Lanes of our direction left of the ego's.
-        lanes_right: Lanes of our direction right of the ego's.
-        lanes_oncoming: Lanes of the other direction.
-        median_m: Strip between the directions.
-        gap_m: Mean free distance between vehicles of a lane.
-        trucks: Share of buses and trucks in traffic.
-        two_wheelers: Share of motorcycles in traffic.
-        parked_per_100m: Vehicles parked along each side.
-        pedestrians_per_100m: People on both pavements together.
-        bicycles_per_100m: Bicycles along the right edge.
-        max_curvature: Largest curvature of the road in 1/m.
+        lanes_left: Number of lanes left of the ego lane in the direction of the ego.
+        lanes_right: Number of lanes right of the ego lane in the direction of the ego.
+        lanes_oncoming: Number of lanes in the opposite direction.
+        median_m: Width of the strip between the directions.
+        gap_m: Mean of the exponentially distributed part of the gaps in a lane.
+        trucks: Fraction of buses and trucks in traffic.
+        two_wheelers: Fraction of motorcycles in traffic.
+        parked_per_100m: Number of parked vehicles on each side per 100 m.
+        pedestrians_per_100m: Number of pedestrians on both pavements together per 100 m.
+        bicycles_per_100m: Number of bicycles along the right edge per 100 m.
+        max_curvature: Maximum curvature of the road in 1/m.
         walls: Probability of a wall or facade on each side.
         wall_m: Distance of walls from the edge of the road.
         rails: Probability of a guard rail on each side.
-        trees_per_100m: Trees and poles on each side.
-        perpendicular: True if parked vehicles stand across the road.
+        trees_per_100m: Number of trees or poles on each side per 100 m.
+        perpendicular: Whether vehicles park perpendicular to the road.
     """
 
     speed_mps: tuple[float, float]
@@ -60,7 +60,7 @@ class Environment:
     perpendicular: bool = False
 
     def with_vulnerable(self, times: float) -> Environment:
-        """As many times the pedestrians, motorcycles and bicycles."""
+        """Returns a copy with the numbers of VRUs multiplied by `times`."""
         names = ("two_wheelers", "pedestrians_per_100m", "bicycles_per_100m")
         return dataclasses.replace(self, **{n: times * getattr(self, n) for n in names})
 
@@ -111,25 +111,25 @@ def make_surroundings(
     rng: np.random.Generator,
     ground_m: float,
 ) -> tuple[Reflectors, tuple[float, ...]]:
-    """Static scatterers along the road: ground, rails, walls, trees and poles.
+    """Draws the static reflectors along the road: ground, rails, walls, trees and poles.
 
     Args:
         law: Road type.
         road: Centerline.
-        length_m: How far they reach.
-        edges: Right and left edge, meters left of the centerline.
-        rng: Source of everything random.
-        ground_m: Height of the ground in the radar's frame.
+        length_m: Length of the road along which reflectors are placed.
+        edges: Right and left edge of the road in meters left of the centerline.
+        rng: Random generator.
+        ground_m: Height of the ground in the radar frame.
 
     Returns:
-        The scatterers in the world frame, and the lateral positions of the rails and
+        The reflectors in the world frame, and the lateral positions of the rails and
         walls, which mirror objects.
     """
     parts: list[tuple] = []
     mirrors: list[float] = []
 
     def add(kind, along, left, height, dbsm, side=None) -> None:
-        """Reflectors over the road; `side` is where their normal points, if anywhere."""
+        """Adds reflectors whose normal points left (1) or right (-1), or isotropic ones."""
         x, y, heading = road.position(along, left)
         turn = np.nan if side is None else side * np.pi / 2.0
         kinds = np.full(len(x), REFLECTOR_KINDS.index(kind))

@@ -1,9 +1,9 @@
-"""Sequences from real label files: the objects of K-Radar, moving as they moved.
+"""Sequences with the objects and motion of real K-Radar label files.
 
-Labels hold positions relative to the ego vehicle; their change from frame to frame is
-the relative velocity, which is all that the radar's range rate needs. The ego's own
-speed, needed for the surroundings, is inferred from the tracks; surroundings are
-procedural, in the style of the sequence's road type.
+Labels contain positions relative to the ego vehicle. Their change between frames gives the
+relative velocity, from which the radar's range rate follows. The speed of the ego vehicle,
+which the surroundings require, is inferred from the tracks. The surroundings are procedural
+and depend on the road type of the sequence.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ def make_real_sequence(
     radar_from_lidar_m: tuple[float, float, float],
     rng: np.random.Generator,
 ) -> Sequence:
-    """A scene from the labels of one sequence.
+    """Creates a scene from the labels of one sequence.
 
     Args:
         frames: Consecutive frames of one sequence in order, with all their labels.
-        radar_from_lidar_m: Meters to add to LiDAR positions to get radar positions.
-        rng: Source of the surroundings and of what labels do not tell.
+        radar_from_lidar_m: Translation in meters from LiDAR to radar positions.
+        rng: Random generator for the surroundings.
 
     Returns:
-        Scene whose objects have the labels' boxes, frame by frame.
+        Scene whose objects have the boxes of the labels in every frame.
     """
     tracks = collect_tracks(frames, radar_from_lidar_m)
     clock = np.array([f.header.timestamp_s for f in frames])
@@ -63,7 +63,7 @@ def make_real_sequence(
     reflectors, mirrors = make_surroundings(
         law, Road(), along[-1] + SIGHT_M, edges, rng, ground
     )
-    # The road is straight along x: there the labels' frame moves with the ego.
+    # The road is straight along x, so the labels' frame only moves along x.
     world = tracks.position_m + along[:, None, None] * (1.0, 0.0, 0.0)
     velocity = relative + speed[:, None, None] * (1.0, 0.0)
     lanes = np.arange(-law.lanes_right - 0.5, law.lanes_left + 1.0)
@@ -86,10 +86,11 @@ def make_real_sequence(
 def collect_tracks(
     frames: list[Frame], radar_from_lidar_m: tuple[float, float, float]
 ) -> Tracks:
-    """Labels of all frames as tracks, positions in the radar's frame.
+    """Collects the labels of all frames as tracks with positions in the radar frame.
 
-    Identity is the label's id together with its class. Labels without an id (-1), and
-    a second label of the same identity in one frame, become tracks of one frame.
+    Labels with the same track id and class form a track. A label without an id (-1), or
+    with the id and class of an earlier label in the same frame, becomes a track of one
+    frame.
     """
     columns: dict[tuple, dict[int, tuple]] = {}
     for index, frame in enumerate(frames):
@@ -122,11 +123,12 @@ def collect_tracks(
 def relative_velocity(
     tracks: Tracks, clock: Float[np.ndarray, " F"]
 ) -> Float[np.ndarray, "F N 2"]:
-    """Velocities in the radar's frame from the labels' motion.
+    """Computes velocities relative to the radar from the motion of the labels.
 
-    Central differences over neighboring frames where the track is present on both
-    sides, one-sided at its ends, zero for tracks of one frame. Labels jitter by some
-    centimeters, so three velocities in a row are averaged.
+    Velocities are central differences where the track is present in both adjacent frames,
+    one-sided differences at its ends, and zero for tracks of one frame and above
+    `MAX_SPEED_MPS`. As labels jitter by some centimeters, three successive velocities are
+    averaged.
     """
     flat = tracks.position_m[..., :2]
     count, present = len(clock), tracks.is_present
@@ -157,12 +159,13 @@ def relative_velocity(
 def infer_ego_speed(
     tracks: Tracks, relative: Float[np.ndarray, "F N 2"], prior_mps: tuple[float, float]
 ) -> Float[np.ndarray, " F"]:
-    """Speed of the ego vehicle that the tracks suggest.
+    """Infers the speed of the ego vehicle from the tracks.
 
-    Traffic of our direction never drives backward, so the ego is at least as fast as
-    the fastest approach of a vehicle that heads our way (parked ones reach the bound),
-    and oncoming traffic approaches at least as fast as the ego drives. Where nothing
-    tells, the road type's usual speed stands in. Medians over two seconds.
+    Vehicles with the heading of the ego vehicle do not drive backward, so the speed is at
+    least the highest speed at which one of them approaches, and equal to it if that vehicle
+    is parked. Oncoming traffic approaches at least at the speed of the ego vehicle, which
+    gives an upper bound. Without evidence from the tracks, the mean of `prior_mps` is used.
+    The result is a median over two seconds.
     """
     heading = np.cos(tracks.yaw_rad)
     seen = tracks.is_present & (np.abs(relative).sum(-1) > 0)
@@ -178,9 +181,10 @@ def infer_ego_speed(
 
 
 def _ground_height(tracks: Tracks) -> float:
-    """Height of the ground under the boxes near the ego, in the radar's frame.
+    """Estimates the height of the ground from boxes near the ego, in the radar frame.
 
-    Few boxes on a slope mislead: it stays near the height the radar is mounted at.
+    The result is limited to values near `GROUND_M`, as a few boxes on a slope would give a
+    wrong height.
     """
     bottom = tracks.position_m[..., 2] - tracks.size_m[..., 2] / 2.0
     near = tracks.is_present & (
@@ -192,7 +196,7 @@ def _ground_height(tracks: Tracks) -> float:
 
 
 def _road_edges(tracks: Tracks, law: Environment) -> tuple[float, float]:
-    """Lateral bounds of the labelled objects near the road, right and left."""
+    """Returns the right and left edge of the road, including the labeled objects near it."""
     left = tracks.position_m[..., 1][tracks.is_present]
     left = left[np.abs(left) < 18.0]
     right_edge = -(law.lanes_right + 0.5) * law.lane_width_m - 1.0

@@ -1,9 +1,9 @@
 """The objects and surroundings of the ego vehicle in one sequence.
 
-A `Sequence` is a list of tracks (boxes that keep their identity, moving or parked) and
-of static reflectors in a fixed world frame, and the path of the ego vehicle through
-it; `Sequence.frame` gives what the sensors see at one instant, in the ego frame.
-Procedural worlds (`traffic`) and real labels (`replay`) both end here.
+A `Sequence` contains tracks (moving or parked boxes with an identity) and static reflectors
+in a fixed world frame, and the path of the ego vehicle. `Sequence.frame` returns the objects
+and reflectors at one time in the ego frame. Sequences are created procedurally (`traffic`)
+or from real labels (`replay`).
 """
 
 from __future__ import annotations
@@ -26,13 +26,18 @@ class Road:
     """Centerline of a road: an arc of constant curvature that starts at the origin along x.
 
     Attributes:
-        curvature_per_m: Inverse radius, positive turns left; 0 is straight.
+        curvature_per_m: Inverse radius, positive for left turns and 0 for a straight road.
     """
 
     curvature_per_m: float = 0.0
 
     def position(self, along_m: Any, left_m: Any) -> tuple[Any, Any, Any]:
-        """World x, y and heading of a point given along and left of the centerline."""
+        """Returns world x, y and road heading at a point relative to the centerline.
+
+        Args:
+            along_m: Distance along the centerline.
+            left_m: Distance to the left of the centerline.
+        """
         along_m = np.asarray(along_m, np.float64)
         k = self.curvature_per_m
         heading = k * along_m
@@ -45,13 +50,13 @@ class Road:
 
 @dataclasses.dataclass(frozen=True)
 class Tracks:
-    """Every object of a sequence at every frame, in the world frame.
+    """All objects of a sequence in every frame, in the world frame.
 
     Attributes:
         position_m: Box centers.
         yaw_rad: Headings.
-        velocity_mps: Over ground.
-        is_present: True where an object is there.
+        velocity_mps: Velocity over ground.
+        is_present: True where an object is present.
         size_m: Length, width, height.
         cls: Index into `CLASSES`.
         track_id: Identity written to the labels.
@@ -75,8 +80,8 @@ class Reflectors:
     Attributes:
         position_m: x, y, z.
         rcs_dbsm: Radar cross-section.
-        normal_rad: Direction of the surface's normal in the ground plane, NaN
-            where the reflector looks the same from everywhere.
+        normal_rad: Direction of the surface's normal in the ground plane, or NaN for an
+            isotropic reflector.
         kind: Index into `REFLECTOR_KINDS`.
     """
 
@@ -91,11 +96,11 @@ REFLECTOR_KINDS = ("ground", "rail", "wall", "pole", "tree")
 
 @dataclasses.dataclass(frozen=True)
 class SceneFrame:
-    """One instant, seen from the radar: x forward, y left, z up from the radar.
+    """Objects and surroundings in one frame, in the radar frame (x forward, y left, z up).
 
     Attributes:
         boxes: x, y, z, l, w, h, yaw.
-        velocity_mps: Over ground, along the ego axes.
+        velocity_mps: Velocity over ground, along the axes of the radar frame.
         cls: Index into `CLASSES`.
         track: Index into the tracks of the sequence.
         ego_velocity_mps: Velocity of the radar over ground, along its own axes.
@@ -122,16 +127,16 @@ class Sequence:
         name: Number of the sequence.
         environment: K-Radar's road type.
         time: "day" or "night".
-        weather: One of K-Radar's seven.
+        weather: One of K-Radar's seven weather conditions.
         ego_along_m: Position of the radar along the road's centerline.
-        ego_speed_mps: Straight ahead.
+        ego_speed_mps: Speed of the ego vehicle, which drives straight ahead.
         tracks: Objects.
         reflectors: Static surroundings.
-        road: Centerline, on which the ego drives.
-        lanes_m: Borders of the lanes, meters left of the centerline.
-        ground_m: Height of the ground in the radar's frame (negative).
-        mirrors_m: Rails and walls that reflect like mirrors: meters left of the
-            centerline.
+        road: Centerline of the road, along which the ego vehicle drives.
+        lanes_m: Borders of the lanes in meters left of the centerline.
+        ground_m: Height of the ground in the radar frame (negative).
+        mirrors_m: Positions of the rails and walls that mirror objects, in meters left of
+            the centerline.
     """
 
     name: int
@@ -153,7 +158,7 @@ class Sequence:
         return np.stack(self.road.position(self.ego_along_m, 0.0), 1)
 
     def frame(self, index: int, max_distance_m: float = 150.0) -> SceneFrame:
-        """What surrounds the radar at frame `index`, up to a distance."""
+        """Returns the objects and reflectors at frame `index` up to a maximum distance."""
         pose, tracks, fixed = self.ego_pose[index], self.tracks, self.reflectors
         centers = _to_ego(tracks.position_m[index], pose)
         chosen = np.flatnonzero(
@@ -164,7 +169,7 @@ class Sequence:
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = _to_ego(fixed.position_m, pose)
         distance = np.hypot(points[:, 0], points[:, 1])
-        # The ego vehicle blocks what is behind the radar; nothing stands within 2 m.
+        # The ego vehicle blocks the view to the rear, and nothing is within 2 m of the radar.
         seen = np.flatnonzero(
             (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
         )
@@ -190,12 +195,12 @@ def traveled(
     speed_mps: Float[np.ndarray, " F"],
     period_s: float | Float[np.ndarray, " F"] = FRAME_PERIOD_S,
 ) -> Float[np.ndarray, " F"]:
-    """Meters since the first frame at speeds that are held for a period each."""
+    """Returns the distance since the first frame if each speed is held for one period."""
     return np.concatenate([[0.0], np.cumsum((speed_mps * period_s)[:-1])])
 
 
 def class_index(name: str) -> int:
-    """Index of a class name; K-Radar's groups count as their single class."""
+    """Returns the index of a class name, where a group counts as its class."""
     return CLASSES.index(name.removesuffix(" Group"))
 
 
@@ -204,12 +209,14 @@ def is_blocked(
     boxes: Float[np.ndarray, "N 7"],
     owner: Int[np.ndarray, " S"],
 ) -> Bool[np.ndarray, " S"]:
-    """True where the straight way from the origin to a point crosses a box.
+    """Returns True for points whose line of sight from the origin enters a box.
+
+    Boxes that contain the origin do not block.
 
     Args:
         targets: Points.
-        boxes: Obstacles.
-        owner: Index of a box that does not block (the point's own), or -1.
+        boxes: Boxes that can block.
+        owner: Index of the box that the point belongs to, which does not block it, or -1.
     """
 
     def into_boxes(p: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S N 3"]:
@@ -229,12 +236,12 @@ def is_blocked(
 
 
 def wrap_angle(angle_rad: Any) -> Any:
-    """The same angle in [-pi, pi)."""
+    """Wraps an angle to [-pi, pi)."""
     return np.mod(np.asarray(angle_rad) + np.pi, 2.0 * np.pi) - np.pi
 
 
 def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
-    """Vectors in the ground plane turned counter-clockwise."""
+    """Rotates vectors in the ground plane counter-clockwise."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return cos * x - sin * y, sin * x + cos * y
 
@@ -242,6 +249,6 @@ def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
 def _to_ego(
     points: Float[np.ndarray, "N 3"], pose: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "N 3"]:
-    """World points in the frame of the radar at `pose` (x, y, heading)."""
+    """Transforms world points to the frame of the radar at `pose` (x, y, heading)."""
     x, y, z = points.T
     return np.stack([*rotate(x - pose[0], y - pose[1], -pose[2]), z], 1)

@@ -1,7 +1,7 @@
-"""Procedural sequences: roads with lanes, traffic, parked rows, people, surroundings.
+"""Procedural sequences with lanes, traffic, parked vehicles, people and surroundings.
 
-Everything is drawn once per sequence from its seed; a frame is then a matter of time.
-Vehicles of a lane keep the lane's speed, so they keep their distances.
+All random values are drawn once per sequence from its seed, and its frames differ only in
+time. All vehicles in a lane have the same speed, so the distances between them are constant.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from radejax.simulation.world.scene import (
     traveled,
 )
 
-# Length, width, height in meters and their standard deviations.
+# Mean and standard deviation of length, width and height in meters.
 SIZES = {
     "Sedan": ((4.6, 1.87, 1.55), (0.3, 0.07, 0.12)),
     "Bus or Truck": ((8.2, 2.4, 2.9), (1.9, 0.12, 0.35)),
@@ -47,23 +47,23 @@ def make_sequence(
     rng: np.random.Generator,
     vru_density_scale: float = 1.0,
 ) -> Sequence:
-    """A procedural sequence; the same generator state gives the same sequence.
+    """Creates a procedural sequence. The same generator state gives the same sequence.
 
     Args:
         name: Number of the sequence.
         environment: A key of `ENVIRONMENTS`.
         time: "day" or "night".
-        weather: One of K-Radar's seven.
-        num_frames: Length at 10 frames a second.
-        rng: Source of everything random.
-        vru_density_scale: Pedestrians and two-wheelers, as a multiple of the
-            environment's own.
+        weather: One of K-Radar's seven weather conditions.
+        num_frames: Number of frames, at 10 frames per second.
+        rng: Random generator.
+        vru_density_scale: Factor on the environment's number of pedestrians, motorcycles
+            and bicycles.
     """
     law = ENVIRONMENTS[environment].with_vulnerable(vru_density_scale)
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * FRAME_PERIOD_S
     mean_speed = rng.uniform(*law.speed_mps)
-    waves = clock / rng.uniform(8.0, 25.0) + rng.random()  # traffic slows and speeds up
+    waves = clock / rng.uniform(8.0, 25.0) + rng.random()  # the speed varies slowly
     speed = mean_speed * (1.0 + 0.12 * np.sin(2 * np.pi * waves))
     along = traveled(speed)
     traffic = _Traffic(law, road, clock, along, speed, rng)
@@ -102,7 +102,7 @@ class _Traffic:
     lane_borders: tuple[float, ...] = ()
 
     def fill(self) -> tuple[float, float]:
-        """Adds everybody; returns the right and left edges of the road."""
+        """Adds all objects and returns the right and left edge of the road."""
         law, rng, width = self.law, self.rng, self.law.lane_width_m
         stands = self.ego_speed.max() == 0.0  # on the shoulder
         lanes = range(-law.lanes_right, law.lanes_left + 1)
@@ -136,7 +136,7 @@ class _Traffic:
     def _add(
         self, cls: str, size: Float[np.ndarray, "3"], along, left, speed, turn: float
     ) -> None:
-        """An object whose places and speeds are one number or one per frame."""
+        """Adds an object whose positions and speeds are one number or one per frame."""
         path = (np.broadcast_to(v, self.clock.shape) for v in (along, left, speed))
         self.paths.append((cls, size, *path, turn))
 
@@ -151,7 +151,7 @@ class _Traffic:
         return "Motorcycle" if draw < law.trucks + law.two_wheelers else "Sedan"
 
     def _lane(self, left_m, speed, direction, *, is_ego_lane=False) -> None:
-        """A file of vehicles that keep their distances."""
+        """Adds the vehicles of one lane, with constant distances between them."""
         rng = self.rng
         way = traveled(speed) * direction
         relative = way - self.ego_along
@@ -171,7 +171,7 @@ class _Traffic:
             along += size[0] / 2.0 + 4.0 + rng.exponential(self.law.gap_m)
 
     def _parked(self, left_m: float, side: float) -> None:
-        """Vehicles at rest along the edge."""
+        """Adds parked vehicles along one edge of the road."""
         rng = self.rng
         along = rng.uniform(-20.0, 0.0)
         while along < self.ego_along[-1] + SIGHT_M:
@@ -190,7 +190,7 @@ class _Traffic:
             along += footprint / 2 + 0.7 + rng.exponential(max(spacing, 0.3))
 
     def _walkers(self, right_m: float, left_m: float) -> None:
-        """People along the pavements, some of them crossing the road."""
+        """Adds pedestrians on the pavements, some of whom cross the road."""
         rng = self.rng
         length = self.ego_along[-1] + 80.0
         for _ in range(rng.poisson(self.law.pedestrians_per_100m * length / 100.0)):
@@ -210,7 +210,7 @@ class _Traffic:
             self._add("Pedestrian", size, along, left, pace, turn)
 
     def _cyclists(self, left_m: float) -> None:
-        """Bicycles along the right edge of the road."""
+        """Adds bicycles along the right edge of the road."""
         rng = self.rng
         length = self.ego_along[-1] + 80.0
         for _ in range(rng.poisson(self.law.bicycles_per_100m * length / 100.0)):
@@ -220,9 +220,9 @@ class _Traffic:
             self._add("Bicycle", self._size("Bicycle"), along, left, pace, 0.0)
 
     def tracks(self) -> Tracks:
-        """All paths as boxes in the world frame, nearer ones first.
+        """Returns all paths as boxes in the world frame, sorted by initial distance.
 
-        There are some: every road type has oncoming traffic.
+        There is at least one path, because every road type has oncoming traffic.
         """
         paths = sorted(self.paths, key=lambda p: abs(p[2][0]))
         cls, sizes, *path, turn = zip(*paths, strict=True)
