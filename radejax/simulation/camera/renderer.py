@@ -1,8 +1,8 @@
-"""The front stereo camera's image of a scene, drawn through the calibration.
+"""Renders the image of the front stereo camera for a scene and a camera calibration.
 
-Ground and sky are computed per pixel from the viewing rays; objects are boxes of
-simple parts (`shapes`), painted from far to near. It is a drawing, not a photograph:
-enough for a network to find vehicles and people at the pixels the labels say.
+Ground and sky are computed for each pixel from its viewing ray. Objects consist of simple
+parts (`shapes`) and are painted from far to near. The images are not photorealistic, but
+vehicles and people appear at the pixels that correspond to their labels.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ _HALF_BRIGHT_M = 20.0
 def stereo_calibration(
     radar_from_lidar_m: tuple[float, float, float], width: int = 1280, height: int = 720
 ) -> tuple[CameraCalibration, ...]:
-    """Left and right front camera with K-Radar's intrinsics, scaled to an image size.
+    """Returns the left and right front camera of K-Radar, scaled to an image size.
 
     Args:
-        radar_from_lidar_m: Meters to add to LiDAR positions to get radar positions.
-        width: Width of one of the two images.
-        height: Height.
+        radar_from_lidar_m: Translation in meters from LiDAR to radar positions.
+        width: Width in pixels of each of the two images.
+        height: Height in pixels of the images.
     """
     return tuple(
         CameraCalibration.from_angles(
@@ -69,14 +69,14 @@ def stereo_calibration(
 
 @dataclasses.dataclass(frozen=True)
 class Ground:
-    """Viewing rays of a camera where they meet the ground.
+    """Intersections of a camera's viewing rays with the ground.
 
     Attributes:
-        hits: Pixels that show ground; P of them.
-        x_m: Forward in the radar's frame.
-        y_m: Left.
-        depth_m: Distance.
-        up: Vertical component of the unit ray (the sky's gradient).
+        hits: Mask of the P pixels that show ground.
+        x_m: Forward coordinate of the intersection in the radar frame.
+        y_m: Left coordinate of the intersection in the radar frame.
+        depth_m: Distance of the intersection from the camera.
+        up: Vertical component of the unit ray, for the gradient of the sky.
     """
 
     hits: Bool[np.ndarray, "H W"]
@@ -86,9 +86,9 @@ class Ground:
     up: Float[np.ndarray, "H W"]
 
 
-@functools.lru_cache(maxsize=4)  # of a dataset's cameras, for all its sequences
+@functools.lru_cache(maxsize=4)  # all sequences of a dataset share their cameras
 def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
-    """Where every pixel's ray meets the ground plane `z = ground_m` (radar frame)."""
+    """Intersects the ray of every pixel with the plane `z = ground_m` (radar frame)."""
     fx, fy, cx, cy = calibration.intrinsics
     u, v = np.meshgrid(
         np.arange(calibration.width) + 0.5, np.arange(calibration.height) + 0.5
@@ -114,7 +114,7 @@ def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
 def undistort(
     seen: Float[np.ndarray, "*points 2"], distortion: Float[np.ndarray, "5"]
 ) -> Float[np.ndarray, "*points 2"]:
-    """Inverse of the lens model by fixed-point iteration; normalized coordinates."""
+    """Removes lens distortion from normalized coordinates by fixed-point iteration."""
     k1, k2, p1, p2, k3 = distortion
     ideal = seen.copy()
     for _ in range(12):
@@ -128,14 +128,14 @@ def undistort(
 
 
 class CameraRenderer:
-    """Draws the front stereo image of frames of one sequence.
+    """Renders the front stereo images of one sequence.
 
     Args:
-        sequence: Scene; its conditions choose light, colors and weather.
+        sequence: Scene, whose conditions determine light, colors and weather.
         calibrations: Left and right camera.
-        seed: Colors of the objects, drops and flakes.
-        cover_lens: Let bad weather cover the lens at times.
-        mode: "scene", or "oracle": only silhouettes of the objects, see `silhouettes`.
+        seed: Seed of object colors, precipitation and lens cover.
+        cover_lens: Whether bad weather covers the lens in some frames.
+        mode: "scene", or "oracle" for only silhouettes of the objects (see `silhouettes`).
     """
 
     def __init__(
@@ -165,11 +165,11 @@ class CameraRenderer:
         )
 
     def render(self, frame: SceneFrame) -> UInt8[np.ndarray, "H W2 3"]:
-        """Image of the pair, left half first."""
+        """Renders the images of both cameras side by side, the left camera first."""
         return np.concatenate([self.view(frame, side) for side in (0, 1)], axis=1)
 
     def view(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
-        """Image of one camera."""
+        """Renders the image of the left (0) or right (1) camera."""
         if self.mode == "oracle":
             return self.silhouettes(frame, side)
         calibration = self.calibrations[side]
@@ -191,10 +191,11 @@ class CameraRenderer:
         return np.asarray(canvas)
 
     def silhouettes(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
-        """Objects in the color of their class on black.
+        """Renders the objects as silhouettes in the color of their class on black.
 
-        The nearer the brighter, half as bright at 20 m, near ones before far ones, in
-        any weather and light: what a camera that knows classes and distances would see.
+        Brightness decreases with distance, to one half at 20 m, and near objects cover far
+        ones. Weather and light have no effect. The image encodes the class and distance of
+        every visible object.
         """
         calibration = self.calibrations[side]
         canvas = Image.new("RGB", (calibration.width, calibration.height))
@@ -207,9 +208,9 @@ class CameraRenderer:
         return np.asarray(canvas)
 
     def shown_boxes(self, frame: SceneFrame, side: int) -> Int32[np.ndarray, "H W"]:
-        """Index of the box of the frame that a pixel shows, -1 for none.
+        """Returns the index of the box that each pixel shows, -1 for none.
 
-        As if air and lens were clear; what the roadside hides is not shown.
+        Air and lens are assumed to be clear. Roadside shapes cover the objects behind them.
         """
         calibration = self.calibrations[side]
         canvas = Image.new("I", (calibration.width, calibration.height), -1)
@@ -219,7 +220,7 @@ class CameraRenderer:
         return np.asarray(canvas)
 
     def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:
-        """What one camera sees of objects and roadside, far ones first."""
+        """Returns the polygons of objects and roadside in one camera, far ones first."""
         calibration = self.calibrations[side]
         origin, white = shapes.camera_position(calibration), self.air.white
         roadside = details.make_panels(frame, origin, self.sequence.ground_m, white)
@@ -229,10 +230,10 @@ class CameraRenderer:
         )
 
     def _lamps(self, frame, calibration, draw) -> None:
-        """Rear lights and headlights of vehicles by night, where nothing hides them."""
+        """Draws the visible headlights and rear lights of vehicles at night."""
         vehicles = np.flatnonzero(np.isin(frame.cls, _WITH_LAMPS))
         x, y, z, length, width, height, yaw = frame.boxes[np.repeat(vehicles, 2)].T
-        is_front = rotate(x, y, -yaw)[0] < 0  # the end that looks at us
+        is_front = rotate(x, y, -yaw)[0] < 0  # the front faces the radar
         along = np.where(is_front, 1.0, -1.0) * length / 2.0
         across = np.tile([-0.75, 0.75], len(vehicles)) * width / 2.0
         dx, dy = rotate(along, across, yaw)
@@ -251,7 +252,7 @@ class CameraRenderer:
     def _background(
         self, frame: SceneFrame, ground: Ground
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """Ground, road with markings, and sky."""
+        """Renders ground, road with markings, and sky."""
         fade = np.clip(ground.up * 2.5, 0.0, 1.0)[..., None]
         image = self.sky * (1.0 - 0.35 * fade)
         image[ground.hits] = self._ground_color(frame, ground)
@@ -260,7 +261,7 @@ class CameraRenderer:
     def _ground_color(
         self, frame: SceneFrame, ground: Ground
     ) -> Float[np.ndarray, "P 3"]:
-        """Colors of the pixels that show ground."""
+        """Computes the colors of the pixels that show ground."""
         sequence, lanes = self.sequence, self.sequence.lanes_m
         x, y, depth = ground.x_m, ground.y_m, ground.depth_m
         verge = _VERGE.get(sequence.environment, _GRASS)
@@ -271,7 +272,8 @@ class CameraRenderer:
         color = np.broadcast_to(verge, (x.size, 3)) + 24.0 * grain[:, None]
         if lanes:
             on_road = (left > min(lanes) - 0.4) & (left < max(lanes) + 0.4)
-            tracks = 0.5 + 0.5 * np.cos(left * 2.0 * np.pi / 1.7)  # swept by tyres
+            # Tire tracks have less snow.
+            tracks = 0.5 + 0.5 * np.cos(left * 2.0 * np.pi / 1.7)
             snow = (self.air.white * (0.35 + 0.65 * tracks))[:, None]
             asphalt = _ASPHALT * (1.0 - 0.3 * self.air.wetness)
             asphalt = asphalt + 14.0 * grain[:, None]
@@ -292,7 +294,7 @@ class CameraRenderer:
 def _hash_noise(
     i: Float[np.ndarray, "*all"], j: Float[np.ndarray, "*all"]
 ) -> Float[np.ndarray, "*all"]:
-    """Uniform numbers in [0, 1) that depend on two whole numbers only."""
+    """Computes uniform numbers in [0, 1) as a hash of two integers."""
     bits = (
         i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
     ) & 0xFFFFFFFF
