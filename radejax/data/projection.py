@@ -82,7 +82,7 @@ def project_columns(
 ) -> Float[np.ndarray, "R A DE"]:
     """Computes `project_tensor` of a tesseract that is passed as slabs of one azimuth.
 
-    Files store a tesseract in this order.
+    Files store tesseracts in this order.
 
     Args:
         columns: C-contiguous slabs of linear power, one for every azimuth. All slabs may

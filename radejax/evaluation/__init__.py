@@ -35,7 +35,7 @@ def evaluate(
     Args:
         ground_truth: Columns frame `[N]` int, box `[N, 7]` x, y, z, l, w, h, yaw (meters,
             radians, radar frame, full extents, z at mid-height) and cls `[N]` names. The
-            results of K-Radar's protocols depend on the order of boxes within a frame.
+            results of K-Radar's protocols depend on the order of boxes within each frame.
         predictions: The same columns and score `[M]` in [0, 1].
         classes: Classes to evaluate. `empty_frames` considers only these.
         iou_thresholds: A match needs an IoU above the threshold.

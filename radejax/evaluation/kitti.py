@@ -74,7 +74,7 @@ def write_kitti(
         K-Radar's tools.
 
     Raises:
-        UserError: K-Radar has no key for a class, or no frame has ground truth.
+        UserError: K-Radar has no key for one of the classes, or no frame has ground truth.
         DataError: A frame is not in the frame table.
     """
     ids = frame_ids(frames)

@@ -378,7 +378,7 @@ def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
 
 
 def to_row(result: Result) -> dict[str, Any]:
-    """Converts a result to a row of metrics.json and metrics.csv."""
+    """Converts a result to one row of metrics.json and metrics.csv."""
     others = ["ap", "precision", "recall", "score", "low", "high", "is_simulated"]
     terms = {name: value for name, value in vars(result).items() if name not in others}
     return {

@@ -1,7 +1,7 @@
 """Detection in folders of frames, as in `radejax detect`.
 
 Labels are needed only to find images: in K-Radar, only the header of a label file states
-which image belongs to a frame.
+which image belongs to each frame.
 """
 
 from __future__ import annotations

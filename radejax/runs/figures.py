@@ -53,7 +53,7 @@ def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
 
 
 def spread(values: Any, count: int) -> list[Any]:
-    """Return at most `count` evenly spaced items of a sequence."""
+    """Return at most `count` evenly spaced items."""
     places = np.linspace(0, len(values) - 1, min(count, len(values)))
     return [values[int(i)] for i in np.round(places)]
 

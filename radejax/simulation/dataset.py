@@ -333,7 +333,7 @@ def _start_worker(root: pathlib.Path, *of_scenes: Any) -> None:
 
 
 def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
-    """Prepares a frame, writes the result to a file and returns the path of the file.
+    """Prepares one frame, writes the result to a file and returns the path of the file.
 
     The result itself is too large to be returned by a worker.
     """

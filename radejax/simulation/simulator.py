@@ -1,7 +1,7 @@
 """Sequences of a simulated dataset, and the radar input and labels of their frames.
 
 A source lists sequences and their frames (numbers, time stamps, split) without simulating
-them. It creates the scene of a sequence on request, procedurally or from label files.
+them. It creates the scene of each sequence on request, procedurally or from label files.
 """
 
 from __future__ import annotations

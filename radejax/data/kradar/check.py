@@ -76,7 +76,7 @@ class HealthReport:
 
 
 def _with_shares(row: Mapping[str, Any]) -> dict[str, str]:
-    """Formats a row of `objects` as text with the share of every class."""
+    """Formats one row of `objects` as text with the share of every class."""
     total = max(sum(row[cls] for cls in CLASSES), 1)
     cells = {}
     for cls in CLASSES:

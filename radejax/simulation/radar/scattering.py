@@ -196,7 +196,7 @@ def face_gain(
 
 
 class FrameScattering(NamedTuple):
-    """Scatterers of a frame in Cartesian coordinates.
+    """Scatterers of one frame in Cartesian coordinates.
 
     Attributes:
         position_m: Position in the radar frame.

@@ -50,7 +50,7 @@ class Road:
 
 @dataclasses.dataclass(frozen=True)
 class Tracks:
-    """All objects of a sequence in every frame, in the world frame.
+    """All objects of one sequence in every frame, in the world frame.
 
     Attributes:
         position_m: Box centers.
