@@ -175,10 +175,14 @@ def test_symmetric_bounded_and_bev_at_least_volume(a, b):
 
 @settings(deadline=None, max_examples=100)
 @given(box_numbers)
+@example((0.0, 0.0, 1.9424906969070435, 1.0, 1.5, 0.25, 1.0))
 def test_identical_boxes_have_iou_1(a):
     a = as_box(a)
     np.testing.assert_allclose(bev_pairs(a, a), 1, atol=5e-7)
-    np.testing.assert_allclose(volume_pairs(a, a), 1, atol=1e-6)
+    # Top and bottom are rounded to float32, which the IoU doubles.
+    z, height = np.abs(a[0, [2, 5]])
+    rounding = 2 * np.finfo(np.float32).eps * (z + height / 2) / height
+    np.testing.assert_allclose(volume_pairs(a, a), 1, atol=5e-7 + rounding)
     half_turn = a + np.array([0, 0, 0, 0, 0, 0, np.pi], np.float32)
     # Adding pi rounds the angle by 1e-7, which long boxes feel most.
     np.testing.assert_allclose(bev_pairs(a, half_turn), 1, atol=1e-5)
