@@ -35,11 +35,10 @@ def read_weights(data: bytes) -> dict[str, np.ndarray]:
 
 
 def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
-    """Loads the detector of an exported folder.
+    """Loads the detector of an exported folder as a function `detect(projection, ...)`.
 
-    Returns:
-        A function `detect(projection, ...)` that returns a dictionary of arrays. Its
-        keyword arguments `score_threshold`, `nms_iou` and `roi` replace the defaults.
+    The function returns a dictionary of arrays. Its keyword arguments `score_threshold`,
+    `nms_iou` and `roi` replace the defaults.
     """
     folder = pathlib.Path(folder)
     config = json.loads((folder / "config.json").read_text())
