@@ -111,7 +111,6 @@ def same(folder, a, b):
     ]
     for values in metrics:
         values.pop("run")
-        values["options"].pop("run")
     different += ["metrics"] * (metrics[0] != metrics[1])
     return different
 
