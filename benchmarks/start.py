@@ -16,7 +16,7 @@ import time
 from case import Case
 
 _ROOT = pathlib.Path(__file__).resolve().parents[1]
-_FIRST_STEP = " 1/12 ["  # of the progress bar, once the first step has finished
+_FIRST_STEP = " 1/12 ["  # in the progress bar after the first step
 _DETECT = f"""
 import sys
 sys.path.append({str(_ROOT / "benchmarks")!r})
@@ -83,10 +83,11 @@ def until(text, arguments, folder, programs):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    output = ""
-    while chunk := process.stdout.read1():  # not lines: the bar's ends when it moves on
-        output += chunk.decode()
-        if text in output:
+    output = b""
+    # The output is not read by lines, as the line of the progress bar has no end.
+    while chunk := process.stdout.read1():
+        output += chunk
+        if text.encode() in output:
             seconds = time.perf_counter() - began
             process.kill()
             _, process.returncode, usage = os.wait4(process.pid, 0)
@@ -94,4 +95,6 @@ def until(text, arguments, folder, programs):
             return seconds, usage.ru_utime + usage.ru_stime
     process.wait()
     process.stdout.close()
-    raise RuntimeError(f"no {text!r} from {arguments}: {output[-2000:]}")
+    raise RuntimeError(
+        f"no {text!r} from {arguments}: {output[-2000:].decode(errors='replace')}"
+    )

@@ -191,7 +191,7 @@ _INT8, _INT32, _UINT32 = 1, 5, 6
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
 _HEAD = 512  # bytes of a variable before its values, more than any real array has
-_CHUNK = 1 << 16  # deflated bytes to inflate at a time: little enough for the cache
+_CHUNK = 1 << 16  # deflated bytes that are inflated at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,7 +274,7 @@ def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
             content[filled : filled + len(part)] = part
             filled += len(part)
             if filled > layout.num_bytes or inflater.unused_data:
-                break  # before a corrupted file fills the memory
+                break  # otherwise a corrupted file could fill the memory
         if not inflater.eof or filled != layout.num_bytes or inflater.unused_data:
             raise _corrupted(file, f"does not inflate to {layout.num_bytes} bytes")
         values = np.frombuffer(content, layout.dtype, count, layout.offset)

@@ -118,7 +118,7 @@ class TrainState(struct.PyTreeNode):
     Attributes:
         step: Number of steps taken, including skipped ones; int32.
         num_skipped: Number of steps skipped because loss or gradient was not finite.
-        num_skipped_in_row: Number of steps skipped since the last step that was not.
+        num_skipped_in_row: Number of consecutive steps skipped up to now.
         params: Trained parameters, float32.
         model_state: Other variable collections, such as running batch statistics.
         opt_state: State of the optimizer.

@@ -229,8 +229,8 @@ def _project_faces(
 ) -> list[list[float]]:
     """Projects faces to flat lists of pixels, clipped at the near plane.
 
-    Edges are subdivided to follow the lens distortion. A face that is entirely in front of
-    the near plane or outside of the image gives an empty list.
+    Edges are subdivided to follow the lens distortion. A face that is entirely nearer
+    than the near plane or outside of the image gives an empty list.
     """
     camera = calibration.camera("raw")
     following = np.roll(faces, -1, axis=1)
