@@ -50,7 +50,8 @@ def overlay(
 
     FRAME is sequence/radar_lidar, sequence/radar, or one sequence, of which the first
     frame is drawn. All frames are drawn where --out ends in .gif or .mp4.
-    --sequences and --weather select frames without a FRAME.
+    --sequences and --weather select frames without a FRAME. Labels of every visibility
+    are drawn, also those that training leaves out.
 
     Example: radejax overlay 1/00033_00001 --data ROOT
     """

@@ -353,7 +353,7 @@ def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
     for style, boxes in scene.sets:
         label = f"{style.name} ({len(boxes)})" if show_counts else style.name
         if boxes.score is not None and scene.score_threshold is not None:
-            label += f", score from {scene.score_threshold:g}"
+            label += f", score ≥ {scene.score_threshold:g}"
         line = Line2D([], [], color=style.color, lw=style.width, label=label)
         line.set_path_effects(halo(style.width + 1.4))
         handles.append(line)

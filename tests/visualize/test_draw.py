@@ -84,7 +84,7 @@ def test_boxes_are_drawn_where_they_are():
     texts = {t.get_text() for t in ax.texts}
     assert texts == {"Sedan", "Bus or Truck 0.88"}
     legend = [t.get_text() for t in ax.get_legend().get_texts()]
-    found = "prediction (1), score from 0.3"
+    found = "prediction (1), score ≥ 0.3"
     assert legend == ["ground truth (1)", found, "wide region"]
 
 
