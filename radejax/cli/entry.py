@@ -41,10 +41,10 @@ _WRONG_PATH = (
 def exit_codes(*, debug: bool = False) -> Iterator[None]:
     """Ends the program with a one-line message instead of a traceback for user errors.
 
-    The exit code is 2 for wrong use (arguments, folders), 1 for corrupted data or a full
-    disk and 130 for an interrupt (see `core.errors`). If the caller closed standard
-    error, messages are discarded, as they could otherwise be written to another file that
-    has its file descriptor.
+    The exit code is 2 for wrong use (arguments, folders), 1 for corrupted data, a full
+    disk or another error of a file system, and 130 for an interrupt (see `core.errors`).
+    If the caller closed standard error, messages are discarded, as they could otherwise
+    be written to another file that has its file descriptor.
 
     Args:
         debug: Whether to show the traceback.
@@ -69,8 +69,9 @@ def _exit_code(error: BaseException) -> int | None:
         return getattr(error, "exit_code", None)
     if is_no_space(error):
         return FAILED
-    is_users = isinstance(error, _WRONG_PATH) or error.errno == errno.EROFS
-    return WRONG_USE if is_users else None
+    if isinstance(error, _WRONG_PATH) or error.errno == errno.EROFS:
+        return WRONG_USE
+    return FAILED if error.filename else None
 
 
 def _message(error: BaseException) -> str:

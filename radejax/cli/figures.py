@@ -13,6 +13,7 @@ import click
 import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
+from radejax.core.structures import frame_key
 
 ANIMATIONS = (".gif", ".mp4")
 
@@ -61,6 +62,7 @@ def overlay(
     from radejax.visualize.style import save_figure
 
     sequence, _, frame_name = name.partition("/")
+    frame_name = frame_key(frame_name)
     if sequence.isdecimal():
         part["sequence_numbers"] = (int(sequence),)
     elif name or not (part["sequence_numbers"] or part["weather"]):

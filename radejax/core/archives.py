@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import zipfile
 from collections.abc import Iterator
 
 import numpy as np
 
 from radejax.core.errors import DataError, one_line
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, as_path
 
 
 @contextlib.contextmanager
@@ -28,7 +27,10 @@ def wrap_read_errors(where: PathLike, what: str) -> Iterator[None]:
         raise
     except Exception as error:  # on corrupted files, readers raise errors of any type
         if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
-            raise  # an error of the file system, such as a missing permission
+            # An error of the file system, such as a missing permission. Only `open` names
+            # the file.
+            error.filename = error.filename or str(where)
+            raise
         raise DataError(
             f"{where}: corrupted, not {what} ({type(error).__name__}: {one_line(error)})"
         ) from None
@@ -63,8 +65,8 @@ def read_npy(path: PathLike) -> np.ndarray:
         DataError: The file is corrupted, or its size differs from that in its header.
     """
     with wrap_read_errors(path, "a NumPy array file"):
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-        size, expected = os.path.getsize(path), array.offset + array.nbytes
+        array = np.load(as_path(path), mmap_mode="r", allow_pickle=False)
+        size, expected = as_path(path).stat().st_size, array.offset + array.nbytes
         if size != expected:
             raise DataError(f"{path}: corrupted, {size} bytes, expected {expected}")
         return np.array(array)
@@ -79,7 +81,7 @@ def read_npz(path: PathLike) -> dict[str, np.ndarray]:
     """
     with (
         wrap_read_errors(path, "a NumPy archive"),
-        open(path, "rb") as file,  # NumPy would leave it open if reading fails
+        open(as_path(path), "rb") as file,  # NumPy would leave it open if reading fails
         np.load(file, allow_pickle=False) as arrays,
     ):
         return dict(arrays)
@@ -95,4 +97,4 @@ def read_safetensors(path: PathLike) -> dict[str, np.ndarray]:
     import safetensors.numpy  # only few users of this module need it
 
     with wrap_read_errors(path, "a safetensors file"):
-        return safetensors.numpy.load_file(path)
+        return safetensors.numpy.load_file(as_path(path))

@@ -23,6 +23,7 @@ from ml_collections.config_dict import placeholder
 from ml_collections.config_flags import config_path
 
 from radejax.core.errors import UserError
+from radejax.core.files import as_path
 from radejax.core.structures import CLASSES, NARROW_ROI
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
@@ -89,7 +90,7 @@ def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
         >>> config_file("quickstart").name
         'quickstart.py'
     """
-    path = pathlib.Path(name)
+    path = as_path(name)
     own = CONFIGS / f"{path.stem}.py"
     if not path.suffix and path.name == str(name) and own.is_file():
         return own

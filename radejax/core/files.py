@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import fnmatch
 import json
 import logging
 import os
@@ -36,7 +37,7 @@ def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
     Raises:
         DiskFullError: No space is left on the disk.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary_path(path)
     try:
@@ -67,7 +68,7 @@ def swapped_in(folder: PathLike) -> Iterator[pathlib.Path]:
     Raises:
         DiskFullError: No space is left on the disk.
     """
-    folder = pathlib.Path(folder)
+    folder = as_path(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary_path(folder)
     remove_stale(folder.parent, f".{folder.name}.")
@@ -153,6 +154,51 @@ def is_no_space(error: BaseException) -> bool:
 # Reading -----------------------------------------------------------------------------
 
 
+def as_path(path: PathLike) -> pathlib.Path:
+    """Converts a path of a user, with `~` for the home folder, to a `Path`.
+
+    Raises:
+        UserError: The path begins with `~`, and there is no such home folder.
+    """
+    try:
+        return pathlib.Path(path).expanduser()
+    except RuntimeError:
+        raise UserError(f"{path}: there is no home folder to replace ~") from None
+
+
+def find_files(folder: PathLike, *patterns: str) -> list[pathlib.Path]:
+    """Finds files in a folder and all its subfolders, also through symbolic links.
+
+    A folder to which several links lead is visited once, so that links may form a loop.
+
+    Args:
+        folder: Folder to search.
+        *patterns: Patterns of the file names, such as "*.npy".
+
+    Returns:
+        Sorted paths below `folder`.
+
+    Raises:
+        OSError: A folder cannot be read.
+    """
+
+    def stop(error: OSError) -> None:
+        raise error
+
+    found, visited = [], set()
+    for parent, folders, names in os.walk(folder, onerror=stop, followlinks=True):
+        real = os.path.realpath(parent)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders.sort()
+        for pattern in patterns:
+            matching = fnmatch.filter(names, pattern)
+            found += [pathlib.Path(parent, name) for name in matching]
+    return sorted(found)
+
+
 def read_text(path: PathLike) -> str:
     """Reads a UTF-8 text file, without a byte order mark.
 
@@ -162,7 +208,7 @@ def read_text(path: PathLike) -> str:
             the message contains the line number.
     """
     try:
-        content = pathlib.Path(path).read_bytes()
+        content = as_path(path).read_bytes()
     except (IsADirectoryError, NotADirectoryError):
         raise DataError(f"{path}: expected a text file") from None
     return decoded(content, str(path))
@@ -243,7 +289,7 @@ def claim(
             differ.
         DataError: The JSON file is corrupted.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     try:
         found = read_object(path)
     except FileNotFoundError:
@@ -289,7 +335,7 @@ def lock(path: PathLike, message: str | None = None) -> Iterator[None]:
     Raises:
         UserError: Another process holds the lock, and `message` is given.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
         try:

@@ -10,6 +10,7 @@ the radar (ego) frame in meters: x forward, y left, z up, with the origin of z a
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import jax
@@ -43,6 +44,25 @@ WIDE_ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 
 ROIS = {"narrow": NARROW_ROI, "wide": WIDE_ROI}
 """Regions by name. Their bounds apply to box centers and are inclusive."""
+
+
+def frame_key(text: str) -> str:
+    """Returns the key "sequence/radar_lidar" of a K-Radar frame in its usual spelling.
+
+    Leading zeros and the suffix of label files may differ from it, and the sequence or the
+    LiDAR number may be missing. Other names are returned unchanged.
+
+    Examples:
+        >>> frame_key("05/33_1.txt"), frame_key("5/00033"), frame_key("night/a7")
+        ('5/00033_00001', '5/00033', 'night/a7')
+    """
+    sequence, slash, name = text.rpartition("/")
+    if re.fullmatch("[0-9]{1,9}", sequence):
+        sequence = str(int(sequence))
+    name = name.removesuffix(".txt")
+    if re.fullmatch("[0-9]{1,9}(_[0-9]{1,9})?", name):
+        name = "_".join(f"{int(number):05d}" for number in name.split("_"))
+    return f"{sequence}{slash}{name}"
 
 
 class Batch(struct.PyTreeNode):

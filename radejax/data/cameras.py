@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import UInt8
 
+from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import (
     DataError,
     Range,
@@ -35,15 +36,21 @@ IMAGE_SIZE = (720, 1280)
 
 
 def read_left_image(
-    path: pathlib.Path, size: tuple[int, int] = IMAGE_SIZE, *, resize: bool = False
+    path: pathlib.Path,
+    size: tuple[int, int] = IMAGE_SIZE,
+    *,
+    resize: bool = False,
+    calibrated_size: tuple[int, int] | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Reads the left image from a front image file (a stereo pair or the left image only).
 
     Args:
-        path: Image file. With `resize`, an image that is more than twice as wide as high
-            is a stereo pair; otherwise, one that is twice as wide as `size`.
+        path: Image file. 16-bit gray levels are divided by 256.
         size: Height and width of the result.
         resize: Whether to resize images of other sizes to `size` with a box filter.
+        calibrated_size: Height and width of the images of the camera calibration, or None
+            if they are `size`. An image whose aspect ratio is closer to twice that of
+            these images is a stereo pair.
 
     Raises:
         DataError: The file is corrupted, or the image has another size and `resize` is
@@ -52,26 +59,30 @@ def read_left_image(
     from PIL import Image
 
     height, width = size
-    try:
+    with (
+        wrap_read_errors(path, "a readable image"),
         # Pillow decodes from memory: reading from a file, it would try to allocate the
         # size that a corrupted chunk claims, up to 4 GB.
-        with Image.open(io.BytesIO(path.read_bytes())) as file:
-            found = file.size
-            if not resize and found not in ((2 * width, height), (width, height)):
-                raise DataError(
-                    f"{path}: {found[0]} x {found[1]} pixels, expected "
-                    f"{2 * width} x {height} (stereo) or {width} x {height}"
-                )
-            is_pair = found[0] > 2 * found[1] if resize else found[0] == 2 * width
-            left = (0, 0, found[0] // 2 if is_pair else found[0], found[1])
-            image = file.convert("RGB").crop(left)
-            if image.size != (width, height):
-                image = image.resize((width, height), Image.Resampling.BOX)
-            return np.asarray(image)
-    except DataError:
-        raise
-    except Exception as error:  # Pillow's decoders raise many types of exceptions
-        raise DataError(f"{path}: corrupted image ({error})") from None
+        Image.open(io.BytesIO(path.read_bytes())) as file,
+    ):
+        found = file.size
+        if not resize and found not in ((2 * width, height), (width, height)):
+            raise DataError(
+                f"{path}: {found[0]} x {found[1]} pixels, expected "
+                f"{2 * width} x {height} (stereo) or {width} x {height}"
+            )
+        high, wide = calibrated_size or size
+        is_pair = found[0] * high > math.sqrt(2) * wide * found[1]
+        left = (0, 0, found[0] // 2 if is_pair else found[0], found[1])
+        if file.mode.startswith("I"):  # 16 bits, which Pillow would clip to 255
+            levels = np.asarray(file) >> 8
+            image = Image.fromarray(levels.astype(np.uint8)).convert("RGB")
+        else:
+            image = file.convert("RGB")
+        image = image.crop(left)
+        if image.size != (width, height):
+            image = image.resize((width, height), Image.Resampling.BOX)
+        return np.asarray(image)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -130,6 +130,13 @@ class LabelledFrame:
             radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
         )
 
+    def calibrated_size(self) -> tuple[int, int] | None:
+        """Returns height and width of the calibration's images, or None without one."""
+        if self.camera_calibration_path is None:
+            return None
+        calibration = self.read_calibration()
+        return calibration.height, calibration.width
+
 
 FrameSequence = Sequence[LabelledFrame]
 """A dataset, or a part of one, of which only the frames are read."""

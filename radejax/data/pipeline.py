@@ -43,6 +43,8 @@ class CameraInputs:
         features: Features from an image backbone that replace the images, or None.
         sources: For every frame, the path of its front image or the key of its
             features; None for frames without either.
+        calibrated_sizes: For every frame, height and width of the images of its
+            calibration; None for frames without one.
     """
 
     cameras: tuple[Camera, ...]
@@ -50,6 +52,7 @@ class CameraInputs:
     options: CameraOptions
     features: Records | None
     sources: Sequence[Any]
+    calibrated_sizes: Sequence[tuple[int, int] | None]
 
     def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
         """Returns black images `[count, H, W, 3]` uint8, or features that are zero."""
@@ -64,7 +67,12 @@ class CameraInputs:
             return self.empty_images(1)[0]
         if self.features is not None:
             return self.features[source]
-        return read_left_image(source, self.image_size, resize=self.options.resize)
+        return read_left_image(
+            source,
+            self.image_size,
+            resize=self.options.resize,
+            calibrated_size=self.calibrated_sizes[index],
+        )
 
 
 def camera_inputs(
@@ -104,18 +112,21 @@ def camera_inputs(
                 "`radejax embed`"
             )
     cameras: list[Camera] = []
+    sizes: list[tuple[int, int] | None] = []
     missing: list[str] = []
-    known: dict[Any, Camera] = {}
+    known: dict[Any, tuple[Camera, tuple[int, int]]] = {}
     for frame, image in zip(frames, sources, strict=True):
         if image is None or frame.camera_calibration_path is None:
             missing.append(frame.key)
             cameras.append(no_camera(image_size))
+            sizes.append(None)
             continue
         shift = options.shift(frame.radar_from_lidar_m, frame.radar_from_lidar_z_m)
         source = frame.camera_calibration_path, shift
         if source not in known:
             known[source] = _camera(frame, shift, image_size, options)
-        cameras.append(known[source])
+        cameras.append(known[source][0])
+        sizes.append(known[source][1])
     if missing and not options.allow_missing:
         raise UserError(
             f"{len(missing)} of {len(frames)} frames have no front image or no camera "
@@ -128,7 +139,7 @@ def camera_inputs(
             len(missing),
             len(frames),
         )
-    return CameraInputs(tuple(cameras), image_size, options, features, sources)
+    return CameraInputs(tuple(cameras), image_size, options, features, sources, sizes)
 
 
 def _camera(
@@ -136,11 +147,16 @@ def _camera(
     radar_from_lidar_m: tuple[float, ...],
     image_size: tuple[int, int],
     options: CameraOptions,
-) -> Camera:
-    """Returns the camera of one frame for images of the model's size."""
+) -> tuple[Camera, tuple[int, int]]:
+    """Returns the camera of one frame for images of the model's size.
+
+    Returns:
+        The camera, and the height and width of the images of the calibration file.
+    """
     calibration = frame.read_calibration(radar_from_lidar_m)
     height, width = image_size
-    if (calibration.height, calibration.width) != (height, width):
+    size = calibration.height, calibration.width
+    if size != image_size:
         if not options.resize:
             raise UserError(
                 f"{frame.camera_calibration_path}: calibration of {calibration.width} x "
@@ -148,7 +164,7 @@ def _camera(
                 "(config.model.image.size); config.data.camera.resize=True resizes"
             )
         calibration = calibration.resized(width, height)
-    return calibration.camera(options.projection)
+    return calibration.camera(options.projection), size
 
 
 def require_images(

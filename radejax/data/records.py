@@ -26,7 +26,8 @@ from jaxtyping import Real
 from tqdm import tqdm
 
 from radejax.core import files
-from radejax.core.errors import DataError, UserError, one_line, require
+from radejax.core.archives import wrap_read_errors
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.workers import process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.data.projection import ENCODINGS, encode
@@ -63,7 +64,7 @@ class Records:
             FileNotFoundError: There is no such folder.
             DataError: `records.json` is corrupted.
         """
-        path = pathlib.Path(folder) / _DESCRIPTION
+        path = files.as_path(folder) / _DESCRIPTION
         if not path.is_file():
             raise FileNotFoundError(
                 f"{folder}: no {_DESCRIPTION}; expected a folder that `radejax "
@@ -96,7 +97,7 @@ class Records:
         """
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
         wanted = {"shape": list(shape), "dtype": dtype, "source": source}
-        files.claim(pathlib.Path(folder) / _DESCRIPTION, wanted, "other records")
+        files.claim(files.as_path(folder) / _DESCRIPTION, wanted, "other records")
         return cls.open(folder)
 
     @functools.cached_property
@@ -120,7 +121,7 @@ class Records:
         """Lists the folder and returns the keys of all frames that have a record."""
         return {
             path.relative_to(self.folder).as_posix().removesuffix(".npy")
-            for path in self.folder.rglob("*.npy")
+            for path in files.find_files(self.folder, "*.npy")
             if not path.name.startswith(".")
         }
 
@@ -136,19 +137,13 @@ class Records:
             DataError: The file is corrupted.
         """
         path = self.path(key)
-        try:
+        expected = f"a {self.dtype} array of shape {self.shape}"
+        with wrap_read_errors(path, f"{expected}; delete it and write it again"):
             with open(path, "rb") as file:
                 array = np.lib.format.read_array(file, allow_pickle=False)
             if array.shape != self.shape or array.dtype.name != self.dtype:
                 raise ValueError(f"{array.dtype} array of shape {array.shape}")
             return array
-        except FileNotFoundError:
-            raise
-        except Exception as error:  # NumPy raises many types for corrupted files
-            raise DataError(
-                f"{path}: corrupted record ({one_line(error)}), expected a {self.dtype} "
-                f"array of shape {self.shape}; delete the file and write it again"
-            ) from None
 
     def write(self, key: str, array: Real[np.ndarray, "..."]) -> None:
         """Writes the record of a frame atomically."""
@@ -304,7 +299,7 @@ def preprocess(
             records of another kind, or a worker process was killed.
         DataError: `records.json` is corrupted.
     """
-    began, folder = time.perf_counter(), pathlib.Path(folder)
+    began, folder = time.perf_counter(), files.as_path(folder)
     if not len(frames):
         raise UserError("no frames to preprocess")
     index, count = shard

@@ -30,7 +30,7 @@ from jaxtyping import Float, Real
 
 from radejax.core.archives import read_npy, wrap_read_errors
 from radejax.core.errors import DataError
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, as_path
 from radejax.data.projection import MAX_LEVEL, project_columns, project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -155,7 +155,10 @@ def _opened(
         FileNotFoundError: There is no such file.
         DataError: Whatever is wrong with it, in the block too.
     """
-    with wrap_read_errors(path, "a MATLAB file"), open(path, "rb", buffering=0) as file:
+    with (
+        wrap_read_errors(path, "a MATLAB file"),
+        open(as_path(path), "rb", buffering=0) as file,
+    ):
         layout = _find_array(file)
         shape, axes = layout.shape, "(Doppler, range, elevation, azimuth)"
         if len(shape) != 4 or shape != tuple(shape_drea or shape):

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, atomic_write
-from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS, Boxes
+from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS, Boxes, frame_key
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not evaluated are ignored."""
@@ -346,11 +346,11 @@ def with_ids(
     named = np.asarray(table["frame"])
     if named.dtype.kind in "iu" or not named.size:
         return {**table, "frame": named.astype(np.int64)}
-    names = [str(name).removesuffix(".txt") for name in named]
+    names = [frame_key(str(name)) for name in named]
     known: dict[str, int] = {}
     if frames is not None:
         ids = np.asarray(frames["frame"]).tolist()
-        by_key = dict(zip(frame_keys(frames), ids, strict=True))
+        by_key = dict(zip(map(frame_key, frame_keys(frames)), ids, strict=True))
         by_radar = {key.rpartition("_")[0]: i for key, i in by_key.items()}
         known = by_key | by_radar | by_key  # keys come first and take precedence
     is_known = np.array([name in known for name in names])

@@ -61,7 +61,7 @@ def read_table(
         DataError: A column is missing, a value is not a number, or a frame is unknown;
             the message names the file and the row.
     """
-    path = pathlib.Path(path)
+    path = files.as_path(path)
     wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
     columns: Columns
     if _is_kitti(path):
@@ -168,7 +168,7 @@ def load(
         FileNotFoundError: A file or folder does not exist.
         DataError: A file has malformed content.
     """
-    path = pathlib.Path(path)
+    path = files.as_path(path)
     if (path / "predictions.npz").is_file():
         source = dataclasses.replace(source, ground_truth=str(path))
         path = path / "predictions.npz"
@@ -207,7 +207,7 @@ def _load_ground_truth(
 ) -> tuple[Columns, Columns | None, dict[str, int]]:
     """Returns ground truth, the frame table or None, and counts of labels."""
     if source.ground_truth:
-        truth = pathlib.Path(source.ground_truth)
+        truth = files.as_path(source.ground_truth)
         of_report = (truth / "ground_truth.npz", truth / "evaluation/ground_truth.npz")
         truth = next((place for place in of_report if place.is_file()), truth)
         table = truth.with_name("frames.json")
@@ -234,7 +234,7 @@ def _load_ground_truth(
 
 def stored_from(path: PathLike) -> float:
     """Returns the minimum score of stored predictions in their report, or 0 without one."""
-    path = pathlib.Path(path)
+    path = files.as_path(path)
     if not (path / "metrics.json").is_file():
         return 0.0
     return float(files.read_json(path / "metrics.json")["options"]["min_score"])

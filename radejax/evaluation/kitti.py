@@ -89,7 +89,7 @@ def write_kitti(
 
     truth = lines(ground_truth, "ground truth", scored=False)
     found = lines(take(predictions, is_above), "predictions", scored=True)
-    root = pathlib.Path(folder) / f"{float(score_threshold)}"
+    root = files.as_path(folder) / f"{float(score_threshold)}"
     kinds = [kind for kind in DESCRIPTION if kind in frames]
     listed: dict[pathlib.Path, list[str]] = {}
     for position in sorted(truth):
@@ -159,7 +159,7 @@ def read_kitti(folder: str | pathlib.Path) -> tuple[Columns, Columns, Columns]:
         UserError: The folder `preds` is missing, or there are several score thresholds.
         DataError: A line is malformed; the message names the file and the line.
     """
-    root = _find_root(pathlib.Path(folder))
+    root = _find_root(files.as_path(folder))
     numbers, found = _read_folder(root / "preds", scored=True)
     others, truth = _read_folder(root / "gts", scored=False)
     frames = _frame_table(sorted({*numbers, *others}), root / "desc")

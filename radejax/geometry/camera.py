@@ -24,6 +24,7 @@ from flax import struct
 from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import DataError, require
+from radejax.core.files import as_path
 from radejax.geometry.boxes import array_module, corners
 from radejax.geometry.radar_grid import ArrayValues
 
@@ -274,7 +275,7 @@ class CameraCalibration(ArrayValues):
             DataError: A line is not `key: number`, a key is missing or a value is out of
                 range. The message names the file.
         """
-        path = pathlib.Path(path)
+        path = as_path(path)
         if not path.is_file():
             raise FileNotFoundError(f"camera calibration {path} does not exist")
         values = _read_numbers(path)

@@ -18,9 +18,10 @@ import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.core.structures import Detections
+from radejax.core.structures import Detections, frame_key
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
+from radejax.data.kradar.dataset import sequence_number
 from radejax.data.pipeline import camera_inputs
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
@@ -55,17 +56,15 @@ def find_frames(
         UserError: There is no frame; the message names what was searched.
     """
     found: set[pathlib.Path] = set()
-    for path in map(pathlib.Path, paths):
+    for path in map(files.as_path, paths):
         if not path.exists():
             raise FileNotFoundError(f"no such file or folder: {path}")
         if path.is_file():
             found.add(path)
-        for pattern in PATTERNS:
-            found.update(path.rglob(pattern))
+        found.update(files.find_files(path, *PATTERNS))
     folders = {_sequence(path) for path in found}
     if sequence_numbers:
-        wanted = {str(number) for number in sequence_numbers}
-        folders = {f for f in folders if f.name.lstrip("0") in wanted}
+        folders = {f for f in folders if sequence_number(f) in sequence_numbers}
     if weather:
         check_weather(weather)
         descriptions = {f: read_description(f / "description.txt") for f in folders}
@@ -112,7 +111,8 @@ def front_images(
     sequences = [
         folder
         for folder in {_sequence(path) for path in paths}
-        if folder.name.isdecimal() and (labels or any(folder.glob("info_label*")))
+        if sequence_number(folder) is not None
+        and (labels or any(folder.glob("info_label*")))
     ]
     if not sequences:
         return {}
@@ -187,13 +187,13 @@ def detect_files(
                 f"{output_name(path)}.json: detect each root into a folder of its own"
             )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
-    data, out = detector.saved.config.data, pathlib.Path(out)
+    data, out = detector.saved.config.data, files.as_path(out)
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
         labels = labels or data.labels
         known = front_images(frames, detector, labels, data.label_version)
     out.mkdir(parents=True, exist_ok=True)
-    keys = [frame_key(path) for path in frames]
+    keys = [key_of(path) for path in frames]
     names = [f"{output_name(path)}.json" for path in frames]
     if file_format == "kitti":
         names = [f"preds/{number:06d}.txt" for number in range(len(frames))]
@@ -228,16 +228,16 @@ def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> lis
     return [json.dumps(boxes, indent=2) + "\n" for boxes in named]
 
 
-def frame_key(path: pathlib.Path) -> str:
-    """Return the key of a frame without the LiDAR index, such as "5/00033".
+def key_of(path: pathlib.Path) -> str:
+    """Return the key of the frame of a radar file without the LiDAR index: "5/00033".
 
     Only label files contain the LiDAR index.
     """
     radar = path.stem.removeprefix("DERA_").removeprefix("tesseract_")
     sequence = _sequence(path).name
-    return f"{sequence}/{radar}" if sequence else radar
+    return frame_key(f"{sequence}/{radar}" if sequence else radar)
 
 
 def output_name(path: pathlib.Path) -> str:
     """Return a name such as "5_00033", which is unique among the sequences of a dataset."""
-    return frame_key(path).replace("/", "_")
+    return key_of(path).replace("/", "_")

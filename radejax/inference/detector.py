@@ -21,7 +21,7 @@ from jaxtyping import Bool, Real, Shaped, UInt8
 
 from radejax import models
 from radejax.core.errors import UserError, require
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, as_path
 from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
 from radejax.data.cameras import CameraOptions, no_camera, read_left_image
 from radejax.data.projection import MAX_LEVEL, project_jax
@@ -361,15 +361,19 @@ def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]
 # Inputs ------------------------------------------------------------------------------
 
 
-def _read_paths(given: Any, read: Callable[[pathlib.Path], np.ndarray]) -> Any:
+def _read_paths(given: Any, read: Callable[[pathlib.Path, int], np.ndarray]) -> Any:
     """Replace paths by the arrays that they contain.
 
     An array is returned unchanged. A path or a list becomes a list of arrays and None.
+    `read` is called with the path and its position in the list.
     """
     if not isinstance(given, str | os.PathLike | Sequence):
         return given
     entries = [given] if isinstance(given, _PATH) else given
-    return [read(pathlib.Path(x)) if isinstance(x, _PATH) else x for x in entries]
+    return [
+        read(as_path(entry), index) if isinstance(entry, _PATH) else entry
+        for index, entry in enumerate(entries)
+    ]
 
 
 def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
@@ -387,7 +391,7 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
         UserError: The shape is neither that of projections nor that of tesseracts, or
             there is no frame.
     """
-    radar = _read_paths(frames, lambda path: read_frame(path, grid))
+    radar = _read_paths(frames, lambda path, _: read_frame(path, grid))
     if isinstance(radar, list):
         if not radar:
             raise UserError("no frames: the list is empty")
@@ -475,8 +479,8 @@ def camera_batch(
         raise UserError("image and camera belong together: give both or none")
     images, cameras, has_image = None, None, np.zeros(num_frames, bool)
     if image is not None:
-        images, has_image = _images(image, model, options.resize)
         cameras = _cameras(camera, num_frames, model, options)
+        images, has_image = _images(image, cameras, model, options.resize)
         given = len(images), len(cameras.is_valid)
         if given != (num_frames, num_frames):
             raise UserError(
@@ -495,13 +499,20 @@ def camera_batch(
 
 
 def _images(
-    image: Any, model: Any, resize: bool
+    image: Any, cameras: Camera, model: Any, resize: bool
 ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
     """Return the images as one array, and a mask that is True where an image is given."""
     sizes = ((*model.image_size, 3), model.feature_shape)
-    image = _read_paths(
-        image, lambda path: read_left_image(path, model.image_size, resize=resize)
-    )
+    sizes_px = np.asarray(cameras.size_px, int)
+
+    def read(path: pathlib.Path, index: int) -> UInt8[np.ndarray, "H W 3"]:
+        # A wrong number of images is reported later.
+        width, height = sizes_px[min(index, len(sizes_px) - 1)]
+        return read_left_image(
+            path, model.image_size, resize=resize, calibrated_size=(height, width)
+        )
+
+    image = _read_paths(image, read)
     if isinstance(image, list):
         has_image = np.array([one is not None for one in image])
         empty = np.zeros(sizes[0], np.uint8)
@@ -540,7 +551,7 @@ def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
         return camera
     if not isinstance(camera, CameraCalibration):
         camera = CameraCalibration.from_kradar(
-            pathlib.Path(camera), radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
+            as_path(camera), radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
         )
     own_m = camera.radar_from_lidar_m
     shift_m = np.array(options.shift(own_m, own_m[2]))

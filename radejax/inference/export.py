@@ -102,7 +102,7 @@ def export(
     require(is_known, "platforms", platforms, f"some of {KNOWN_PLATFORMS}")
     if half and kind != "huggingface":
         raise UserError("--half is only supported with --format huggingface")
-    folder = pathlib.Path(folder)
+    folder = files.as_path(folder)
     programs: dict[str, bytes] = {}
     if kind == "stablehlo":
         programs[PROGRAM_FILE] = _stablehlo(

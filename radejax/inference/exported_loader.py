@@ -40,7 +40,7 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     The function returns a dictionary of arrays. Its keyword arguments `score_threshold`,
     `nms_iou` and `roi` replace the defaults.
     """
-    folder = pathlib.Path(folder)
+    folder = pathlib.Path(folder).expanduser()
     config = json.loads((folder / "config.json").read_text())
     data = {name: read_file(folder / name, x) for name, x in config["sha256"].items()}
     run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)

@@ -157,7 +157,12 @@ def embed_dataset(
     found = sum(frame.key in keys for frame in frames)
 
     def read(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
-        return read_left_image(frame.camera_path, model.image_size, resize=resize)
+        return read_left_image(
+            frame.camera_path,
+            model.image_size,
+            resize=resize,
+            calibrated_size=frame.calibrated_size(),
+        )
 
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
     params = jax.device_put({"params": {IMAGE_BACKBONE: params}})

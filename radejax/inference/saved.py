@@ -102,7 +102,7 @@ def load_model(
             is not the one that the run was trained with.
         DataError: A file is corrupted, or config and weights do not fit each other.
     """
-    path = pathlib.Path(path).absolute()
+    path = files.as_path(path).absolute()
     if not path.exists():
         raise FileNotFoundError(f"no such file or folder: {path}")
     is_exported = (path / WEIGHTS_FILE).is_file()
@@ -181,7 +181,7 @@ def save_model(
         UserError: The image transformer was fine-tuned, so that the model is incomplete
             without its weights, and `with_backbone` is False.
     """
-    folder = pathlib.Path(folder)
+    folder = files.as_path(folder)
     variables = {name: dict(tree) for name, tree in saved.variables.items()}
     params, image = variables["params"], saved.config.model.get("image")
     is_vit = image is not None and image.kind == "vit"
@@ -289,9 +289,9 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
         return saved
     source, start = given or data.image_backbone, saved.run.get("init_from")
     part: Any = {"params": {}}
-    if given is not None or (source and pathlib.Path(source).exists()):
+    if given is not None or (source and files.as_path(source).exists()):
         part = image_backbone.load_image_backbone(source, saved.model)
-    elif start and pathlib.Path(start).exists() and not data.embeddings:
+    elif start and files.as_path(start).exists() and not data.embeddings:
         source, part = start, _fitting_variables(start, saved.config.model)
     if IMAGE_BACKBONE not in part["params"]:
         if source is not None:
@@ -365,7 +365,7 @@ def starting_weights(
 def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
     """Read the weights of another run or an official file, which must fit `config.model`."""
     wanted = json.loads(config.to_json())
-    if pathlib.Path(path).is_dir():
+    if files.as_path(path).is_dir():
         other = load_model(path)
         found = json.loads(other.config.model.to_json())
         if lines := files.differences(found, wanted, "config.model"):

@@ -7,7 +7,6 @@ import functools
 import hashlib
 import json
 import logging
-import pathlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -20,6 +19,7 @@ from ml_collections import ConfigDict
 from radejax import models
 from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError, require
+from radejax.core.files import as_path
 from radejax.core.structures import Batch
 from radejax.data import pipeline, records
 from radejax.data.augment import Augmentation
@@ -250,7 +250,7 @@ def located(config: ConfigDict) -> ConfigDict:
 
 def _check_exist(paths: Iterable[str | None]) -> None:
     for path in filter(None, paths):
-        if not pathlib.Path(path).exists():
+        if not as_path(path).exists():
             raise FileNotFoundError(f"no such file or folder: {path}")
 
 
@@ -262,10 +262,10 @@ def _simulated_root(simulation: ConfigDict) -> str:
 
 def _set_paths(options: ConfigDict, roots: Iterable[str]) -> None:
     """Make paths of `config.data` absolute; records are in the first root by default."""
-    roots = tuple(str(pathlib.Path(root).absolute()) for root in roots)
+    roots = tuple(str(as_path(root).absolute()) for root in roots)
     paths = {name: options[name] for name in DATA_PATHS if name != "roots"}
-    paths["records"] = paths["records"] or pathlib.Path(roots[0], "records")
-    absolute = {n: x and str(pathlib.Path(x).absolute()) for n, x in paths.items()}
+    paths["records"] = paths["records"] or as_path(roots[0]) / "records"
+    absolute = {n: x and str(as_path(x).absolute()) for n, x in paths.items()}
     with options.ignore_type():  # a checkpoint's config has lists instead of tuples
         options.update(absolute, roots=roots)
     _check_exist([options.camera_calibration])
@@ -342,7 +342,7 @@ def data_of_run(
             "the model was trained on frames that were never written, there is no split "
             "to evaluate on; give --data ROOT, or use `radejax detect`"
         )
-    if [str(pathlib.Path(root).absolute()) for root in roots] != own:
+    if [str(as_path(root).absolute()) for root in roots] != own:
         whole = {"sequences": (), "weather": (), **dict.fromkeys(DATA_PATHS)}
         changes = whole | changes
     with options.ignore_type():
@@ -361,9 +361,9 @@ def data_name(changes: Mapping[str, Any]) -> str:
     It consists of the names of the first root and the labels, the sequences and the
     weather, or is "other" if none of them is changed.
     """
-    parts = [pathlib.Path(path).resolve().name for path in changes.get("roots", ())[:1]]
+    parts = [as_path(path).resolve().name for path in changes.get("roots", ())[:1]]
     if changes.get("labels") is not None:
-        parts.append(pathlib.Path(changes["labels"]).resolve().stem)
+        parts.append(as_path(changes["labels"]).resolve().stem)
     for name in ("sequences", "weather"):
         parts.append("-".join(map(str, changes.get(name, ()))))
     return "_".join(filter(None, parts)) or "other"

@@ -283,7 +283,7 @@ def evaluate_run(
             range.
     """
     saved = load_model(workdir, step=step, image_backbone=image_backbone)
-    workdir = pathlib.Path(workdir).absolute()
+    workdir = files.as_path(workdir).absolute()
     if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
     EvaluationOptions.from_config(saved.config, **changes)  # reading labels takes long
@@ -311,7 +311,7 @@ def evaluate_run(
     evaluation = Evaluation(
         config, data, split, shuffle_images=shuffle_images, **changes
     )
-    place = pathlib.Path(out or workdir / name)
+    place = files.as_path(out or workdir / name)
     return evaluation.report(
         saved.variables, workdir, out=place, step=saved.step, run=run
     )

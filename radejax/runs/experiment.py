@@ -79,7 +79,7 @@ def run(
         FileNotFoundError: A path does not exist.
     """
     checks.check(config)
-    config, folder = located(config), pathlib.Path(workdir).absolute()
+    config, folder = located(config), files.as_path(workdir).absolute()
     distributed.check_batch_size(config.train.batch_size)
     model, digest = models.build(config.model), None
     if config.data.embeddings is not None:
@@ -186,7 +186,7 @@ def run_info(
             `run.json` is kept.
     """
     if init_from is not None:
-        init_from = str(pathlib.Path(init_from).absolute())
+        init_from = str(files.as_path(init_from).absolute())
     elif (workdir / "run.json").exists():
         init_from = files.read_object(workdir / "run.json").get("init_from")
     versions = {"radejax": radejax.__version__, "jax": jax.__version__}
@@ -261,7 +261,7 @@ def run_seeds(
         UserError: Two seeds are equal, or `run` raises it.
     """
     require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
-    workdir, tables = pathlib.Path(workdir).absolute(), {}
+    workdir, tables = files.as_path(workdir).absolute(), {}
     for seed in seeds:
         one = config.copy_and_resolve_references()
         one.seed = seed

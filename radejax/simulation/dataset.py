@@ -82,7 +82,7 @@ def simulate_dataset(
             of another config, the disk is full, or a worker was killed.
     """
     checked = SimulationConfig.from_mapping(config)
-    root = pathlib.Path(root)
+    root = files.as_path(root)
     if _is_finished(root, checked):
         _log.info("Simulated dataset %s is complete: reused.", root)
         return root

@@ -53,7 +53,7 @@ class Checkpoints:
         max_to_keep: int | None = 2,
         read_only: bool = False,
     ) -> None:
-        self.folder = pathlib.Path(folder).absolute()
+        self.folder = files.as_path(folder).absolute()
         newest = policies.LatestN(n=max_to_keep)
         best = policies.BestN(
             get_metric_fn=_best_of, n=1, keep_checkpoints_without_metrics=False

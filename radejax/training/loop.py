@@ -93,7 +93,7 @@ def train(
         UserError: The run would continue with other data, the warm-up is too long, or no
             space is left on the disk.
     """
-    options, folder = config.train, pathlib.Path(workdir)
+    options, folder = config.train, files.as_path(workdir)
     optimizer = make_optimizer(
         make_schedule(options, steps_per_epoch),
         weight_decay=options.weight_decay,

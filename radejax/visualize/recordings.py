@@ -20,7 +20,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from radejax.core.errors import UserError
-from radejax.core.files import atomic_path
+from radejax.core.files import as_path, atomic_path
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.style import COLOR_MAP, Scene, color_limits_of, label_texts
 
@@ -46,7 +46,7 @@ def animate(
         UserError: The suffix is not supported, there are no figures, or ffmpeg is missing
             or fails.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     writer: PillowWriter | FFMpegWriter
     if path.suffix.lower() == ".gif":
         writer = PillowWriter(frames_per_second)  # type: ignore[arg-type]
@@ -91,7 +91,7 @@ def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
     Raises:
         UserError: rerun is not installed, the suffix is not .rrd, or there are no frames.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     if path.suffix != ".rrd":
         raise UserError(f"recordings are written as .rrd, got {path.name!r}")
     try:

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
 from radejax.core.errors import UserError
-from radejax.core.files import PathLike, atomic_path
+from radejax.core.files import PathLike, as_path, atomic_path
 from radejax.core.structures import Boxes
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
@@ -337,7 +337,7 @@ def save_figure(figure: Figure, path: PathLike) -> pathlib.Path:
     Raises:
         UserError: matplotlib does not support the suffix.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     suffix = figure_format(path)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=suffix)

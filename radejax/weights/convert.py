@@ -17,7 +17,6 @@ such as `("^backbone/start/", "backbone.start_conv.")`. Names of leaves and layo
 from __future__ import annotations
 
 import os
-import pathlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -30,7 +29,7 @@ import numpy as np
 from radejax import models
 from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, as_path
 from radejax.models.lifting import ReferencePoints
 from radejax.weights import torch_file
 
@@ -202,7 +201,7 @@ def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], 
     """
     content, source = content_or_path, "state dict"
     if isinstance(content, str | os.PathLike):
-        path, source = pathlib.Path(content), str(content)
+        path, source = as_path(content), str(content)
         is_torch = path.suffix != ".safetensors"
         content = torch_file.read(path) if is_torch else read_safetensors(path)
     start = re.compile(rf"((?:.*\.)?)(?:{'|'.join(map(re.escape, parts))})")

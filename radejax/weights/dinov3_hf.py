@@ -7,7 +7,6 @@ yourself, and keep them out of checkpoints that are published.
 from __future__ import annotations
 
 import contextlib
-import pathlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -86,7 +85,7 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
             shape; all are listed.
         UserError: The folder holds another kind of model.
     """
-    folder = pathlib.Path(folder)
+    folder = files.as_path(folder)
     missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
     if missing:
         raise FileNotFoundError(
@@ -110,7 +109,7 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         params: Its parameters, as of `load(folder)[1]["params"]`.
         folder: Made if missing; files in it are replaced.
     """
-    folder = pathlib.Path(folder)
+    folder = files.as_path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
     config |= _constants(model.gated_mlp)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import math
 import os
-import pathlib
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import numpy as np
 
 from radejax.core.archives import read_member
 from radejax.core.errors import DataError, one_line
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, as_path
 
 _DTYPES = {
     "DoubleStorage": "float64",
@@ -52,7 +51,7 @@ def read(path: PathLike) -> Any:
         FileNotFoundError: There is no such file.
         DataError: It is no torch file, corrupted, or holds other objects.
     """
-    path = pathlib.Path(path)
+    path = as_path(path)
     with path.open("rb") as file:
         start = file.read(4)
     if start != b"PK\x03\x04":

@@ -122,12 +122,12 @@ def test_left_half_of_the_stereo_pair(tmp_path):
         read_left_image(tmp_path / "c.png")
     content = (tmp_path / "a.png").read_bytes()
     (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
-    with pytest.raises(DataError, match=r"a\.png: corrupted image"):
+    with pytest.raises(DataError, match=r"a\.png: corrupted"):
         read_left_image(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"a\.png: corrupted image"):
+    with pytest.raises(DataError, match=r"a\.png: corrupted"):
         read_left_image(tmp_path / "a.png")
     Image.new("L", (4, 4)).save(tmp_path / "a.png")
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:44])
-    with pytest.raises(DataError, match=r"a\.png: corrupted image"):
+    with pytest.raises(DataError, match=r"a\.png: corrupted"):
         read_left_image(tmp_path / "a.png", resize=True)

@@ -314,7 +314,7 @@ def test_a_corrupted_record_is_named_when_it_is_read(
         dataclasses.replace(OPTIONS, shuffle=False, num_threads=num_threads),
     )
     next(corrupted)
-    with pytest.raises(DataError, match=rf"{data[4].key}\.npy: corrupted record"):
+    with pytest.raises(DataError, match=rf"{data[4].key}\.npy: corrupted"):
         next(corrupted)
 
 

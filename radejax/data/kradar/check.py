@@ -140,9 +140,11 @@ def check_dataset(
     for number, path in tqdm(tensors, "check", unit="file", disable=not progress):
         try:
             check_tesseract(path, shape_drea=data.grid.shape_drea, deep=deep)
-        except (DataError, OSError) as error:
+        except DataError as error:
             summary.problems.append(("tesseract corrupted", str(error)))
             corrupted[number] += 1
+        except OSError as error:
+            summary.problems.append(("tesseract not readable", str(error)))
     is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea
     rows = []
     for number, folder in folders.items():

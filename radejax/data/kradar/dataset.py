@@ -28,8 +28,8 @@ from jaxtyping import Bool, Float, Shaped
 
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
-from radejax.core.files import PathLike, read_json, read_text
-from radejax.core.structures import CLASSES
+from radejax.core.files import PathLike, as_path, find_files, read_json, read_text
+from radejax.core.structures import CLASSES, frame_key
 from radejax.data.dataset import LabelledFrame, LabelledFrames, Summary
 from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
@@ -185,8 +185,8 @@ class KRadar(LabelledFrames[Frame]):
                 )
         else:
             self._label_source = str(labels)
-            self._label_paths = find_labels(pathlib.Path(labels))
-            self._split_folders += [pathlib.Path(labels), pathlib.Path(labels).parent]
+            self._label_paths = find_labels(as_path(labels))
+            self._split_folders += [as_path(labels), as_path(labels).parent]
         grid = _read_common(roots, "radar_grid.json", RadarGrid.from_dict)
         z_m = _read_common(
             self._split_folders,
@@ -292,7 +292,7 @@ class KRadar(LabelledFrames[Frame]):
         Frames that are in both official split files are reported.
         """
         if split not in ("train", "test"):
-            if not os.path.isfile(split):
+            if not as_path(split).is_file():
                 raise UserError(
                     f"split {split!r} is neither 'train', 'test', None nor a split file"
                 )
@@ -523,7 +523,12 @@ def _as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]
         return []
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
-    return [pathlib.Path(path) for path in paths]
+    return [as_path(path) for path in paths]
+
+
+def sequence_number(folder: pathlib.Path) -> int | None:
+    """Returns the number of a sequence's folder, or None for any other folder."""
+    return int(folder.name) if _SEQUENCE.fullmatch(folder.name) else None
 
 
 def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
@@ -536,11 +541,12 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
     found: dict[int, list[pathlib.Path]] = {}
     for root in roots:
         for folder in sorted(root.iterdir()):
-            if _SEQUENCE.fullmatch(folder.name) and folder.is_dir():
-                same = found.setdefault(int(folder.name), [])
+            number = sequence_number(folder)
+            if number is not None and folder.is_dir():
+                same = found.setdefault(number, [])
                 if same and same[-1].parent == root:
                     raise DataError(
-                        f"sequence {int(folder.name)} is there twice, as {same[-1]} and "
+                        f"sequence {number} is there twice, as {same[-1]} and "
                         f"{folder}: delete or move one"
                     )
                 same.append(folder)
@@ -618,10 +624,20 @@ def find_own_labels(
         for subfolder in subfolders:
             listing = folder.listing(subfolder)
             names = sorted(name for name in listing if _LABEL_NAME.fullmatch(name))
-            found |= {(number, n.removesuffix(".txt")): listing[n] for n in names}
+            for name in names:
+                _add_label(found, (number, frame_key(name)), listing[name])
             if names:
                 break
     return found
+
+
+def _add_label(found: dict[Key, LabelPath], key: Key, file: LabelPath) -> None:
+    if key in found:
+        raise DataError(
+            f"frame {key[0]}/{key[1]} is there twice, as {found[key]} and {file}: one "
+            "revision of every label, delete or move the other"
+        )
+    found[key] = file
 
 
 def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
@@ -638,12 +654,15 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
     """
     files: list[tuple[pathlib.PurePath, LabelPath]]
     if path.is_dir():
-        files = [(file.relative_to(path), file) for file in sorted(path.rglob("*.txt"))]
+        files = [(file.relative_to(path), file) for file in find_files(path, "*.txt")]
     else:
         with wrap_read_errors(path, "a folder or a zip file of labels"):
             archive = zipfile.ZipFile(path)  # stays open while its members are used
         files = [
-            (pathlib.PurePosixPath(name), zipfile.Path(archive, name))
+            (
+                pathlib.PurePosixPath(name.replace("\\", "/")),
+                zipfile.Path(archive, name),
+            )
             for name in archive.namelist()
         ]
     found: dict[Key, LabelPath] = {}
@@ -652,13 +671,7 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
         sequence = next(filter(None, folders), None)
         if sequence is None or not _LABEL_NAME.fullmatch(name.name):
             continue
-        key = int(sequence[1]), name.stem
-        if key in found:
-            raise DataError(
-                f"{path}: frame {key[0]}/{key[1]} is there twice, as {found[key]} and "
-                f"{file}: one revision of every label, delete or move the other"
-            )
-        found[key] = file
+        _add_label(found, (int(sequence[1]), frame_key(name.name)), file)
     if not found:
         raise UserError(
             f"{path}: no label files in it, expected <sequence>/<radar>_<lidar>.txt "
@@ -679,7 +692,7 @@ def read_split(path: PathLike) -> list[Key]:
     frames = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if match := _SPLIT_LINE.fullmatch(line):
-            frames.append((int(match[1]), match[2]))
+            frames.append((int(match[1]), frame_key(match[2])))
         elif line.strip():
             raise DataError(
                 f"{path}:{number}: {line[:80]!r}, expected 'sequence,label file', such "
