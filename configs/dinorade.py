@@ -54,7 +54,7 @@ VARIANTS = {
     "rcw": {},
     "rcw_resnet50": {"model.image.kind": "resnet50"},
 }
-"""Fields that each row of Table 4 changes in the whole model."""
+"""Fields that each row of Table 4 changes in the full model."""
 
 PRESETS = {
     "paper": {
@@ -81,7 +81,7 @@ PRESETS = {
         "data.camera.calibration": "common",
     },
 }
-"""Fields in which paper and released code differ, in addition to those of RADE-Net."""
+"""Fields in which the paper and the released code differ, in addition to RADE-Net's."""
 
 CLASS_SETS = ("all", "sedan")
 
@@ -104,7 +104,7 @@ def get_config(arg: str | None = None) -> ConfigDict:
             config.update_from_flattened_dict(rows)
     if preset == "official":
         config.model.query_grid = _axes(LiftingAxes.official())
-        # The released ResNet gets colors in [0, 1].
+        # The released code only scales the images of its ResNet to [0, 1].
         config.model.image.standardize = variant != "rcw_resnet50"
     config.update_from_flattened_dict(VARIANTS[variant])
     if sigma is not None:

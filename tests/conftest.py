@@ -15,7 +15,7 @@ from absl import flags
 # Compilation takes most of the tests' time. Therefore LLVM does not optimize, and the older
 # fusion emitters are used, which compile several times as fast (jaxlib 0.11 has removed them
 # and aborts on the flag). `import jax` reads the variable. With XLA_FLAGS= in the
-# environment, as in CI's slow tests, programs are compiled as for users.
+# environment, as in some of CI's slow tests, XLA compiles with its default settings.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0"
@@ -25,7 +25,7 @@ os.environ.setdefault(
 
 import jax
 
-# Programs that several tests or processes compile are compiled once in a session; the
+# Functions that several tests or processes compile are compiled once per session; the
 # workers of pytest-xdist inherit the folder.
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="radejax-test-cache-")
@@ -51,7 +51,7 @@ def pytest_addoption(
         action="store_true",
         help="check the annotations of radejax, shapes of arrays among them",
     )
-    # Here and not when options are read: other conftests import radejax before.
+    # The checks are installed here, as other conftests import radejax before options are read.
     if "--shapes" in pluginmanager.getplugin("pytestconfig").invocation_params.args:
         from . import shapes
 
@@ -63,7 +63,7 @@ _GRACE_SECS = 60.0
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.stash[_STDERR] = os.dup(2)  # before tests' output is caught
+    config.stash[_STDERR] = os.dup(2)  # before pytest captures the output
 
 
 @pytest.hookimpl(wrapper=True)
@@ -119,7 +119,7 @@ def _process_as_it_was() -> Iterator[None]:
 
 @pytest.fixture
 def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs compile for one device, as compiling for eight takes long on few cores."""
+    """Run trainings on one device, as compiling for eight takes long on few cores."""
     from radejax.training import distributed
 
     mesh = distributed.make_mesh(1)
@@ -128,7 +128,7 @@ def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def shared() -> pathlib.Path:
-    """Folder of reference data that users do not have; skips the test without it."""
+    """Folder of unpublished reference data. Tests are skipped if it does not exist."""
     if not SHARED.is_dir():
         pytest.skip("reference data (../shared) not available")
     return SHARED
@@ -136,15 +136,15 @@ def shared() -> pathlib.Path:
 
 @pytest.fixture(scope="session")
 def make() -> types.ModuleType:
-    """Recipes of the radar-camera golden files: seeded weights and inputs."""
+    """Module with the seeded weights and inputs of the radar-camera golden files."""
     from radejax.core.config import (
         load_module,
-    )  # after --shapes has installed its checks
+    )  # imported after --shapes has installed its checks
 
     return load_module(GOLDEN / "dinorade_make.py")
 
 
 @pytest.fixture(scope="session")
 def golden() -> pathlib.Path:
-    """Folder of small golden files in the repository."""
+    """Folder of the golden files in the repository."""
     return GOLDEN

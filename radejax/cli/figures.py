@@ -18,7 +18,7 @@ from radejax.core.structures import frame_key
 ANIMATIONS = (".gif", ".mp4")
 
 MODEL = pathlib.Path(__file__).with_name("demo_model")
-"""Saved model: seed 0 of the quickstart; docs/detector.md has the commands that made it."""
+"""Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
 
 
 @click.command(cls=entry.Command)

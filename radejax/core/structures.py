@@ -27,8 +27,8 @@ CLASSES = ("Sedan", "Bus or Truck", "Pedestrian", "Motorcycle", "Bicycle")
 """K-Radar's five detection classes in the order of every class axis."""
 
 RARE_SHARE = 0.02
-"""Classes below this share of the training objects of a weather are marked, as in Table 2
-of DinoRADE."""
+"""Classes with less than this fraction of the training objects of a weather are marked, as in
+Table 2 of DinoRADE."""
 
 BOX_FIELDS = ("x", "y", "z", "l", "w", "h", "yaw")
 """Names of the parameters of a box, in meters and radians."""

@@ -22,7 +22,7 @@ from radejax.core.errors import UserError
 POWER_FLOOR = 1e-10
 LOG_OFFSET_DB = 1.2
 LOG_SCALE_DB = 184.3
-"""p = (10 log10(power + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB."""
+"""A level is (10 log10(power + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB."""
 
 MAX_LEVEL = 100.0
 """Bound on the absolute value of a level; any power in float64 gives -0.54 to 17."""

@@ -1,12 +1,12 @@
 """Readers of 4D radar tensors (MATLAB v5) and of the released `.npy` projections.
 
-Only the part of MATLAB's format that the one real array of a radar tensor needs is read:
-a file is a header of 128 bytes and elements: a tag (type, number of bytes) and content.
-A variable is an element of type 14, or of type 15, which is one of type 14 deflated. It
-contains, each with a tag of its own: flags, shape, name and values.
+The reader supports the part of MATLAB's format that one real array needs. A file consists of
+a header of 128 bytes and elements. An element is a tag (type, number of bytes) and content.
+A variable is an element of type 14, or one of type 15, which contains a deflated element of
+type 14. Flags, shape, name and values of a variable are elements inside it.
 
-Every tag is compared with the others, so that a flipped bit in any of them is an error.
-Deflated variables have a checksum of their values, plain ones have none.
+Every tag is checked against the others, so that a flipped bit in any of them is an error.
+Deflated variables have a checksum of their values; uncompressed ones do not.
 
 References:
     MathWorks, MAT-File Format, chapter 1.
@@ -40,18 +40,18 @@ VARIABLE = "arrDREA"
 def read_tesseract(
     path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Real[np.ndarray, "D R E A"]:
-    """A 4D radar tensor as it is stored: linear power, column-major.
+    """Read a 4D radar tensor as it is stored: linear power, column-major.
 
     Args:
         path: `tesseract_*.mat` with the variable `arrDREA`.
-        shape_drea: Shape that the sensor's grid demands; None: any four axes.
+        shape_drea: Expected shape, or None to accept any four axes.
 
     Returns:
-        The array in the type of the file.
+        The array in the stored type.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is truncated, corrupted, or of another shape.
+        DataError: The file is truncated or corrupted, or has no real `arrDREA` of the shape.
     """
     with _opened(path, shape_drea) as (file, layout):
         return _read_array(file, layout)
@@ -60,11 +60,11 @@ def read_tesseract(
 def project_file(
     path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """`project_tensor` of a file; arguments and errors as in `read_tesseract`.
+    """Compute `project_tensor` of a file; see `read_tesseract` for arguments and errors.
 
-    An uncompressed file is streamed: every azimuth is reduced while it is in the cache,
-    and the 260 MB are never held. (A memory map would do the same, but a bad disk sector
-    would kill the process instead of raising an error.)
+    Negative, infinite or NaN power is a `DataError` too. Uncompressed floats are streamed:
+    every azimuth is reduced while it is in the cache, and the 260 MB are never in memory. (A
+    memory map would save as much, but a bad disk sector would then kill the process.)
     """
     with _opened(path, shape_drea) as (file, layout):
         if layout.deflated is None and layout.dtype.kind == "f":
@@ -82,9 +82,9 @@ def check_tesseract(
     shape_drea: tuple[int, ...] | None = None,
     deep: bool = False,
 ) -> None:
-    """Raises what `project_file` would, from the head and the size of the file only.
+    """Raise the errors of `project_file` that header and size of a file show.
 
-    Corrupted values are found by `deep` only, which reads and projects the file.
+    With `deep`, the file is read and projected, which also detects corrupted values.
     """
     if deep:
         project_file(path, shape_drea=shape_drea)
@@ -96,19 +96,19 @@ def check_tesseract(
 def read_projection_npy(
     path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """A projection as the released code writes it, channels moved last.
+    """Read a projection of the released code and move its channels last.
 
     Args:
-        path: `DERA_tesseract_*.npy`, `[D+E, R, A]` float32 or float64.
-        projection_shape: `(R, A, D+E)` that the sensor's grid demands; None: any.
+        path: `DERA_tesseract_*.npy`, `[D+E, R, A]` floats.
+        projection_shape: Expected shape `(R, A, D+E)`, or None to accept any.
 
     Returns:
-        The array in the type of the file.
+        The array in the stored type.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is truncated, corrupted, of another shape or type, or has
-            values that are not finite or that no power gives.
+        DataError: The file is truncated, corrupted or of another shape or type, or has values
+            that are not finite or beyond `MAX_LEVEL`.
     """
     stored = read_npy(path)
     if stored.ndim != 3 or stored.dtype.kind != "f":
@@ -133,11 +133,11 @@ def read_projection_npy(
 
 
 def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-    """float32 projection of a radar tensor file or a released projection.
+    """Return the float32 projection of a radar tensor file or a released projection.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: It is corrupted, or of another shape than the grid.
+        DataError: The file is corrupted or has another shape than the grid.
     """
     if pathlib.Path(path).suffix != ".npy":
         return project_file(path, shape_drea=grid.shape_drea)
@@ -149,11 +149,11 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
 def _opened(
     path: PathLike, shape_drea: tuple[int, ...] | None
 ) -> Iterator[tuple[io.FileIO, Layout]]:
-    """The file, unbuffered, and where its tensor is.
+    """Open a file without buffering and find its tensor.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: Whatever is wrong with it, in the block too.
+        DataError: The file is invalid, or reading it fails inside the `with` block.
     """
     with (
         wrap_read_errors(path, "a MATLAB file"),
@@ -172,13 +172,13 @@ def _opened(
 def _read_columns(
     file: io.FileIO, layout: Layout
 ) -> Iterator[Real[np.ndarray, "E R D"]]:
-    """The azimuth columns of a file, one after the other, all in the same buffer."""
+    """Yield the azimuth columns of a file in order, all in the same buffer."""
     slab = np.empty(layout.shape[2::-1], layout.dtype)
     view = slab.data.cast("B")
     file.seek(layout.offset)
     for i in range(layout.shape[3]):
         filled = 0
-        while filled < len(view):  # network file systems return parts
+        while filled < len(view):  # network file systems may return less
             num_bytes = file.readinto(view[filled:])
             if not num_bytes:
                 raise EOFError(f"the file ends in column {i}")
@@ -190,23 +190,23 @@ def _read_columns(
 
 _MATRIX, _DEFLATED = 14, 15
 _INT8, _INT32, _UINT32 = 1, 5, 6
-# Classes of arrays and types of stored values, by their number in the file.
+# Types of arrays and types of stored values, by their numbers in the format.
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
-_HEAD = 512  # bytes of a variable before its values, more than any real array has
-_CHUNK = 1 << 16  # deflated bytes that are inflated at a time
+_HEAD = 512  # bytes of a variable that contain everything before its values
+_CHUNK = 1 << 16  # number of deflated bytes that are inflated at once
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where the values of an array are, column-major.
+    """Location of the column-major values of an array in a file.
 
     Attributes:
-        dtype: Type of the values, as stored.
+        dtype: Type of the values as stored.
         shape: Shape of the array.
-        offset: First byte of the values, in the file or in the inflated variable.
-        deflated: Begin and length of the deflated variable; None for a plain one.
-        num_bytes: Size of the variable, inflated.
+        offset: Offset of the values in bytes, in the file or in the inflated variable.
+        deflated: Offset and length of the deflated variable, or None if it is uncompressed.
+        num_bytes: Size of the inflated variable with its tag.
     """
 
     dtype: np.dtype
@@ -217,16 +217,16 @@ class Layout:
 
 
 def _find_array(file: BinaryIO) -> Layout:
-    """Type, shape and place of the tensor in a file that is open for reading.
+    """Find type, shape and location of the tensor in a file that is open for reading.
 
     Raises:
-        DataError: The file is not a MATLAB v5 file, is truncated or corrupted, or has
-            no real array of its name.
+        DataError: The file is not a MATLAB v5 file, is truncated or corrupted, or has no real
+            array with the name `VARIABLE`.
     """
     size = os.fstat(file.fileno()).st_size
     file.seek(0)
     header = file.read(128)
-    if header[124:] != b"\0\1IM":  # of a little-endian machine
+    if header[124:] != b"\0\1IM":  # version and little-endian byte order
         hint = "; save it in v7 or v6" if header.startswith(b"MATLAB 7.3") else ""
         raise DataError(f"{file.name}: not a MATLAB v5 file{hint}")
     names, start = [], 128
@@ -258,10 +258,10 @@ def _find_array(file: BinaryIO) -> Layout:
 
 
 def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
-    """The values of a variable, in the type of the file.
+    """Read the values of a variable in the stored type.
 
     Raises:
-        DataError: They are truncated or fail their checksum.
+        DataError: The values are truncated or do not inflate to the expected size.
     """
     count = math.prod(layout.shape)
     if layout.deflated is None:
@@ -277,7 +277,7 @@ def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
             content[filled : filled + len(part)] = part
             filled += len(part)
             if filled > layout.num_bytes or inflater.unused_data:
-                break  # otherwise a corrupted file could fill the memory
+                break  # a corrupted file could otherwise fill the memory
         if not inflater.eof or filled != layout.num_bytes or inflater.unused_data:
             raise _corrupted(file, f"does not inflate to {layout.num_bytes} bytes")
         values = np.frombuffer(content, layout.dtype, count, layout.offset)
@@ -287,7 +287,7 @@ def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
 
 
 def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
-    """Name of a variable, and its layout if it is the tensor."""
+    """Return the name of a variable, and its layout if it is the tensor."""
     kind, num_bytes = struct.unpack_from("<II", head)
     flags_kind, flags_size, at, after = _tag(head, 8)
     (flags,) = struct.unpack_from("<I", head, at)
@@ -308,7 +308,7 @@ def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
         )
     stored_kind, stored_size, at, end = _tag(head, after)
     stored = np.dtype(_STORED.get(stored_kind, np.void))
-    # MATLAB may store floats as smaller integers.
+    # MATLAB may store float arrays as smaller integers.
     is_smaller = stored.kind in "iu" and stored.itemsize < wanted.itemsize
     if stored != wanted and not (is_smaller and wanted.kind == "f"):
         raise _corrupted(file, f"{wanted} stored as type {stored_kind}")
@@ -321,9 +321,9 @@ def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
 
 
 def _tag(head: bytes, at: int) -> tuple[int, int, int, int]:
-    """Type, size and begin of an element's content, and where the next element is."""
+    """Return type, size and offset of an element's content, and offset of the next element."""
     (word,) = struct.unpack_from("<I", head, at)
-    if word >> 16:  # up to four bytes, within the tag
+    if word >> 16:  # small element: up to four bytes within the tag
         return word & 0xFFFF, word >> 16, at + 4, at + 8
     (size,) = struct.unpack_from("<I", head, at + 4)
     return word, size, at + 8, at + 8 + size + -size % 8

@@ -23,10 +23,10 @@ from radejax.evaluation.results import condition_masks
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
 OPERATING_SCORE = 0.3
-"""Score above which predictions count for precision, recall and the worst frames."""
+"""Score threshold of precision, recall and the worst frames."""
 
 Masks = dict[str, tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " M"]]]
-"""Objects and predictions of each subset."""
+"""Masks `[N]` of the objects and `[M]` of the predictions by the name of the subset."""
 
 
 def matched_objects(
@@ -216,13 +216,13 @@ def worst_frames(
 # Sanity checks ------------------------------------------------------------------------
 
 MAX_BEHIND = 0.01
-"""Largest fraction of predictions behind the sensor that causes no warning."""
+"""Fraction of predictions behind the sensor (x < 0) above which a warning is given."""
 
 MAX_OFFSET_M = 0.25
-"""A larger median offset is reported where it is nearly the same for all objects."""
+"""Median offset in meters above which a nearly constant offset is reported."""
 
 MIN_OBJECTS = 10
-"""Objects with a prediction near them that a median offset needs."""
+"""Minimum number of objects with a prediction nearby from which the median is computed."""
 
 
 def sanity_checks(data: EvaluationSet) -> list[str]:

@@ -33,7 +33,7 @@ from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions
 
 LOW_SCORE = 0.1
-"""Predictions stored from a higher score on are too few for AP without a threshold."""
+"""If the lowest stored score is above this and the score threshold, a warning is given."""
 
 # Tables -------------------------------------------------------------------------------
 

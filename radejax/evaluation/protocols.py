@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Real
 from radejax.core.errors import UserError, require
 
 EMPTY_FRAMES = ("protocol", "class", "frame", "none")
-"""Which frames to ignore, see `evaluate`."""
+"""Rules for the frames to ignore, see `evaluate`."""
 
 EPSILON = 1e-12  # of RADE-Net's evaluator, in both precision and recall
 
@@ -60,11 +60,11 @@ class Protocol:
 
 
 AUTHORS_PROTOCOL = "coco101"
-"""Protocol of RADE-Net's and DinoRADE's own rows: RADE-Net's evaluator, 101 recall
-levels, frames without the class ignored (the printed 0.99 is its lower bound 1/101)."""
+"""Protocol of RADE-Net's and DinoRADE's own results: RADE-Net's evaluator at 101 recall levels,
+without frames that lack the class. An AP printed as 0.99 is its lower bound, 100 / 101."""
 
 RECOMMENDED = "all_point"
-"""The protocol that docs/evaluation.md recommends, with the reasons."""
+"""Recommended protocol, for the reasons in docs/evaluation.md."""
 
 
 _ALL = (

@@ -406,10 +406,10 @@ Cell = tuple[str, str, str, float]
 """Condition, class, space and IoU threshold."""
 
 Place = dict[str, Any]
-"""Some of the four by name, as keywords of a layout; the others are the usual ones."""
+"""Some fields of a `Cell` by name; the others have the values in `_USUAL`."""
 
 _ABLATIONS = ["RADE-Net, Table III", "DinoRADE, Table 4"]
-"""Tables of ablated models, with which a run is not compared."""
+"""Ablation tables, with whose rows a run is not compared."""
 
 _BOTH: list[Place] = [{"space": space} for space in SPACES]
 _USUAL: Place = {"condition": "all", "cls": "Sedan", "space": "3d", "iou": 0.3}

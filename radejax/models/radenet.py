@@ -30,7 +30,7 @@ from radejax.models.layers import Map
 Projection = Float[jax.Array, "B R A DE"]
 
 REMAT = ("none", "blocks", "full")
-"""Activations that the backward pass recomputes instead of storing them.
+"""Which activations are stored; the backward pass recomputes the others.
 
 "none" stores all, "blocks" only those between blocks, and "full" only those between
 backbone, neck and heads.

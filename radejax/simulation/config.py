@@ -23,7 +23,7 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
 
 SIMULATOR_VERSION = 4
-"""Raised whenever the same config gives other files than before."""
+"""Version that increases whenever the same config gives different files than before."""
 
 # Environment, time and weather of the procedural sequences, used cyclically.
 CONDITIONS = (
@@ -67,7 +67,7 @@ FULL_SIZE = {
     "image_width": 1280,
     "image_height": 720,
 }
-"""Fields of a config with K-Radar's own sensors."""
+"""Fields of a config that simulates K-Radar's own radar and camera."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,10 +31,10 @@ from radejax.simulation.world.scene import (
 from radejax.simulation.world.traffic import make_sequence
 
 MIN_SNR_DB = 10.0
-"""Minimum ratio of power to noise of an object that is visible to the radar."""
+"""SNR that an object must exceed to be visible to the radar."""
 
 MIN_LIT = 0.15
-"""Minimum fraction of its power that other objects do not block."""
+"""Fraction of an object's power that must reach the radar unblocked for it to be visible."""
 
 
 @dataclasses.dataclass(frozen=True)

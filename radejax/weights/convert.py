@@ -1,17 +1,18 @@
-"""Conversion of PyTorch tensors by name to Flax variables, in both directions.
+"""Conversion between named PyTorch tensors and Flax variables.
 
-A model is described by rules that rewrite the names of our modules to those of torch,
-such as `("^backbone/start/", "backbone.start_conv.")`. Names of leaves and layouts follow:
+Every model has rules that rewrite the names of its Flax modules to those of torch, such as
+`("^backbone/start/", "backbone.start_conv.")`. Names of leaves and layouts are common to all:
 
-| leaf | torch | layout there |
+| Flax leaf | torch name | torch layout |
 |---|---|---|
 | kernel of a convolution `[k, k, in, out]` | weight | `[out, in, k, k]` |
 | kernel of `upsample_*`, `up_*` `[k, k, in, out]` | weight | `[in, out, k, k]` |
 | kernel of a linear layer `[in, out]` | weight | `[out, in]`, or a 1x1 convolution |
-| scale, bias | weight, bias | as here |
-| mean, var | running_mean, running_var | as here |
+| scale, bias | weight, bias | unchanged |
+| mean, var | running_mean, running_var | unchanged |
 
-`{}` in a name of torch is the index of a layer: such layers are stacked here.
+`{}` in a torch name is the index of a layer. The Flax variable has such layers stacked along
+its first axis.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from radejax.models.lifting import ReferencePoints
 from radejax.weights import torch_file
 
 Rules = Sequence[tuple[str, str | Callable[[re.Match], str]]]
-"""Arguments of `re.sub`, applied in order to our path, "backbone/start/kernel". A rule
-ends each module that it rewrites with a dot: a name that keeps a slash is unknown."""
+"""Patterns and replacements of `re.sub`, applied in order to paths of Flax variables such as
+"backbone/start/kernel". A path that still contains a slash afterwards is of an unknown module."""
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shape of each variable by its path, "params/backbone/start/kernel"."""
@@ -58,21 +59,23 @@ def from_torch(
     source: PathLike,
     ignored: str = r"\Z",
 ) -> dict[str, Any]:
-    """Variables of a model from tensors by name.
+    """Convert named tensors to the variables of a model.
 
     Args:
-        rules: Names of the model's modules in torch.
-        shapes: Shapes of the wanted variables.
-        tensors: NumPy, JAX or torch arrays.
-        source: What error messages call them.
-        ignored: Pattern of names (from the start) that may be left over.
+        rules: Rules of the model.
+        shapes: Shapes of the variables.
+        tensors: NumPy, JAX or torch arrays by torch name.
+        source: Name of the tensors in error messages.
+        ignored: Pattern of the start of names that are ignored if they are not used. Unused
+            `num_batches_tracked` are always ignored.
 
     Returns:
         Nested variables in float32.
 
     Raises:
-        DataError: Tensors are missing, unexpected or of another shape; all are listed.
-        UserError: No rule is for a module: torch's code has no such part.
+        DataError: Tensors are missing, unexpected or of another shape. The message lists up
+            to 20 of them.
+        UserError: A module matches no rule, because torch's code has no counterpart.
     """
     left, problems = dict(tensors), []
 
@@ -82,7 +85,7 @@ def from_torch(
             return None
         value = to_numpy(left.pop(name))
         ours = to_our_layout(path, value)
-        if ours.ndim == 4 and len(shape) == 2:  # a 1x1 convolution, or patches
+        if ours.ndim == 4 and len(shape) == 2:  # 1x1 convolution or patch embedding
             ours = ours.reshape(-1, ours.shape[-1])
         if ours.shape != shape:
             expected = to_torch_layout(path, np.broadcast_to(0, shape)).shape
@@ -112,7 +115,7 @@ def from_torch(
 
 
 def to_torch(rules: Rules, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Tensors by name: inverse of `from_torch`, but for 1x1 convolutions."""
+    """Invert `from_torch`; kernels stored as `[in, out]` become `[out, in]` in all cases."""
     tensors = {}
     for path, leaf in flax.traverse_util.flatten_dict(variables, sep="/").items():
         name, value = torch_name(rules, path), np.asarray(leaf, np.float32)
@@ -124,10 +127,10 @@ def to_torch(rules: Rules, variables: Mapping[str, Any]) -> dict[str, np.ndarray
 
 
 def torch_name(rules: Rules, path: str) -> str:
-    """Name in torch of a variable of ours, "params/backbone/start/kernel".
+    """Return the torch name of a Flax path such as "params/backbone/start/kernel".
 
     Raises:
-        UserError: No rule is for its module.
+        UserError: The module matches no rule.
     """
     ours = name = path.partition("/")[2]
     for pattern, replacement in rules:
@@ -141,17 +144,17 @@ def torch_name(rules: Rules, path: str) -> str:
 
 
 def to_torch_layout(path: str, value: np.ndarray) -> np.ndarray:
-    """A variable of ours in the layout of torch."""
+    """Transpose a Flax variable to the layout of torch."""
     return value.transpose(_torch_axes(path, value.ndim))
 
 
 def to_our_layout(path: str, value: np.ndarray) -> np.ndarray:
-    """Inverse of `to_torch_layout`."""
+    """Invert `to_torch_layout`."""
     return value.transpose(np.argsort(_torch_axes(path, value.ndim)))
 
 
 def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
-    """Our axes in the order of torch."""
+    """Return the axes of a Flax variable in the order of torch."""
     if not path.endswith("kernel"):
         return tuple(range(ndim))
     if ndim == 4:
@@ -160,7 +163,7 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
 
 
 def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
-    """Shape of every variable of a detector by its path, without creating any."""
+    """Return the shapes of a detector's variables by path, without creating the variables."""
     bins, channels = model.pad_multiple, model.doppler_bins + model.elevation_bins
 
     def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
@@ -175,7 +178,7 @@ def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
 
 
 def shapes_of(variables: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Shape of every leaf by its path."""
+    """Return the shapes of the leaves by path."""
     flat = flax.traverse_util.flatten_dict(dict(variables), sep="/")
     return {path: tuple(leaf.shape) for path, leaf in flat.items()}
 
@@ -184,20 +187,20 @@ def shapes_of(variables: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
 
 
 def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], str]:
-    """The state dict in a file or checkpoint, without prefixes of its names.
+    """Read the state dict in a file or checkpoint and remove the prefix of its names.
 
     Args:
-        content_or_path: Tensors by name, or a checkpoint that holds them under one key;
-            or a file: `.pth`, `.pt` (read without torch) or `.safetensors`.
-        *parts: Start of one of its names, "backbone."; what precedes it, such as
-            "module.", is taken off all names.
+        content_or_path: Tensors by name, a checkpoint with such a mapping under one key, or
+            the path of a file with either: `.safetensors`, otherwise a file of `torch.save`.
+        *parts: Alternative starts of names by which the state dict is found, such as
+            "backbone.". A prefix in front of it, such as "module.", is removed from all names.
 
     Returns:
-        Tensors by name, and what error messages call them.
+        Tensors by name, and the name of the source for error messages.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: The file is corrupted, or has no such state dict or several.
+        DataError: The file is corrupted, or contains no such state dict or more than one.
     """
     content, source = content_or_path, "state dict"
     if isinstance(content, str | os.PathLike):
@@ -223,8 +226,8 @@ def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], 
 
 
 def to_numpy(tensor: Any) -> np.ndarray:
-    """A NumPy array of a NumPy, JAX or torch tensor; bfloat16 of torch is float32."""
-    if hasattr(tensor, "detach"):  # torch, which need not be importable
+    """Convert a NumPy, JAX or torch array to NumPy; torch's bfloat16 becomes float32."""
+    if hasattr(tensor, "detach"):  # a torch tensor; checked without importing torch
         tensor = tensor.detach().cpu()
         return (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).numpy()
     return np.asarray(tensor)

@@ -1,7 +1,7 @@
-"""Official DinoRADE checkpoints (PyTorch) to Flax. torch is not needed.
+"""Conversion of official DinoRADE checkpoints (PyTorch) to Flax, without torch.
 
-The released code names its tensors `rad_backbone.*`, `rad_neck.*`, `head.*` (as
-RADE-Net's), `image_neck.*`, `fusion.*` and `image_backbone.*`.
+The released code names its tensors `rad_backbone.*`, `rad_neck.*`, `head.*` (as in
+RADE-Net), `image_neck.*`, `fusion.*` and `image_backbone.*`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from radejax.weights.convert import (
 from radejax.weights.image_backbone import RESNET_RULES
 
 PART = "rad_backbone."
-"""Start of names by which a state dict of DinoRADE is recognized."""
+"""Start of names by which a DinoRADE state dict is recognized."""
 
-# In models without CBAM as well; built by the released code and never called.
+# Modules that the released code always creates, even if its forward pass does not use them.
 _UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\."
 
 
@@ -39,27 +39,29 @@ def load(
     dinov3: PathLike | None = None,
     **model_overrides: Any,
 ) -> tuple[DinoRade, dict[str, Any]]:
-    """Model and variables from an official checkpoint, with the released geometry.
+    """Load model and variables from an official checkpoint, with the released geometry.
 
-    Project with `CameraCalibration.from_kradar(file,
-    radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see
-    `radejax.models.lifting`. The maps keep the padded grid, which for official weights
-    is `RadarGrid.kradar().padded(8, "stretched")`.
+    The camera is `CameraCalibration.from_kradar(file,
+    radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see `radejax.models.lifting`.
+    The maps include the padding; their grid for official weights is
+    `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:
         state_dict_or_path: Tensors by name, or a file, see `convert.read_state_dict`.
-        dinov3: Folder with the image backbone, if the checkpoint has none. Without
-            either the model can be applied to embedded images only.
-        **model_overrides: Fields of the radar branch (`config.model`) or of the fusion
-            (`config.model.fusion`) that names and shapes do not show.
+        dinov3: Folder of a DINOv3 that replaces the checkpoint's image backbone, if it has
+            one. Without any backbone, the model accepts only embedded images.
+        **model_overrides: Fields of `config.model` or `config.model.fusion`, which replace
+            those inferred from names and shapes and the defaults.
 
     Returns:
         The model, and `{"params": ..., "batch_stats": ...}` in float32.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        UserError: An override is unknown or impossible.
-        DataError: Tensors are missing, unexpected or of another shape; all are listed.
+        FileNotFoundError: The checkpoint, the folder or a file in it is missing.
+        UserError: An override is unknown or invalid, `doppler_bins` and `elevation_bins`
+            are needed and missing, or the folder contains another kind of model.
+        DataError: A file is corrupted, or tensors are missing, unexpected or of another
+            shape. The message lists up to 20 of them.
     """
     tensors, source = read_state_dict(state_dict_or_path, PART)
     config, variables = read(tensors, source, dinov3, **model_overrides)
@@ -72,7 +74,7 @@ def read(
     dinov3: PathLike | None = None,
     **model_overrides: Any,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`config.model` and variables from tensors by official name; see `load`."""
+    """Return `config.model` and variables for tensors by official name; see `load`."""
     tensors = without_lora(tensors)
     config = load_config("dinorade:official").model.to_dict()
     fusion = config["fusion"]
@@ -84,7 +86,7 @@ def read(
     is_resnet = any(n.startswith("image_backbone.frozen_layers.") for n in tensors)
     is_resnet = is_resnet and dinov3 is None
     if is_resnet:
-        # The released code feeds its ResNet colors in [0, 1].
+        # The released code only scales the images of its ResNet to [0, 1].
         config["image"] |= {"kind": "resnet50", "standardize": False}
         shapes = variable_shapes(models.build(config))
     else:
@@ -103,11 +105,11 @@ def read(
 def _transformer(
     tensors: Mapping[str, Any], source: str, dinov3: PathLike | None
 ) -> tuple[dict[str, Any], Mapping[str, Any] | None]:
-    """Fields and parameters of the image transformer of a folder or the checkpoint."""
+    """Return fields and parameters of the transformer in the folder, else the checkpoint."""
     if dinov3 is not None:
         vit, variables = dinov3_hf.load(dinov3)
         return dinov3_hf.image_fields(vit), variables["params"]
-    # What PEFT and transformers put before the backbone's own names.
+    # PEFT and transformers add prefixes to the names of the backbone.
     start = re.compile(rf"{IMAGE_BACKBONE}\.(base_model\.model\.)?(model\.)?")
     own = {start.sub("", k): v for k, v in tensors.items() if start.match(k)}
     if not own:
@@ -120,7 +122,7 @@ def _transformer(
 def infer_fusion(
     tensors: Mapping[str, Any], overrides: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Fields of `config.model.fusion` that names and shapes show, and the overrides."""
+    """Infer fields of `config.model.fusion` from names and shapes, and apply the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
     fields = {
         "weighting": "cnn" if has_weights else "off",
@@ -139,7 +141,7 @@ _FUSION: Rules = (
     (r"^image_fusion/attention/(\w+)/", r"fusion.deform_attn.\1."),
     (r"^image_fusion/gate_hidden/", "fusion.fusion_gate.0."),
     (r"^image_fusion/gate_out/", "fusion.fusion_gate.2."),
-    # Convolution, normalization and ReLU each take a number.
+    # In torch, convolution, normalization and ReLU have consecutive indices.
     (r"^image_fusion/weighting/", "fusion.weighting_network/"),
     (r"network/conv_(\d)/", lambda m: f"network.{3 * int(m[1]) - 3}."),
     (r"network/norm_(\d)/", lambda m: f"network.{3 * int(m[1]) - 2}."),
@@ -158,7 +160,7 @@ _CAMERA_NECK: Rules = (
 
 _RESNET: Rules = (
     *RESNET_RULES,
-    # Positions in the released Sequential: stem, its norm, ReLU, pooling, stages.
+    # Indices in the released Sequential: stem, its norm, ReLU, pooling, three stages.
     (r"^conv1\.", "image_backbone.frozen_layers.0."),
     (r"^bn1\.", "image_backbone.frozen_layers.1."),
     (r"^layer([123])\.", lambda m: f"image_backbone.frozen_layers.{int(m[1]) + 3}."),
@@ -168,16 +170,19 @@ _RESNET: Rules = (
 
 
 def rules(heads: str, is_resnet: bool) -> Rules:
-    """Rules from modules of DinoRADE to the official ones, for `convert`."""
+    """Return the rules from modules of `DinoRade` to official names, for `convert`."""
     image = _RESNET if is_resnet else _CAMERA_NECK
     return (*image, *_FUSION, *radenet_torch.rules(heads, "rad_"))
 
 
 def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
-    """Adds low-rank adapters (PEFT) to the weights they adapt.
+    """Merge low-rank adapters (PEFT) into the weights that they adapt: W + B A.
 
-    The released settings have rank and alpha 16, hence a factor of 1; they also never
-    train them, which leaves B at zero.
+    The factor alpha / rank is 1, because both are 16 in the released settings. These settings
+    also never train the adapters, so B is zero.
+
+    Raises:
+        DataError: An adapter has no matrix A, B or W, or their shapes do not match.
     """
     merged = {
         name.replace(".base_layer.", "."): value

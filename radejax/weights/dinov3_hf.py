@@ -1,7 +1,7 @@
-"""DINOv3 weights as Hugging Face distributes them, to Flax and back, without torch.
+"""Conversion of DINOv3 weights between Hugging Face's format and Flax, without torch.
 
-The weights are gated and their license restricts passing them on: download them
-yourself, and keep them out of checkpoints that are published.
+The weights are gated and their license restricts redistribution: every user must download
+them, and published checkpoints must not contain them.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _FIELDS = {
     "num_register_tokens": "num_registers",
     "use_gated_mlp": "gated_mlp",
 }
-"""Our name of each field of Hugging Face's config."""
+"""Attributes of `ViT` by the name of the corresponding field of Hugging Face's config."""
 
 
 def _constants(gated_mlp: bool) -> dict[str, Any]:
-    """Fields that are the same in all published models of DinoRADE's size."""
+    """Return the fields of Hugging Face's config for which only one value is supported."""
     return {
         "model_type": "dinov3_vit",
         "rope_theta": 100.0,
@@ -66,24 +66,24 @@ _RULES: Rules = (
     ),
     (r"^layers/(up|gate|down)/", r"layer.{}.mlp.\1_proj."),
 )
-"""Rules from modules of ours to Hugging Face's, for `convert`."""
+"""Rules from modules of `ViT` to Hugging Face's names, for `convert`."""
 
 
 def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
-    """Model and variables from a folder with `config.json` and `model.safetensors`.
+    """Load model and variables from a folder with `config.json` and `model.safetensors`.
 
     Args:
-        folder: For instance a download of `facebook/dinov3-vits16-pretrain-lvd1689m`.
+        folder: Folder such as a download of `facebook/dinov3-vits16-pretrain-lvd1689m`.
 
     Returns:
-        The model, and `{"params": ...}` with float32 arrays. Applied to normalized
-        images it gives transformers' `last_hidden_state`.
+        The model, and `{"params": ...}` with float32 arrays. For normalized images, the model
+        computes the `last_hidden_state` of Hugging Face transformers.
 
     Raises:
         FileNotFoundError: The folder or one of its files is missing.
         DataError: A file is corrupted, or tensors are missing, unexpected or of another
-            shape; all are listed.
-        UserError: The folder holds another kind of model.
+            shape. The message lists up to 20 of them.
+        UserError: The folder contains another kind of model.
     """
     folder = files.as_path(folder)
     missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
@@ -102,12 +102,12 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
 
 
 def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
-    """Writes a model as a folder that `load`, and transformers, read.
+    """Write a model to a folder that `load` and Hugging Face transformers can read.
 
     Args:
-        model: Its fields go into `config.json`.
-        params: Its parameters, as of `load(folder)[1]["params"]`.
-        folder: Made if missing; files in it are replaced.
+        model: Model whose fields are written to `config.json`.
+        params: Parameters of the model, such as `load(folder)[1]["params"]`.
+        folder: Folder, which is created if necessary. Existing files are replaced.
     """
     folder = files.as_path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -121,11 +121,11 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
 
 
 def model_from_config(config: Mapping[str, Any]) -> ViT:
-    """The model that a Hugging Face `config.json` describes.
+    """Create the model that a Hugging Face `config.json` describes.
 
     Raises:
-        UserError: It is not a DINOv3 ViT, a field is missing, of a wrong type, out of
-            range or not supported.
+        UserError: It does not describe a DINOv3 ViT, or a field is missing, of a wrong type,
+            out of range or not supported.
     """
     constants = _constants(config.get("use_gated_mlp") is True)
     for name, value in constants.items():
@@ -136,10 +136,10 @@ def model_from_config(config: Mapping[str, Any]) -> ViT:
 
 
 def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
-    """The model that DINOv3 tensors by name are of.
+    """Create the model whose sizes are those of DINOv3 tensors by name.
 
     Raises:
-        DataError: They are not those of a DINOv3 ViT.
+        DataError: The tensors are not those of a DINOv3 ViT.
     """
     try:
         hidden, _, patch, _ = tensors["embeddings.patch_embeddings.weight"].shape
@@ -151,7 +151,7 @@ def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
     return ViT(
         hidden_size=hidden,
         num_layers=len(layers),
-        num_heads=hidden // 64,  # all DINOv3 models have heads of 64 channels
+        num_heads=hidden // 64,  # 64 channels per head in all but the 7B model
         mlp_dim=mlp_dim,
         patch_size=patch,
         num_registers=num_registers,
@@ -160,32 +160,33 @@ def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
 
 
 def image_fields(model: ViT) -> dict[str, Any]:
-    """Fields of `config.model.image` that a backbone has."""
+    """Return the fields of `config.model.image` that describe a backbone."""
     return {name: getattr(model, name) for name in _FIELDS.values()}
 
 
 def to_params(
     model: ViT, tensors: Mapping[str, Any], source: str = "state dict"
 ) -> dict[str, Any]:
-    """Parameters of `model` from DINOv3 tensors by name.
+    """Convert DINOv3 tensors by name to the parameters of `model`.
 
     Raises:
-        DataError: Tensors are missing, unexpected or of another shape; all are listed.
+        DataError: Tensors are missing, unexpected or of another shape. The message lists up
+            to 20 of them.
     """
-    # transformers 5 saves some models with a prefix.
+    # transformers 5 adds a prefix to the names of some models.
     tensors = {name.removeprefix("model."): t for name, t in tensors.items()}
-    # Where one is missing or of another shape, `from_torch` says so.
+    # `from_torch` reports a tensor that is missing or has another shape.
     with contextlib.suppress(KeyError, ValueError):
         tokens = [to_numpy(tensors[name]) for name in (_CLASS, _REGISTERS)]
         tensors[_CLASS] = np.concatenate(tokens, 1)
         del tensors[_REGISTERS]
-    # The mask token is used in pretraining only.
+    # The mask token is only used in pretraining.
     ignored = r"embeddings\.mask_token$"
     return from_torch(_RULES, _shapes(model), tensors, source, ignored)["params"]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """DINOv3 tensors by name of the parameters of `model`: inverse of `to_params`."""
+    """Invert `to_params` and add a mask token of zeros."""
     size, params = model.patch_size, dict(params)
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))

@@ -1,6 +1,6 @@
-"""Weights of image backbones: DINOv3 from Hugging Face, ResNet-50 from torchvision.
+"""Weights of image backbones: DINOv3 from Hugging Face and ResNet-50 from torchvision.
 
-torch is not needed.
+All files are read without torch.
 """
 
 from __future__ import annotations
@@ -33,24 +33,26 @@ from radejax.weights.convert import (
 def load_image_backbone(
     path: PathLike | None, model: nn.Module, embeddings_sha256: str | None = None
 ) -> Mapping[str, Any] | None:
-    """Pretrained part of the variables, for `radejax.training.step.with_pretrained`.
+    """Load pretrained variables for `radejax.training.step.with_pretrained`.
 
     Args:
-        path: A DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
-        model: Says which kind is expected.
-        embeddings_sha256: Checksum of the weights that embeddings are from, which stand
-            for the frozen part: what is left is the ResNet's last stage, and nothing of
-            a DINOv3.
+        path: DINOv3 folder from Hugging Face, or ResNet-50 file from torchvision or of
+            `save_resnet`.
+        model: Detector, which determines the kind of backbone.
+        embeddings_sha256: Checksum of the weights that computed the embeddings, if there
+            are any. The frozen parameters are then checked against it and not returned.
+            This leaves the last stage of a ResNet, and no parameter of a DINOv3.
 
     Returns:
-        None without a path, and where embeddings leave nothing.
+        The variables, or None without a path.
 
     Raises:
-        FileNotFoundError: Not there, or a folder lacks a file.
-        DataError: Tensors are missing, unexpected or mis-shaped.
-        UserError: It is another model than the configured one, or not the one that the
-            embeddings are from; or the model has a frozen backbone and no weights are
-            given.
+        FileNotFoundError: The file, the folder or a file in it is missing.
+        DataError: A file is corrupted, or tensors are missing, unexpected or of another
+            shape.
+        UserError: The weights are of another model than the configured one or the one that
+            computed the embeddings; the model has no camera; or a frozen backbone has no
+            weights (nor embeddings, which suffice for a transformer).
     """
     has_camera = models.has_camera(model)
     if path is None:
@@ -84,12 +86,12 @@ def load_image_backbone(
 
 
 def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
-    """`UserError` unless weights have the checksum of those of a run or of embeddings.
+    """Raise a `UserError` unless weights have the checksum of a run or of embeddings.
 
     Args:
         params: Parameters of an image backbone.
-        sha256: Checksum that `weights_sha256` gave, or how it begins.
-        source: Where `params` are from.
+        sha256: Checksum that `weights_sha256` returned, or its first digits.
+        source: Source of `params` for the error message.
     """
     found = weights_sha256(params)
     if not found.startswith(sha256):
@@ -103,7 +105,7 @@ def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
 def check_fits(
     model: nn.Module, variables: Mapping[str, Any], source: PathLike
 ) -> None:
-    """`UserError` unless variables are those of a model; the backbone may be missing."""
+    """Raise a `UserError` unless variables fit a model; the backbone may be missing."""
     wanted, found = variable_shapes(model), shapes_of(variables)
     if IMAGE_BACKBONE not in variables.get("params", {}):
         wanted = {k: s for k, s in wanted.items() if f"/{IMAGE_BACKBONE}/" not in k}
@@ -115,7 +117,7 @@ def check_fits(
 
 
 def weights_sha256(params: Mapping[str, Any]) -> str:
-    """Checksum of a tree of weights: names, shapes and values."""
+    """Return the SHA-256 of the names, shapes and float32 values of a tree of weights."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
@@ -123,7 +125,7 @@ def weights_sha256(params: Mapping[str, Any]) -> str:
     return digest.hexdigest()
 
 
-# ResNet-50 as torchvision distributes it ---------------------------------------------
+# ResNet-50 of torchvision ------------------------------------------------------------
 
 RESNET_RULES: Rules = (
     (r"^image_backbone/stem_conv/", "conv1."),
@@ -136,27 +138,28 @@ RESNET_RULES: Rules = (
     (r"\.conv_shortcut/", ".downsample.0."),
     (r"\.norm_shortcut/", ".downsample.1."),
 )
-"""Rules from modules of DinoRADE to torchvision's; its last stage is part of our neck."""
+"""Rules from modules of `DinoRade`, whose neck contains the last stage, to torchvision's."""
 
 
 def load_resnet(
     state_dict_or_path: Mapping[str, Any] | PathLike, model: nn.Module
 ) -> dict[str, Any]:
-    """Variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
+    """Load the variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 
     Args:
-        state_dict_or_path: The file, or its tensors by name.
-        model: A `DinoRade` with a ResNet.
+        state_dict_or_path: File, or its tensors by name.
+        model: `DinoRade` with a ResNet.
 
     Returns:
-        `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}`,
-        without the 1x1 projection, which is DinoRADE's own: for
-        `radejax.training.step.with_pretrained`. Of a file of `save_resnet`, which has no
-        last stage, only "image_backbone".
+        `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}` for
+        `radejax.training.step.with_pretrained`, without the 1x1 projection, which only
+        DinoRADE has. A file of `save_resnet` has no last stage and gives only the
+        parameters of "image_backbone".
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: Tensors are missing, unexpected or of another shape; all are listed.
+        DataError: The file is corrupted, or tensors are missing, unexpected or of another
+            shape. The message lists up to 20 of them.
     """
     tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
     has_last = any(name.startswith("layer4.") for name in tensors)
@@ -170,6 +173,6 @@ def load_resnet(
 
 
 def save_resnet(params: Mapping[str, Any], path: PathLike) -> None:
-    """Writes the parameters of a `ResNetTrunk` under torchvision's names."""
+    """Write the parameters of a `ResNetTrunk` to a safetensors file with torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
     safetensors.numpy.save_file(to_torch(RESNET_RULES, trunk), path)

@@ -1,4 +1,4 @@
-"""Official RADE-Net checkpoints (PyTorch) to Flax and back. torch is not needed."""
+"""Conversion between official RADE-Net checkpoints (PyTorch) and Flax, without torch."""
 
 from __future__ import annotations
 
@@ -26,33 +26,35 @@ from radejax.weights.convert import (
 StateDict = Mapping[str, Any]
 
 PART = "backbone."
-"""Start of names by which a state dict of RADE-Net is recognized."""
+"""Start of names by which a RADE-Net state dict is recognized."""
 
-_UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # in official models without CBAM as well
+_UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # official models without CBAM have them too
 
 
 def load(
     state_dict_or_path: StateDict | PathLike, **model_overrides: Any
 ) -> tuple[RadeNet, dict[str, Any]]:
-    """Model and variables from an official checkpoint.
+    """Load model and variables from an official checkpoint.
 
-    The maps keep the padded grid, which for official weights is
+    The maps include the padding; their grid for official weights is
     `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:
-        state_dict_or_path: Mapping from names to arrays (NumPy or torch), or a file, see
+        state_dict_or_path: NumPy or torch arrays by name, or a file, see
             `convert.read_state_dict`.
-        **model_overrides: Fields of `config.model` that names and shapes do not show:
-            the released model without CBAM still has its tensors (`cbam=None` switches
-            it off), and `num_groups` (32).
+        **model_overrides: Fields of `config.model`, which replace those inferred from names
+            and shapes and the defaults. `cbam=None` is needed for released models without
+            CBAM, as they contain its tensors, and `num_groups` for other than 32 groups.
 
     Returns:
         The model, and `{"params": ...}` with float32 arrays.
 
     Raises:
         FileNotFoundError: There is no such file.
-        UserError: An override is no field of the model or impossible.
-        DataError: Tensors are missing, unexpected or of another shape; all are listed.
+        UserError: An override is unknown or invalid, or `doppler_bins` and `elevation_bins`
+            are needed and missing, see `infer_config`.
+        DataError: The file is corrupted, or tensors are missing, unexpected or of another
+            shape. The message lists up to 20 of them.
     """
     tensors, source = read_state_dict(state_dict_or_path, PART)
     config, variables = read(tensors, source, **model_overrides)
@@ -62,7 +64,7 @@ def load(
 def read(
     tensors: StateDict, source: str, **model_overrides: Any
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`config.model` and variables from tensors by official name; see `load`."""
+    """Return `config.model` and variables for tensors by official name; see `load`."""
     config = load_config("radenet:official").model.to_dict()
     config |= infer_config(tensors, source, model_overrides)
     shapes = variable_shapes(models.build(config))
@@ -71,31 +73,31 @@ def read(
 
 
 def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """State dict that the official code loads: inverse of `load`.
+    """Return a state dict that the official code can load; this is the inverse of `load`.
 
     To write a file, use `safetensors.numpy.save_file(state, path)`, or `torch.save` after
     `torch.from_numpy` of every array.
 
-    The official model has CBAM tensors even where it does not use them; a model without
-    CBAM gets untrained ones, so that a strict load succeeds there.
+    Official models without CBAM contain its tensors too. For a model without CBAM, they are
+    filled with ones (scales) and zeros, so that a strict load succeeds.
 
     Args:
-        model: The model the variables belong to.
+        model: Model that the variables belong to.
         variables: `{"params": ...}`.
 
     Returns:
         NumPy arrays by official name.
 
     Raises:
-        UserError: `cbam="paper"`, or a center or scale of the input, has no official
-            counterpart.
+        UserError: The model has `cbam="paper"` or an `input_center` or `input_scale`, which
+            have no official counterpart.
     """
     if model.cbam == "paper":
         raise UserError(
             'the official code has no cbam="paper"; it knows "official" and None'
         )
     if (model.input_center, model.input_scale) != (0.0, 1.0):
-        # Not to be put into the first weights either: maps are padded with zeros.
+        # They cannot be merged into the first weights, because zeros are padded after them.
         raise UserError(
             "the official code's network takes the projection as it is; this model has "
             f"input_center={model.input_center} and input_scale={model.input_scale}: "
@@ -115,18 +117,18 @@ def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
 def infer_config(
     tensors: StateDict, source: str, overrides: StateDict, prefix: str = ""
 ) -> dict[str, Any]:
-    """Fields of `config.model` that names and shapes show, and the overrides.
+    """Infer fields of `config.model` from names and shapes, and apply the overrides.
 
     Args:
-        tensors: By official name.
-        source: What error messages call them.
-        overrides: Fields of `config.model`, which hold instead.
-        prefix: Of "backbone.", "neck.": "rad_" in DinoRADE.
+        tensors: Tensors by official name.
+        source: Name of the tensors in error messages.
+        overrides: Fields of `config.model` that replace the inferred ones.
+        prefix: Prefix of "backbone" and "neck" in names: "rad_" in DinoRADE.
 
     Raises:
-        DataError: A tensor that shows a size is missing.
-        UserError: The input has other than 101 channels and no stem to show how many
-            are Doppler; override `doppler_bins` and `elevation_bins`.
+        DataError: A tensor from which a size is inferred is missing.
+        UserError: The number of Doppler channels is unknown, because the model has no input
+            stem and not 101 channels, and `doppler_bins` or `elevation_bins` is missing.
     """
 
     def size(name: str, axis: int) -> int:
@@ -175,11 +177,11 @@ def infer_config(
 
 
 def rules(heads: str, prefix: str = "") -> Rules:
-    """Rules from modules of RADE-Net to the official ones, for `convert`.
+    """Return the rules from modules of `RadeNet` to official names, for `convert`.
 
     Args:
-        heads: Kind, "expanded" or "default".
-        prefix: Prefix of "backbone" and "neck": "rad_" in DinoRADE.
+        heads: Kind of the heads, "expanded" or "default".
+        prefix: Prefix of "backbone" and "neck" in official names: "rad_" in DinoRADE.
     """
     unet = f"{prefix}backbone"
     out = 9 if heads == "expanded" else 3
@@ -199,7 +201,7 @@ def rules(heads: str, prefix: str = "") -> Rules:
         (r"\.conv/", ".0."),
         (r"\.norm/", ".1."),
         *neck_rules("neck", f"{prefix}neck.neck"),
-        # Convolution, normalization and activation each take a number.
+        # In torch, convolution, normalization and activation have consecutive indices.
         (r"^heads/heatmap/", "head.heatmap_head.head/"),
         (r"^heads/box/", "head.reg_head.head/"),
         (r"head/conv_(\d)/conv/", lambda m: f"head.{3 * int(m[1]) - 3}."),
@@ -209,7 +211,7 @@ def rules(heads: str, prefix: str = "") -> Rules:
 
 
 def neck_rules(ours: str, theirs: str) -> Rules:
-    """A neck of either kind; the plain one has `conv`, the dilated `conv_1`, `conv_2`."""
+    """Return the rules of a plain neck (with `conv`) or dilated one (`conv_1`, `conv_2`)."""
     block = rf"({re.escape(theirs)}\.\d\.(?:conv1\.)?)"
     return (
         (rf"^{ours}/block_(\d)/", lambda m: f"{theirs}.{int(m[1]) - 1}."),
@@ -220,10 +222,10 @@ def neck_rules(ours: str, theirs: str) -> Rules:
 
 
 def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
-    """Shape of every official tensor that a model uses, by its official name."""
+    """Return the shapes of the official tensors that a model uses, by official name."""
     names = rules(model.heads)
     return {
-        # A broadcast scalar has the shape without the memory.
+        # A broadcast scalar has the shape without using the memory.
         torch_name(names, path): to_torch_layout(path, np.broadcast_to(0, shape)).shape
         for path, shape in variable_shapes(model).items()
     }

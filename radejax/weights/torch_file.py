@@ -1,8 +1,8 @@
-"""A reader of PyTorch's `.pth` files (zip format, torch 1.6 and later) without torch.
+"""Reader of PyTorch's `.pth` files (zip format, torch 1.6 and later) without torch.
 
-A pickle can run any code. This reader executes only the pickle instructions that torch
-writes for state dicts, and builds only containers, numbers, strings and arrays: whatever
-else a file names is an error, as under `torch.load(..., weights_only=True)`.
+A pickle can run arbitrary code. This reader executes only the pickle instructions that torch
+writes for state dicts, and creates only containers, numbers, strings and arrays. As with
+`torch.load(..., weights_only=True)`, a reference to any other object raises an error.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _MAX_DIMS = 16
 
 
 def read(path: PathLike) -> Any:
-    """Content of a `.pth` file, with NumPy arrays for tensors.
+    """Read the content of a `.pth` file, with tensors as NumPy arrays.
 
     Args:
-        path: A file written by `torch.save`: a state dict, or a checkpoint of plain
-            containers and numbers around one.
+        path: File written by `torch.save`: a state dict, or a checkpoint that contains one
+            and otherwise only plain containers, numbers and strings.
 
     Returns:
-        Dicts, lists, tuples, numbers, strings and read-only arrays; bfloat16 becomes
-        float32, which represents it exactly.
+        Dicts, lists, tuples, numbers, strings and arrays. bfloat16 becomes float32, which
+        represents it exactly.
 
     Raises:
         FileNotFoundError: There is no such file.
-        DataError: It is no torch file, corrupted, or holds other objects.
+        DataError: The file is not a torch file, is corrupted, or contains other objects.
     """
     path = as_path(path)
     with path.open("rb") as file:
@@ -65,7 +65,7 @@ def read(path: PathLike) -> Any:
             return _Unpickler(archive, f"{root}/").load()
     except DataError as error:
         raise DataError(f"{path}: {one_line(error)}") from None
-    # What a corrupted pickle raises is not limited to one family.
+    # A corrupted pickle can raise errors of any type.
     except Exception as error:
         raise DataError(f"{path}: corrupted torch file ({one_line(error)})") from None
 
@@ -83,7 +83,7 @@ def _rebuild_tensor(
     hooks: object = None,
     metadata: object = None,
 ) -> np.ndarray:
-    """A view of a storage, after checking that it lies inside."""
+    """Return a view of a storage, after checking that it is within the storage."""
     if not isinstance(storage, _Storage) or max(len(shape), len(strides)) > _MAX_DIMS:
         raise DataError("a tensor without a storage or of more than 16 axes")
     if any(type(n) is not int or n < 0 for n in (offset, *shape, *strides)):
@@ -105,7 +105,7 @@ def _rebuild_parameter(
 
 
 def _new_dict() -> dict[str | int, Any]:
-    """An OrderedDict, which torch fills by further instructions."""
+    """Return a dict for an `OrderedDict`, which later instructions fill."""
     return {}
 
 
@@ -124,12 +124,12 @@ _OPCODES = (
     + pickle.BINGET + pickle.LONG_BINGET + pickle.GLOBAL + pickle.REDUCE
     + pickle.BINPERSID
 )  # fmt: skip
-"""Instructions of a state dict, and none that hashes or calls arbitrary objects."""
+"""Instructions of state dicts; none of them hashes or calls arbitrary objects."""
 
 
-# In Python: the one in C allocates the memo that a file claims, and has no dispatch.
+# The Python unpickler, as that in C has no dispatch table and allocates any memo size.
 class _Unpickler(pickle._Unpickler):
-    """Executes the allowed instructions on the allowed names."""
+    """Unpickler that executes only `_OPCODES` and resolves only `_ALLOWED` names."""
 
     dispatch: ClassVar[dict[int, Callable[..., None]]] = {
         code: pickle._Unpickler.dispatch[code] for code in _OPCODES
@@ -140,7 +140,7 @@ class _Unpickler(pickle._Unpickler):
 
     def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
         self._archive, self._root = archive, root
-        # Members together take memory in proportion to the file, whatever they claim.
+        # All members together may use memory in proportion to the file's size.
         self._budget = 4 * os.path.getsize(str(archive.filename)) + (1 << 20)
         has_order = f"{root}byteorder" in archive.namelist()
         is_big = has_order and self._member("byteorder") == b"big"
@@ -162,7 +162,7 @@ class _Unpickler(pickle._Unpickler):
         return _ALLOWED[module, name]
 
     def persistent_load(self, pid: Any) -> _Storage:
-        """A storage by `("storage", dtype, key, device, size)`."""
+        """Return the storage of an identifier `("storage", dtype, key, device, size)`."""
         kind, dtype, key, _, size = pid
         if kind != "storage" or dtype not in _DTYPES.values() or type(key) is not str:
             raise DataError("a tensor without a storage of numbers")
@@ -180,7 +180,7 @@ class _Unpickler(pickle._Unpickler):
         return self._storages[key]
 
     def _ignore_state(self) -> None:
-        """BUILD: the `_metadata` of a state dict; no object here has a state."""
+        """Ignore the state of `BUILD`, which is the `_metadata` of a state dict."""
         self.stack.pop()
 
     def _set_item(self) -> None:
@@ -191,7 +191,7 @@ class _Unpickler(pickle._Unpickler):
         self._update(self.pop_mark())
 
     def _update(self, items: list[Any]) -> None:
-        """Keys are checked first: hashing nested tuples takes unlimited time."""
+        """Check keys before adding them, as hashing nested tuples can take unlimited time."""
         target, keys = self.stack[-1], items[::2]
         if type(target) is not dict or any(type(k) not in (str, int) for k in keys):
             raise DataError("a dict whose keys are neither names nor integers")

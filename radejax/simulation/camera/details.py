@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame
 
 FRONT, REAR, LEFT, RIGHT, TOP = range(5)
-"""Faces of a block, in the order of `shapes`."""
+"""Indices of the faces of a block, in the order of `shapes`."""
 
 
 class Detail(NamedTuple):

@@ -51,7 +51,7 @@ AIR = {
 LEVELS = ("clear", "partial", "heavy", "full")
 
 BLOCK_FRAMES = 50
-"""A lens stays as it is for this long: until a wiper or the wind changes it."""
+"""Number of frames after which the lens cover changes, as by a wiper or wind."""
 
 
 def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:

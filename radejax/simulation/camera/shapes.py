@@ -68,9 +68,9 @@ _VERTICES = np.array(  # corners of a block: front, rear, left, right, top
 _NORMALS = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)], float)
 _EDGE_PARTS = 3
 _DETAIL_M = 60.0
-"""Farther objects show no details: a plate is two pixels wide there."""
+"""Distance from which objects have no details; a plate is two pixels wide there."""
 _NEAR_M = 0.3
-"""Faces nearer than this are cut away."""
+"""Distance of the near plane, at which faces are clipped."""
 _SUN = np.array([0.35, 0.45, 0.82])
 
 

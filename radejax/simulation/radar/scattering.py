@@ -68,15 +68,15 @@ CLASS_SCATTERING = {
     "Motorcycle": ClassScattering(2.0, 3.0, 14, 1.0, 0.2),
     "Bicycle": ClassScattering(-2.0, 3.0, 14, 1.0, 0.35),
 }
-"""All values are our choice, see the docstring of the module."""
+"""All values are our choice; see the docstring of the module."""
 
 OCCLUDED_DB = -22.0
-"""Two-way loss behind another object: what creeps around and under it still returns.
-Our choice."""
+"""Two-way gain in dB behind another object. Our choice: some power is diffracted around it or
+reflected under it."""
 
 _GLINT_WIDTH_RAD = np.deg2rad(6.0)
 _BACK_LEAK = 0.02
-"""Power of a scatterer on a face turned away, which the body shields."""
+"""Relative power of a scatterer on a face that is turned away from the radar."""
 
 
 class ObjectScatterers(NamedTuple):
@@ -269,7 +269,7 @@ def received_power(
 
 
 CAPACITY_STEP = 512
-"""`Scatterers` are padded to a multiple of this, so that frames share compiled code."""
+"""`Scatterers` are padded to a multiple of this, so that frames share compiled executables."""
 
 
 def to_scatterers(
@@ -341,7 +341,7 @@ def scatter_surroundings(
 
 
 MIRROR_DB = -18.0
-"""Two reflections on a rail or wall, there and back, with all its gaps and posts."""
+"""Gain in dB of two reflections at a rail or wall, which has gaps and posts."""
 
 _MIRROR_REACH_M = 45.0
 

@@ -28,7 +28,7 @@ from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
 
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
-"""Axes of a tesseract `[D, R, E, A]` in the array of rows `[R, E, D, A]`."""
+"""Permutation of the axes from rows `[R, E, D, A]` to a tesseract `[D, R, E, A]`."""
 
 
 _RANGES = {
@@ -290,7 +290,7 @@ def _beams(
 
 
 _product = functools.partial(jnp.dot, precision=lax.Precision.HIGHEST)
-"""Weak echoes beside strong ones: 80 dB of power are 1e-4 of the amplitude."""
+"""Matrix product in full float32 precision, so that strong echoes do not mask weak ones."""
 
 
 def _noise(

@@ -9,10 +9,10 @@ import numpy as np
 from radejax.simulation.world.scene import REFLECTOR_KINDS, Reflectors, Road
 
 GROUND_M = -0.9
-"""The ground in the radar's frame: K-Radar's radar is mounted at bumper height."""
+"""Height of the ground in the radar frame. K-Radar's radar is mounted at bumper height."""
 
 SIGHT_M = 130.0
-"""How far ahead of the ego objects are placed."""
+"""Distance ahead of the ego vehicle up to which objects are placed."""
 
 
 @dataclasses.dataclass(frozen=True)

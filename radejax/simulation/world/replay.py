@@ -31,7 +31,7 @@ from radejax.simulation.world.scene import (
 )
 
 MAX_SPEED_MPS = 60.0
-"""Faster relative motion is taken for a swap of identities."""
+"""Relative speed above which motion is assumed to be a swap of track identities."""
 
 
 def make_real_sequence(

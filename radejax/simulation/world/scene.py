@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from radejax.core.structures import CLASSES
 
 FRAME_PERIOD_S = 0.1
-"""K-Radar records 10 frames a second."""
+"""Time between two frames: K-Radar records 10 frames per second."""
 
 
 @dataclasses.dataclass(frozen=True)
