@@ -1,4 +1,4 @@
-"""A measurement of `run.py`, and functions that measurements share."""
+"""The type of the measurements of `run.py`, and functions that they share."""
 
 import dataclasses
 import functools
@@ -11,18 +11,19 @@ import numpy as np
 
 @dataclasses.dataclass(kw_only=True)
 class Case:
-    """A measurement of several implementations in alternation.
+    """A measurement of one or several implementations in alternation.
 
     Attributes:
         name: Name of the measurement.
         columns: Function per implementation that runs it once and returns wall and CPU seconds;
             "radejax" is this package.
-        frames: Frames per call.
+        frames: Number of frames per call.
         dtype: Data type of the computation.
-        error: Largest difference of the results relative to the largest value, or None.
+        error: Largest difference of the results relative to the largest value; None if they are
+            not compared.
         tolerance: Largest permitted `error`; a case above it is not measured.
-        mib: Memory of the program without its arguments.
-        compile_s: Compile time of radejax in seconds.
+        mib: Temporary memory of radejax's program in MiB, without arguments and results.
+        compile_s: Time in seconds to trace and compile radejax's program.
         note: Remark, or a function that returns it after the measurement.
     """
 
@@ -38,7 +39,7 @@ class Case:
 
 
 def difference(found, wanted):
-    """Largest difference of arrays, relative to the largest value of each."""
+    """Returns the largest difference of pairs of arrays relative to the largest wanted value."""
     return max(
         float(np.abs(np.asarray(a, np.float32) - b).max() / np.abs(b).max())
         for a, b in zip(found, wanted, strict=True)
@@ -46,10 +47,7 @@ def difference(found, wanted):
 
 
 def compiled(function, *arguments, precision=None, **options):
-    """Compiled program, and the fields of a `Case` with its memory and compile time.
-
-    The memory excludes arguments and results.
-    """
+    """Returns a compiled program, and `Case` fields with its memory and compile time."""
     began = time.perf_counter()
     with jax.default_matmul_precision(precision or "default"):
         program = jax.jit(function, **options).lower(*arguments).compile()
@@ -59,12 +57,12 @@ def compiled(function, *arguments, precision=None, **options):
 
 
 def timed(function):
-    """Wall and CPU seconds of one call."""
+    """Returns wall and CPU seconds of one call; CPU seconds are those of the whole process."""
     wall, processor = time.perf_counter(), time.process_time()
     function()
     return time.perf_counter() - wall, time.process_time() - processor
 
 
 def waiting(program, *arguments):
-    """Function for a column: seconds of a call until its results are ready."""
+    """Returns a function for a column that times a call until its results are ready."""
     return functools.partial(timed, lambda: jax.block_until_ready(program(*arguments)))

@@ -1,7 +1,6 @@
-"""Benchmarks of `run.py`: what is measured, compared with what, and at which sizes.
+"""Benchmarks of `run.py`, with the implementations to compare and their sizes.
 
-Each entry yields cases one after the other; the data of a case are released before the next one is
-built.
+A benchmark yields its cases one by one, so that not all of their data are in memory at once.
 """
 
 import collections
@@ -41,7 +40,7 @@ GRID = RadarGrid.kradar()
 
 
 def tpm(machine):
-    """Tensor max projection of a tesseract, as `loadmat` lays it out."""
+    """Tensor max projection of a tesseract in the memory order of `loadmat`, and from files."""
     tesseract = inputs.make_tesseract(GRID.shape_drea)
     columns = {
         "radejax": lambda: timed(lambda: project_tensor(tesseract)),
@@ -79,7 +78,7 @@ def tpm(machine):
 
 
 def nms(machine):
-    """Decoding of peaks to boxes, compared with the released Python loops."""
+    """Decoding of peaks to boxes with NMS, compared with the released Python loops."""
     for peaks in (40, 100):
         maps, loops = inputs.make_maps(peaks), inputs.peaks_on_host(peaks)
         ours = inputs.jitted_decode(128)
@@ -99,7 +98,7 @@ def nms(machine):
 
 
 def evaluate(machine):
-    """Evaluation of as many predictions as the test split has: every protocol and weather."""
+    """Evaluation of a test split of K-Radar's size in every protocol and weather."""
     for false_per_frame in (2, 50):
         truth, found, frames = inputs.synthetic_set(false_per_frame=false_per_frame)
         options = EvaluationOptions(protocols=tuple(PROTOCOLS))
@@ -125,7 +124,7 @@ def load(machine):
             table = make_table(source, inputs.labelled(source), max_objects=32)
             batches = make_loader(table, LoaderOptions(size))
             take = functools.partial(itertools.islice, batches, count // size)
-            # Only the last batch is kept, as in training.
+            # As in training, earlier batches are released.
             columns[name] = functools.partial(
                 timed, lambda take=take: collections.deque(take(), maxlen=1)
             )
@@ -138,7 +137,7 @@ def load(machine):
 
 
 def simulate(machine):
-    """Fused projections of the simulator: one frame, and a batch on an accelerator."""
+    """Fused projections of the simulator: one frame on a CPU, a batch on an accelerator."""
     count = 1 if machine["platform"] == "cpu" else 16
     frames, run = inputs.simulator_of(count)
     arrays = jax.device_put(
@@ -157,7 +156,7 @@ def simulate(machine):
 
 
 def deploy(machine):
-    """Exported programs of `radejax export`, compared with the detector that was exported."""
+    """Programs of `radejax export`, compared with the detector that was exported."""
     has_onnx = importlib.util.find_spec("onnxruntime") and machine["platform"] == "cpu"
     for name in ("quickstart", "radenet"):
         config = load_config(name)
@@ -204,5 +203,5 @@ BENCHMARKS = {
     "deploy": (deploy, 150),
     "start": (start.start, 240),
 }
-"""Function, and seconds that it takes on two cores, by name for `--only`, in the order in
-which they are run: the most important ones first."""
+"""Function and its duration in seconds on two cores by name, which `--only` selects. The most
+important benchmarks come first and run first."""

@@ -2,9 +2,10 @@
 
     python benchmarks/fuzz.py --minutes 30 [--readers labels,split] [--out FILE.json]
 
-All readers get the same time. Every input has a number; a later run with `--start` uses other
-inputs. An input that is neither read nor rejected with a documented exception is printed at once,
-and the exit code is 1. `--keep READER:NUMBER` adds an input to tests/fuzz/corpus.
+All readers get the same time. Inputs are numbered, and `--start` selects the first one, so that a
+later run can use other inputs. An input that is neither read nor rejected with a documented
+exception is printed after its block of 1,000 inputs, and the exit code is 1.
+`--keep READER:NUMBER` adds an input to tests/fuzz/corpus.
 """
 
 import argparse
@@ -24,7 +25,7 @@ AT_ONCE = 1000
 
 
 def fuzz(name, seconds, start):
-    """Run one reader on corrupted files; returns its counts and the inputs that it mishandled."""
+    """Runs a reader on corrupted files; returns counts of outcomes and the wrong outcomes."""
     total, all_wrong, end = collections.Counter(), [], time.time() + seconds
     while not total or time.time() < end:
         counts, wrong = engine.counts(name, start, AT_ONCE)
@@ -35,7 +36,7 @@ def fuzz(name, seconds, start):
 
 
 def keep(name, number):
-    """Add an input to the corpus."""
+    """Adds an input to the corpus."""
     with tempfile.TemporaryDirectory() as folder:
         case = engine.Case(name, READERS[name], pathlib.Path(folder))
         path, content = case.content(number)
@@ -45,7 +46,7 @@ def keep(name, number):
 
 
 def table(results):
-    """Markdown table with one row per reader and the exceptions that it raised."""
+    """Returns a Markdown table with the number of inputs per reader and outcome."""
     lines = ["| reader | inputs | read | refused | wrong |", "|---|---|---|---|---|"]
     for name, (counts, wrong) in results.items():
         refused = counts.total() - counts["read"] - len(wrong)

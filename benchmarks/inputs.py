@@ -1,6 +1,6 @@
-"""Inputs of the benchmarks: tensors, maps, records, predictions, and the released loops.
+"""Inputs of the benchmarks, and the steps of the reference implementation.
 
-Sizes are K-Radar's. Values are random where they do not matter for the time.
+Sizes are those of K-Radar. Values are random where they do not affect the time.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
 
-# K-Radar's front camera, sequence 1.
+# Calibration of the front camera in K-Radar's sequence 1.
 CALIBRATION = CameraCalibration.from_angles(
     intrinsics=(567.7208, 577.2137, 628.7208, 369.3069),
     distortion=(-0.0288738, 0.0006023, 0.0039573, -0.0050472, 0.0),
@@ -42,21 +42,21 @@ CALIBRATION = CameraCalibration.from_angles(
 
 
 def make_tesseract(shape):
-    """Column-major noise with K-Radar's order of magnitude, `[D, R, E, A]`."""
+    """Returns column-major noise `[D, R, E, A]` with K-Radar's order of magnitude."""
     rng = np.random.default_rng(0)
     noise = rng.standard_exponential(shape[::-1], np.float32)
     return (noise * np.float32(1e10)).T
 
 
 def project_released(tesseract):
-    """Released formula: logarithm of every bin, transpose, two maxima."""
+    """Computes the projection `[R, A, D+E]` as released: logarithms, transpose, two maxima."""
     level = (10 * np.log10(tesseract + 1e-10) + 1.2) / 184.3
     level = np.transpose(level, (1, 3, 2, 0))  # [R, A, E, D]
     return np.concatenate([level.max(axis=2), level.max(axis=3)], axis=-1)
 
 
 def frames_of(size, **camera):
-    """Random projections with a few boxes in view."""
+    """Returns a batch of random projections with eight boxes each in the field of view."""
     rng = np.random.default_rng(0)
     boxes = np.zeros((size, 8, 8), np.float32)
     boxes[..., 0] = rng.uniform(5, 70, (size, 8))
@@ -75,7 +75,7 @@ def frames_of(size, **camera):
 
 
 def simulator_of(count, weather="rain"):
-    """Inputs of the simulated radar for frames of a scene, and the function that projects them."""
+    """Returns inputs of the simulated radar for frames of a scene, and the simulating function."""
     config = SimulationConfig.from_mapping(default_config() | FULL_SIZE)
     sequence = make_sequence(
         1, environment="urban", time="day", weather=weather, num_frames=count,
@@ -92,7 +92,7 @@ def simulator_of(count, weather="rain"):
 
 @contextlib.contextmanager
 def folder_of_records(count, grid, dtype):
-    """Context with a folder of random projections as records."""
+    """Context manager of records with random projections in a temporary folder."""
     levels = np.random.default_rng(0).random(grid.projection_shape, np.float32)
     with tempfile.TemporaryDirectory() as folder:
         source = {"grid": grid.to_dict()}
@@ -103,7 +103,7 @@ def folder_of_records(count, grid, dtype):
 
 
 def labelled(records):
-    """Frames of the records, with five boxes each."""
+    """Returns the frames of the records, with five boxes each."""
     box = np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]])
     return [
         types.SimpleNamespace(
@@ -114,7 +114,7 @@ def labelled(records):
 
 
 def write_npy(folder, count, grid):
-    """Random projections as the released code stores them, float64."""
+    """Writes random float64 projections `[D+E, R, A]` like the released code; returns paths."""
     r, a, c = grid.projection_shape
     stored = np.random.default_rng(0).random((c, r, a))
     paths = [folder / f"DERA_tesseract_{i:05d}.npy" for i in range(count)]
@@ -124,7 +124,7 @@ def write_npy(folder, count, grid):
 
 
 def read_npy(paths, size, count):
-    """Read `count` frames with `np.load` and `np.stack`, the same files repeatedly."""
+    """Reads `count` frames in batches with `np.load` and `np.stack`; files repeat cyclically."""
     names = itertools.cycle(paths)
     for _ in range(count // size):
         np.stack([np.load(path) for path in itertools.islice(names, size)])
@@ -138,7 +138,7 @@ THRESHOLD, NMS_IOU = 0.3, 0.3
 
 
 def make_maps(num_peaks: int, seed: int = 0) -> DetectionMaps:
-    """Maps with single-bin peaks of distinct scores, too far apart to suppress each other."""
+    """Returns maps with single-bin peaks of distinct scores that are three or more bins apart."""
     rng = np.random.default_rng(seed)
     logits = rng.uniform(-6, -4, MAP_SHAPE).astype(np.float32)
     cells = [(i, j) for i in range(20, 256, 3) for j in range(1, 111, 3)]
@@ -153,7 +153,7 @@ def make_maps(num_peaks: int, seed: int = 0) -> DetectionMaps:
 
 
 def loop_decode(logits: np.ndarray, params: np.ndarray) -> list[tuple]:
-    """Decode (score, class, box) of every peak in a loop, then apply NMS; by descending score."""
+    """Decodes (score, class, box) of one frame's peaks in a loop, sorts them and applies NMS."""
     scores = 1 / (1 + np.exp(-logits))
     around = np.pad(scores, [(1, 1), (1, 1), (0, 0)], constant_values=-np.inf)
     around = np.lib.stride_tricks.sliding_window_view(around, (3, 3), (0, 1))
@@ -169,7 +169,7 @@ def loop_decode(logits: np.ndarray, params: np.ndarray) -> list[tuple]:
 
 
 def loop_nms(found: list[tuple]) -> list[tuple]:
-    """Greedy NMS in a loop: keep the best box, drop the boxes that overlap it, repeat."""
+    """Applies greedy NMS in a loop to boxes in descending order of score."""
     kept = []
     while found:
         best, rest = found[0], found[1:]
@@ -185,7 +185,7 @@ def loop_iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def jitted_decode(pre_nms):
-    """Jitted decoding of maps to boxes with the given number of peaks before NMS."""
+    """Returns a jitted decoder of maps with the given number of peaks before NMS."""
     return jax.jit(
         functools.partial(
             decode,
@@ -199,7 +199,7 @@ def jitted_decode(pre_nms):
 
 
 def peaks_on_host(num_peaks):
-    """Arguments of `loop_decode` for one frame's maps."""
+    """Returns the arguments of `loop_decode` for one frame's maps."""
     maps = make_maps(num_peaks)
     return [np.asarray(x[0]) for x in (maps.heatmap_logits, maps.box_params)]
 
@@ -211,12 +211,12 @@ SIZES = ((4.4, 1.9, 1.6), (9, 2.6, 3), (0.7, 0.7, 1.7), (2, 0.8, 1.5), (1.8, 0.7
 
 
 def synthetic_set(num_frames: int = 17536, false_per_frame: float = 2.0, seed: int = 0):
-    """Ground truth, predictions and frames with the counts of the real split."""
+    """Returns ground truth, predictions and frames with the object counts of the test split."""
     rng = np.random.default_rng(seed)
     counts = [int(n * num_frames / 17536) for n in COUNTS]
     cls = np.repeat(np.arange(5), counts)
     num = cls.size
-    # Objects gather in some frames, as in traffic.
+    # As in traffic, some frames have many objects and others few.
     weight = rng.gamma(0.7, size=num_frames)
     frame = np.sort(rng.choice(num_frames, num, p=weight / weight.sum()))
     rng.shuffle(cls)
@@ -260,8 +260,8 @@ def synthetic_set(num_frames: int = 17536, false_per_frame: float = 2.0, seed: i
 
 
 def onnx_session(path):
-    """Function from a projection to all outputs of an exported detector."""
-    import onnxruntime  # of the extra "onnx"
+    """Returns a function from a projection to all outputs of an exported detector."""
+    import onnxruntime  # an optional dependency, in the extra "onnx"
 
     session = onnxruntime.InferenceSession(path)
     settings = {"score_threshold": 0.0, "nms_iou": 0.3, "roi": [-1e9, 1e9] * 3}

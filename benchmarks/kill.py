@@ -2,14 +2,13 @@
 
     python benchmarks/kill.py --kills 20 [--seed 0] [--workdir DIR]
 
-An uninterrupted run comes first, then the same run is killed again and again after a random time,
-up to the duration of a whole start. A run that ends before it is killed is compared, and another
-one begins. All parameters, the logged losses and the metrics of the evaluation must be
-bit-identical.
+After an uninterrupted run, the same run is started and killed again and again. Each kill comes
+after a random time of up to the duration of a whole run, or of `--longest` seconds. A run that ends
+before it is killed is compared, and another one begins. All parameters, the logged losses and the
+metrics of the evaluation must be equal to those of the uninterrupted run.
 
-Data and records are made by the uninterrupted run, so that no kill interrupts simulation or
-preprocessing, and there is no evaluation during training. `tests/test_quickstart.py` kills at all
-stages.
+The uninterrupted run simulates and preprocesses the data, so that no kill interrupts these stages,
+and there is no evaluation during training. `tests/test_quickstart.py` kills at all stages.
 """
 
 import argparse
@@ -32,7 +31,7 @@ from radejax.runs import experiment
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 
-# Every start forks a process that has imported the modules; imports are not tested.
+# Every start forks a process that has already imported the modules, as imports are not tested.
 PROCESSES = multiprocessing.get_context("forkserver")
 PROCESSES.set_forkserver_preload(
     ["radejax.cli.entry", "radejax.runs.evaluate", "radejax.simulation.dataset"]
@@ -40,7 +39,7 @@ PROCESSES.set_forkserver_preload(
 
 
 def make_config(steps):
-    """The quickstart, so small that a start takes longer than training."""
+    """Returns a quickstart config that is so small that starting takes longer than training."""
     path = REPOSITORY / "configs" / "quickstart.py"
     module = load_module(path)
     config = module.get_config("short")
@@ -53,7 +52,7 @@ def make_config(steps):
         neck="plain",
         heads="default",
     )
-    # Ten frames are two steps per epoch.
+    # Ten frames are two steps per epoch, as incomplete batches are dropped.
     config.train.update(
         num_epochs=steps // 2, checkpoint_every_steps=7, log_every_steps=5
     )
@@ -62,7 +61,7 @@ def make_config(steps):
 
 
 def run(folder, name, steps):
-    """Train in a child process."""
+    """Trains and evaluates in a child process, which writes its output into a log file."""
     sys.stdout = sys.stderr = (folder / f"{name}.log").open("a")
     jax.config.update("jax_platforms", "cpu")
     entry.set_up_jax()
@@ -84,7 +83,7 @@ def finish(process):
 
 
 def stage(folder):
-    """Stage that a killed run had reached."""
+    """Returns the stage that a killed run had reached."""
     if (folder / "evaluation").exists():
         return "evaluation"
     steps = [p.name for p in (folder / "checkpoints").glob("*") if p.name.isdigit()]
@@ -92,7 +91,7 @@ def stage(folder):
 
 
 def same(folder, a, b):
-    """Names of the values that differ."""
+    """Returns the kinds of results that differ between two runs."""
     different = []
     variables = [load_model(folder / run).variables for run in (a, b)]
     equal = jax.tree.map(np.array_equal, *variables)
@@ -160,7 +159,7 @@ def main():
 
 
 def compare(folder, process, name):
-    """Exit if a finished run differs from the uninterrupted one."""
+    """Exits if a run failed or differs from the uninterrupted one; waits for its end first."""
     finish(process)
     different = same(folder, "undisturbed", name)
     if different:

@@ -14,9 +14,9 @@ class ModuleCall:
     """One call of a module.
 
     Attributes:
-        module: The unbound module; apply it with its own part of the variables.
-        args: Arrays of the call.
-        kwargs: Other arguments, such as `train=False`.
+        module: The unbound module, which is applied with its own part of the variables.
+        args: Positional arguments of the call.
+        kwargs: Keyword arguments of the call, such as `train=False`.
         output: Result of the call.
     """
 
@@ -27,15 +27,16 @@ class ModuleCall:
 
 
 def module_calls(run: Callable[[], Any], depth: int = 1) -> dict[str, ModuleCall]:
-    """The calls of a model's parts while it runs, by their names in the parameters.
+    """Records the calls of a model's submodules while it runs.
 
     Args:
-        run: Applies or initializes a model, also while it is traced.
-        depth: Most levels of parts: 1 for those of the model itself.
+        run: Function that applies or initializes a model; it may be traced.
+        depth: Maximum depth of the submodules; 1 for the direct submodules of the model.
 
     Returns:
-        In the order in which the calls end: "backbone", "neck", "heads", and with depth
-        2 "backbone/stem"; the last call of a part that is called several times.
+        Calls by the path of the submodule in the parameters, such as "backbone", or
+        "backbone/stem" with depth 2, in the order in which their first calls end. Of a
+        submodule that is called several times, the last call is kept.
 
     Examples:
         >>> calls = module_calls(lambda: model.apply(variables, projection))  # doctest: +SKIP

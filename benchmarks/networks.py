@@ -1,6 +1,7 @@
 """Benchmarks of the networks, compared with the same networks in PyTorch with the same weights.
 
-Random weights and inputs at full size: 256 x 107 x 101 projections, 720 x 1280 images.
+Weights and inputs are random and have full size: projections of 256 x 107 x 101, images of
+720 x 1280 pixels.
 """
 
 import functools
@@ -38,11 +39,11 @@ FORWARD = [
 ]
 TRAINING = [("bfloat16", 8), ("bfloat16", 32), ("tf32", 8), ("float32", 8)]
 COMPILED = {("bfloat16", 8), ("bfloat16", 10), ("tf32", 8), ("tf32", 10)}
-"""Dtypes and batch sizes on an accelerator; those that `torch.compile` runs as well."""
+"""Dtypes and batch sizes on an accelerator for which `torch.compile` is measured as well."""
 
 
 def settings(machine, those):
-    """Pairs of dtype and batch size that fit into memory."""
+    """Returns the pairs of dtype and batch size to measure: on a CPU, float32 and one frame."""
     return [("float32", 1)] if machine["platform"] == "cpu" else those
 
 
@@ -61,7 +62,7 @@ def random_variables(model, *arguments):
 
 
 def network(path, dtype, **fields):
-    """Config, model and precision of its matrix products."""
+    """Returns config, model and the precision of its matrix products; None is the default."""
     config = load_config(str(CONFIGS / path))
     config.model.update(
         dtype="bfloat16" if dtype == "bfloat16" else "float32", **fields
@@ -71,7 +72,7 @@ def network(path, dtype, **fields):
 
 
 def torch_state(model, variables):
-    """Parameters with the tensor names of `torch_dinorade.DinoRade`."""
+    """Returns the variables as a state dict of `torch_dinorade.DinoRade`."""
     params = dict(variables["params"])
     rules = (
         *radenet_torch.neck_rules("image_fusion/radar_neck", "radar_neck.neck"),
@@ -103,19 +104,19 @@ def rivals(machine, *arguments):
 
 
 def same_maps(machine, maps):
-    """Difference between the maps of radejax and torch; None without torch."""
+    """Returns the difference between the maps of radejax and torch, or None without torch."""
     if not machine["rival"]:
         return None
     ours = [np.moveaxis(np.asarray(x), -1, 1) for x in jax.tree.leaves(maps)]
-    # Torch's are on the padded bins.
+    # The maps of torch include the padded azimuth bins.
     theirs = [x[..., : ours[0].shape[-1]] for x in machine["rival"].outputs()]
     return difference(ours, theirs)
 
 
 def step_of(config, model, variables, batch, precision):
-    """Training step of radejax, which keeps its state, and the fields of a `Case` with its cost.
+    """Returns a training step of radejax and the fields of a `Case` with its cost.
 
-    The function takes a batch or uses the one given here.
+    The step keeps its state between calls. It takes a batch, by default the one given here.
     """
     optimizer = make_optimizer(lambda _: 1e-4, weight_decay=0.01)
     state = create_state(
@@ -146,7 +147,7 @@ NO_LOSSES = "ours with the losses, torch's with a mean square in their place"
 
 
 def radenet(machine):
-    """RADE-Net's forward pass."""
+    """Forward pass of RADE-Net."""
     for dtype, size in settings(machine, FORWARD):
         config, model, precision = network("radenet.py", dtype)
         x = inputs.frames_of(size).projection
@@ -169,7 +170,7 @@ def radenet(machine):
 
 
 def radenet_training(machine):
-    """RADE-Net's training step."""
+    """Training step of RADE-Net, on an accelerator also with rematerialization."""
     chosen = [(*pair, "none") for pair in settings(machine, TRAINING)]
     if machine["platform"] != "cpu":
         chosen += [("bfloat16", 32, kind) for kind in ("blocks", "full")]
@@ -214,7 +215,7 @@ def feeding(machine):
             spent[-1] = spent[-1][0], time.perf_counter() - began
 
         def note():
-            waits, walls = zip(*spent[1:], strict=True)  # without what fills the queue
+            waits, walls = zip(*spent[1:], strict=True)  # the first fills the queue
             return f"waits for data: {sum(waits) / sum(walls):.2%}"
 
         yield Case(
@@ -240,7 +241,7 @@ def dinorade(machine, task="forward"):
             inputs.CALIBRATION.camera(), model.query_grid, 256, 112
         ).points
         places = np.asarray(places, np.float32)
-        # All in the image, as torch's has it.
+        # All queries count as in view, as in the PyTorch network.
         camera = ReferencePoints(places, np.ones(places.shape[:-1], bool))
         batch = inputs.frames_of(size, image=image, camera=camera)
         arguments = batch.projection, image, camera
@@ -280,7 +281,7 @@ def dinorade(machine, task="forward"):
 
 
 def attention(machine):
-    """Deformable attention of 286,720 queries on a 180 x 320 map."""
+    """Deformable attention of 286,720 queries on a camera map of 180 x 320."""
     width, heads, points = ATTENTION
     bins, elevation = 256 * 112, 10
     rng = np.random.default_rng(0)
@@ -329,7 +330,7 @@ def attention(machine):
 
 
 def detector(machine):
-    """Tesseracts in host memory to boxes, compared with the released sequence of steps."""
+    """Tesseracts in host memory to boxes, compared with the steps of the released code."""
     is_cpu = machine["platform"] == "cpu"
     for dtype, size in itertools.product(
         ("float32",) if is_cpu else ("bfloat16", "tf32"), (1, 10)
@@ -362,7 +363,7 @@ def detector(machine):
 
 
 def released_chain(frames, network, maps):
-    """Wall and CPU seconds of projection, network and loops over peaks, in turn."""
+    """Returns total wall and CPU seconds of projection, network and loops over peaks."""
     parts = [
         timed(lambda: [inputs.project_released(frame) for frame in frames]),
         network(),

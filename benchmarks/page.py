@@ -1,4 +1,4 @@
-"""Tables of `docs/reports/benchmarks.md` from the JSON files in `docs/reports/benchmarks/`."""
+"""Writes tables into `docs/reports/benchmarks.md` from JSON in `docs/reports/benchmarks/`."""
 
 import json
 import pathlib
@@ -13,7 +13,7 @@ BEGIN, END = "<!-- tables: benchmarks/run.py -->", "<!-- end of tables -->"
 
 
 def store(run, folder):
-    """Write a run into its device's file and keep the file's other measurements."""
+    """Writes a run into the file of its device, replacing earlier results of its benchmarks."""
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^a-z0-9]+", "_", run["device"].lower()).strip("_")
     path = folder / f"{name}.json"
@@ -26,7 +26,7 @@ def store(run, folder):
 
 
 def write_page():
-    """Write the tables of all JSON files between the two markers of the page."""
+    """Writes the tables of all JSON files between the two markers of the page."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
     before, rest = PAGE.read_text().split(BEGIN)
     _, after = rest.split(END)
@@ -35,14 +35,14 @@ def write_page():
 
 
 def table(result):
-    """Markdown table of one JSON file."""
+    """Returns the Markdown of the tables of one JSON file."""
     if "tables" in result:
         return "\n\n".join(map(plain_table, result["tables"]))
     return devices_table(result["runs"]) if "runs" in result else programs_table(result)
 
 
 def plain_table(content):
-    """Markdown of a table written by hand, with title and text."""
+    """Returns the Markdown of a manually written table with title and text."""
     lines = [f"### {content['title']}", "", content["text"], ""]
     head, rows = content["columns"], content["rows"]
     lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)]
@@ -50,7 +50,7 @@ def plain_table(content):
 
 
 def devices_table(runs):
-    """Markdown of the measurements of `run.py` on one device, from one or several runs."""
+    """Returns the Markdown of the measurements of one or several runs on one device."""
     lines = [
         f"### {runs[-1]['device']}",
         "",
@@ -78,7 +78,7 @@ def devices_table(runs):
 
 
 def row_text(row, where):
-    """Row of a device's table; on a CPU, CPU times are shown and compared as well."""
+    """Returns a row of a device's table; on a CPU, it lists CPU times too and compares these."""
     is_cpu = where == "cpu"
     clock = row["processor_s" if is_cpu else "wall_s"]
     others = [name for name in clock if name != "radejax"]
@@ -109,14 +109,14 @@ def row_text(row, where):
 
 
 def duration(seconds):
-    """Duration with three digits and a unit."""
+    """Formats a duration with three significant digits and a unit."""
     if seconds >= 1:
         return f"{seconds:.3g} s"
     return f"{1e3 * seconds:.3g} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.3g} us"
 
 
 def programs_table(result):
-    """Markdown of the results of `programs.py`."""
+    """Returns the Markdown of the results of `programs.py`."""
     devices = list(result["programs"][0]["least_ms_a_frame"])
     lines = [
         "### Programs, lowered for CUDA and not run",

@@ -1,4 +1,4 @@
-"""Analyzes programs that are lowered for GPU and TPU without running them; lower time bounds.
+"""Analyzes programs lowered for GPUs without running them, and computes lower bounds of their time.
 
     python benchmarks/programs.py    # full size, bfloat16; a minute, without accelerator
 
@@ -6,10 +6,10 @@ Writes `docs/reports/benchmarks/programs.json` and its table in `docs/reports/be
 
 Every program is lowered with `jax.export` for a platform that need not be available. `facts`
 extracts types, host callbacks, convolutions, transposes and loops from its text. `work` counts the
-operations and bytes of matrix products, convolutions and gathers, including loops and the chosen
-branches of `platform_dependent`, which XLA's own analysis counts once or not at all. Everything
-else is elementwise or a reduction and is fused. The lower bound is the sum over these operations
-of the larger of operations / peak and bytes / bandwidth.
+operations and bytes of matrix products, convolutions, gathers and scatters, including loops and
+the chosen branches of `platform_dependent`, which XLA's own analysis counts once or not at all.
+Other operations, most of which can be fused, are not counted. The lower bound is the sum over the
+counted operations of the larger of operations / peak and bytes / bandwidth.
 """
 
 import argparse
@@ -40,9 +40,9 @@ import page
 
 CONFIGS = pathlib.Path(__file__).parents[1] / "configs"
 
-# Dense peaks: bfloat16 and TF32 in FLOP/s, memory in byte/s, from NVIDIA's data sheets of
-# H100 SXM, H200 SXM and A100 SXM 80 GB; of AGX Orin 64 GB from its technical brief, where
-# 170 sparse INT8 TOP/s of the GPU are 42.5 dense in 16 bits and 21.25 in TF32.
+# Dense peaks of bfloat16 and TF32 in FLOP/s and of the memory in byte/s. Those of H100 SXM,
+# H200 SXM and A100 SXM 80 GB are from NVIDIA's data sheets, those of AGX Orin 64 GB from its
+# technical brief: 170 sparse INT8 TOP/s are 42.5 dense in 16 bits and 21.25 in TF32.
 DEVICES = {
     "H100": (989e12, 494e12, 3.35e12),
     "H200": (989e12, 494e12, 4.8e12),
@@ -59,7 +59,7 @@ def shape_of(*shape, dtype=jnp.float32):
 
 
 def batch_of(model, grid, size, max_objects=16):
-    """Shapes of a training batch."""
+    """Returns the shapes of a training batch."""
     rows = size, max_objects
     image = camera = None
     if models.has_camera(model):
@@ -76,7 +76,7 @@ def batch_of(model, grid, size, max_objects=16):
 
 
 def detector(config, grid, size):
-    """The function from projections to detections, and the shapes of its arguments."""
+    """Returns the function from inputs to detections, and the shapes of its arguments."""
     model = models.build(config.model)
     batch = batch_of(model, grid, size)
     inputs = [x for x in (batch.projection, batch.image, batch.camera) if x is not None]
@@ -87,7 +87,7 @@ def detector(config, grid, size):
 
 
 def train_step(config, grid, size):
-    """One step of training, and the shapes of its arguments."""
+    """Returns the training step, and the shapes of its arguments."""
     model = models.build(config.model)
     _, (variables, *_) = detector(config, grid, size)
     optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.01)
@@ -105,7 +105,7 @@ def train_step(config, grid, size):
 
 
 def simulator(grid, num_scatterers=1024):
-    """One simulated frame, fused to its projection, and the shapes of its arguments."""
+    """Returns the simulation of one frame's projection, and the shapes of its arguments."""
     points = [shape_of(num_scatterers)] * 4
     scatterers = tensor.Scatterers(*points, amplitude=shape_of(num_scatterers, 2))
     noise = shape_of(grid.num_range, grid.num_doppler)
@@ -114,7 +114,7 @@ def simulator(grid, num_scatterers=1024):
 
 
 def text_of(function, arguments, platform):
-    """The StableHLO text of a program for a platform."""
+    """Returns the StableHLO text of a program for a platform."""
     exported = jax.export.export(jax.jit(function), platforms=(platform,))(*arguments)
     return exported.mlir_module()
 
@@ -123,12 +123,11 @@ def text_of(function, arguments, platform):
 
 
 def facts(text):
-    """Facts from a program's text.
+    """Extracts facts from a program's text.
 
-    Returns:
-        "ops" by name; "types" of elements; "calls" to external code; "convolutions" by result
-        type; "turned": shapes of the arrays of four or more axes whose innermost axis a
-        transpose moves; "wide": operations that compute in 64 bits.
+    "ops", "calls" (to external code) and "convolutions" (by result type) are counts. "types" is
+    the set of element types. "turned" lists the shapes of arrays with four or more axes whose
+    innermost axis a transpose moves. "wide" has the source locations of 64-bit operations.
     """
     lines = text.splitlines()
     turned = []
@@ -165,18 +164,17 @@ def facts(text):
 
 
 def work(function, arguments, platform):
-    """FLOPs and bytes of all products, convolutions, gathers and scatters.
+    """Lists (name, dtype, FLOPs, bytes, times) of all products, convolutions, gathers and scatters.
 
-    Returns:
-        List of (name, dtype, FLOPs, bytes, times), `times` for what is in a loop of known
-        length; loops until a condition holds (NMS) count once.
+    `times` is the product of the lengths of the enclosing scans. Loops with a condition, such as
+    that of NMS, count once. Of scatters, only those that add are listed.
     """
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return list(_work(jaxpr, platform, 1))
 
 
 def _work(jaxpr, platform, times):
-    chosen = {}  # the branch that a platform's index names
+    chosen = {}  # index of the platform's branch
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name == "platform_index":
@@ -214,7 +212,7 @@ def _flops(eqn):
 
 
 def least_seconds(found, device):
-    """Lower bound of a device's time in seconds, see the module docstring."""
+    """Returns the lower bound of a device's time in seconds; see the module docstring."""
     bfloat16, tf32, bandwidth = DEVICES[device]
     total = 0.0
     for _, dtype, flops, moved, times in found:
@@ -227,7 +225,7 @@ def least_seconds(found, device):
 
 
 def full_size(size, dtype="bfloat16"):
-    """Name -> function, arguments and frames of every program at full size."""
+    """Returns function, shapes of arguments and number of frames of each program by name."""
     grid = RadarGrid.kradar()
     programs = {"simulator": (*simulator(grid), 1)}
     for name, path in (("RADE-Net", "radenet.py"), ("DinoRADE", "dinorade.py")):
@@ -245,7 +243,7 @@ HEAVY = (
 
 
 def rows(size):
-    """One row per program: its facts and the lower bound in milliseconds per frame."""
+    """Yields the facts of each program and its lower bounds in milliseconds per frame."""
     for name, (function, arguments, frames) in full_size(size).items():
         sys.stderr.write(f"{name}\n")
         found = work(function, arguments, "cuda")

@@ -1,9 +1,10 @@
-"""Evaluates one set of predictions in all protocols: the tables of docs/why_aps_differ.md.
+"""Evaluates one set of predictions in all protocols, as in docs/reports/protocol_comparison.md.
 
     python benchmarks/protocols.py ../shared/fixtures/kradar_eval
 
-The folder has ground_truth.npz and predictions.npz (columns frame, box, cls, score and class_names,
-and a frame table frame_weather). Prints Markdown tables.
+The folder has ground_truth.npz and predictions.npz with the columns frame, box, cls and, for
+predictions, score. Both also have class_names, which cls indexes, and the weather of every frame
+in frame_weather. The tables are printed as Markdown.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from radejax.evaluation.report import Table, number
 
 
 def load(folder: pathlib.Path) -> tuple[EvaluationSet, np.ndarray]:
-    """The evaluation set in the narrow region, and the weather of every frame."""
+    """Returns the evaluation set in the narrow region, and the weather of every frame."""
     tables = []
     for name in ("ground_truth", "predictions"):
         file = np.load(folder / f"{name}.npz")
@@ -28,7 +29,7 @@ def load(folder: pathlib.Path) -> tuple[EvaluationSet, np.ndarray]:
 
 
 def show(title: str, data: EvaluationSet, rows: dict) -> None:
-    """Prints one table; `rows` are labels and keyword arguments of `results`."""
+    """Prints one table; `rows` maps labels to keyword arguments of `EvaluationSet.results`."""
     body = []
     for label, options in rows.items():
         results = data.results(**options)

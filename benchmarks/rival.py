@@ -1,6 +1,6 @@
-"""PyTorch networks in a second process, for comparison in alternation.
+"""PyTorch networks in a second process, for interleaved comparison.
 
-While one process runs, the other waits, so that threads and memory do not interfere. The code of
+While one process computes, the other one waits, so that their threads do not compete. The code of
 the second process is `torch_half.py`.
 """
 
@@ -17,16 +17,16 @@ ATTENTION = 128, 4, 4
 
 
 class Rival:
-    """PyTorch in another process; `columns` are measured next to radejax.
+    """PyTorch in another process, whose `columns` are measured next to radejax.
 
     Args:
-        device: "cpu" or "cuda".
+        device: "cpu" or "cuda". `is_there` is False if PyTorch does not find it.
     """
 
     def __init__(self, device):
         key = os.urandom(16)
         with multiprocessing.connection.Listener(authkey=key) as listener:
-            ours = "GLIBC_TUNABLES"  # of radejax.core.memory: torch has the defaults
+            ours = "GLIBC_TUNABLES"  # of radejax.core.memory; torch uses defaults
             theirs = {k: v for k, v in os.environ.items() if k != ours}
             code = "import sys, torch_half; torch_half.serve(*sys.argv[1:])"
             self._process = subprocess.Popen(
@@ -38,7 +38,7 @@ class Rival:
         self.is_there = self._connection.recv()
 
     def ask(self, *message):
-        """Send a message and return the answer; an exception there is raised here."""
+        """Sends a message and returns the answer, or raises it if it is an exception."""
         self._connection.send(message)
         answer = self._connection.recv()
         if isinstance(answer, Exception):
@@ -46,12 +46,12 @@ class Rival:
         return answer
 
     def columns(self, what, *arguments):
-        """Name -> function that gives wall and CPU seconds of what is built."""
+        """Builds a network; returns functions that run it and return wall and CPU seconds."""
         names = self.ask("build", what, *arguments)
         return {name: functools.partial(self.ask, "time", name) for name in names}
 
     def outputs(self):
-        """Arrays that a call gives."""
+        """Runs the network that was built last and returns its outputs as arrays."""
         return self.ask("outputs", "torch")
 
     def close(self):
@@ -60,7 +60,7 @@ class Rival:
 
 
 def start(platform):
-    """Start PyTorch on the device of JAX; None if it is not installed or lacks the device."""
+    """Starts PyTorch on the device of JAX; None if it is not installed or lacks the device."""
     if importlib.util.find_spec("torch") is None:
         return None
     rival = Rival("cpu" if platform == "cpu" else "cuda")

@@ -5,11 +5,12 @@
     python benchmarks/run.py --minutes 15          # what did not fit is listed
     python benchmarks/run.py --tables              # only write the tables again
 
-radejax and torch (where it is installed: eager, and `torch.compile` on a GPU) run in two processes
-that alternate. Results are compared first; a case whose results differ is an error. Writes
-`docs/reports/benchmarks/DEVICE.json` and the tables of `docs/reports/benchmarks.md`. Times are
-medians of wall and CPU time per frame. Ratios are of CPU time on a CPU, where other processes may
-run, and of wall time otherwise. New measurements replace earlier ones of the same file.
+radejax and, if it is installed, torch (eager, and with `torch.compile` on a GPU) run in two
+processes that alternate. Results are compared first; a case whose results differ is not measured,
+and the exit code is 1. Writes `docs/reports/benchmarks/DEVICE.json` and the tables of
+`docs/reports/benchmarks.md`. Times are medians of wall and CPU time per frame. Speedups are ratios
+of CPU times on a CPU, where other processes may run, and of wall times otherwise. New measurements
+replace earlier ones of the same benchmarks on the same device.
 """
 
 import argparse
@@ -25,7 +26,7 @@ import time
 import traceback
 from importlib import metadata
 
-# torch needs memory of the GPU as well.
+# By default, JAX would reserve most of the GPU's memory, which torch needs as well.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
@@ -36,7 +37,7 @@ from cases import BENCHMARKS
 from radejax.core import memory
 
 MAX_REPEATS = 20
-SECONDS_A_CASE = 30.0  # the first repeats are slower: memory is still asked for
+SECONDS_A_CASE = 30.0  # the first repeats are slower, as they still allocate memory
 
 
 def main():
@@ -51,7 +52,7 @@ def main():
     arguments = parser.parse_args()
     is_whole = True
     if not arguments.tables:
-        memory.restart_with_huge_pages()  # as every command; torch's process does not
+        memory.restart_with_huge_pages()  # like every command, unlike the process of torch
         jax.config.update("jax_enable_compilation_cache", False)
         chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
         result = run(
@@ -65,9 +66,9 @@ def main():
 
 
 def run(chosen, seconds, store=lambda so_far: None):
-    """Run the benchmarks that fit into the time; returns the content of the JSON file.
+    """Runs the benchmarks that fit into the time and returns the results of the run.
 
-    The file is written after each benchmark, so that an interrupted run keeps its results.
+    They are passed to `store` after each benchmark, so that an interrupted run keeps its results.
     """
     began = time.perf_counter()
     device = jax.devices()[0]
@@ -95,7 +96,7 @@ def run(chosen, seconds, store=lambda so_far: None):
                     not_run.append(f"{name} from {case.name}, {case.dtype} on")
                     break
                 rows.append({"benchmark": name} | measured(case, left))
-        except Exception as error:  # said in the table; the others are measured yet
+        except Exception as error:  # the table lists it; others still run
             traceback.print_exc()
             rows.append({"benchmark": name, "name": name, "refused": repr(error)[:300]})
         store(so_far())
@@ -107,7 +108,7 @@ def run(chosen, seconds, store=lambda so_far: None):
 
 
 def measured(case, seconds_left):
-    """One row: medians by column of interleaved calls, after a first call of each."""
+    """Returns a row with medians by column of interleaved calls after a first call of each."""
     row = {"name": case.name, "dtype": case.dtype, "frames": case.frames}
     row |= {"error": case.error, "mib": case.mib, "compile_s": case.compile_s}
     if case.error is not None and not case.error <= case.tolerance:
@@ -135,7 +136,7 @@ def measured(case, seconds_left):
 
 
 def facts(device, *more):
-    """Versions, machine and date of a run."""
+    """Returns device, date, versions, load and command of a run."""
     packages = ("jax", "numpy", *filter(None, more))
     name = device.device_kind
     if device.platform == "cpu":
@@ -152,9 +153,9 @@ def facts(device, *more):
 
 
 def processor_name(path=pathlib.Path("/proc/cpuinfo")):
-    """Name of the CPU, or its architecture where Linux has none.
+    """Returns the name of the CPU, or its architecture if Linux does not list a name.
 
-    It includes family and model, as virtual machines may call every generation "AMD EPYC".
+    The name includes family and model, as virtual machines may call every generation "AMD EPYC".
     """
     text = path.read_text() if path.is_file() else ""
     said = dict(re.findall(r"^([\w ]+?)\s*: (.+)$", text, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""Measures the time from a tensor in host memory to boxes, by stage and module.
+"""Measures the time from a tensor in host memory to boxes by stage and module.
 
 python benchmarks/stages.py runs/quickstart --batch-size 1 10
 """
@@ -32,10 +32,11 @@ STAGES = ("transfer", "projection", "network", "decode + NMS")
 
 
 def untrained(config: ConfigDict, **overrides: Any) -> Detector:
-    """Detector with random weights of a config, on the sensor that it is made for.
+    """Returns a detector with random weights for a config.
 
     Args:
-        config: A whole config.
+        config: A complete config. Its `simulation` section gives the grid; without one, the grid
+            is K-Radar's.
         **overrides: Arguments of `Detector`.
     """
     grid = RadarGrid.kradar()
@@ -45,7 +46,7 @@ def untrained(config: ConfigDict, **overrides: Any) -> Detector:
     inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
     if models.has_camera(model):
         inputs += placeholder(1, model)
-    # Only shapes: compiling the initialization takes longer than measuring.
+    # Only shapes are computed, as compiling the initialization takes longer than measuring.
     shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(0)
     variables = jax.tree.map(
@@ -62,23 +63,23 @@ def measure(
     tesseract: bool = True,
     seed: int = 0,
 ) -> list[dict[str, Any]]:
-    """Time calls of a detector on random tensors, its stages and the network's parts.
+    """Times calls of a detector on random tensors, its stages and the network's submodules.
 
-    Stages and parts are timed separately, each until its result is ready. The whole is one
-    call of the detector, in which the compiler and asynchronous dispatch may overlap the
-    stages. All are interleaved in every repeat, and the best repeat counts.
+    Stages and submodules are timed separately, each until its result is ready. The whole is
+    one call of the detector, in which the compiler and asynchronous dispatch may overlap the
+    stages. All are interleaved in every repeat, and the shortest time is returned.
 
     Args:
-        detector: A detector; a radar-camera model gets black images.
+        detector: A detector; a radar-camera model gets black images that count as valid.
         batch_sizes: Numbers of frames per call.
         repeats: Number of repeats after a first call that compiles.
-        tesseract: Start from tesseracts; otherwise from projections, without that stage.
+        tesseract: Whether the input is tesseracts or projections, which omits a stage.
         seed: Seed of the random tensors.
 
     Returns:
-        One dictionary per batch size: batch, input, seconds of every stage ("stages"), of
-        their sum, of the network's parts ("parts": backbone, neck, heads, and the camera's)
-        and of the whole call, frames_per_s of the whole, device, and jax's version.
+        One dictionary per batch size with "batch", "input", "device", "jax" (version), the
+        seconds of each stage ("stages"), of their sum ("sum_s"), of the network's submodules
+        ("parts") and of the whole call ("whole_s"), and its "frames_per_s".
 
     References:
         Leitgeb et al., RADE-Net, section IV-B.2: backbone, neck and head of batches of 10
@@ -147,7 +148,7 @@ def _measure(
 def _parts(
     model: nn.Module, variables: Mapping[str, Any], inputs: tuple[Any, ...]
 ) -> dict[str, Callable[[], Any]]:
-    """Calls of the network's parts with the arguments that they have in the network."""
+    """Returns calls of the network's submodules with the arguments that the network passes."""
     calls: dict[str, ModuleCall] = {}
 
     @jax.jit
@@ -166,7 +167,7 @@ def _parts(
 
 
 def _best(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Shortest time of each function, interleaved, after one call that compiles."""
+    """Returns the shortest of interleaved times of each function after a call that compiles."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for repeat in range(repeats + 1):
         for name, function in functions.items():
@@ -178,9 +179,9 @@ def _best(functions: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str,
 
 
 def as_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Milliseconds of every stage with its share of their sum, one column per batch size.
+    """Formats the milliseconds of each stage and their percentage of the sum by batch size.
 
-    The network's parts are below it; within the network, the compiler may fuse them.
+    The network's submodules are listed below it. Within the network, the compiler may fuse them.
     """
     names = [n for n in STAGES if any(n in row["stages"] for row in rows)]
     header = ["from " + rows[0]["input"], *(f"batch {r['batch']}" for r in rows)]
@@ -202,7 +203,7 @@ def _cell(row: Mapping[str, Any], seconds: float) -> str:
 
 
 def main() -> None:
-    """Times the model of a run or exported folder, or an untrained one of a config."""
+    """Times the model of a run, exported folder or file, or an untrained model of a config."""
     parser = argparse.ArgumentParser(description=__doc__)
     model = parser.add_mutually_exclusive_group(required=True)
     model.add_argument("source", nargs="?", help="Run, exported folder or .pth file.")

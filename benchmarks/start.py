@@ -1,7 +1,7 @@
-"""Measures the time from a command to its first step, and from import to the first boxes.
+"""Measures the time from the start of a process to its first training step or first boxes.
 
-Each time is that of a new process. "radejax" uses the compilation cache of an earlier start,
-"first start" has none.
+Each time is that of a new process. The column "radejax" uses the compilation cache of an earlier
+start, and the column "first start" uses an empty cache.
 """
 
 import functools
@@ -16,7 +16,7 @@ import time
 from case import Case
 
 _ROOT = pathlib.Path(__file__).resolve().parents[1]
-_FIRST_STEP = " 1/12 ["  # in the progress bar after the first step
+_FIRST_STEP = " 1/12 ["  # the progress bar contains it after the first step
 _DETECT = f"""
 import sys
 sys.path.append({str(_ROOT / "benchmarks")!r})
@@ -30,7 +30,7 @@ print("found:", np.asarray(found(x).scores).shape)
 
 
 def start(machine):
-    """Time from the command to the first step, and from `import radejax` to the first boxes."""
+    """Starts of `train.py` until its first step, and of a detector until its first boxes."""
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         numbers = itertools.count()
@@ -51,7 +51,7 @@ def start(machine):
             ("detector of RADE-Net, to its first boxes", detect),
         ):
             kept = folder / f"programs{next(numbers)}"
-            run(kept)  # also simulates and projects the data
+            run(kept)  # fills the cache; for training, also makes the data
             yield Case(
                 name=what,
                 columns={
@@ -63,10 +63,10 @@ def start(machine):
 
 
 def until(text, arguments, folder, programs):
-    """Wall and CPU seconds of a Python process until it writes a text.
+    """Returns wall and CPU seconds of a Python process until it writes a text.
 
     Args:
-        text: Text that ends the measurement; the process is stopped then.
+        text: Text that ends the measurement; the process is killed then.
         arguments: Arguments of the interpreter.
         folder: Working directory.
         programs: Folder of the compilation cache.
@@ -84,7 +84,7 @@ def until(text, arguments, folder, programs):
         stderr=subprocess.STDOUT,
     )
     output = b""
-    # The output is not read by lines, as the line of the progress bar has no end.
+    # The output is not read by lines, because the progress bar does not end its line.
     while chunk := process.stdout.read1():
         output += chunk
         if text.encode() in output:

@@ -1,10 +1,10 @@
 """DinoRADE in PyTorch, for comparison only.
 
-The network of `configs/dinorade.py` without options: layers and sizes as described in the paper and
-the released code, with every query in the image. Deformable attention is the pure PyTorch form
-(`grid_sample`), which the released code uses where its CUDA operator was not built; self-attention
-is PyTorch's fused one. Tensors of the radar branch have RADE-Net's released names, the others those
-of radejax's parameters (`networks.torch_state`).
+The network is that of `configs/dinorade.py` without options, with the layers and sizes of the paper
+and the released code, and every query counts as in view. Deformable attention has the pure PyTorch
+form (`grid_sample`), which the released code uses if its CUDA operator is not built. Self-attention
+is PyTorch's fused operator. Tensors of the radar branch have the names of the released RADE-Net,
+and the others those of radejax's parameters (`networks.torch_state`).
 """
 
 import collections
@@ -16,7 +16,7 @@ from torch.nn import functional
 
 
 class Block(nn.Module):
-    """Transformer block with rotary position embedding and layer scale."""
+    """Transformer block with rotary position embedding of patches and layer scale."""
 
     def __init__(self, c):
         super().__init__()
@@ -51,7 +51,7 @@ class Block(nn.Module):
 
 
 class ViT(nn.Module):
-    """`[B, 3, H, W]` -> patch tokens `[B, h, w, C]`."""
+    """Image transformer from normalized images `[B, 3, H, W]` to patch tokens `[B, h, w, C]`."""
 
     def __init__(self, c):
         super().__init__()
@@ -61,7 +61,7 @@ class ViT(nn.Module):
         self.layers = nn.ModuleList([Block(c) for _ in range(c["num_layers"])])
         self.norm = nn.LayerNorm(width)
         rows, columns = (n // self.patch for n in c["size"])
-        for name in ("cos", "sin"):  # of the rotary angles: they come with the weights
+        for name in ("cos", "sin"):  # of the rotary angles, loaded with the weights
             table = torch.zeros(rows * columns, width // c["num_heads"])
             self.register_buffer(name, table)
 
@@ -77,7 +77,7 @@ class ViT(nn.Module):
 
 
 class CameraNeck(nn.Module):
-    """Patch tokens `[B, h, w, C]` -> camera map `[B, features, 4h, 4w]`."""
+    """Upsampling from patch tokens `[B, h, w, C]` to a camera map `[B, features, 4h, 4w]`."""
 
     def __init__(self, inputs, features):
         super().__init__()
@@ -97,7 +97,7 @@ class CameraNeck(nn.Module):
 
 
 class Attention(nn.Module):
-    """Deformable cross-attention of lifted queries, mean over a bin's queries."""
+    """Deformable cross-attention of lifted queries, averaged over the queries of a bin."""
 
     def __init__(self, width, heads, points):
         super().__init__()
@@ -108,7 +108,7 @@ class Attention(nn.Module):
         self.output_proj = nn.Linear(width, width)
 
     def forward(self, feature, scale, points, camera):
-        """`[B, N, C]`, `[B, N, E]`, `[N, E, 2]`, `[B, C, h, w]` -> `[B, N, C]`."""
+        """Maps `[B, N, C]`, `[B, N, E]`, `[N, E, 2]` and `[B, C, h, w]` to `[B, N, C]`."""
         b, n, c = feature.shape
         h, w = camera.shape[2:]
         query = (scale[..., None] * feature[:, :, None]).flatten(1, 2)
@@ -127,11 +127,11 @@ class Attention(nn.Module):
 
 
 class DinoRade(nn.Module):
-    """Projection and image -> logits and boxes; the image backbone is frozen.
+    """Detector from projection and image to logits and boxes, with a frozen image backbone.
 
     Args:
         c: `config.model` of `configs/dinorade.py`.
-        points: `[R * A, E, 2]` places of the queries in the image.
+        points: `[R * A, E, 2]` reference points (x, y) in 0..1 of the queries in the image.
     """
 
     def __init__(self, c, points):
@@ -156,7 +156,7 @@ class DinoRade(nn.Module):
         self.register_buffer("points", points, persistent=False)
 
     def embed(self, image):
-        """`[B, H, W, 3]` uint8 -> features of the frozen backbone."""
+        """Normalizes images `[B, H, W, 3]` uint8 and returns their patch tokens."""
         with torch.no_grad():
             x = image.permute(0, 3, 1, 2).float() / 255
             mean = torch.tensor([0.485, 0.456, 0.406], device=x.device)
@@ -165,7 +165,7 @@ class DinoRade(nn.Module):
             return self.image_backbone(x)
 
     def forward(self, x, image):
-        """`[B, D+E, R, A]`, R and A padded, and `[B, H, W, 3]` uint8."""
+        """Takes projections `[B, D+E, R, A]` with padded R and A, and uint8 `[B, H, W, 3]`."""
         elevation = x[:, self.doppler_bins :]
         x = self.radar_neck(self.backbone(x))
         camera = self.camera_neck(self.image_neck(self.embed(image)))

@@ -1,4 +1,4 @@
-"""The second process of `rival.py`: networks in plain PyTorch."""
+"""Program of the second process of `rival.py`, which runs the PyTorch networks."""
 
 import functools
 import multiprocessing.connection
@@ -12,7 +12,7 @@ from rival import ATTENTION
 
 
 def serve(address, key, device):
-    """Build and run networks on request until None is received."""
+    """Builds and runs networks on request until None is received."""
     connection = multiprocessing.connection.Client(address, authkey=bytes.fromhex(key))
     connection.send(device == "cpu" or torch.cuda.is_available())
     torch.set_float32_matmul_precision("highest")
@@ -38,15 +38,15 @@ def _tensors(state):
 
 
 def _channels_first(x):
-    """`[B, R, A, C]` -> `[B, C, R, A]`, azimuth padded to a multiple of 8."""
+    """Converts `[B, R, A, C]` to `[B, C, R, A]` with azimuth padded to a multiple of 8."""
     x = np.pad(x, ((0, 0), (0, 0), (0, -x.shape[2] % 8), (0, 0)))
     return np.ascontiguousarray(x.transpose(0, 3, 1, 2))
 
 
 def _calls(device, network, dtype, task, is_compiled, inputs):
-    """Functions that run a task by column name: a forward pass or a training step.
+    """Returns functions by column name that run a forward pass or a training step.
 
-    A step is a forward pass, the gradient of the outputs' mean square, and AdamW.
+    A step is a forward pass, the gradient of the outputs' mean square, and an AdamW update.
     """
     torch.backends.cuda.matmul.allow_tf32 = dtype == "tf32"
     torch.backends.cudnn.allow_tf32 = dtype == "tf32"
@@ -86,21 +86,21 @@ def _calls(device, network, dtype, task, is_compiled, inputs):
 
 
 def radenet(device, config, state, projection, *how):
-    """RADE-Net with the released tensor names; `how` is as in `_calls`."""
+    """Builds RADE-Net; `how` is dtype, task and is_compiled as in `_calls`."""
     network = torch_radenet.RadeNet(config)
     network.load_state_dict(_tensors(state))
     return _calls(device, network, *how, [_channels_first(projection)])
 
 
 def dinorade(device, config, state, points, projection, image, *how):
-    """Whole network with its image backbone; `how` is as in `_calls`."""
+    """Builds DinoRADE with its image backbone; `how` is as in `radenet`."""
     network = torch_dinorade.DinoRade(config, torch.tensor(points))
     network.load_state_dict(_tensors(state))
     return _calls(device, network, *how, [_channels_first(projection), image])
 
 
 def attention(device, state, feature, scale, points, value):
-    """Forward pass of deformable attention."""
+    """Builds deformable attention, of which only the float32 forward pass is measured."""
     module = torch_dinorade.Attention(*ATTENTION)
     module.load_state_dict(_tensors(state))
     value = np.ascontiguousarray(value.transpose(0, 3, 1, 2))

@@ -1,7 +1,7 @@
-"""RADE-Net in PyTorch, for comparison only: speed, and reference values of tests.
+"""RADE-Net in PyTorch, only for comparing speed and as reference values of tests.
 
-Written from the description of the released network. Tensors have its names, so that state dicts
-can be converted by `radejax.weights.radenet_torch` in both directions.
+The network follows the description of the released one. Tensors have its names, so that
+`radejax.weights.radenet_torch` can convert state dicts in both directions.
 """
 
 import torch
@@ -18,7 +18,7 @@ def single_conv(inputs, outputs, groups):
 
 
 class SingleConv(nn.Module):
-    """Convolution, GroupNorm, SiLU."""
+    """3 x 3 convolution, GroupNorm and SiLU."""
 
     def __init__(self, inputs, outputs, groups):
         super().__init__()
@@ -29,7 +29,7 @@ class SingleConv(nn.Module):
 
 
 class DoubleConv(nn.Module):
-    """Two of them plus the input."""
+    """Two `SingleConv` and a shortcut, which has a 1 x 1 convolution if the widths differ."""
 
     def __init__(self, inputs, outputs, groups):
         super().__init__()
@@ -58,7 +58,7 @@ class Bottleneck(nn.Module):
 
 
 class Upsample(nn.Module):
-    """Transposed 2x2 convolution."""
+    """Transposed 2 x 2 convolution with stride 2."""
 
     def __init__(self, width):
         super().__init__()
@@ -69,7 +69,7 @@ class Upsample(nn.Module):
 
 
 class ChannelAttention(nn.Module):
-    """Factor per channel."""
+    """Factor per channel from its maximum and mean."""
 
     def __init__(self, width):
         super().__init__()
@@ -86,7 +86,7 @@ class ChannelAttention(nn.Module):
 
 
 class SpatialAttention(nn.Module):
-    """Factor per bin."""
+    """Factor per bin from the maximum and mean over channels, in the given order."""
 
     def __init__(self, mean_first):
         super().__init__()
@@ -101,7 +101,7 @@ class SpatialAttention(nn.Module):
 
 
 class CBAM(nn.Module):
-    """Both attentions, as released or as in the paper."""
+    """Channel and spatial attention, as released ("official") or as in the paper ("paper")."""
 
     def __init__(self, width, groups, kind):
         super().__init__()
@@ -128,7 +128,7 @@ def stem_conv(inputs, outputs, size, groups):
 
 
 class Stem(nn.Module):
-    """Doppler and elevation apart, then mixed."""
+    """Stem with separate convolutions of Doppler and elevation, and one that mixes them."""
 
     def __init__(self, doppler, elevation, width, groups):
         super().__init__()
@@ -144,7 +144,7 @@ class Stem(nn.Module):
 
 
 class Backbone(nn.Module):
-    """U-shaped encoder and decoder."""
+    """U-shaped encoder and decoder with optional attention on the skip connections."""
 
     def __init__(self, c):
         super().__init__()
@@ -189,7 +189,7 @@ class Backbone(nn.Module):
 
 
 class PlainBlock(nn.Module):
-    """Block of the plain neck."""
+    """Block of the plain neck: convolution, GroupNorm and SiLU."""
 
     def __init__(self, width, groups, dilation=1):
         super().__init__()
@@ -201,7 +201,7 @@ class PlainBlock(nn.Module):
 
 
 class DilatedBlock(nn.Module):
-    """Block of the dilated neck."""
+    """Residual block of the dilated neck."""
 
     def __init__(self, width, groups, dilation):
         super().__init__()
@@ -214,7 +214,7 @@ class DilatedBlock(nn.Module):
 
 
 class Neck(nn.Module):
-    """Three blocks."""
+    """Neck of three blocks, whose dilations are 1, 2 and 3 in the dilated neck."""
 
     def __init__(self, c):
         super().__init__()
@@ -230,7 +230,7 @@ class Neck(nn.Module):
 
 
 class Head(nn.Module):
-    """One head."""
+    """Head of one narrow convolution block, or of three wide ones if expanded."""
 
     def __init__(self, c, outputs):
         super().__init__()
@@ -247,7 +247,7 @@ class Head(nn.Module):
 
 
 class Heads(nn.Module):
-    """Heatmap and box parameters."""
+    """Heads of the heatmap and the box parameters."""
 
     def __init__(self, c):
         super().__init__()
@@ -259,9 +259,9 @@ class Heads(nn.Module):
 
 
 class RadeNet(nn.Module):
-    """`[B, D+E, R, A]`, R and A padded -> logits `[B, C, R, A]`, boxes `[B, 8, R, A]`.
+    """Detector from `[B, D+E, R, A]`, padded, to logits `[B, C, R, A]` and boxes `[B, 8, R, A]`.
 
-    `config` has the fields of `config.model`, with `cbam=None` for off.
+    `config` has the fields of `config.model`, where `cbam` must be None instead of "off".
     """
 
     def __init__(self, config):

@@ -12,14 +12,15 @@
 | quickstart | the quickstart's input scaling and longer training |
 | camera | the quickstart with and without a camera |
 
-Every variant is an ordinary run of a config. It is trained on scenes of its seed and evaluated on
-held-out scenes, which are the same for all variants. The same command resumes after an
-interruption. `--table_only` writes the tables of the finished runs. Several processes with the
-same command share the seeds; give each its own core (`taskset -c 0 python ...`).
+A variant is an ordinary run of a config, or the run of another variant evaluated with shuffled
+images. Runs are trained on the scenes of their seed and evaluated on held-out scenes, which are
+the same for all variants. The same command resumes after an interruption. `--table_only` writes
+the tables of the finished runs. Several processes with the same command share the seeds; give
+each its own core (`taskset -c 0 python ...`).
 
-AP is BEV at IoU 0.3, protocol `all_point`, mean over seeds. Intervals are paired, 95 %, from
-resampled sequences of the held-out scenes. A claim is supported if the interval lies above 0 and
-the difference reaches the claimed one, and contradicted if the interval ends below it.
+AP is BEV at IoU 0.3 with the protocol `all_point`, averaged over the seeds. The 95 % intervals are
+from paired resamples of the held-out sequences. A claim is supported if the interval lies above 0
+and the difference reaches the claimed one, and contradicted if the interval ends below that.
 """
 
 from __future__ import annotations
@@ -67,10 +68,10 @@ from radejax.simulation.dataset import simulate_dataset
 HELD_OUT_SEED = 1_000_003
 COMMON = {
     "simulation.output": "projection",
-    "simulation.test_sequences": 2,  # evaluated on the held-out scenes instead
+    "simulation.test_sequences": 2,  # models are compared on the held-out scenes instead
     "evaluation.num_visualizations": 0,
 }
-"""Fields of every run, in addition to those of the seed and the variant."""
+"""Config fields of every run, in addition to those of the seed and the variant."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,61 +87,61 @@ class Work:
     out: pathlib.Path
 
     def fields(self, cell: Cell, seed: int) -> dict[str, Any]:
-        """Config fields of a run, by dotted name."""
+        """Returns the config fields of a run by dotted name."""
         return {"seed": seed, "simulation.seed": seed, **COMMON, **cell.fields}
 
     def config(self, cell: Cell, seed: int) -> ConfigDict:
-        """Config of a run."""
+        """Returns the config of a run."""
         name, _, options = cell.config.partition(":")
         config = load_config(f"{CONFIGS / name}.py:{options}")
         config.update_from_flattened_dict(self.fields(cell, seed))
         return config
 
     def run_folder(self, name: str, seed: int) -> pathlib.Path:
-        """Workdir of a variant's run."""
+        """Returns the workdir of the run that a variant trains or evaluates."""
         cell = self.study.cells[name]
         kind = cell.config.partition(":")[0]
         folder = (cell.exchanges or name).replace(" ", "_")
         return self.out / "runs" / kind / folder / f"seed{seed}"
 
     def report(self, name: str, seed: int) -> pathlib.Path:
-        """Folder of the evaluation of a variant on the held-out scenes."""
+        """Returns the folder of the evaluation of a variant on the held-out scenes."""
         end = "_shuffled" if self.study.cells[name].exchanges else ""
         return self.run_folder(name, seed) / f"held{end}"
 
     def is_done(self, name: str, seed: int) -> bool:
-        """Whether a variant is trained and evaluated; `cell.json` is written last."""
+        """Returns True if a variant is trained and evaluated, as `cell.json` is written last."""
         return (self.report(name, seed) / "cell.json").exists()
 
     def root(self, cell: Cell, seed: int | None) -> pathlib.Path:
-        """Folder of the training data of a seed, or of the held-out scenes for None."""
+        """Returns the folder of the training data of a seed, or of held-out scenes for None."""
         kind, name = cell.config.partition(":")[0], "held"
         if seed is not None:
             name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
         return self.out / "data" / f"{kind}-{name}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
-        """Simulate the data if they are missing and return their folder."""
+        """Simulates the data of `root` if they are missing and returns their folder."""
         simulation = plain(self.config(cell, seed or 0).simulation)
         if seed is None:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
-            simulation["vru_density_scale"] = 1.0  # scaled in training scenes only
+            simulation["vru_density_scale"] = 1.0  # only training scenes are scaled
         return str(simulate_dataset(simulation, self.root(cell, seed)))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Lock that is held while data shared by all seeds are made."""
+        """Returns a lock to hold while data that all seeds share are made."""
         return files.lock(self.out / "shared.lock")
 
     def backbone(self, cell: Cell) -> pathlib.Path | None:
-        """Path of the frozen image backbone of a variant, or None."""
+        """Returns the path of the frozen image backbone of a variant, or None."""
         _, *options = re.split("[:,]", cell.config)
         if "resnet50" in options:
             return self.out / "backbone_resnet50" / pretrain_backbone.RESNET_FILE
         return self.out / "backbone" if "pretrained" in options else None
 
     def image_backbone(self, cell: Cell) -> str | None:
-        """Pretrain the image backbone of a variant if it is missing and return its path."""
+        """Pretrains the image backbone of a variant if it is missing and returns its path."""
         if (path := self.backbone(cell)) is None:
             return None
         folder = path.parent if path.suffix else path
@@ -150,11 +151,11 @@ class Work:
         return str(path)
 
     def command(self, name: str, seed: int) -> str:
-        """Command that repeats and evaluates a run with the data in `out`."""
+        """Returns the shell command that repeats and evaluates a run with the data in `out`."""
         cell = self.study.cells[name]
         file, _, options = cell.config.partition(":")
         fields = self.fields(cell, seed).items()
-        # Relative paths, as the tables are committed.
+        # Paths are relative, because the tables are committed to the repository.
         data, held = map(
             os.path.relpath, (self.root(cell, seed), self.root(cell, None))
         )
@@ -169,7 +170,7 @@ class Work:
         return " ".join([*parts, *["--shuffle-images 0"] * bool(cell.exchanges)])
 
     def make(self, name: str, seed: int) -> bool:
-        """Train and evaluate a variant; False if a signal stopped it."""
+        """Trains and evaluates a variant; returns False if a signal stopped its run."""
         cell, folder = self.study.cells[name], self.run_folder(name, seed)
         started, backbone = time.perf_counter(), self.image_backbone(cell)
         trained = folder / "evaluation" / "metrics.json"
@@ -200,7 +201,10 @@ class Work:
 
 
 def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Boolean masks `[F]` of frames by condition; camera studies add weather and lens."""
+    """Returns boolean masks `[F]` of frames by condition; camera studies add weather and lens.
+
+    Conditions with fewer than two sequences are omitted, as they cannot be resampled.
+    """
     weather = np.asarray(frames["weather"])
     found = {"all": np.ones(len(weather), bool)}
     base = work.study.cells[work.study.base]
@@ -214,7 +218,11 @@ def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
 def resampled(
     work: Work, name: str, seed: int, resamples: int
 ) -> dict[str, np.ndarray]:
-    """APs `[1 + B, C + 1]` by condition: all sequences, then resamples; classes, then mean."""
+    """Returns the APs `[1 + B, C + 1]` in percent of a run by condition.
+
+    The first row is over all sequences, the others are over resamples. The last column is the mean
+    over the classes. The result is cached in the folder of the evaluation.
+    """
     path = work.report(name, seed) / f"resampled_{resamples}.npz"
     if path.exists():
         with np.load(path) as stored:
@@ -239,7 +247,7 @@ def resampled(
 
 
 def verdict(difference: float, low: float, high: float, least: float = 0.0) -> str:
-    """Verdict on the claim that a difference is positive and at least `least`."""
+    """Returns the verdict on the claim that a difference is positive and at least `least`."""
     if low > 0 and difference >= least:
         return "supported"
     return "contradicted" if high < least or high < 0 else "inconclusive"
@@ -247,7 +255,7 @@ def verdict(difference: float, low: float, high: float, least: float = 0.0) -> s
 
 @dataclasses.dataclass
 class Comparer:
-    """Differences of variants over the seeds that both have."""
+    """Computes the differences of variants over the seeds for which both are finished."""
 
     work: Work
     seeds: tuple[int, ...]
@@ -259,15 +267,15 @@ class Comparer:
         )
 
     def done(self, *names: str) -> list[int]:
-        """Seeds for which all of the named variants are finished."""
+        """Returns the seeds for which all of the named variants are finished."""
         return [s for s in self.seeds if all(self.work.is_done(n, s) for n in names)]
 
     def mean(self, name: str, seeds: list[int], condition: str) -> np.ndarray:
-        """APs `[1 + B, C + 1]`, mean over seeds."""
+        """Returns the APs `[1 + B, C + 1]` of `resampled`, averaged over the seeds."""
         return np.mean([self.samples(name, s)[condition] for s in seeds], axis=0)
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """AP of every variant, condition and class, and its difference to the base."""
+        """Yields the AP of each variant, condition and class, and its difference to the base."""
         base = self.work.study.base
         for name in self.work.study.cells:
             if not (seeds := self.done(name)):
@@ -283,7 +291,7 @@ class Comparer:
                     yield row
 
     def gap(self, a: str, b: str, cls: str, condition: str = "all") -> dict[str, Any]:
-        """Difference a - b of a class with its interval; empty without a common seed."""
+        """Returns the difference a - b of a class and its interval; empty without common seed."""
         if not (seeds := self.done(a, b)):
             return {}
         ap_a, ap_b = (self.mean(name, seeds, condition) for name in (a, b))
@@ -292,7 +300,7 @@ class Comparer:
         return {"difference": float(gaps[0]), "low": low, "high": high}
 
     def claims(self) -> Iterator[dict[str, Any]]:
-        """The study's claims with difference, interval and verdict."""
+        """Yields the study's claims with difference, interval and verdict."""
         for claim in self.work.study.claims:
             found = self.gap(claim.a, claim.b, claim.cls)
             word = verdict(**found, least=claim.least) if found else "open"
@@ -303,7 +311,7 @@ class Comparer:
 def write_tables(
     work: Work, table: str, seeds: tuple[int, ...], resamples: int
 ) -> None:
-    """Write `table_<name>.md`, `.tex` and `.json` of the finished variants."""
+    """Writes `table_<name>.md`, `.tex` and `.json` for the finished variants; prints two tables."""
     comparer = Comparer(work, seeds, resamples)
     rows, claims = list(comparer.rows()), list(comparer.claims())
     made = tables(work.study, rows, claims)
@@ -323,7 +331,7 @@ def write_tables(
 
 
 def progress(work: Work, left: list[tuple[str, int]], num_all: int) -> str:
-    """Text that says how many runs are left and about how long they take."""
+    """Returns a text with the number of finished runs, the estimated time left and the next run."""
     paths = work.out.glob("runs/*/*/seed*/held*/cell.json")
     minutes = [files.read_json(path)["minutes"] for path in paths]
     hours = len(left) * float(np.mean(minutes)) / 60 if minutes else None
@@ -333,7 +341,7 @@ def progress(work: Work, left: list[tuple[str, int]], num_all: int) -> str:
 
 
 def chosen(study: Study, cells: str | None) -> list[str]:
-    """Names of the selected variants; all if none are selected."""
+    """Returns the names of the selected variants, or of all variants if `cells` is empty."""
     names = [name.strip() for name in cells.split(",")] if cells else [*study.cells]
     if unknown := [name for name in names if name not in study.cells]:
         raise UserError(
@@ -363,7 +371,7 @@ def main(table, seeds, cells, out, minutes, resamples, table_only):
         def left(*of: int) -> list[tuple[str, int]]:
             return [(n, s) for s, n in every if s in of and not work.is_done(n, s)]
 
-        if minutes is not None:  # the running training saves a checkpoint
+        if minutes is not None:  # SIGTERM makes a training save a checkpoint and stop
             alarm = threading.Timer(
                 60 * minutes, os.kill, (os.getpid(), signal.SIGTERM)
             )

@@ -1,4 +1,4 @@
-"""Variants and claims that `ablation.py` compares."""
+"""Variants that `ablation.py` compares, and claims about them."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _VARIANTS = load_module(CONFIGS / "radenet.py").VARIANTS
 _RADAR = "quickstart:ablation"
 _LABELS = {"data.label_permutation_seed": 0}
 _OWN_INPUT = {"model.input_center": 0.545, "model.input_scale": 25.0}
-"""Centering and scaling of the quickstart's input."""
+"""Centering and scaling of the input in `configs/quickstart.py`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A variant: a run, or another evaluation of one.
+    """A variant, which is a run or another evaluation of the run of another variant.
 
     Attributes:
         config: Name of a config file and its options, such as "quickstart:ablation".
         fields: Config fields that the variant changes.
-        exchanges: Variant whose run is evaluated with shuffled images.
+        exchanges: Variant whose run is evaluated with shuffled images; None for a new run.
     """
 
     config: str
@@ -51,9 +51,10 @@ class Study:
     Attributes:
         title: Title of the table.
         base: Variant that the others are compared with.
-        cells: Variants by name; equal variants of two studies share a run.
+        cells: Variants by name. Variants of two studies with the same name and config file
+            share a run, so they must be equal.
         claims: Claims to check.
-        held_out: Number of scenes for the evaluation.
+        held_out: Number of held-out scenes, of one frame each.
     """
 
     title: str
@@ -69,7 +70,7 @@ def _radar(**fields: Any) -> Cell:
 
 
 def _row(name: str) -> Cell:
-    """Variant of a row of Table III, with the decoder's width doubled as in the paper."""
+    """Returns the variant of a row of Table III; "expand" doubles the width of this decoder."""
     fields = {f"model.{k}": v for k, v in _VARIANTS[name].items()}
     return Cell(
         _RADAR, fields | ({"model.decoder_width": 64} if name == "expand" else {})

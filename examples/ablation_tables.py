@@ -1,4 +1,4 @@
-"""Tables of `ablation.py`: APs, differences with intervals, verdicts."""
+"""Tables of `ablation.py` with APs, differences with intervals, and verdicts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from radejax.evaluation.report import Table, number
 
 
 def interval_text(row: Mapping[str, Any]) -> str:
-    """Format a difference as "+1.2 (0.3 to 2.1)"."""
+    """Formats a difference as "+1.2 (0.3 to 2.1)", or "-" if the row has none."""
     if "difference" not in row:
         return "-"
     low, high = (number(row[name], digits=1) for name in ("low", "high"))
@@ -20,7 +20,7 @@ def interval_text(row: Mapping[str, Any]) -> str:
 
 
 def tables(study: Study, rows: list[dict], claims: list[dict]) -> list[Table]:
-    """A table of APs, a table of differences per condition, and a table of claims."""
+    """Returns a table of APs, one table of differences per condition, and a table of claims."""
     terms = "AP BEV at IoU 0.3, all_point, mean over seeds"
     by = {(row["condition"], row["cell"], row["cls"]): row for row in rows}
     columns, cells = (

@@ -4,10 +4,10 @@
 
 The first table has AP with the matching of nuScenes: a prediction matches an object of its class
 if the distance of their centers on the ground is below a threshold. The second table has the
-errors of the centers along and across the line of sight, and the fraction of matched boxes with
-an IoU above 0.3, as predicted and with one error removed. A class with a high AP here and a low
-one by IoU is detected, but its boxes are inaccurate. A class with a low AP in both is not
-detected.
+median errors of the centers along and across the line of sight for the largest threshold, and the
+fraction of matched boxes with a BEV IoU above 0.3, as predicted and with one error removed. A
+class with a high AP here and a low AP by IoU is detected, but its boxes are inaccurate. A class
+with a low AP in both is not detected.
 """
 
 import itertools
@@ -32,27 +32,28 @@ DISTANCES_M = (
     20.0,
     40.0,
     73.0,
-)  # 73 m is the distance of the far corners of the region
+)  # the far corners of the narrow region are 72.3 m away
 IOU = 0.3
 
 
 def matched(data: EvaluationSet, within_m: float) -> np.ndarray:
-    """Index `[M]` of the matched object of every prediction, -1 without a match.
+    """Returns the index `[M]` of the object that each prediction matches, or -1.
 
-    Each prediction, by descending score, takes the nearest free object within `within_m` meters.
+    In descending order of score, each prediction takes the nearest unmatched object of its frame
+    and class whose distance is below `within_m` meters.
     """
     first = np.searchsorted(data.gt_group, data.pred_group)
     after = np.searchsorted(data.gt_group, data.pred_group, side="right")
     pred, gt = ranges(first, after - first)
     gap = data.pred.box[pred, :2] - data.gt.box[gt, :2]
-    # match_free prefers the largest value above the threshold, here the smallest distance.
+    # match_free prefers the largest value, so distances are negated to prefer the smallest one.
     pairs = Pairs(pred, gt, -np.hypot(gap[:, 0], gap[:, 1]))
     score, groups = data.pred.score, data.pred_group
     return match_free(pairs, score, groups, len(data.gt), -within_m)
 
 
 def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float:
-    """All-point AP of one class in percent."""
+    """Returns the all-point AP of one class in percent, or NaN without objects of the class."""
     chosen = np.flatnonzero(data.pred.cls == cls)
     order = chosen[np.argsort(-data.pred.score[chosen], kind="stable")]
     num_gt = int((data.gt.cls == cls).sum())
@@ -61,7 +62,7 @@ def average_precision(data: EvaluationSet, match: np.ndarray, cls: int) -> float
 
 
 def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Errors `[N, 2]` in meters, along the line of sight to the true boxes and across it."""
+    """Returns error vectors `[N, 2]` in meters along the line of sight to the object and across."""
     gap, to = found[:, :2] - truth[:, :2], truth[:, :2]
     to = to / np.linalg.norm(to, axis=1, keepdims=True)
     along = (gap * to).sum(1, keepdims=True) * to
@@ -69,10 +70,10 @@ def errors(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def overlapping(truth: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
-    """Masks `[N]` of boxes with IoU above the threshold.
+    """Returns four masks `[N]` of the boxes with a BEV IoU above the threshold.
 
     The boxes are taken as predicted, without the error along the line of sight, without the error
-    across it, and with true size and yaw.
+    across it, and with the true size and yaw.
     """
     along, across = errors(truth, found)
     tried = [found.copy() for _ in range(4)]
@@ -83,7 +84,7 @@ def overlapping(truth: np.ndarray, found: np.ndarray) -> list[np.ndarray]:
 
 
 def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
-    """APs by class and distance threshold."""
+    """Returns the table of APs by class and distance threshold."""
     matches = [matched(data, limit) for limit in within]
     rows = [
         [name, int((data.gt.cls == cls).sum())]
@@ -95,7 +96,7 @@ def ap_table(data: EvaluationSet, within: tuple[float, ...]) -> Table:
 
 
 def error_rows(data: EvaluationSet, match: np.ndarray) -> Iterator[list[str | int]]:
-    """Number of matches, errors and overlaps by class and distance of the object."""
+    """Yields counts, errors and fractions of overlaps by class and distance of the object."""
     hit = np.flatnonzero(match >= 0)
     truth, found = data.gt.take(match[hit]), data.pred.box[hit]
     sizes = [np.linalg.norm(e, axis=1) for e in errors(truth.box, found)]

@@ -1,13 +1,14 @@
-"""A classical baseline: CA-CFAR, clustering, and boxes by rules.
+"""A classical baseline: CA-CFAR, clustering by distance, and boxes by rules.
 
-Bins that exceed the mean of their neighborhood (cell-averaging CFAR) are grouped into clusters.
-The radar cross-section (RCS) of a cluster from the radar equation selects its class, and the
-mean size of the class gives its box. Only the RCS limits between classes are fitted.
+Local maxima that exceed the mean of their neighborhood (cell-averaging CFAR) are detected. Peaks
+near a stronger peak belong to its cluster. The radar cross-section (RCS) of the strongest bin from
+the radar equation selects the class, and the box has the mean size of this class. Only the RCS
+limits between classes are fitted.
 
 References:
     Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
-    Clusters of radar detections: Kellner et al., "Grid-based DBSCAN for clustering extended
-    objects in radar data", IV 2012.
+    Clustering of radar detections, simplified here: Kellner et al., "Grid-based DBSCAN for
+    clustering extended objects in radar data", IV 2012.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ class CfarSettings:
     """Settings of the baseline.
 
     Attributes:
-        threshold_db: Power of a detected bin above the mean of its training cells.
-        guard_cells: Half width of the guard around a bin, in bins.
-        training_cells: Half width of the ring of training cells around the guard.
-        peak_drop_db: A cluster ends where the power is this far below its peak.
-        merge_m: Clusters whose peaks are closer than this are merged.
+        threshold_db: Minimum power of a peak above the mean of its training cells.
+        guard_cells: Number of guard cells on each side of a bin.
+        training_cells: Number of training cells on each side, outside the guard cells.
+        peak_drop_db: Drop of power from the peak at which a cluster ends toward the radar.
+        merge_m: A peak that is closer than this to a stronger peak is dropped.
         rcs_steps: Smallest apparent RCS in dBsm of each class, in descending order; weaker
-            clusters are clutter. A bin contains only a part of an object's power.
-            `fit_rcs_steps` estimates the limits on a training split; the defaults are
-            those of the quickstart's dataset.
+            clusters are clutter. The RCS is apparent because a bin contains only a part of
+            an object's power. `fit_rcs_steps` estimates the limits on a training split; the
+            defaults are those of the quickstart's dataset.
     """
 
     threshold_db: float = 9.0
@@ -63,21 +64,21 @@ def fit_rcs_steps(
     balanced: bool = False,
     least_gap_db: float = 1.0,
 ) -> tuple[tuple[str, float], ...]:
-    """Fit the RCS limits between classes to labeled objects.
+    """Fits the RCS limits between classes to labeled objects.
 
-    Classes are ordered by their median. The limit between two neighbors is the one with the fewest
-    classification errors. The limit of the last class is its lower quartile: weaker clusters are
-    clutter.
+    Classes are ordered by descending median RCS. The limit between two neighbors is the one with
+    the fewest classification errors between them. The limit of the last class is its lower
+    quartile. Limits are lowered if they are closer than `least_gap_db`.
 
     Args:
         cls: Class name of each object.
         rcs_dbsm: Apparent RCS of each object, see `object_rcs_db`.
-        balanced: Count errors as fractions of their classes, so that rare classes have the
-            same weight as frequent ones.
-        least_gap_db: Smallest RCS interval of a class.
+        balanced: Whether to count errors as fractions of their classes, so that rare classes
+            have the same weight as frequent ones.
+        least_gap_db: Smallest difference between consecutive limits.
 
     Returns:
-        Pairs of name and smallest RCS, for `CfarSettings.rcs_steps`.
+        Name and smallest RCS of each class that occurs, for `CfarSettings.rcs_steps`.
     """
     cls, values = np.asarray(cls), np.asarray(rcs_dbsm, float)
     groups = {name: values[cls == name] for name in CLASSES if (cls == name).any()}
@@ -108,9 +109,9 @@ def object_rcs_db(
     *,
     margin_m: float = 0.5,
 ) -> np.ndarray:
-    """Apparent RCS `[N]` of boxes `[N, 7]`: that of the strongest bin in each box.
+    """Returns the apparent RCS `[N]` in dBsm of the strongest bin in each box of `[N, 7]`.
 
-    NaN for boxes that contain no bin center.
+    Boxes are enlarged by `margin_m` on each side. The RCS of a box without bin centers is NaN.
     """
     power_db = _power_db(projection, grid)
     rcs = apparent_rcs_db(power_db, grid.range_m[:, None], parameters)
@@ -127,12 +128,12 @@ def object_rcs_db(
 
 
 def apparent_rcs_db(power_db, range_m, parameters: RadarParameters):
-    """RCS in dBsm from the radar equation and a bin's power in dB."""
+    """Returns the RCS in dBsm of a bin's power in dB; ranges below 1 m count as 1 m."""
     return power_db - parameters.gain_db + 40.0 * np.log10(np.maximum(range_m, 1.0))
 
 
 def _power_db(projection: np.ndarray, grid: RadarGrid) -> np.ndarray:
-    """Range-azimuth map `[R, A]` in dB."""
+    """Returns the power `[R, A]` in dB, the maximum over the Doppler channels."""
     return projection[..., : grid.num_doppler].max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
 
 
@@ -144,17 +145,17 @@ def detect(
     *,
     ground_m: float = -1.6,
 ) -> dict[str, np.ndarray]:
-    """Detect boxes in one projection.
+    """Detects boxes in one projection.
 
     Args:
         projection: Normalized projection `[R, A, D+E]`.
         grid: Sensor axes of the projection.
-        parameters: Gain and noise of the radar, for the RCS.
-        settings: Thresholds; None for the defaults.
-        ground_m: Height of the ground in the radar frame, on which boxes stand.
+        parameters: Parameters of the radar, whose gain is used for the RCS.
+        settings: Settings of the detector; None for the defaults.
+        ground_m: z of the ground, on which boxes stand, measured like the z of boxes.
 
     Returns:
-        Columns `box [K, 7]` (radar frame), `cls [K]` class names and `score [K]` in [0, 1], by
+        Columns `box [K, 7]` (radar frame), `cls [K]` class names and `score [K]` in [0, 1), by
         descending score.
     """
     settings = settings or CfarSettings()
@@ -180,9 +181,9 @@ def detect(
 
 
 def local_mean_db(power_db: np.ndarray, settings: CfarSettings) -> np.ndarray:
-    """Mean power `[R, A]` of the training cells around each bin, in dB.
+    """Returns the mean linear power `[R, A]` of the training cells around each bin in dB.
 
-    Linear power is averaged. The map is padded with its edge values.
+    The map is padded with its edge values.
     """
     power = 10.0 ** (power_db / 10.0)
     inner = 2 * settings.guard_cells + 1
@@ -199,7 +200,10 @@ def find_peaks(
     grid: RadarGrid,
     settings: CfarSettings,
 ) -> list[tuple[int, int]]:
-    """Local maxima above the threshold by descending power, none close to a stronger one."""
+    """Returns the (range, azimuth) bins of the peaks, by descending power.
+
+    Peaks are local maxima above the CFAR threshold that are not near a stronger peak.
+    """
     is_peak = (power_db == ndimage.maximum_filter(power_db, 3)) & (
         excess_db > settings.threshold_db
     )
@@ -208,7 +212,7 @@ def find_peaks(
     places = grid.bin_to_ego(cells[:, 0].astype(float), cells[:, 1].astype(float))
     kept: list[int] = []
     for i, place in enumerate(places):
-        # One object has several peaks, most of them along the range axis.
+        # One object has several peaks, most of which lie along the range axis.
         gap = np.hypot(*(places[kept] - place).T) if kept else np.zeros(0)
         if not (gap < settings.merge_m).any():
             kept.append(i)
@@ -216,7 +220,7 @@ def find_peaks(
 
 
 def _near_side(power_db, r, a, grid, settings) -> np.ndarray:
-    """Ground position `[2]` of the near side of the cluster around a peak."""
+    """Returns the position (x, y) in meters of a cluster's side nearest to the radar."""
     level = power_db[r, a] - settings.peak_drop_db
     first = r
     while first > 0 and r - first < 4 and power_db[first - 1, a] > level:
@@ -227,13 +231,13 @@ def _near_side(power_db, r, a, grid, settings) -> np.ndarray:
         left -= 1
     while right < grid.num_azimuth - 1 and row[right + 1] > level:
         right += 1
-    # The window spreads a point over two bins on either side.
+    # The window spreads a point over two bins on each side, so the first bin is too near.
     near = min(first + 1.5, r)
     return np.asarray(grid.bin_to_ego(float(near), 0.5 * (left + right)))
 
 
 def _fit_box(name: str, near: np.ndarray, ground_m: float) -> list[float]:
-    """Box of the mean size of a class, heading along x, with a given near side."""
+    """Returns a box of a class's mean size along x, whose rear side has its center at `near`."""
     length, width, height = SIZES[name][0]
     x, y = near
     return [x + length / 2.0, y, ground_m + height / 2.0, length, width, height, 0.0]

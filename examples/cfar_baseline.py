@@ -3,9 +3,9 @@
     python examples/cfar_baseline.py --data DATA --out DATA/cfar
 
 DATA is a K-Radar folder, simulated (`train.py` writes one below data/) or real, with its records
-in DATA/records. The RCS limits between classes are fitted to the training split (of another
-folder with `--fit-data`), the detector runs on the test split, and OUT contains the same report
-as that of a network (`report.txt`, `metrics.json`, `tables.md`, ...).
+in DATA/records. The RCS limits between classes are fitted to the training split of DATA, or of
+another folder with `--fit-data`. The detector runs on the test split of DATA, and OUT contains the
+same report as for a network (`report.txt`, `metrics.json`, `tables.md`, ...).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions
 from radejax.simulation.radar.tensor import RadarParameters
 
-# The gain shifts all cross-sections and the limits between classes alike.
+# Another gain would shift all cross-sections and the fitted limits by the same amount.
 PARAMETERS = RadarParameters()
 
 
@@ -53,16 +53,19 @@ def run_baseline(
     balanced: bool = False,
     fit_data: str | pathlib.Path | None = None,
 ) -> Report:
-    """Fit on the training split, detect on the test split and write the report.
+    """Fits on the training split, detects on the test split and writes the report.
 
     Args:
         data: K-Radar folder with `records/` in it.
         out: Folder of the report.
         protocols: Names of evaluation protocols.
-        score_threshold: Score threshold of the network that it is compared with.
-        bootstrap: Number of resamples of sequences for confidence intervals.
-        balanced: Rare classes have the same weight as frequent ones in the fit.
-        fit_data: Folder of the training split, if it is not `data`.
+        score_threshold: Score threshold of the network to compare with.
+        bootstrap: Number of resamples of sequences for confidence intervals; 0 for none.
+        balanced: Whether rare classes have the same weight as frequent ones in the fit.
+        fit_data: Folder of the training split; None for `data`.
+
+    Raises:
+        UserError: The training split has no frames.
     """
     data, fit_data = pathlib.Path(data), pathlib.Path(fit_data or data)
     to_fit = KRadar(fit_data, split="train")
@@ -96,7 +99,7 @@ def run_baseline(
 
 
 def fit(records: Records, frames: KRadar, *, balanced: bool = False) -> CfarSettings:
-    """Settings with RCS limits that are fitted to the objects of a split."""
+    """Returns settings with RCS limits that are fitted to the objects of a split."""
     names, values = [], []
     for frame in tqdm(frames, unit="frame", desc="fit"):
         projection = decode(records[frame.key])
@@ -112,7 +115,7 @@ def fit(records: Records, frames: KRadar, *, balanced: bool = False) -> CfarSett
 def predict(
     records: Records, frames: KRadar, settings: CfarSettings
 ) -> dict[str, np.ndarray]:
-    """Detections of a split as columns "frame", "box", "cls", "score"."""
+    """Returns the detections of a split as columns "frame", "box", "cls" and "score"."""
     parts = []
     for index, frame in enumerate(tqdm(frames, unit="frame", desc="detect")):
         projection = decode(records[frame.key])

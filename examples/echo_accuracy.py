@@ -6,12 +6,12 @@
 
 The result is a reference for detectors, not an upper bound. In simulated scenes with the radar of
 the quickstart or of K-Radar, the Doppler bin of the object's body is assumed to be known. The
-strongest bin near the object is located, and its position between bins is interpolated by
-parabolas in range and azimuth. The mean distance from the echo to the center is removed, as it
-depends on the size of the object. The table lists the fraction of boxes of true size and heading
-at these positions that overlap the true box with an IoU above 0.3. If every object had one such
-box in random order, AP would be about the square of that fraction. A network sees more than three
-bins, but does not know the Doppler bin.
+strongest of the 3 x 3 bins around the object's center is located, and its position between bins is
+interpolated by parabolas in range and azimuth. The mean offset of the echo from the center, which
+depends on the size of the object, is removed. The table lists the fraction of boxes of true size
+and heading at these positions that overlap the true box with a BEV IoU above 0.3. If every object
+had one such box with a random score, AP would be about the square of that fraction. A network uses
+more bins, but does not know the Doppler bin.
 """
 
 from collections.abc import Iterator
@@ -33,14 +33,14 @@ DISTANCES_M = ((5.0, 20.0), (20.0, 40.0))
 
 
 def between(values: np.ndarray) -> float:
-    """Position of the maximum of a parabola through three values, in bins from the middle."""
+    """Returns the offset in bins, at most 0.5, of a parabola's maximum from the middle value."""
     left, middle, right = map(float, values)
     bend = left - 2.0 * middle + right
     return float(np.clip((left - right) / (2.0 * bend), -0.5, 0.5)) if bend < 0 else 0.0
 
 
 def locate(power_db: np.ndarray, cell: np.ndarray) -> np.ndarray:
-    """Position in bins of the strongest echo near a bin in a map `[R, A]` of one Doppler bin."""
+    """Returns the position of the strongest of the 3 x 3 bins around a bin of a map `[R, A]`."""
     row, column = np.clip(cell, 2, np.array(power_db.shape) - 3)
     beside = power_db[row - 1 : row + 2, column - 1 : column + 2]
     top = np.unravel_index(beside.argmax(), beside.shape)
@@ -53,7 +53,7 @@ def locate(power_db: np.ndarray, cell: np.ndarray) -> np.ndarray:
 def measured(
     config: SimulationConfig, cls: str
 ) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Box, range error [m] and azimuth error [m] of every visible object of a class."""
+    """Yields box and errors [m] in range and azimuth of visible objects in the narrow region."""
     grid, source = config.make_grid(), make_source(config)
     doppler_step = grid.doppler_mps[1] - grid.doppler_mps[0]
     for name in source.numbers:
@@ -79,17 +79,17 @@ def measured(
 
 
 def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """BEV IoU `[N]` of true boxes with themselves after moving them by errors [m]."""
+    """Returns the BEV IoU `[N]` of true boxes with their copies moved by errors in meters."""
     bearing = np.arctan2(boxes[:, 1], boxes[:, 0])
     ahead, aside = np.cos(bearing), np.sin(bearing)
     moved = boxes.copy()
-    moved[:, 0] += along * ahead + across * aside  # azimuth grows to the right
+    moved[:, 0] += along * ahead + across * aside  # azimuth is positive to the right
     moved[:, 1] += along * aside - across * ahead
     return bev_iou(moved[:, None], boxes[:, None])[:, 0, 0]
 
 
 def table(config: SimulationConfig, cls: str) -> Table:
-    """Errors and fraction of overlapping boxes by distance."""
+    """Returns the table of errors and the fraction of overlapping boxes by distance."""
     found = np.array([[*box, *errors] for box, *errors in measured(config, cls)])
     boxes, along, across = np.split(found.reshape(-1, 9), (7, 8), axis=1)
     distance, rows = np.hypot(boxes[:, 0], boxes[:, 1]), []

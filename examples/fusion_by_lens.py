@@ -4,10 +4,10 @@
     python train.py --config configs/quickstart_fusion.py:radar
     python examples/fusion_by_lens.py runs/quickstart_fusion runs/quickstart_fusion-radar
 
-Compares two runs on the same simulated test frames, by weather and by the state of the lens,
-which the simulator knows: AP of both, their difference with an interval from resampled sequences,
-and the weight of the camera in the fused map. Writes tables into OUT. `--data ROOT` selects
-another simulated dataset on which both runs were evaluated with
+Two runs are compared on the same simulated test frames by weather and by the state of the lens,
+which follows from the simulation's seed. The tables in OUT list the AP of both, their difference
+with an interval from resampled sequences, and the weight of the camera in the fused map.
+`--data ROOT` selects another simulated dataset on which both runs were evaluated with
 `python evaluate.py --workdir RUN --data ROOT` and the same `--split`.
 """
 
@@ -43,7 +43,7 @@ GROUPS = {
 
 
 def conditions(weather, lens):
-    """Masks of frames by condition: all, every kind of weather, and `GROUPS`."""
+    """Returns masks of frames by condition: all frames, each kind of weather, and `GROUPS`."""
     found = {"all": np.ones(len(weather), bool)}
     found |= {str(name): np.asarray(weather) == name for name in np.unique(weather)}
     for name, rule in GROUPS.items():
@@ -52,7 +52,7 @@ def conditions(weather, lens):
 
 
 def lens_of_frames(root, frames):
-    """State of the lens in every row of the frame table of a simulated dataset."""
+    """Returns the lens cover of each frame in the frame table of a procedural dataset."""
     marker = pathlib.Path(root) / MARKER
     if not marker.exists():
         raise UserError(f"{root} is no simulated dataset: {MARKER} is missing")
@@ -71,7 +71,7 @@ def lens_of_frames(root, frames):
 
 
 def evaluation_set(report, classes, roi, chosen):
-    """Ground truth and predictions of a report for some of its frames."""
+    """Returns the evaluation set of a report for some of its frames, and their sequences."""
     truth, found, frames, _ = load(report, Source(), classes)
     found, _ = repair_sizes(found, "false_positive")
     ids = np.asarray(frames["frame"])[chosen]
@@ -88,19 +88,19 @@ def evaluation_set(report, classes, roi, chosen):
 
 
 def share_rows(share, sequence, groups, resamples):
-    """Weight of the camera by condition, and its difference to that of all frames.
+    """Yields the mean weight of the camera by condition, and its difference to that of all frames.
 
     Args:
-        share: `[F]` mean over the bins in view of a frame; NaN without an image.
+        share: `[F]` mean weight over the bins in view of each frame; NaN without an image.
         sequence: `[F]` sequence numbers.
         groups: `[F]` masks by condition.
-        resamples: Number of resamples of sequences, for 95 % intervals.
+        resamples: Number of resamples of sequences for 95 % intervals.
     """
     counts = sequence_weights(sequence, resamples=resamples, seed=0)
     counts = np.concatenate([np.ones((1, len(share))), counts])
     counts[:, np.isnan(share)] = 0.0
     share = np.nan_to_num(share)
-    with np.errstate(invalid="ignore"):  # a resample may have no frame of a condition
+    with np.errstate(invalid="ignore"):  # a resample may lack a condition
         means = {
             name: counts[:, chosen] @ share[chosen] / counts[:, chosen].sum(-1)
             for name, chosen in groups.items()
@@ -114,7 +114,7 @@ def share_rows(share, sequence, groups, resamples):
 
 
 def rows_of_group(name, reports, config, chosen, resamples):
-    """A row for Sedan and a row for the mean of the classes that occur."""
+    """Returns the APs of both runs in a condition for Sedan and the mean over classes."""
     options = config.evaluation
     fusion, radar = (
         evaluation_set(report, tuple(config.classes), tuple(options.roi), chosen)
@@ -155,7 +155,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
 @click.option("--split", default="test", show_default=True, help="Or all.")
 @click.option("--resamples", default=1000, show_default=True)
 def main(fusion, radar, out, data, split, resamples):
-    """Compare the workdirs FUSION and RADAR, evaluated on the same test split."""
+    """Compare the workdirs FUSION and RADAR, which were evaluated on the same split."""
     entry.set_up_jax()
     with entry.exit_codes():
         run = open_model(fusion)
@@ -186,7 +186,7 @@ def main(fusion, radar, out, data, split, resamples):
 
         files.write_json(out / "camera_share.json", average_shares(by_lens(), run.grid))
         sequences = np.asarray(frames["sequence"])
-        # Intervals come from resampled sequences: a single one has none.
+        # Intervals come from resampled sequences, of which at least two are needed.
         is_small = {
             name: len(set(sequences[chosen])) < 2 for name, chosen in groups.items()
         }

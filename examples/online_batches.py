@@ -1,8 +1,8 @@
 """Training batches that are simulated when they are needed.
 
-The host samples scenes and scatterers, and the accelerator computes the projections of a whole
-batch in one call. A batch depends only on the seed and its step, so that a run resumes from its
-step.
+The host creates scenes and scatterers, and the accelerator computes the projections of a whole
+batch in one call. A batch depends only on the config, the seed and its step, so a run can resume
+from its step.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ class OnlineBatches:
 
     Args:
         config: Plain values as from `default_config`; its training sequences are used.
-        batch_size: Frames per batch.
-        max_objects: Rows for boxes, N of `Batch`.
-        seed: Seed of the choice of frames and of their noise; scenes follow the config's seed.
-        num_threads: Threads that compute scatterers.
-        start_step: First step; to resume, the step that was reached.
+        batch_size: Number of frames per batch.
+        max_objects: Number of rows for boxes, N of `Batch`. The nearest objects are kept.
+        seed: Seed of the choice of frames and of their noise. Scenes use the config's seed.
+        num_threads: Number of threads that compute scatterers.
+        start_step: Step of the first batch; to resume, the step that was reached.
 
     Attributes:
+        grid: Axes of the radar.
         step: Step of the next batch; save it to resume.
         num_cut: Number of boxes so far that did not fit into `max_objects`.
     """
@@ -73,12 +74,12 @@ class OnlineBatches:
         return self
 
     def __next__(self) -> Batch:
-        """Return the next batch."""
+        """Returns the next batch and increments the step."""
         self.step += 1
         return self.batch(self.step - 1)
 
     def batch(self, step: int) -> Batch:
-        """Batch of any step: a pure function of config, seed and step."""
+        """Returns the batch of any step; it depends only on config, seed and step."""
         rng = np.random.default_rng([self._seed, step])
         chosen = rng.integers(len(self._specs), size=self._batch_size)
         rows = range(self._batch_size)
@@ -86,14 +87,14 @@ class OnlineBatches:
         return self._assemble(list(frames))
 
     def loader(self) -> grain.DatasetIterator:
-        """Iterator of the same batches with prefetching, whose position can be saved."""
+        """Returns a prefetching iterator from step 0, whose position can be saved."""
         steps = grain.MapDataset.range(np.iinfo(np.int32).max)
         reading = grain.ReadOptions(num_threads=2, prefetch_buffer_size=2)
         return iter(steps.map(self.batch).to_iter_dataset(reading))
 
     @property
     def frame_names(self) -> list[str]:
-        """Sequence and frame of each index in `Batch.frame`."""
+        """Sequence and frame of each index in `Batch.frame`, separated by a slash."""
         return [f"{number}/{spec.name}" for number, spec in self._specs]
 
     def _make_simulator(self, number: int) -> SequenceSimulator:
@@ -102,7 +103,10 @@ class OnlineBatches:
         )
 
     def _frame(self, index: int, step: int, row: int):
-        """Radar input, boxes `[n, 7]` in the radar frame and classes of one frame."""
+        """Returns index, radar input, noise key, boxes `[n, 7]` and classes `[n]` of a frame.
+
+        Boxes are in the radar frame and limited to objects that are visible to the radar.
+        """
         number, spec = self._specs[index]
         with self._lock:  # one thread creates a scene, the others reuse it
             simulator = self._simulator(number)
@@ -112,7 +116,7 @@ class OnlineBatches:
         boxes = frame.boxes[visible].copy()
         boxes[:, 2] -= self._config.radar_from_lidar_m[
             2
-        ]  # z as readers of files have it
+        ]  # boxes keep the LiDAR's z, as when labels are read from files
         key = tensor.frame_key(self._seed, step, row)
         return index, given, key, boxes, frame.cls[visible]
 
@@ -147,7 +151,7 @@ class OnlineBatches:
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def _simulate_batch(scatterers, noise, keys, grid, parameters):
-    """Projections `[B, R, A, D+E]` of a batch."""
+    """Computes the projections `[B, R, A, D+E]` of a batch."""
     one = functools.partial(
         tensor.simulate,
         grid=grid,
@@ -157,7 +161,7 @@ def _simulate_batch(scatterers, noise, keys, grid, parameters):
 
 
 def _stack(inputs: list[RadarInput]) -> tuple[tensor.Scatterers, np.ndarray]:
-    """Stack inputs, padded to the longest in steps that limit recompilation."""
+    """Stacks inputs, padded to a multiple of 1,024 scatterers to limit recompilation."""
     capacity = max(given.scatterers.range_m.shape[0] for given in inputs)
     capacity = -(-capacity // 1024) * 1024
 

@@ -3,8 +3,8 @@
     python examples/online_training.py --config configs/quickstart.py \\
         --workdir runs/online --sequences 1000
 
-Every step uses new frames of procedural scenes, so that only the simulator itself can be overfit.
-The same command resumes after an interruption. To detect objects with the result:
+Every step samples frames of many procedural scenes and simulates them with new noise. The same
+command resumes after an interruption. To detect objects with the result:
 
     radejax detect --model runs/online/checkpoints --out boxes data/sim
 """
@@ -32,7 +32,7 @@ from radejax.training import distributed, loop
 from radejax.training.step import TrainState
 
 SEED_OFFSET = 1_000_003
-"""Added to the seed of the scenes, so that a dataset of the same config is held out."""
+"""Offset added to the seed of the scenes, so that a dataset of the same config is held out."""
 
 _log = logging.getLogger(__name__)
 
@@ -40,23 +40,24 @@ _log = logging.getLogger(__name__)
 def train_online(
     config: ConfigDict, workdir: str | os.PathLike, *, num_sequences: int = 1000
 ) -> TrainState:
-    """Train a radar model on new frames; resumes an earlier run in the workdir.
+    """Trains a radar model on simulated frames, or resumes the run in the workdir.
 
-    An epoch has as many frames as the sequences have in all. Frames are sampled with replacement,
-    have new noise every time and are not augmented.
+    An epoch has as many frames as all sequences together, rounded down to whole batches. Frames
+    are sampled with replacement, have new noise every time and are not augmented.
 
     Args:
         config: Config with a `simulation` section that describes the sensor and the number of
             frames per sequence. Its dataset is not used.
-        workdir: Workdir of the run: `config.json`, `checkpoints/`, `metrics.jsonl`.
+        workdir: Workdir of the run, with `config.json`, `checkpoints/` and `metrics.jsonl`.
         num_sequences: Number of procedural sequences.
 
     Returns:
-        The state after the last step.
+        The state after the last step, which is an earlier one if a signal ended the training.
 
     Raises:
-        UserError: The config has a camera model, other classes or real scenes, there are several
-            processes, or the workdir belongs to a run with another config.
+        UserError: The config has no `simulation` section, a camera model, other classes or real
+            scenes, or a field out of its range; there are several processes; or the workdir is in
+            use or belongs to a run with another config.
     """
     simulation = plain(config.get("simulation") or {})
     for is_wrong, text in (

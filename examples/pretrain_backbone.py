@@ -4,10 +4,10 @@
     python train.py --config configs/quickstart_fusion.py:pretrained \\
         --image-backbone backbones/small
 
-It takes the place of DINOv3 on simulated data. It is trained on images of scenes with another seed
-than those of the dataset, to predict which classes each patch shows and how near they are, which
-the renderer knows; labels of the detector are not used. The output folder has Hugging Face's
-DINOv3 format; with `--config configs/quickstart_fusion.py:resnet50` it has a
+The backbone replaces DINOv3 on simulated data. It is trained on images of scenes with another seed
+than those of the dataset, to predict which classes each patch shows and how near they are. These
+targets come from the renderer; labels of the detector are not used. The output folder has Hugging
+Face's DINOv3 format, or with `--config configs/quickstart_fusion.py:resnet50` a file
 `resnet50.safetensors` with torchvision's names. The average precision of the patches of each
 class is printed for scenes of a third seed.
 """
@@ -53,15 +53,15 @@ CONFIG = (
     / "quickstart_fusion.py:pretrained"
 )
 SEEDS = (2_000_003, 3_000_017)
-"""Added to the seed of the dataset, for training images and test images."""
+"""Offsets added to the seed of the dataset for the training images and the test images."""
 
 REPORT, RESNET_FILE = "pretraining.json", "resnet50.safetensors"
 PIXELS_SHOWN = 4
-"""Number of pixels of a class from which on a patch counts as showing it."""
+"""Minimum number of pixels of a class in a patch that counts as showing it."""
 NEAR_M = 10.0
 SMALL = tuple(map(CLASSES.index, ("Pedestrian", "Motorcycle", "Bicycle")))
 SHARE_TURNED = 0.4
-"""Fraction of the cars in training images that become VRUs; see `with_small_ones`."""
+"""Fraction of the cars in training images that VRUs replace; see `with_small_ones`."""
 
 
 class Images(NamedTuple):
@@ -69,8 +69,8 @@ class Images(NamedTuple):
 
     Attributes:
         image: `[N, H, W, 3]` uint8.
-        pixels: `[N, h, w, K]` uint16, number of pixels of each class.
-        nearness: `[N, h, w]`, 10 m / distance, mean over the pixels of objects.
+        pixels: `[N, h, w, K]` uint16, number of pixels of each class in each patch.
+        nearness: `[N, h, w]` 10 m / distance, averaged over the pixels of objects; 0 without any.
     """
 
     image: np.ndarray
@@ -79,7 +79,7 @@ class Images(NamedTuple):
 
 
 def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
-    """Replace a fraction of the cars by VRUs, which are rare otherwise."""
+    """Replaces a random fraction of the cars of a sequence by VRUs, which are rare otherwise."""
     rng = np.random.default_rng([seed, sequence.name, 17])
     tracks, cls = sequence.tracks, sequence.tracks.cls.copy()
     size, position = tracks.size_m.copy(), tracks.position_m.copy()
@@ -96,7 +96,10 @@ def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
 def draw(
     simulation: dict[str, Any], patch: int, count: int, seed: int, share: float = 0.0
 ) -> Images:
-    """One image of each of `count` procedural scenes; `share` as in `with_small_ones`."""
+    """Renders one image of each of `count` procedural scenes; `patch` is in pixels.
+
+    VRUs replace the fraction `share` of the cars, see `with_small_ones`.
+    """
     fields = {"seed": seed, "train_sequences": count, "test_sequences": 0}
     fields |= {"frames_per_sequence": 1}
     config = SimulationConfig.from_mapping(simulation | fields)
@@ -116,7 +119,7 @@ def draw(
     )
 
     def of_patches(pixels: np.ndarray) -> np.ndarray:
-        """Sum `[H, W, K]` over patches."""
+        """Sums `[H, W, K]` over the pixels of each patch, giving `[h, w, K]`."""
         rows, columns = shape[1:]
         return pixels.reshape(rows, patch, columns, patch, -1).sum((1, 3))
 
@@ -146,7 +149,7 @@ def draw(
 
 
 class Patches(nn.Module):
-    """Backbone with a linear layer: `[B, h, w, K + 1]` logits and nearness."""
+    """Backbone with a linear layer that predicts `[B, h, w, K + 1]` logits and nearness."""
 
     backbone: ViT | ResNetTrunk
 
@@ -164,8 +167,8 @@ class Patches(nn.Module):
 
 
 def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
-    """Cross-entropy by class plus the squared error of the nearness."""
-    # A few pixels are enough, as a distant pedestrian has no more.
+    """Returns the weighted cross-entropy by class plus the squared error of the nearness."""
+    # A few pixels suffice for a target of 1, as a distant pedestrian has no more.
     target = jnp.minimum(pixels / (2.0 * PIXELS_SHOWN), 1.0)
     entropy = optax.sigmoid_binary_cross_entropy(found[..., :-1], target)
     entropy = jnp.sum(entropy * (1.0 + 2.0 * target), axis=-1)
@@ -176,7 +179,7 @@ def loss(found: jax.Array, pixels: jax.Array, nearness: jax.Array) -> jax.Array:
 def train(
     model: Patches, data: Images, *, epochs: int, seed: int, batch_size: int = 16
 ) -> Any:
-    """Train with AdamW, a cosine schedule and random mirroring; returns the variables."""
+    """Trains with AdamW, a cosine schedule and random mirroring, and returns the variables."""
     steps = epochs * (len(data.image) // batch_size)
     schedule = optax.warmup_cosine_decay_schedule(0.0, 1.5e-3, steps // 20, steps)
     optimizer = optax.chain(
@@ -219,14 +222,14 @@ def train(
 
 
 def average_precision(score: np.ndarray, is_shown: np.ndarray) -> float:
-    """Average precision of a ranking; NaN without positives."""
+    """Returns the average precision from 0 to 1 of a ranking, or NaN without positives."""
     right = is_shown.ravel()[np.argsort(-score.ravel(), kind="stable")]
     precision = np.cumsum(right) / np.arange(1, right.size + 1)
     return float(precision[right].mean()) if right.any() else float("nan")
 
 
 def patch_ap(model: Patches, variables: Any, data: Images) -> dict[str, float]:
-    """Average precision by class of the patches that show at least `PIXELS_SHOWN` pixels."""
+    """Returns the AP by class; patches with at least `PIXELS_SHOWN` pixels are positives."""
     predict = jax.jit(model.apply)
     found = [
         predict(variables, data.image[i : i + 32]) for i in range(0, len(data[0]), 32)
@@ -239,7 +242,7 @@ def patch_ap(model: Patches, variables: Any, data: Images) -> dict[str, float]:
 
 
 def save(backbone: ViT | ResNetTrunk, variables: Any, out: pathlib.Path) -> None:
-    """Write the backbone in the format that `--image-backbone` reads."""
+    """Writes the backbone in the format that `--image-backbone` reads."""
     own = {name: part["backbone"] for name, part in variables.items()}
     if isinstance(backbone, ViT):
         dinov3_hf.save(backbone, own["params"], out)
@@ -264,7 +267,7 @@ def pretrain(
     epochs: int = 10,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Pretrain and write the backbone of a config; returns the patch AP by class.
+    """Pretrains and writes the backbone of a config, and returns the patch AP by class.
 
     Args:
         config: Config of a radar-camera model with a `simulation` section.
@@ -272,10 +275,10 @@ def pretrain(
         images: Number of training images.
         held_out: Number of test images.
         epochs: Number of epochs.
-        seed: Seed of weights and order, and added to that of the scenes.
+        seed: Seed of initialization and batches, which is also added to that of the scenes.
 
     Raises:
-        UserError: The config has no simulated images.
+        UserError: The config has no images of procedural scenes, or its model has no camera.
     """
     simulation = plain(config.get("simulation") or {})
     if not simulation or "image" not in config.model:

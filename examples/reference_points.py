@@ -3,8 +3,9 @@
     python examples/reference_points.py cam-front_00001.png cam_front0.yml \\
         --label 00033_00001.txt --out reference_points.png
 
-Repeats DinoRADE's Figure 2 for one image: reference points of every 16th range bin in red, boxes
-of the label file in white, and the position of the radar in blue if it is in view.
+Repeats DinoRADE's Figure 2 for one image. Reference points of every 16th range bin and every second
+azimuth bin are red, boxes of the label file are white, and the position of the radar is blue if it
+is in view.
 """
 
 import pathlib
@@ -35,18 +36,18 @@ def draw_reference_points(
     *,
     every: tuple[int, int, int] = (16, 2, 1),
 ) -> int:
-    """Draw valid reference points and the radar's position onto the axes of an image.
+    """Draws valid reference points and the radar's position onto the axes of an image.
 
     Args:
         ax: Axes in pixels, for example from `radejax.visualize.camera.draw_camera`.
-        points: `[R, A, E, 2]` (x, y) from 0 to 1 between the edges of the image, as in
-            `radejax.models.lifting.ReferencePoints`, of one frame.
+        points: `[R, A, E, 2]` (x, y) of one frame from 0 to 1 between the edges of the image,
+            as in `radejax.models.lifting.ReferencePoints`.
         is_valid: `[R, A, E]` bool, True for points in the image.
         calibration: Calibration that the points were computed with.
         every: Steps in range, azimuth and elevation bins.
 
     Returns:
-        Number of points drawn.
+        The number of points drawn.
 
     References:
         DinoRADE, figure 2.
