@@ -1,7 +1,11 @@
 """RADE-Net and DinoRADE in JAX: 3D object detection in 4D radar tensors."""
 
 import importlib
+import sys
 from typing import Any
+
+if sys.platform == "win32":
+    raise ImportError("radejax runs on Linux and macOS; on Windows, use WSL 2")
 
 __version__ = "0.2.0"
 

@@ -25,10 +25,14 @@ from radejax.cli import entry
 @entry.step
 @entry.part
 @click.option(
-    "--score-threshold", type=float, help="Score threshold. Default: the config's."
+    "--score-threshold",
+    type=entry.FRACTION,
+    help="Score threshold. Default: the config's.",
 )
 @click.option(
-    "--nms-iou", type=float, help="IoU threshold of NMS. Default: the config's."
+    "--nms-iou",
+    type=entry.FRACTION,
+    help="IoU threshold of NMS. Default: the config's.",
 )
 @click.option(
     "--format",

@@ -9,8 +9,10 @@ import contextlib
 import errno
 import json
 import logging
+import math
 import os
 import pathlib
+import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -24,6 +26,8 @@ from radejax.core.files import is_no_space
 FAILED = 1
 WRONG_USE = 2
 INTERRUPTED = 128 + signal.SIGINT
+
+_HOME = re.compile(r"(?:^|(?<=[=,('\"]))~(?=[/,)'\"]|$)")
 
 _WRONG_PATH = (
     FileNotFoundError,
@@ -80,8 +84,10 @@ def _message(error: BaseException) -> str:
     if not isinstance(error, OSError) or error.filename is None:
         return str(error)
     message = f"{error.strerror}: {error.filename}"
-    if error.errno == errno.EROFS:
-        message += "; name another place (--out, --workdir, --records, --data)"
+    if error.errno in (errno.EROFS, errno.EACCES):
+        reason = "" if error.errno == errno.EROFS else "if it is to be written, "
+        place = "name another place (--out, --workdir, --records, --data)"
+        message += f"; {reason}{place}"
     return message
 
 
@@ -105,10 +111,12 @@ def set_up_jax() -> None:
     # Orbax logs every step. Its log is not needed, as its errors are also raised.
     absl_logging.set_verbosity(absl_logging.FATAL)
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read an absl flag
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # JAX reads the variable itself
-        home = os.environ.get("XDG_CACHE_HOME", pathlib.Path.home() / ".cache")
-        folder = pathlib.Path(home, "radejax", "jax")
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):  # JAX reads the variable itself
+        # Without a home folder, `expanduser` leaves "~", and programs are not cached.
+        home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+        if os.path.isabs(home):
+            folder = os.path.join(home, "radejax", "jax")
+            jax.config.update("jax_compilation_cache_dir", folder)
     # Small programs are cached too: compiling the fifty at the start of a run takes a
     # second.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -136,6 +144,14 @@ class Group(Program, click.Group):
     """The group of commands of one program."""
 
 
+def expand_home(arguments: list[str]) -> list[str]:
+    """Replaces `~` by the home folder in every path of the arguments.
+
+    Shells replace it only at the start of an argument, not in `--data=~/kradar`.
+    """
+    return [_HOME.sub(lambda m: os.path.expanduser(m[0]), arg) for arg in arguments]
+
+
 class Command(Program):
     """A command that reports user errors in one line with an exit code.
 
@@ -161,6 +177,9 @@ class Command(Program):
             with formatter.section(group):
                 formatter.write_dl(records)
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, expand_home(args))
+
     def invoke(self, ctx: click.Context) -> Any:
         with exit_codes(debug=ctx.params.pop("debug")):
             return super().invoke(ctx)
@@ -173,7 +192,20 @@ def echo_result(as_json: bool, values: Any, text: str) -> None:
 
 # Options -----------------------------------------------------------------------------
 
+
+class _Number(click.FloatRange):
+    """Finite numbers in a range; click's own type accepts NaN."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number", param, ctx)
+        return number
+
+
 COUNT = click.IntRange(1)
+FRACTION = _Number(0, 1)
+METERS = _Number()
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
 FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(exists=True)

@@ -57,7 +57,7 @@ _SETTINGS = together(
     ),
     click.option(
         "--score-threshold",
-        type=float,
+        type=entry.FRACTION,
         help="Threshold of all protocols except all_point. Default: 0, or the run's.",
     ),
     click.option(
@@ -74,7 +74,7 @@ _SETTINGS = together(
     ),
     click.option(
         "--bootstrap",
-        type=int,
+        type=click.IntRange(0),
         help="Resamples of sequences for 95 % intervals; 0: none. Default: 200 (score), "
         "2000 (compare), or the run's.",
     ),
@@ -89,7 +89,7 @@ _PREDICTIONS = together(
     click.option(
         "--z-offset",
         "z_offset_m",
-        type=float,
+        type=entry.METERS,
         help="Meters to add to the z of predictions.",
     ),
     click.option(
@@ -114,14 +114,18 @@ _OTHER_DATA = (
 @entry.image_backbone
 @click.option(
     "--shuffle-images",
-    type=int,
+    type=click.IntRange(0),
     help="Seed. Sanity check: pair every frame with another frame's image.",
 )
 @click.option(
-    "--min-score", type=float, help="Do not store predictions below this score."
+    "--min-score",
+    type=entry.FRACTION,
+    help="Do not store predictions below this score.",
 )
-@click.option("--batch-size", type=int, help="Frames per batch.")
-@click.option("--num-visualizations", type=int, help="Number of frames to draw.")
+@click.option("--batch-size", type=entry.COUNT, help="Frames per batch.")
+@click.option(
+    "--num-visualizations", type=click.IntRange(0), help="Number of frames to draw."
+)
 @_SETTINGS
 @entry.json_option
 def evaluate(

@@ -13,7 +13,6 @@ import click
 import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
-from radejax.core.structures import frame_key
 
 ANIMATIONS = (".gif", ".mp4")
 
@@ -58,6 +57,7 @@ def overlay(
     """
     import tqdm
 
+    from radejax.core.structures import frame_key
     from radejax.visualize.recordings import animate
     from radejax.visualize.style import save_figure
 

@@ -23,6 +23,7 @@ class _Command(entry.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parses the arguments; stores config fields as text in `ctx.meta["fields"]`."""
+        args = entry.expand_home(args)
         words = [word for word in args if not word.startswith(_PREFIX)]
         fields = [word.removeprefix(_PREFIX) for word in args if word not in words]
         pairs = (field.partition("=") for field in fields)
@@ -70,8 +71,10 @@ class _Command(entry.Command):
     "--coordinator",
     help="host:port of process 0. Default: detected under Slurm, Open MPI and on TPU pods.",
 )
-@click.option("--num-processes", type=int, help="Total number of processes.")
-@click.option("--process-id", type=int, help="Rank of this process, from 0.")
+@click.option("--num-processes", type=entry.COUNT, help="Total number of processes.")
+@click.option(
+    "--process-id", type=click.IntRange(0), help="Rank of this process, from 0."
+)
 @click.pass_context
 def train(
     ctx: click.Context,

@@ -12,6 +12,8 @@ import numpy as np
 from radejax.core.errors import DataError, one_line
 from radejax.core.files import PathLike, as_path
 
+_POINTER = b"version https://git-lfs"
+
 
 @contextlib.contextmanager
 def wrap_read_errors(where: PathLike, what: str) -> Iterator[None]:
@@ -87,6 +89,16 @@ def read_npz(path: PathLike) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
+def check_not_pointer(path: PathLike) -> None:
+    """Raises a `DataError` if a file is a pointer of Git LFS in place of the content."""
+    with open(as_path(path), "rb") as file:
+        if file.read(len(_POINTER)) == _POINTER:
+            raise DataError(
+                f"{path}: a pointer of Git LFS, not the file itself: run `git lfs pull` in "
+                "its folder, or download the file"
+            )
+
+
 def read_safetensors(path: PathLike) -> dict[str, np.ndarray]:
     """Reads the arrays of a safetensors file by name.
 
@@ -96,5 +108,6 @@ def read_safetensors(path: PathLike) -> dict[str, np.ndarray]:
     """
     import safetensors.numpy  # only few users of this module need it
 
+    check_not_pointer(path)
     with wrap_read_errors(path, "a safetensors file"):
         return safetensors.numpy.load_file(as_path(path))

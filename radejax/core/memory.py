@@ -23,7 +23,8 @@ def restart_with_huge_pages() -> None:
     `GLIBC_TUNABLES`), or if the kernel does not let programs choose (`madvise`). C
     libraries other than glibc ignore the variable.
     """
-    is_set = any(name.startswith(("MALLOC_", "GLIBC_TUNABLES")) for name in os.environ)
+    allocator = ("MALLOC_", "GLIBC_TUNABLES")
+    is_set = any(v for n, v in os.environ.items() if n.startswith(allocator))
     if is_set or not sys.executable or not _PAGES.exists():
         return
     if "[madvise]" in _PAGES.read_text():

@@ -21,7 +21,12 @@ from radejax.core.errors import (
     or_none,
     several,
 )
-from radejax.geometry.camera import Camera, CameraCalibration, ImageKind
+from radejax.geometry.camera import (
+    LOOKING_AHEAD,
+    Camera,
+    CameraCalibration,
+    ImageKind,
+)
 
 _FINITE: Range = math.isfinite, "a finite number"
 _OPTIONS = {
@@ -144,7 +149,7 @@ def no_camera(image_size: tuple[int, int]) -> Camera:
     calibration = CameraCalibration(
         intrinsics=np.array([width, width, width / 2, height / 2]),
         distortion=np.zeros(5),
-        rotation=np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+        rotation=LOOKING_AHEAD,
         translation_m=np.zeros(3),
         width=width,
         height=height,

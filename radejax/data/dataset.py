@@ -124,11 +124,13 @@ class LabelledFrame:
         self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
         """Reads the camera calibration, with the frame's own translation or a given one."""
-        assert self.camera_calibration_path is not None  # callers check it
-        return CameraCalibration.from_kradar(
-            self.camera_calibration_path,
-            radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m,
+        path = self.camera_calibration_path
+        assert path is not None  # callers check it
+        calibration = CameraCalibration.from_kradar(
+            path, radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m
         )
+        calibration.require_view_ahead(path)
+        return calibration
 
     def calibrated_size(self) -> tuple[int, int] | None:
         """Returns height and width of the calibration's images, or None without one."""

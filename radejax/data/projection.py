@@ -8,6 +8,7 @@ which reads each cell from memory only once if it follows the tensor's memory or
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -26,6 +27,11 @@ LOG_SCALE_DB = 184.3
 
 MAX_LEVEL = 100.0
 """Bound on the absolute value of a level; any power in float64 gives -0.54 to 17."""
+
+_MAX_ZERO_SHARE = 0.05
+_MAX_DECIBELS = 300.0
+_DECIBEL_LEVEL = (10 * math.log10(_MAX_DECIBELS) + LOG_OFFSET_DB) / LOG_SCALE_DB
+_LOWEST_LEVEL = (10 * math.log10(2 * POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
 
 def project_tensor(
@@ -112,12 +118,13 @@ def _project_slab(
     as the unsigned integers with the same bits. NumPy reduces integers twice as fast,
     because it does not need to handle NaN; a positive NaN is the largest value in both
     cases. Power has no sign bit. If a slab has one nevertheless, the integer maximum has
-    it too, and the slab is reduced again as floats.
+    it too, and the slab is reduced again as floats; bins with a negative cell are NaN, as
+    the logarithm of that cell.
     """
     unsigned = np.dtype(f"u{slab.dtype.itemsize}")
     power = reduce(slab.view(unsigned))
     if power.max() >> (8 * unsigned.itemsize - 1):
-        power = reduce(slab)
+        power = reduce(np.where(slab < 0, slab.dtype.type(np.nan), slab))
     to_log_scale(power.view(slab.dtype), out)
 
 
@@ -145,6 +152,29 @@ def to_log_scale(
     level = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
     return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
+
+
+def find_problem(
+    beams: Float[np.ndarray, "..."], lowest_power: float = 0.0
+) -> str | None:
+    """Describes why values cannot come from linear power; returns None if they can.
+
+    A tensor is taken to be in decibels if all its cells are above 1 and at most 300: in
+    linear power, noise has a wider range, with cells below 1.
+
+    Args:
+        beams: Levels, as in a projection, of the strongest cell of every elevation and
+            azimuth.
+        lowest_power: Power of the weakest cell of the tensor, or of a large part of it.
+    """
+    if not (lowest_power >= 0 and (np.abs(beams) <= MAX_LEVEL).all()):  # also if NaN
+        return "some values are negative, infinite or NaN"
+    share = np.mean(beams < _LOWEST_LEVEL)
+    if share > _MAX_ZERO_SHARE:
+        return f"{share:.0%} of the beams have a power of exactly 0 at every range"
+    if lowest_power > 1 and beams.max() <= _DECIBEL_LEVEL:
+        return f"all values are between 1 and {_MAX_DECIBELS:g}, as in decibels"
+    return None
 
 
 @jax.jit

@@ -31,7 +31,12 @@ from jaxtyping import Float, Real
 from radejax.core.archives import read_npy, wrap_read_errors
 from radejax.core.errors import DataError
 from radejax.core.files import PathLike, as_path
-from radejax.data.projection import MAX_LEVEL, project_columns, project_tensor
+from radejax.data.projection import (
+    MAX_LEVEL,
+    find_problem,
+    project_columns,
+    project_tensor,
+)
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -62,17 +67,20 @@ def project_file(
 ) -> Float[np.ndarray, "R A DE"]:
     """Compute `project_tensor` of a file; see `read_tesseract` for arguments and errors.
 
-    Negative, infinite or NaN power is a `DataError` too. Uncompressed floats are streamed:
+    Values that cannot be power are a `DataError` too. Uncompressed floats are streamed:
     every azimuth is reduced while it is in the cache, and the 260 MB are never in memory. (A
     memory map would save as much, but a bad disk sector would then kill the process.)
     """
     with _opened(path, shape_drea) as (file, layout):
         if layout.deflated is None and layout.dtype.kind == "f":
+            lowest = next(_read_columns(file, layout)).min()
             projection = project_columns(_read_columns(file, layout), layout.shape)
         else:
-            projection = project_tensor(_read_array(file, layout))
-    if not np.isfinite(projection).all():
-        raise DataError(f"{path}: corrupted, {VARIABLE} has negative or infinite power")
+            tensor = _read_array(file, layout)
+            lowest, projection = tensor[..., 0].min(), project_tensor(tensor)
+    beams = projection[..., layout.shape[0] :].max(axis=0)
+    if problem := find_problem(beams, lowest):
+        raise DataError(f"{path}: corrupted, {VARIABLE} is not linear power: {problem}")
     return projection
 
 
@@ -189,7 +197,7 @@ def _read_columns(
 # MATLAB v5 files --------------------------------------------------------------------
 
 _MATRIX, _DEFLATED = 14, 15
-_INT8, _INT32, _UINT32 = 1, 5, 6
+_INT8, _UINT8, _INT32, _UINT32 = 1, 2, 5, 6
 # Types of arrays and types of stored values, by their numbers in the format.
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
@@ -294,10 +302,14 @@ def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
     if (kind, flags_kind, flags_size) != (_MATRIX, _UINT32, 8):
         raise _corrupted(file, f"a variable begins with types {kind}, {flags_kind}")
     dims_kind, dims_size, at, after = _tag(head, after)
-    shape = struct.unpack_from(f"<{dims_size // 4}i", head, at)
+    shape = struct.unpack_from(
+        f"<{dims_size // 4}{'iI'[dims_kind == _UINT32]}", head, at
+    )
     name_kind, name_size, at, after = _tag(head, after)
     name = head[at : at + name_size].decode("ascii", "replace")
-    if (dims_kind, dims_size % 4, name_kind) != (_INT32, 0, _INT8):
+    # MATLAB writes the first of these types, other programs also the second.
+    is_known = dims_kind in (_INT32, _UINT32) and name_kind in (_INT8, _UINT8)
+    if not is_known or dims_size % 4:
         raise _corrupted(file, f"shape of type {dims_kind}, name of type {name_kind}")
     if name != VARIABLE:
         return name, None

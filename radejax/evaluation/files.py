@@ -110,9 +110,12 @@ def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
             and all(type(number) in (int, float) for number in numbers)
         )
         if not is_good:
+            needed = ("frame", "cls", "score")[: 3 if scored else 2]
+            lacking = [name for name in needed if name not in values]
+            without = f" without {' and '.join(lacking)}" if lacking else ""
             raise DataError(
-                f"{path}: row {row} is {record!r:.300}, expected a list of records with "
-                f"frame, cls, score and numbers {', '.join(BOX_FIELDS)} (or as box)"
+                f"{path}: row {row}{without} is {record!r:.300}, expected a list of records "
+                f"with {', '.join(needed)} and numbers {', '.join(BOX_FIELDS)} (or as box)"
             )
         yield frame, cls, box, score
 

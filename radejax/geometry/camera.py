@@ -50,7 +50,11 @@ _LENS = ("k1", "k2", "k3", "k4", "k5")
 _PINHOLE = ("fx", "fy", "px", "py")
 _KEYS = _PINHOLE + _LENS + _ANGLES + _SHIFTS
 
+LOOKING_AHEAD = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+"""Rotation from LiDAR axes to the axes of a camera that looks straight ahead."""
+
 _MAX_PIXELS = 1 << 16
+_AZIMUTHS_DEG = range(-45, 46, 5)
 _MAX_VALUE = 1e9  # far beyond pixels, coefficients and meters of any camera
 
 # Pairs of corner indices in the order of `boxes.corners`.
@@ -266,6 +270,10 @@ class CameraCalibration(ArrayValues):
     def from_kradar(cls, path: str | pathlib.Path, **fields: Any) -> CameraCalibration:
         """Reads one of K-Radar's `cam_*.yml` files, of one sequence or of all.
 
+        K-Radar's calibration tool writes angles relative to a camera that looks straight
+        ahead (`cam_calib/from_gui_tool`). As the roll of an upright camera is about 90
+        degrees otherwise, angles with a roll of less than 45 degrees are read as relative.
+
         Args:
             path: Path of the file, which has one `key: number` per line.
             **fields: Values for the remaining attributes, e.g. `radar_from_lidar_m`.
@@ -283,7 +291,7 @@ class CameraCalibration(ArrayValues):
             raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
         yaw, pitch, roll = (values[key] for key in _ANGLES)
         try:
-            return cls.from_angles(
+            calibration = cls.from_angles(
                 intrinsics=[values[key] for key in _PINHOLE],
                 distortion=[values[key] for key in _LENS],
                 yaw_deg=yaw,
@@ -296,6 +304,10 @@ class CameraCalibration(ArrayValues):
             )
         except ValueError as error:
             raise DataError(f"{path}: {error}") from None
+        if abs(roll) >= 45:
+            return calibration
+        rotation = calibration.rotation @ LOOKING_AHEAD
+        return dataclasses.replace(calibration, rotation=rotation)
 
     def to_kradar_text(self) -> str:
         """Returns the content of a K-Radar calibration file, which `from_kradar` reads."""
@@ -317,6 +329,23 @@ class CameraCalibration(ArrayValues):
         )
 
     # Use -----------------------------------------------------------------------------
+
+    def require_view_ahead(self, source: object) -> None:
+        """Raises a `DataError` unless a front camera can see objects ahead of the radar.
+
+        Args:
+            source: Name of the calibration for the error message.
+        """
+        range_m, azimuth_rad = np.meshgrid(
+            np.arange(5.0, 61), np.deg2rad(_AZIMUTHS_DEG)
+        )
+        x_m, y_m = range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)
+        ahead = np.stack([x_m, y_m, np.zeros_like(x_m)], -1)
+        if not self.in_image(*self.project_ego(ahead)).any():
+            raise DataError(
+                f"{source}: not the calibration of a front camera: nothing that is 5 to "
+                "60 m ahead is in the image"
+            )
 
     def camera(self, image: ImageKind = "raw", *, is_valid: bool = True) -> Camera:
         """Returns the pytree with which jitted code projects onto one kind of image.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import functools
@@ -24,7 +25,12 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
 from radejax.data.cameras import CameraOptions, no_camera, read_left_image
-from radejax.data.projection import MAX_LEVEL, project_jax
+from radejax.data.projection import (
+    MAX_LEVEL,
+    find_problem,
+    project_jax,
+    to_log_scale,
+)
 from radejax.data.tesseract import read_frame
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.camera import (
@@ -376,6 +382,32 @@ def _read_paths(given: Any, read: Callable[[pathlib.Path, int], np.ndarray]) -> 
     ]
 
 
+def as_numbers(values: Any, name: str) -> Any:
+    """Convert an array of any kind of real numbers to one that JAX accepts.
+
+    Args:
+        values: Array; those on a device are returned unchanged.
+        name: Name of the array for the error message.
+
+    Raises:
+        UserError: The values are masked, or are not real numbers.
+    """
+    if isinstance(values, jax.Array):
+        return values
+    if np.ma.is_masked(values):
+        count = np.ma.count_masked(values)
+        raise UserError(
+            f"{name}: {count} values are masked; fill them: array.filled(x)"
+        )
+    array = np.asarray(values)
+    if array.dtype == object:
+        with contextlib.suppress(TypeError, ValueError):
+            array = array.astype(np.float64)
+    if not (array.dtype.kind in "iu" or jnp.issubdtype(array.dtype, jnp.floating)):
+        raise UserError(f"{name}: array of {array.dtype}, expected real numbers")
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
 def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     """Combine radar frames into one array with a leading axis B.
 
@@ -395,7 +427,8 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     if isinstance(radar, list):
         if not radar:
             raise UserError("no frames: the list is empty")
-        radar = np.stack(radar)
+        radar = np.stack([as_numbers(frame, "frames") for frame in radar])
+    radar = as_numbers(radar, "frames")
     shape = tuple(np.shape(radar))
     projection, tesseract = grid.projection_shape, grid.shape_drea
     if shape in (projection, tesseract):
@@ -409,15 +442,11 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     )
 
 
-_MAX_DECIBELS = 300.0
-
-
 def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:
     """Count the frames whose values cannot be linear power or levels of a projection.
 
-    A frame is taken to be in decibels if all its values are above 1 and at most 300: in
-    linear power, noise has a wider range, with bins below 1. Arrays on a device are not
-    checked. Neither are uint8 arrays, in which every value is a valid level.
+    Arrays on a device are not checked (see `find_problem` for what is), and neither are
+    uint8 arrays, in which every value is a valid level.
 
     Args:
         frames: Projections or tesseracts.
@@ -425,22 +454,27 @@ def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:
     """
     if not isinstance(frames, np.ndarray) or frames.dtype == np.uint8:
         return 0
-    axes = tuple(range(1, frames.ndim))
-    low, high = frames.min(axes), frames.max(axes)  # NaN if the frame contains NaN
-    lowest, limit = -MAX_LEVEL, MAX_LEVEL
-    if frames.ndim == 5:
-        lowest, limit = 0.0, float(np.finfo(np.float32).max)
-    is_decibels = (low > 1.0) & (high <= _MAX_DECIBELS)
-    count = int((~((low >= lowest) & (high <= limit)) | is_decibels).sum())
+    problems = [_find_problem(frame) for frame in frames]
+    count = len(problems) - problems.count(None)
     if count and warn:
         _log.warning(
-            "%d of %d frames contain NaN, Inf or out-of-range values (expected linear "
-            "power or its projection; is the input in decibels?). Their detections are "
-            "meaningless; further ones are counted in num_invalid_frames",
+            "%d of %d frames are not linear power or its projection: %s. Their detections "
+            "are meaningless; further ones are counted in num_invalid_frames",
             count,
             len(frames),
+            next(filter(None, problems)),
         )
     return count
+
+
+def _find_problem(frame: Real[np.ndarray, "..."]) -> str | None:
+    """Describe why a projection or tesseract is not valid; None if it is."""
+    lowest = float(frame.min())
+    if frame.ndim == 3:
+        return find_problem(frame.max(axis=0), 0.0 if lowest >= -MAX_LEVEL else -1.0)
+    with np.errstate(invalid="ignore"):  # the logarithm of a negative maximum
+        beams = to_log_scale(frame.max(axis=(0, 1)).astype(np.float64))
+    return find_problem(beams, lowest)
 
 
 def camera_batch(
@@ -520,7 +554,8 @@ def _images(
             empty = np.zeros_like(np.asarray(image[has_image.argmax()]))
         image = np.stack([empty if one is None else one for one in image])
     else:
-        image = image[None] if np.ndim(image) == 3 else image
+        image = as_numbers(image, "image")
+        image = image[None] if image.ndim == 3 else image
         has_image = np.ones(len(image), bool)
     if image.shape[1:] not in sizes:
         expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in sizes)
@@ -550,9 +585,11 @@ def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
     if isinstance(camera, Camera):
         return camera
     if not isinstance(camera, CameraCalibration):
+        path = as_path(camera)
         camera = CameraCalibration.from_kradar(
-            as_path(camera), radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
+            path, radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
         )
+        camera.require_view_ahead(path)
     own_m = camera.radar_from_lidar_m
     shift_m = np.array(options.shift(own_m, own_m[2]))
     camera = dataclasses.replace(camera, radar_from_lidar_m=shift_m)
@@ -595,6 +632,8 @@ def _settings(
     """Return the given values by the names in `SETTINGS`, without those that are None."""
     given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
     settings: dict[str, Any] = {k: float(v) for k, v in given.items() if v is not None}
+    for name, value in settings.items():
+        require(0 <= value <= 1, name, value, "a number from 0 to 1")
     if roi is not None:
         limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
         require(len(limits) == 6, "roi", roi, "narrow, wide or x0, x1, y0, y1, z0, z1")

@@ -39,7 +39,7 @@ from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
-from radejax.weights.convert import read_state_dict
+from radejax.weights.convert import check_finite, read_state_dict
 
 _log = logging.getLogger(__name__)
 
@@ -111,6 +111,7 @@ def load_model(
     if path.is_file():
         return load_torch(path, image_backbone=image_backbone)
     saved = _read_exported(path) if is_exported else _read_checkpoint(path, step)
+    check_finite(saved.variables, path)
     return _with_backbone(saved, image_backbone)
 
 

@@ -301,7 +301,14 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
     _log.info("%s", data.frames.summary().to_text())
     # Preprocessing can take hours, so the data are checked before it.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
-    pipeline.check_enough(len(data.split("train")), config.train.batch_size)
+    frames = data.split("train")
+    pipeline.check_enough(len(frames), config.train.batch_size)
+    if not any(len(frame.boxes) for frame in frames):
+        raise UserError(
+            f"the {len(frames)} frames of the train split have no object of the classes "
+            f"{', '.join(config.classes)}, with visibility {config.data.visibility} and "
+            "in the field of view: nothing can be learned from them"
+        )
     data.preprocess()
     if config.data.validation:
         frames = data.split("validation")

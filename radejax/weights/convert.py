@@ -73,8 +73,8 @@ def from_torch(
         Nested variables in float32.
 
     Raises:
-        DataError: Tensors are missing, unexpected or of another shape. The message lists up
-            to 20 of them.
+        DataError: Tensors are missing, unexpected, of another shape or not finite. The
+            message lists up to 20 of them.
         UserError: A module matches no rule, because torch's code has no counterpart.
     """
     left, problems = dict(tensors), []
@@ -93,6 +93,8 @@ def from_torch(
                 f"{name} is {value.dtype}{value.shape}, expected {expected}"
             )
             return None
+        if not np.isfinite(ours).all():
+            problems.append(f"{name} has values that are not finite")
         return np.array(ours, np.float32, order="C")
 
     flat: dict[str, Any] = {}
@@ -175,6 +177,14 @@ def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
         points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
         inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]
     return shapes_of(jax.eval_shape(model.init, jax.random.key(0), *inputs))
+
+
+def check_finite(variables: Mapping[str, Any], source: PathLike) -> None:
+    """Raise a `DataError` that names the first variable with NaN or infinite values."""
+    flat = flax.traverse_util.flatten_dict(dict(variables), sep="/")
+    for path, leaf in flat.items():
+        if not np.isfinite(leaf).all():
+            raise DataError(f"{source}: {path} has values that are not finite")
 
 
 def shapes_of(variables: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

@@ -86,6 +86,12 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
         UserError: The folder contains another kind of model.
     """
     folder = files.as_path(folder)
+    path = folder / WEIGHTS_FILE
+    if path.with_name(f"{WEIGHTS_FILE}.index.json").is_file():
+        raise UserError(
+            f"{folder} has its weights in several files: load it with transformers and "
+            f"write one {WEIGHTS_FILE} with save_pretrained(..., max_shard_size='100GB')"
+        )
     missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
     if missing:
         raise FileNotFoundError(
@@ -93,12 +99,18 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
             " as downloaded from Hugging Face"
         )
     config = files.read_object(folder / CONFIG_FILE)
+    tensors = read_safetensors(path)
+    if any(name.startswith("blocks.") for name in tensors):
+        raise UserError(
+            f"{path} has the names of timm or of Meta's code (blocks.0...), expected those "
+            "of transformers (layer.0...): download the model by facebook, such as "
+            "facebook/dinov3-vits16-pretrain-lvd1689m"
+        )
     try:
         model = model_from_config(config)
     except UserError as error:
         raise UserError(f"{folder / CONFIG_FILE}: {error}") from None
-    path = folder / WEIGHTS_FILE
-    return model, {"params": to_params(model, read_safetensors(path), str(path))}
+    return model, {"params": to_params(model, tensors, str(path))}
 
 
 def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:

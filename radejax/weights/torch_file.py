@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from radejax.core.archives import read_member
+from radejax.core.archives import check_not_pointer, read_member
 from radejax.core.errors import DataError, one_line
 from radejax.core.files import PathLike, as_path
 
@@ -52,6 +52,7 @@ def read(path: PathLike) -> Any:
         DataError: The file is not a torch file, is corrupted, or contains other objects.
     """
     path = as_path(path)
+    check_not_pointer(path)
     with path.open("rb") as file:
         start = file.read(4)
     if start != b"PK\x03\x04":

@@ -147,9 +147,26 @@ def test_impossible_power_is_damage(tmp_path, tesseract, value):
     write(path, tesseract, "plain")
     with (
         np.errstate(invalid="ignore"),
-        pytest.raises(DataError, match="negative or infinite power"),
+        pytest.raises(
+            DataError,
+            match="not linear power: some values are negative, infinite or NaN",
+        ),
     ):
         project_file(path)
+
+
+@pytest.mark.parametrize("layout", ["plain", "compressed"])
+def test_values_that_are_no_power_are_named(tmp_path, tesseract, layout):
+    path = tmp_path / "t.mat"
+    write(path, 10 * np.log10(tesseract), layout)
+    with pytest.raises(
+        DataError, match=r"t\.mat: .* between 1 and 300, as in decibels"
+    ):
+        check_tesseract(path, deep=True)
+    tesseract[..., tesseract.shape[3] // 3 :] = 0  # as in a file that is copied in part
+    write(path, tesseract, layout)
+    with pytest.raises(DataError, match=r"80% of the beams have a power of exactly 0"):
+        check_tesseract(path, deep=True)
 
 
 def test_wrong_content_is_named(tmp_path, tesseract):
